@@ -1,0 +1,78 @@
+# `make` alone lists the targets. Each one makes the environment it needs by itself.
+
+VENV  := .venv
+BIN   := $(VENV)/bin
+READY := $(VENV)/.ready
+PIP   := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+# An environment that exists keeps its Python, unless PYTHON names one of another version.
+VERSION := -c 'import sys; print(sys.version.split()[0])'
+ifdef PYTHON
+ifneq ($(shell ($(PYTHON) $(VERSION)) 2>/dev/null),$(shell ($(BIN)/python $(VERSION)) 2>/dev/null))
+.PHONY: $(READY)
+RENEW := yes
+endif
+endif
+PYTHON ?= python3
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test check format docs bench lock clean
+
+help:  ## List the targets
+	@echo "make TARGET [PYTHON=python3.12]"
+	@echo
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) online
+	@$(BIN)/livepde demo
+
+test: $(READY)  ## Run all tests and doctests, with coverage
+	@$(BIN)/pytest --cov
+
+check: $(READY)  ## Check style, format, types and import layers
+	@$(BIN)/ruff check --quiet
+	@$(BIN)/ruff format --check --quiet || { echo "Not formatted as agreed: run 'make format'."; exit 1; }
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports --no-logo
+
+format: $(READY)  ## Format the code and mend what can be mended automatically
+	@$(BIN)/ruff check --fix-only
+	@$(BIN)/ruff format
+
+docs: $(READY)  ## Build the documentation into site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "Built: site/index.html"
+
+bench: $(READY)  ## Measure what one step costs
+	@$(BIN)/livepde bench step
+
+lock:  ## Renew constraints.txt from pyproject.toml with the newest versions
+	@$(PYTHON) -m venv --clear .venv-lock
+	@.venv-lock/bin/python -m pip --disable-pip-version-check --quiet install -e ".[dev]"
+	@.venv-lock/bin/python -m pip --disable-pip-version-check freeze --exclude-editable > constraints.txt
+	@rm -rf .venv-lock
+	@echo "Renewed constraints.txt: read the difference, then run 'make check test'."
+
+clean:  ## Remove caches and build products (not .venv)
+	@rm -rf build dist site htmlcov .coverage .coverage.* .hypothesis
+	@rm -rf .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	@find src tests -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+
+# The stamp is younger than both files as long as the environment holds what they ask for.
+$(READY): pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || \
+	  { echo "Found no '$(PYTHON)': install Python 3.11 or newer, or name yours with 'make PYTHON=...'."; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "livepde needs Python 3.11 or newer, '$(PYTHON)' is" \
+	         "$$($(PYTHON) -c 'import sys; print(sys.version.split()[0])'):" \
+	         "name a newer one with 'make PYTHON=...'."; exit 1; }
+	@if [ -z "$(RENEW)" ] && $(BIN)/python -m pip --version >/dev/null 2>&1; then \
+	  echo "Updating $(VENV)"; \
+	else \
+	  echo "Creating $(VENV) (about a minute, once)"; \
+	  $(PYTHON) -m venv --clear $(VENV) || \
+	    { echo "Python's venv module does not work here; on Debian and Ubuntu: apt-get install python3-venv."; exit 1; }; \
+	fi
+	@$(PIP) install -c constraints.txt -e ".[dev]"
+	@touch $@
