@@ -1,0 +1,71 @@
+"""State values on disk: a NumPy archive of plain arrays, no pickle, written atomically."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import RunError
+from livepde.linalg import Array
+
+__all__ = ["flatten", "read", "rebuild", "write"]
+
+
+def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
+    """Return the leaves of nested dataclasses of arrays and numbers, by dotted path."""
+    if not is_dataclass(value) or isinstance(value, type):
+        return {prefix: value}
+    leaves: dict[str, Any] = {}
+    for item in fields(value):
+        leaves |= flatten(getattr(value, item.name), f"{prefix}.{item.name}")
+    return leaves
+
+
+def rebuild(template: Any, leaves: Mapping[str, Array], prefix: str = "state") -> Any:
+    """Return a value shaped like `template` with the leaves given."""
+    if is_dataclass(template) and not isinstance(template, type):
+        parts = {
+            item.name: rebuild(getattr(template, item.name), leaves, f"{prefix}.{item.name}")
+            for item in fields(template)
+        }
+        return type(template)(**parts)
+    array = leaves[prefix]
+    return array if isinstance(template, np.ndarray) else type(template)(array.item())
+
+
+def write(
+    path: str | os.PathLike[str], header: Mapping[str, Any], leaves: Mapping[str, Any]
+) -> None:
+    """Write header and leaves; the file appears whole or not at all."""
+    target = Path(path)
+    partial = target.with_name(target.name + ".partial")
+    try:
+        with partial.open("wb") as file:
+            np.savez(file, header=json.dumps(dict(header)), **leaves)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(target)
+    except OSError as error:
+        raise RunError(
+            f"Cannot write the checkpoint {target}: {error.strerror or error}."
+        ) from error
+
+
+def read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Return header and leaves of a checkpoint."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            leaves = {name: archive[name] for name in archive.files}
+        header: dict[str, Any] = json.loads(str(leaves.pop("header")))
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise RunError(
+            f"{path} is not a checkpoint of livepde, or it is damaged: {error}."
+        ) from error
+    return header, leaves

@@ -1,0 +1,90 @@
+"""The exceptions of livepde.
+
+::
+
+    LivepdeError
+    ├── ConfigurationError          what was built or asked for does not fit together
+    │   ├── SpaceError              mesh, element, inner product, prior
+    │   ├── ModelError              weak forms and their arguments
+    │   ├── ObservationError        sensors, subdomains, matrices
+    │   ├── LawError                an update law on a problem it cannot serve
+    │   └── CaseError               a case file: wrong key, value, unit, range
+    ├── DataError                   one sample that cannot be used; the estimate is unchanged
+    │   ├── SampleError             wrong shape, text, infinity, unknown channel
+    │   ├── TimeOrderError          time going backwards
+    │   └── MissingInputError       an input without any value yet
+    ├── RunError                    a run directory that is taken, missing or damaged
+    └── LinearAlgebraError          a matrix that cannot be factorised
+
+A step that fails numerically is not an exception: it is reported as `Status` of the estimate.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "CaseError",
+    "ConfigurationError",
+    "DataError",
+    "LawError",
+    "LinearAlgebraError",
+    "LivepdeError",
+    "MissingInputError",
+    "ModelError",
+    "ObservationError",
+    "RunError",
+    "SampleError",
+    "SpaceError",
+    "TimeOrderError",
+]
+
+
+class LivepdeError(Exception):
+    """Base of everything livepde raises on purpose; the message says where, what and the remedy."""
+
+
+class ConfigurationError(LivepdeError, ValueError):
+    """Parts that do not fit together."""
+
+
+class SpaceError(ConfigurationError):
+    """A mesh, element, inner product or prior that does not give a Hilbert space."""
+
+
+class ModelError(ConfigurationError):
+    """A weak form that cannot be evaluated or is not linear where it must be."""
+
+
+class ObservationError(ConfigurationError):
+    """Sensors that do not fit the state space."""
+
+
+class LawError(ConfigurationError):
+    """An update law asked to serve a problem it is not made for."""
+
+
+class CaseError(ConfigurationError):
+    """A case file with a wrong key, value, unit or range."""
+
+
+class DataError(LivepdeError, ValueError):
+    """A sample that cannot be used; nothing was changed by it."""
+
+
+class SampleError(DataError):
+    """A sample with a wrong shape, an infinite value, text, or an unknown channel."""
+
+
+class TimeOrderError(DataError):
+    """A sample that is not later than the one before."""
+
+
+class MissingInputError(DataError):
+    """An input or boundary channel that has not had any value yet."""
+
+
+class RunError(LivepdeError, OSError):
+    """A run directory that is taken, missing or damaged."""
+
+
+class LinearAlgebraError(LivepdeError, ArithmeticError):
+    """A matrix that is singular to working precision."""

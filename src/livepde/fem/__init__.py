@@ -1,0 +1,46 @@
+"""Fields on meshes and weak forms: the only room that knows scikit-fem."""
+
+from __future__ import annotations
+
+from livepde.fem.blocks import FieldBlock
+from livepde.fem.fields import (
+    Channel,
+    Field,
+    Integrand,
+    On,
+    Piecewise,
+    Predicate,
+    Scalar,
+    Unknown,
+    interval,
+)
+from livepde.fem.forms import Form
+from livepde.fem.place import START, Inputs, Moment, Place
+from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
+from livepde.fem.space import FunctionSpace
+
+__all__ = [
+    "START",
+    "Channel",
+    "Field",
+    "FieldBlock",
+    "Form",
+    "FunctionSpace",
+    "Inputs",
+    "Integrand",
+    "Moment",
+    "On",
+    "Piecewise",
+    "Place",
+    "Predicate",
+    "Scalar",
+    "Unknown",
+    "ddot",
+    "div",
+    "dot",
+    "grad",
+    "hess",
+    "interval",
+    "trace",
+    "transpose",
+]

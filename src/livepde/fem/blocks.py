@@ -1,0 +1,286 @@
+"""Each kind of unknown as coefficients with local shape functions on a measure."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from skfem import Basis, FacetBasis, Mesh
+from skfem.element import DiscreteField
+
+from livepde.errors import ObservationError, SpaceError
+from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Unknown
+from livepde.fem.place import Moment, Place
+from livepde.linalg import Array, IntArray
+
+__all__ = ["Block", "FieldBlock", "Local", "Measure", "ScalarBlock", "block_of"]
+
+JETS = ("value", "grad", "hess")
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Where a form is integrated: the whole mesh, a subdomain, or a boundary; with its order."""
+
+    mesh: Mesh
+    order: int
+    name: str | None = None
+
+    @property
+    def on_boundary(self) -> bool:
+        """True if the name is one of a boundary."""
+        return self.name is not None and self.name in (self.mesh.boundaries or {})
+
+    def basis(self, element: Any) -> Any:
+        """Return scikit-fem's basis of an element on this measure."""
+        if self.name is None:
+            return Basis(self.mesh, element, intorder=self.order)
+        if self.on_boundary:
+            return FacetBasis(self.mesh, element, facets=self.name, intorder=self.order)
+        if self.name in (self.mesh.subdomains or {}):
+            return Basis(self.mesh, element, elements=self.name, intorder=self.order)
+        known = [*(self.mesh.boundaries or {}), *(self.mesh.subdomains or {})]
+        raise SpaceError(f"On('{self.name}', ...): the mesh names {known or 'nothing'}.")
+
+    @cached_property
+    def _base(self) -> Any:
+        return self.basis(self.mesh.elem())
+
+    @cached_property
+    def points(self) -> Array:
+        """Coordinates of the quadrature points, shape (d, elements, points)."""
+        x: Array = np.asarray(self._base.global_coordinates())
+        return x
+
+    @cached_property
+    def weights(self) -> Array:
+        """Quadrature weights, shape (elements, points)."""
+        return np.asarray(self._base.dx)
+
+    @cached_property
+    def normal(self) -> Array | None:
+        """Outward normals on a boundary."""
+        return np.asarray(self._base.normals) if self.on_boundary else None
+
+
+@dataclass(frozen=True)
+class Local:
+    """Shape functions of a block on a measure.
+
+    Attributes
+    ----------
+    dofs
+        Coefficient of each local shape function, shape (local, elements).
+    parts
+        What a form sees: (jet, tensor shape) in order, such as ("value", ()), ("grad", (d,)).
+    phi
+        Components of all parts, shape (components, local, elements, points).
+    """
+
+    dofs: IntArray
+    parts: tuple[tuple[str, tuple[int, ...]], ...]
+    phi: Array
+
+
+class Block(ABC):
+    """One unknown of a function space."""
+
+    size: int
+
+    @abstractmethod
+    def local(self, measure: Measure) -> Local:
+        """Return the local shape functions on a measure."""
+
+    @abstractmethod
+    def jet(self, parts: Local, values: Array) -> Any:
+        """Return what a form gets for component values of shape (components, ..., E, P)."""
+
+    @abstractmethod
+    def prior(self) -> Array:
+        """Return the prior mean as coefficients, shape (size,)."""
+
+    @abstractmethod
+    def labels(self, name: str) -> tuple[str, ...]:
+        """Return a label for each coefficient that stands for itself (none for fields)."""
+
+    @property
+    @abstractmethod
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the coefficients, each of shape (size,)."""
+
+
+class ScalarBlock(Block):
+    """Numbers: constant on the domain (`Scalar`) or on each region (`Piecewise`)."""
+
+    def __init__(self, unknown: Scalar | Piecewise) -> None:
+        self.unknown = unknown
+        self.size = 1 if isinstance(unknown, Scalar) else len(unknown.regions)
+
+    def _indicators(self, measure: Measure) -> Array:
+        _, elements, points = measure.points.shape
+        if isinstance(self.unknown, Scalar):
+            return np.ones((1, elements, points))
+        masks = np.zeros((self.size, elements, points))
+        for mask, (name, region) in zip(masks, self.unknown.regions.items(), strict=True):
+            if callable(region):
+                mask[:] = region(measure.points)
+            elif region in (measure.mesh.subdomains or {}) and not measure.on_boundary:
+                members = measure.basis(measure.mesh.elem()).tind
+                if members is None:
+                    members = np.arange(measure.mesh.nelements)
+                mask[np.isin(members, measure.mesh.subdomains[region])] = 1.0
+            else:
+                raise SpaceError(
+                    f"Region '{name}': the mesh has no subdomain '{region}' here; give a "
+                    "predicate on x (needed on boundaries)."
+                )
+        return masks
+
+    def local(self, measure: Measure) -> Local:
+        phi = self._indicators(measure)[None]
+        dofs = np.repeat(np.arange(self.size)[:, None], phi.shape[2], axis=1)
+        return Local(dofs, (("value", ()),), phi)
+
+    def jet(self, parts: Local, values: Array) -> Any:
+        return values[0]
+
+    def prior(self) -> Array:
+        return np.full(self.size, float(self.unknown.prior))
+
+    def labels(self, name: str) -> tuple[str, ...]:
+        if isinstance(self.unknown, Scalar):
+            return (name,)
+        return tuple(f"{name}[{region}]" for region in self.unknown.regions)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        lower, upper = self.unknown.bounds
+        return np.full(self.size, lower), np.full(self.size, upper)
+
+
+class FieldBlock(Block):
+    """A finite-element function."""
+
+    def __init__(self, field: Field) -> None:
+        self.field = field
+        self.basis = Basis(field.mesh, field.element)
+        self.size = int(self.basis.N)
+
+    def local(self, measure: Measure) -> Local:
+        if measure.mesh is not self.field.mesh:
+            raise SpaceError(
+                "State and parameter fields must share one mesh object; their elements may differ."
+            )
+        basis = measure.basis(self.field.element)
+        elements, points = measure.weights.shape
+        first = basis.basis[0][0]
+        parts, shapes = [], []
+        for jet in JETS:
+            part = np.asarray(first) if jet == "value" else getattr(first, jet)
+            if part is None:
+                continue
+            tensor = np.shape(part)[:-2]
+            parts.append((jet, tensor))
+            stack = np.empty((*tensor, basis.Nbfun, elements, points))
+            for i in range(basis.Nbfun):
+                phi = basis.basis[i][0]
+                array = np.asarray(phi) if jet == "value" else getattr(phi, jet)
+                stack[..., i, :, :] = array
+            shapes.append(stack.reshape(-1, basis.Nbfun, elements, points))
+        return Local(np.asarray(basis.element_dofs), tuple(parts), np.concatenate(shapes))
+
+    def jet(self, parts: Local, values: Array) -> DiscreteField:
+        arrays, start = {}, 0
+        for name, tensor in parts.parts:
+            stop = start + int(np.prod(tensor, dtype=int))
+            arrays[name] = values[start:stop].reshape(tensor + values.shape[1:])
+            start = stop
+        return DiscreteField(**arrays)
+
+    def prior(self) -> Array:
+        return self.interpolate(self.field.prior)
+
+    def labels(self, name: str) -> tuple[str, ...]:
+        return ()
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        return np.full(self.size, -np.inf), np.full(self.size, np.inf)
+
+    def interpolate(self, value: Any) -> Array:
+        """Return coefficients of a number, or the L2 projection of a function of x."""
+        if not callable(value):
+            level = float(value)
+            if level == 0.0:
+                return np.zeros(self.size)
+            value = lambda x: np.full(np.shape(x[0]), level)  # noqa: E731
+        coefficients: Array = self.basis.project(lambda x: value(x) + 0.0 * x[0])
+        return coefficients
+
+    def _value_dofs(self, name: str) -> IntArray:
+        dofs = self.basis.get_dofs() if name == "boundary" else self.basis.get_dofs(name)
+        # Essential conditions fix values; derivative unknowns (u_x, u_n, ...) stay free.
+        names = [n for n in (self.field.element.dofnames or []) if "_" not in n]
+        found: IntArray = dofs.all(names)
+        return found
+
+    @cached_property
+    def conditions(self) -> tuple[tuple[IntArray, Any], ...]:
+        """The Dirichlet conditions, in the order given: (coefficients, value)."""
+        return tuple((self._value_dofs(n), value) for n, value in self.field.dirichlet.items())
+
+    @cached_property
+    def fixed(self) -> IntArray:
+        """Coefficients fixed by Dirichlet conditions."""
+        parts = [dofs for dofs, _ in self.conditions]
+        return np.unique(np.concatenate(parts)) if parts else np.zeros(0, dtype=np.int64)
+
+    def impose(self, coefficients: Array, moment: Moment) -> Array:
+        """Return a copy of the coefficients with the Dirichlet values of this moment."""
+        u = coefficients.copy()
+        for dofs, value in self.conditions:
+            if isinstance(value, Channel):
+                u[dofs] = Place(u, None, moment).inputs[value.name]
+            elif callable(value):
+                u[dofs] = value(self.basis.doflocs[:, dofs], moment.t)
+            else:
+                u[dofs] = value
+        return u
+
+    def probe(self, points: Array, what: str = "point") -> sp.csr_array:
+        """Return the matrix that evaluates the function at points of shape (d, k)."""
+        points = np.atleast_2d(np.asarray(points, dtype=float))
+        mesh = self.field.mesh
+        low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+        if points.shape[0] != len(low):
+            raise ObservationError(
+                f"{what}: coordinates of dimension {points.shape[0]}; the mesh has {len(low)}."
+            )
+        for k, point in enumerate(points.T):
+            slack = 1e-12 * (high - low)
+            inside = bool(np.all(point >= low - slack) and np.all(point <= high + slack))
+            if inside and len(low) > 1:
+                try:
+                    self.basis.mesh.element_finder()(*point[:, None])
+                except ValueError:
+                    inside = False
+            if not inside:
+                raise ObservationError(
+                    f"{what} {k} at {point.tolist()} lies outside of the mesh, which spans "
+                    f"{low.tolist()} to {high.tolist()}: check its coordinates and their unit."
+                )
+        return sp.csr_array(self.basis.probes(np.clip(points.T, low, high).T))
+
+    @cached_property
+    def at_vertices(self) -> sp.csr_array:
+        """Matrix that evaluates the function at the vertices of the mesh."""
+        return self.probe(self.field.mesh.p, "vertex")
+
+
+def block_of(unknown: Unknown) -> Block:
+    """Return the block of an unknown."""
+    return FieldBlock(unknown) if isinstance(unknown, Field) else ScalarBlock(unknown)

@@ -1,0 +1,170 @@
+"""What a user writes to say what is unknown: fields on a mesh, scalars, values per region."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from skfem import Mesh, MeshLine
+from skfem.element import Element
+
+from livepde.errors import SpaceError
+from livepde.linalg import Array
+
+__all__ = [
+    "Channel",
+    "Field",
+    "Integrand",
+    "On",
+    "Piecewise",
+    "Predicate",
+    "Scalar",
+    "Unknown",
+    "interval",
+]
+
+Integrand: TypeAlias = Callable[..., Any]
+"""A weak form's integrand; see `Model` for the arguments."""
+
+Predicate: TypeAlias = Callable[[Array], Any]
+"""A subset of the domain: x of shape (d, ...) -> booleans of shape (...)."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A value that arrives with the stream, by the name of its channel."""
+
+    name: str
+
+
+BoundaryValue: TypeAlias = float | Callable[[Any, float], Any] | Channel
+
+
+@dataclass(frozen=True)
+class On:
+    """A form on a named boundary or subdomain of the mesh instead of the whole domain.
+
+    >>> flux = On("left", lambda v, x: x.inputs["Q"] * v)
+    """
+
+    name: str
+    form: Integrand
+
+
+def interval(
+    start: float, stop: float, cells: int, *, regions: Mapping[str, Predicate] | None = None
+) -> MeshLine:
+    """Return a uniform mesh of [start, stop] with boundaries "left" and "right".
+
+    Parameters
+    ----------
+    start, stop
+        End points, in the unit of length of the model.
+    cells
+        Number of elements.
+    regions
+        Named subdomains, each a predicate on the midpoints of the elements.
+    """
+    if not stop > start or cells < 1:
+        raise SpaceError(f"interval({start}, {stop}, {cells}): needs stop > start and cells >= 1.")
+    mesh = MeshLine(np.linspace(start, stop, cells + 1))
+    mesh = mesh.with_boundaries(
+        {"left": lambda x: np.isclose(x[0], start), "right": lambda x: np.isclose(x[0], stop)}
+    )
+    return mesh.with_subdomains(dict(regions)) if regions else mesh
+
+
+def _check_prior(what: str, std: float, bounds: tuple[float, float], prior: float) -> None:
+    if not (np.isfinite(std) and std > 0):
+        raise SpaceError(f"{what}: std must be a positive number; got {std}.")
+    lower, upper = bounds
+    if not lower < upper:
+        raise SpaceError(f"{what}: bounds must be (lower, upper) with lower < upper; got {bounds}.")
+    if not lower <= prior <= upper:
+        raise SpaceError(f"{what}: prior {prior} lies outside of its bounds {bounds}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A function on a mesh: the state u, or a parameter q(x).
+
+    Parameters
+    ----------
+    mesh, element
+        Any scikit-fem mesh and element; `quadrature` is its integration order (default: exact for
+        A(u)q with polynomial factors).
+    inner
+        Inner product of a parameter: "L2", "H1", or a symmetric bilinear form (u, v, x).
+    dirichlet
+        Essential boundary values: name of a boundary ("boundary" for all of it) -> a number, a
+        function g(x, t), or a `Channel` of the stream. For a parameter only 0 (H^1_0).
+    std
+        Prior deviation of a parameter: the inner product is divided by std**2, so that the
+        prior covariance is the inverse Gram matrix.
+    unit, name
+        For tables and plots.
+    """
+
+    mesh: Mesh
+    element: Element
+    inner: str | Integrand = "L2"
+    dirichlet: Mapping[str, BoundaryValue] = field(default_factory=dict)
+    prior: float = 0.0
+    std: float = 1.0
+    unit: str = ""
+    name: str = ""
+    quadrature: int | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.inner, str) and self.inner not in ("L2", "H1"):
+            raise SpaceError(
+                f"inner='{self.inner}': expected 'L2', 'H1' or a symmetric form (u, v, x)."
+            )
+        known = set(self.mesh.boundaries or {}) | {"boundary"}
+        for name in self.dirichlet:
+            if name not in known:
+                raise SpaceError(
+                    f"dirichlet: the mesh has no boundary '{name}'; it has {sorted(known)}."
+                )
+        _check_prior("Field", self.std, (-np.inf, np.inf), self.prior)
+
+
+@dataclass(frozen=True, eq=False)
+class Scalar:
+    """One unknown number with a Gaussian prior; bounds are never left by an estimate."""
+
+    prior: float = 0.0
+    std: float = 1.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        _check_prior("Scalar", self.std, self.bounds, self.prior)
+
+
+@dataclass(frozen=True, eq=False)
+class Piecewise:
+    """One unknown number for each named region, with a common prior.
+
+    Parameters
+    ----------
+    regions
+        Name -> predicate on x, or the name of a subdomain of the mesh. A point in no region sees
+        the value zero; in two regions, the sum.
+    """
+
+    regions: Mapping[str, Predicate | str]
+    prior: float = 0.0
+    std: float = 1.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.regions:
+            raise SpaceError("Piecewise: needs at least one region.")
+        _check_prior("Piecewise", self.std, self.bounds, self.prior)
+
+
+Unknown: TypeAlias = Field | Scalar | Piecewise

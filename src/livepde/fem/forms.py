@@ -1,0 +1,344 @@
+"""Weak forms: the one place where integrands are evaluated.
+
+A form is a scalar functional of several functions, `integral of a(q, u, v, x)`. Each function is
+evaluated with the shape functions of *its own* space, so exchanging two spaces of equal size cannot
+pass unnoticed (fact 9 of the design). Everything a law needs of a form is a first derivative
+(`vector`) or a mixed second derivative (`data`) of that functional:
+
+    A(u) q          = vector("v", q=q, u=u)
+    A(u)            = data("v", "q", u=u)          its transpose is the same numbers: exact
+    d(A(u) q)/du    = data("v", "u", q=q, u=u)
+    d(A(u)^T r)/du  = data("q", "u", u=u, v=r)
+
+Arguments in which the form is linear are replaced by unit jets; derivatives in the others are taken
+by a complex step at the quadrature points, exact to rounding, without an automatic differentiation
+library, and only as good as the integrand is analytic: abs, max or comparison of u need a form of
+the derivative from the user, and `check_model` tells when one is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import LivepdeError, ModelError
+from livepde.fem.blocks import Measure
+from livepde.fem.fields import Integrand, On
+from livepde.fem.place import START, Inputs, Moment, Place
+from livepde.fem.space import FunctionSpace, LocalSpace
+from livepde.linalg import Array, IntArray, Pattern
+
+__all__ = ["Form"]
+
+STEP = 1e-30  # of the complex step: far below rounding, far above underflow
+LARGEST_TENSOR = 20_000_000  # entries of a precomputed trilinear form; beyond it, quadrature
+
+
+@dataclass(frozen=True, eq=False)
+class _Term:
+    """One integrand on one measure, with every argument's space there."""
+
+    integrand: Integrand
+    measure: Measure
+    spaces: Mapping[str, LocalSpace]
+
+    def evaluate(self, values: Mapping[str, Array], moment: Moment) -> tuple[Any, Place]:
+        place = Place(self.measure.points, self.measure.normal, moment)
+        jets = [self.spaces[name].jets(array) for name, array in values.items()]
+        return self.integrand(*jets, place), place
+
+    def weighted(self, density: Any, axes: tuple[int, ...]) -> Array:
+        """Return density times quadrature weights, broadcast to (axes..., E, P)."""
+        array = np.asarray(density) * self.measure.weights
+        return np.broadcast_to(array, (*axes, *self.measure.weights.shape))
+
+
+class Form:
+    """A sum of integrals, linear in every argument not named in `nonlinear`.
+
+    Parameters
+    ----------
+    name
+        For messages: A, B, M, ...
+    integrands
+        One integrand or several; an `On` restricts one to a boundary or subdomain. Each is called
+        with one jet per argument, in the order of `spaces`, and the place x.
+    spaces
+        Argument -> function space.
+    order
+        Quadrature order.
+    nonlinear
+        Arguments in which the form need not be linear (found out by probing).
+    derivative
+        Optional integrand of the derivative in the nonlinear argument: the same arguments, with
+        the direction behind that argument, as in dB(u, du, v, x).
+    inputs
+        Names of the input channels that integrands may read.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        integrands: Integrand | On | Sequence[Integrand | On],
+        spaces: Mapping[str, FunctionSpace],
+        mesh: Any,
+        order: int,
+        nonlinear: str | None = None,
+        derivative: Integrand | Sequence[Integrand] | None = None,
+        inputs: Sequence[str] = (),
+    ) -> None:
+        items = integrands if isinstance(integrands, Sequence) else [integrands]
+        self.name = name
+        self.spaces = dict(spaces)
+        self.nonlinear = nonlinear
+        self.terms: list[_Term] = []
+        for item in items:
+            integrand, where = (item.form, item.name) if isinstance(item, On) else (item, None)
+            measure = Measure(mesh, order, where)
+            locals_ = {key: space.local(measure) for key, space in spaces.items()}
+            self.terms.append(_Term(integrand, measure, locals_))
+        given = derivative if isinstance(derivative, Sequence) else [derivative] * len(items)
+        if len(given) != len(items):
+            raise ModelError(
+                f"Form {name}: give one derivative for each of its {len(items)} terms."
+            )
+        self.derivatives = list(given)
+        self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
+        self._constants: dict[tuple[str, str], Array] = {}
+        self._offsets: dict[str, Array] = {}
+        self._tensors: dict[tuple[str, str], sp.csr_array | None] = {}
+        self._patterns: dict[tuple[str, str], Pattern] = {}
+        self._gathers: dict[tuple[str, str], list[sp.csr_array]] = {}
+        self.uses: frozenset[str] = self._probe()
+
+    def _probe(self) -> frozenset[str]:
+        """Evaluate once: find errors early, and what of time and inputs the form reads."""
+        rng = np.random.default_rng(0)
+        used: set[str] = set()
+        for term in self.terms:
+            values = {
+                key: rng.standard_normal((local.components, *local.shape))
+                for key, local in term.spaces.items()
+            }
+            try:
+                density, place = term.evaluate(values, Moment(0.0, self._inputs))
+                shape = np.broadcast_shapes(np.shape(density), term.measure.weights.shape)
+            except LivepdeError:
+                raise
+            except Exception as error:
+                raise ModelError(
+                    f"Form {self.name}({', '.join(self.spaces)}, x) failed at its first "
+                    f"evaluation: {type(error).__name__}: {error}"
+                ) from error
+            if shape != term.measure.weights.shape:
+                raise ModelError(
+                    f"Form {self.name}({', '.join(self.spaces)}, x) gave shape "
+                    f"{np.shape(density)} where a scalar per point is expected: is a dot(...) "
+                    "or a component index missing?"
+                )
+            used |= place.used
+        return frozenset(used)
+
+    @property
+    def constant(self) -> bool:
+        """True if the form reads neither time nor inputs."""
+        return not self.uses
+
+    @cached_property
+    def affine(self) -> bool:
+        """True if the form is affine in its nonlinear argument (probed at several magnitudes)."""
+        if self.nonlinear is None:
+            return True
+        rng = np.random.default_rng(1)
+        for term in self.terms:
+            values = {
+                key: rng.standard_normal((local.components, *local.shape))
+                for key, local in term.spaces.items()
+            }
+            moment = Moment(0.3, self._inputs)
+
+            def at(x: Array, term: _Term = term, values: dict[str, Array] = values) -> Array:
+                density, _ = term.evaluate({**values, str(self.nonlinear): x}, moment)
+                return np.asarray(density)
+
+            for scale in (1e-3, 1.0, 1e3):
+                a, b = scale * rng.standard_normal((2, *values[self.nonlinear].shape))
+                change = at(a + b) - at(a) - at(b) + at(0 * a)
+                size = max(np.abs(at(a)).max(), np.abs(at(b)).max(), 1e-300)
+                if np.abs(change).max() > 1e-11 * size:
+                    return False
+        return True
+
+    def vector(self, slot: str, moment: Moment = START, **coefficients: Array) -> Array:
+        """Return the derivative in the linear argument `slot`, shape (dim of its space,)."""
+        others = [key for key in self.spaces if key != slot]
+        if self.affine and self.constant and others:
+            linear = [key for key in others if key != self.nonlinear]
+            if not linear:  # B(u) = B(0) + B' u
+                matrix = self.matrix(slot, others[0], moment)
+                offset = self._offset(slot)
+                return matrix @ coefficients[others[0]] + offset
+            rest = {key: coefficients[key] for key in others if key != linear[0]}
+            product: Array = self.matrix(slot, linear[0], moment, **rest) @ coefficients[linear[0]]
+            return product
+        return self._vector(slot, moment, coefficients)
+
+    def _offset(self, slot: str) -> Array:
+        """Return the vector of an affine form where its other argument is zero, computed once."""
+        if slot not in self._offsets:
+            zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
+            self._offsets[slot] = self._vector(slot, START, zero)
+        return self._offsets[slot]
+
+    def _vector(self, slot: str, moment: Moment, coefficients: Mapping[str, Array]) -> Array:
+        result = np.zeros(self.spaces[slot].dim)
+        for term in self.terms:
+            values = {
+                key: local.units(0, 1) if key == slot else local.values(coefficients[key])
+                for key, local in term.spaces.items()
+            }
+            density, _ = term.evaluate(values, moment)
+            local = term.spaces[slot]
+            weighted = term.weighted(density, (local.components,))
+            result += local.evaluation_transposed @ weighted.ravel()
+        return result
+
+    def pattern(self, rows: str, cols: str) -> Pattern:
+        """Return the sparsity of the matrices `data(rows, cols)`."""
+        if (rows, cols) not in self._patterns:
+            pairs = [self._entries(term, rows, cols) for term in self.terms]
+            pattern = Pattern.from_entries(
+                np.concatenate([i for i, _ in pairs]),
+                np.concatenate([j for _, j in pairs]),
+                (self.spaces[rows].dim, self.spaces[cols].dim),
+            )
+            self._patterns[rows, cols] = pattern
+            self._gathers[rows, cols] = [pattern.gather(i, j) for i, j in pairs]
+        return self._patterns[rows, cols]
+
+    @staticmethod
+    def _entries(term: _Term, rows: str, cols: str) -> tuple[IntArray, IntArray]:
+        i, j = term.spaces[rows].dofs, term.spaces[cols].dofs
+        shape = (len(i), len(j), i.shape[1])
+        return np.broadcast_to(i[:, None], shape).ravel(), np.broadcast_to(j, shape).ravel()
+
+    def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
+        """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`.
+
+        Constant bilinear forms are assembled once; constant trilinear ones become one sparse
+        product with the coefficients of the third argument.
+        """
+        others = [key for key in self.spaces if key not in (rows, cols)]
+        if self.affine and self.constant:
+            if not others:
+                return self._constant(rows, cols)
+            if len(others) == 1:
+                tensor = self._tensor(rows, cols, others[0])
+                if tensor is not None:
+                    product: Array = tensor @ coefficients[others[0]]
+                    if others[0] == self.nonlinear:
+                        product += self._constant(rows, cols)
+                    return product
+        return self._quadrature(rows, cols, moment, coefficients)
+
+    def matrix(
+        self, rows: str, cols: str, moment: Moment = START, **coefficients: Array
+    ) -> sp.csr_array:
+        """Return `data(...)` as a CSR matrix."""
+        return self.pattern(rows, cols).matrix(self.data(rows, cols, moment, **coefficients))
+
+    def _quadrature(
+        self, rows: str, cols: str, moment: Moment, coefficients: Mapping[str, Array]
+    ) -> Array:
+        pattern = self.pattern(rows, cols)
+        result = np.zeros(pattern.nnz)
+        for term, gather, given in zip(
+            self.terms, self._gathers[rows, cols], self.derivatives, strict=True
+        ):
+            density = self._density(term, rows, cols, moment, coefficients, given)
+            r, c = term.spaces[rows], term.spaces[cols]
+            weighted = term.weighted(density, (r.components, c.components))
+            half = np.einsum("klep,kiep->liep", weighted, r.phi, optimize=False)
+            local = np.einsum("liep,ljep->ije", half, c.phi, optimize=False)
+            result += gather @ local.ravel()
+        return result
+
+    def _density(
+        self,
+        term: _Term,
+        rows: str,
+        cols: str,
+        moment: Moment,
+        coefficients: Mapping[str, Array],
+        given: Integrand | None,
+    ) -> Array:
+        """Return the integrand's derivative in `rows` and `cols`: (components, components, E, P)."""
+        axis = {rows: 0, cols: 1}
+        arguments: list[tuple[LocalSpace, Array]] = []
+        for key, local in term.spaces.items():
+            units = local.units(axis[key], 2) if key in axis else None
+            if units is not None and key != self.nonlinear:
+                arguments.append((local, units))
+                continue
+            here = local.values(coefficients[key]) if key in coefficients else local.zeros()
+            if units is None:
+                arguments.append((local, here))
+            elif given is not None:
+                arguments += [(local, here[:, None, None]), (local, units)]
+            else:
+                arguments.append((local, here[:, None, None] + 1j * STEP * units))
+        place = Place(term.measure.points, term.measure.normal, moment)
+        jets = [local.jets(values) for local, values in arguments]
+        if self.nonlinear not in axis:
+            return np.asarray(term.integrand(*jets, place))
+        if given is not None:
+            return np.asarray(given(*jets, place))
+        slope: Array = np.imag(term.integrand(*jets, place)) / STEP
+        return slope
+
+    def _constant(self, rows: str, cols: str) -> Array:
+        """Return data(rows, cols) of an affine form at zero, computed once."""
+        if (rows, cols) not in self._constants:
+            self._constants[rows, cols] = self._quadrature(rows, cols, START, {})
+        return self._constants[rows, cols]
+
+    def _tensor(self, rows: str, cols: str, third: str) -> sp.csr_array | None:
+        """Return the matrix third's coefficients -> data(rows, cols), or None if it is too large."""
+        if (rows, cols) in self._tensors:
+            return self._tensors[rows, cols]
+        size = sum(
+            int(np.prod([len(local.dofs) for local in term.spaces.values()]))
+            * term.measure.weights.shape[0]
+            for term in self.terms
+        )
+        if size > LARGEST_TENSOR:
+            self._tensors[rows, cols] = None
+            return None
+        pattern = self.pattern(rows, cols)
+        total = sp.csr_array((pattern.nnz, self.spaces[third].dim))
+        axes = {rows: 0, cols: 1, third: 2}
+        for term in self.terms:
+            values = {key: local.units(axes[key], 3) for key, local in term.spaces.items()}
+            density, _ = term.evaluate(values, START)
+            if self.nonlinear is not None:
+                values[self.nonlinear] = 0.0 * values[self.nonlinear]
+                density = density - term.evaluate(values, START)[0]
+            r, c, t = term.spaces[rows], term.spaces[cols], term.spaces[third]
+            weighted = term.weighted(density, (r.components, c.components, t.components))
+            step = np.einsum("klmep,kiep->ilmep", weighted, r.phi, optimize=False)
+            step = np.einsum("ilmep,ljep->ijmep", step, c.phi, optimize=False)
+            local = np.einsum("ijmep,mnep->ijne", step, t.phi, optimize=False)
+            i = np.broadcast_to(r.dofs[:, None, None], local.shape).ravel()
+            j = np.broadcast_to(c.dofs[None, :, None], local.shape).ravel()
+            n = np.broadcast_to(t.dofs[None, None, :], local.shape).ravel()
+            entries = (local.ravel(), (pattern.positions(i, j), n))
+            total = total + sp.csr_array(entries, shape=total.shape)
+        total = sp.csr_array(total)
+        total.eliminate_zeros()
+        self._tensors[rows, cols] = total
+        return total

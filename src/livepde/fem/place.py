@@ -1,0 +1,87 @@
+"""Where and when a weak form is evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from livepde.errors import MissingInputError
+from livepde.linalg import Array
+
+__all__ = ["START", "Moment", "Place"]
+
+
+class Inputs(Mapping[str, float]):
+    """Values of the input channels at one moment; a missing name is one clear sentence."""
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self._values = MappingProxyType(dict(values))
+
+    def __getitem__(self, name: str) -> float:
+        try:
+            return self._values[name]
+        except KeyError:
+            known = ", ".join(sorted(self._values)) or "none"
+            raise MissingInputError(
+                f"Input channel '{name}' has no value; channels with one: {known}. "
+                "Name it in inputs= of the model and send it with every sample."
+            ) from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+NO_INPUTS = Inputs({})
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A time and the values of the input channels at that time."""
+
+    t: float = 0.0
+    inputs: Mapping[str, float] = field(default_factory=lambda: NO_INPUTS)
+
+
+START = Moment()
+
+
+class Place:
+    """The argument `x` of a weak form.
+
+    `x[0], x[1], ...` are coordinates of the quadrature points; `x.t` the time; `x.inputs["Q"]` the
+    value of an input channel; `x.normal` the outward normal (on boundaries). What a form reads is
+    noted: a form that reads neither time nor inputs is constant in time and assembled once.
+    """
+
+    def __init__(self, x: Array, normal: Array | None, moment: Moment) -> None:
+        self._x = x
+        self._normal = normal
+        self._moment = moment
+        self.used: set[str] = set()
+
+    def __getitem__(self, axis: int) -> Array:
+        coordinate: Array = self._x[axis]
+        return coordinate
+
+    @property
+    def t(self) -> float:
+        """Time."""
+        self.used.add("t")
+        return self._moment.t
+
+    @property
+    def inputs(self) -> Mapping[str, float]:
+        """Values of the input channels."""
+        self.used.add("inputs")
+        return self._moment.inputs
+
+    @property
+    def normal(self) -> Array:
+        """Outward normal on a boundary, shape (d, facets, points)."""
+        if self._normal is None:
+            raise AttributeError("x.normal exists on boundaries only: wrap the form in lp.On(...).")
+        return self._normal

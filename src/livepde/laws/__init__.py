@@ -1,0 +1,24 @@
+"""Update laws and damping rules."""
+
+from __future__ import annotations
+
+from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
+from livepde.laws.gradient import GradientLaw
+from livepde.laws.sensitivity import Replay, SensitivityLaw
+
+__all__ = [
+    "AnyLaw",
+    "Belief",
+    "ConstantDamping",
+    "Damping",
+    "GradientLaw",
+    "Law",
+    "Problem",
+    "Replay",
+    "Report",
+    "Residual",
+    "ResidualDamping",
+    "SensitivityLaw",
+    "Status",
+]

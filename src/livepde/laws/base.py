@@ -1,0 +1,159 @@
+"""What an update law is."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observed
+from livepde.stepping import Advance, Interval, StepFailed
+
+__all__ = ["Belief", "Law", "Problem", "Report", "Status"]
+
+REMEDIES = {
+    "ok": "",
+    "not_converged": "Take a smaller dt_max, a smaller gain, or less damping.",
+    "not_finite": "Check the sample, the bounds of the unknowns, and the gain.",
+    "singular": "Check the model's forms at the current estimate, or take a smaller dt_max.",
+}
+
+
+@dataclass(frozen=True)
+class Status:
+    """How a step went.
+
+    Attributes
+    ----------
+    code
+        "ok", "not_converged", "not_finite" or "singular".
+    detail
+        What happened, empty if all is well.
+    """
+
+    code: str = "ok"
+    detail: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """True if the step was taken."""
+        return self.code == "ok"
+
+    @property
+    def remedy(self) -> str:
+        """What to do about it."""
+        return REMEDIES[self.code]
+
+    @classmethod
+    def of(cls, failure: StepFailed) -> Status:
+        """Return the status of a failed step."""
+        return cls(failure.code, failure.detail)
+
+    def __str__(self) -> str:
+        return self.code if self.ok else f"{self.code}: {self.detail}. {self.remedy}"
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A model and what is observed of it: where the two meet."""
+
+    model: Model
+    observed: Observed
+    control: Advance
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What a law believes at one time.
+
+    Attributes
+    ----------
+    q, u
+        Coefficients of parameter and state, shapes (m,) and (n,).
+    q_factor, u_factor
+        Square roots of the covariances, q_factor @ q_factor.T, shapes (m, k) and (n, k); None for
+        a law that has no covariance.
+    inflation
+        Factor on all standard deviations for correlated or too large innovations, >= 1.
+    """
+
+    q: Array
+    u: Array
+    q_factor: Array | None = None
+    u_factor: Array | None = None
+    inflation: float = 1.0
+
+    @property
+    def q_std(self) -> Array | None:
+        """Standard deviation of each coefficient of q."""
+        return _deviation(self.q_factor, self.inflation)
+
+    @property
+    def u_std(self) -> Array | None:
+        """Standard deviation of each coefficient of u."""
+        return _deviation(self.u_factor, self.inflation)
+
+
+def _deviation(factor: Array | None, inflation: float) -> Array | None:
+    if factor is None:
+        return None
+    std: Array = inflation * np.sqrt((factor**2).sum(axis=1))
+    return std
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What a step tells beside the new state.
+
+    Attributes
+    ----------
+    status
+        How it went; unless ok, the state is the one before.
+    predicted
+        What the law expected of each sensor before it used the sample, shape (sensors,); for a law
+        that has no such prediction, the output of its estimate.
+    steps
+        Substeps taken.
+    notes
+        Numbers worth keeping, such as the norm of r, theta, or the inflation.
+    """
+
+    status: Status
+    predicted: Array
+    steps: int = 0
+    notes: dict[str, float] = field(default_factory=dict)
+
+
+Work = TypeVar("Work")
+State = TypeVar("State")
+
+
+class Law(ABC, Generic[Work, State]):
+    """An update law: frozen configuration; what evolves is an explicit state value.
+
+    A law of your own is one class with these four methods. The state is a frozen dataclass of
+    arrays and numbers: saving it is checkpointing.
+    """
+
+    @abstractmethod
+    def prepare(self, problem: Problem) -> Work:
+        """Return what is computed once: matrices, modes, stages. Raises `LawError`."""
+
+    @abstractmethod
+    def init(self, work: Work, q0: Array, u0: Array) -> State:
+        """Return the state at the start, from coefficients q0 (m,) and u0 (n,)."""
+
+    @abstractmethod
+    def step(self, work: Work, state: State, interval: Interval) -> tuple[State, Report]:
+        """Return the state at the end of the interval; the old one if the step failed."""
+
+    @abstractmethod
+    def belief(self, work: Work, state: State) -> Belief:
+        """Return estimates and, if the law has them, covariances."""
+
+
+AnyLaw = Law[Any, Any]

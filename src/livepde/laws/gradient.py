@@ -1,0 +1,136 @@
+"""The paper's update law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.laws.base import Belief, Law, Problem, Report, Status
+from livepde.laws.coupled import CoupledStage, Gains
+from livepde.laws.damping import Damping, ResidualDamping
+from livepde.linalg import Array
+from livepde.model import h1_form
+from livepde.observation import Split
+from livepde.stepping import Interval, Newton, advance
+
+__all__ = ["GradientLaw", "GradientState"]
+
+
+@dataclass(frozen=True, eq=False)
+class GradientState:
+    """Estimates u^ and q^, shapes (n,) and (m,)."""
+
+    u: Array
+    q: Array
+
+
+class GradientWork:
+    """The problem with its operators M_op and N_op and a stage for each set of present sensors."""
+
+    def __init__(self, problem: Problem, gains: Gains, newton: Newton) -> None:
+        self.problem = problem
+        self.gains = gains
+        self.newton = newton
+        self._stages: dict[Split, CoupledStage] = {}
+
+    def stage(self, present: Array) -> CoupledStage:
+        """Return the coupled stage for the sensors present."""
+        split = self.problem.observed.split(present)
+        if split not in self._stages:
+            if len(self._stages) >= 8:
+                self._stages.clear()
+            self._stages[split] = CoupledStage(self.problem.model, split, self.gains, self.newton)
+        return self._stages[split]
+
+
+@dataclass(frozen=True)
+class GradientLaw(Law[GradientWork, GradientState]):
+    """The online method of Boiger and Kaltenbacher, (est_exact_q) and (est_exact_u).
+
+        q' = gain A(w)* r - sigma q,            w = u_alpha + P u,  r = R u - u_alpha
+        M u' + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
+
+    For observed subdomains and averages. A few noisy point sensors mislead it (jumps of the flux at
+    the sensors reward a vanishing diffusivity): use `SensitivityLaw` there.
+
+    Parameters
+    ----------
+    gain
+        Scale of the inner product of Q, > 0. The theory holds for every value; it sets how fast q
+        learns. Stable for every value, because u and q are solved together.
+    damping
+        Rule for theta = mu / ||r||_V~.
+    nu
+        Weight of P N P u >= 0. It biases the unobserved part and is needed only where the dynamics
+        do not damp that part (D <= 0).
+    sigma
+        Stabilising term of (noisy_q), >= 0.
+    M_op, N_op
+        Integrands (u, v, x) of the operators M and N of (MN1), (MN2); default u v + grad u . grad v.
+    newton
+        The nonlinear iteration.
+    """
+
+    gain: float = 1.0
+    damping: Damping = field(default_factory=ResidualDamping)
+    nu: float = 0.0
+    sigma: float = 0.0
+    M_op: Any = h1_form
+    N_op: Any = h1_form
+    newton: Newton = field(default_factory=Newton)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.gain) and self.gain > 0):
+            raise LawError(f"GradientLaw: gain must be a positive number; got {self.gain}.")
+        for name in ("nu", "sigma"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise LawError(f"GradientLaw: {name} must be a number >= 0; got {value}.")
+
+    def prepare(self, problem: Problem) -> GradientWork:
+        if problem.observed.sensitivity() is not None:
+            raise LawError(
+                "GradientLaw cannot use a sensor that sees a parameter directly: use "
+                "SensitivityLaw, or leave out direct=."
+            )
+        model = problem.model
+        M_op = model.bilinear(self.M_op)
+        N_op = M_op if self.N_op is self.M_op else model.bilinear(self.N_op)
+        gains = Gains(self.gain, self.damping, self.nu, self.sigma, M_op, N_op)
+        return GradientWork(problem, gains, self.newton)
+
+    def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
+        return GradientState(u0, q0)
+
+    def step(
+        self, work: GradientWork, state: GradientState, interval: Interval
+    ) -> tuple[GradientState, Report]:
+        model, observed = work.problem.model, work.problem.observed
+        coupled = work.stage(interval.present)
+        zero = np.zeros(model.X.dim)
+
+        def stage(c: Array, t: float, h: float) -> Array:
+            moment = interval.at(t)
+            boundary = model.impose(zero, moment)
+            u_alpha = coupled.split.reconstruct(interval.z(t), boundary)
+            return coupled.solve(c, h, moment, u_alpha)
+
+        y = np.concatenate([state.u, state.q])
+        y, steps, failure = advance(work.problem.control, stage, y, interval)
+        if failure is not None:
+            return state, Report(
+                Status.of(failure), observed.predict(state.u, state.q, interval.end)
+            )
+        u, q = y[: model.X.dim], y[model.X.dim :]
+        lower, upper = model.parameter_space.bounds
+        new = GradientState(u, np.clip(q, lower, upper))
+        boundary = model.impose(zero, interval.end)
+        r = coupled.split.R @ u - coupled.split.reconstruct(interval.z1, boundary)
+        notes = {"residual": model.X.norm(r), "theta": coupled.theta(r, coupled.RM @ r)}
+        return new, Report(Status(), observed.predict(u, new.q, interval.end), steps, notes)
+
+    def belief(self, work: GradientWork, state: GradientState) -> Belief:
+        return Belief(state.q, state.u)

@@ -1,0 +1,108 @@
+"""Sparse matrices whose sparsity is fixed: only their `data` changes from step to step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.linalg.types import Array, IntArray, Sparse
+
+__all__ = ["Pattern", "sandwich"]
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Positions of the structural non-zeros of a matrix, in CSR order.
+
+    Parameters
+    ----------
+    shape
+        Rows and columns.
+    indptr, indices
+        CSR structure; column indices sorted within each row.
+    """
+
+    shape: tuple[int, int]
+    indptr: IntArray
+    indices: IntArray
+
+    @classmethod
+    def from_entries(cls, rows: IntArray, cols: IntArray, shape: tuple[int, int]) -> Pattern:
+        """Return the pattern that holds every (row, column) given; repeated entries are merged."""
+        keys = np.unique(rows.astype(np.int64) * shape[1] + cols)
+        counts = np.bincount(keys // shape[1], minlength=shape[0])
+        indptr = np.concatenate(([0], np.cumsum(counts)))
+        return cls(shape, indptr.astype(np.int32), (keys % shape[1]).astype(np.int32))
+
+    @classmethod
+    def of(cls, matrix: Sparse) -> Pattern:
+        """Return the pattern of the stored entries of a sparse matrix."""
+        coo = sp.coo_array(matrix)
+        return cls.from_entries(coo.row, coo.col, coo.shape)
+
+    @property
+    def nnz(self) -> int:
+        """Number of structural non-zeros."""
+        return len(self.indices)
+
+    @property
+    def rows(self) -> IntArray:
+        """Row index of each structural non-zero, shape (nnz,)."""
+        return np.repeat(np.arange(self.shape[0], dtype=np.int32), np.diff(self.indptr))
+
+    def positions(self, rows: IntArray, cols: IntArray) -> IntArray:
+        """Return where in `data` the given entries stand; each must be in the pattern."""
+        keys = self.rows.astype(np.int64) * self.shape[1] + self.indices
+        wanted = rows.astype(np.int64) * self.shape[1] + cols
+        found: IntArray = np.searchsorted(keys, wanted)
+        if len(wanted) and (found.max() >= self.nnz or np.any(keys[found] != wanted)):
+            raise IndexError("an entry lies outside of the sparsity pattern")
+        return found
+
+    def matrix(self, data: Array) -> sp.csr_array:
+        """Return the CSR matrix with these values; `data` and the structure are shared."""
+        return sp.csr_array((data, self.indices, self.indptr), shape=self.shape, copy=False)
+
+    def transposed(self, data: Array) -> sp.csc_array:
+        """Return the transpose of `matrix(data)` as CSC, sharing `data`."""
+        shape = (self.shape[1], self.shape[0])
+        return sp.csc_array((data, self.indices, self.indptr), shape=shape, copy=False)
+
+    def gather(self, rows: IntArray, cols: IntArray) -> sp.csr_array:
+        """Return the 0/1 matrix that sums a list of entries into `data`, shape (nnz, entries)."""
+        at = self.positions(rows, cols)
+        ones = np.ones(len(at))
+        return sp.csr_array((ones, (at, np.arange(len(at)))), shape=(self.nnz, len(at)))
+
+
+def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:
+    """Return (owner, rank within owner) for `counts[i]` items of each owner i."""
+    owner = np.repeat(np.arange(len(counts)), counts)
+    first = np.cumsum(counts) - counts
+    return owner, np.arange(len(owner)) - first[owner]
+
+
+def sandwich(
+    left: Sparse, inner: Pattern, right: Sparse
+) -> tuple[IntArray, IntArray, sp.csr_array]:
+    """Return how `left @ inner @ right` depends on the data of `inner`.
+
+    Returns
+    -------
+    rows, cols
+        Entries of the product, repeated where several terms add up.
+    weights
+        Sparse matrix of shape (len(rows), inner.nnz): values of those entries from `inner`'s data.
+    """
+    a, b = sp.csc_array(left), sp.csr_array(right)
+    i, j = inner.rows, inner.indices
+    count_a, count_b = np.diff(a.indptr)[i], np.diff(b.indptr)[j]
+    item, rank = _expand(count_a * count_b)
+    at_a = a.indptr[i[item]] + rank // np.maximum(count_b[item], 1)
+    at_b = b.indptr[j[item]] + rank % np.maximum(count_b[item], 1)
+    values = a.data[at_a] * b.data[at_b]
+    shape = (len(item), inner.nnz)
+    weights = sp.csr_array((values, (np.arange(len(item)), item)), shape=shape)
+    return a.indices[at_a], b.indices[at_b], weights

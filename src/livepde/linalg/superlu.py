@@ -1,0 +1,69 @@
+"""SciPy's SuperLU: the default engine for general sparse matrices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from livepde.errors import LinearAlgebraError
+from livepde.linalg.pattern import Pattern
+from livepde.linalg.types import Array
+
+__all__ = ["SuperLUSolver"]
+
+
+@dataclass(frozen=True, eq=False)
+class SuperLUFactor:
+    """LU factors of the transpose: a CSR matrix read as CSC is its transpose, without a copy."""
+
+    lu: Any
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b."""
+        x: Array = self.lu.solve(b, trans="T")
+        return x
+
+    def solve_transposed(self, b: Array) -> Array:
+        """Return x with K^T x = b."""
+        x: Array = self.lu.solve(b)
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class SuperLUSolver:
+    """Sparse LU of one pattern; `symmetric` for symmetric positive definite matrices.
+
+    The symmetric mode orders A + A^T and does not pivot: 1.6 to 9 times cheaper there.
+    """
+
+    pattern: Pattern
+    symmetric: bool = False
+
+    @property
+    def name(self) -> str:
+        """How the engine introduces itself."""
+        return "SuperLU (SciPy)" + (", symmetric mode" if self.symmetric else "")
+
+    def factorise(self, data: Array) -> SuperLUFactor:
+        """Factorise; raises `LinearAlgebraError` for a singular or non-finite matrix."""
+        if not np.isfinite(data).all():
+            raise LinearAlgebraError("The matrix holds values that are not finite.")
+        transpose = sp.csc_array(self.pattern.transposed(data))
+        options: dict[str, Any] = {}
+        if self.symmetric:
+            options = {
+                "permc_spec": "MMD_AT_PLUS_A",
+                "diag_pivot_thresh": 0.0,
+                "options": {"SymmetricMode": True},
+            }
+        try:
+            return SuperLUFactor(splu(transpose, **options))
+        except RuntimeError as error:
+            raise LinearAlgebraError(
+                f"The {transpose.shape[0]} by {transpose.shape[0]} matrix is singular: check the "
+                "model's forms, or take a smaller time step."
+            ) from error

@@ -1,0 +1,268 @@
+"""The process: M u' + B(u) + A(u) q = F, from weak forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import ModelError
+from livepde.fem import (
+    START,
+    Channel,
+    Field,
+    FieldBlock,
+    Form,
+    FunctionSpace,
+    Integrand,
+    Moment,
+    On,
+    Unknown,
+    dot,
+    grad,
+)
+from livepde.linalg import Array
+from livepde.operators import DualOperator
+from livepde.spaces import HilbertSpace
+
+__all__ = ["Model", "Source", "h1_form", "mass_form"]
+
+Source: TypeAlias = float | Callable[[Any, float], Any]
+
+
+def mass_form(u: Any, v: Any, x: Any) -> Any:
+    """The L2 inner product, u v."""
+    return u * v
+
+
+def h1_form(u: Any, v: Any, x: Any) -> Any:
+    """The H1 inner product, u v + grad u . grad v."""
+    return u * v + dot(grad(u), grad(v))
+
+
+def _no_term(u: Any, v: Any, x: Any) -> Any:
+    return 0.0 * u * v
+
+
+class Model:
+    """A time-dependent PDE with unknown parameters, M u' + B(t, u) + A(t, u) q = F(t) in X*.
+
+    The paper's abstract equation (main) with C(q, u) = A(u) q + B(u) (Assumption ass:equation),
+    tested with the basis of X. Frozen: it is built once and never changes.
+
+    Parameters
+    ----------
+    state
+        The field u; its Dirichlet values may be numbers, functions g(x, t) or channels.
+    parameter
+        What is unknown: a `Field`, `Scalar` or `Piecewise`, or a mapping of names to those.
+    A
+        Integrand (q, u, v, x), linear in q and v; for a mapping of unknowns `q.name`.
+    B
+        Integrand (u, v, x), linear in v.
+    f
+        Source density: a number or f(x, t).
+    M
+        Integrand (u, v, x) of the mass term, symmetric positive; default u v.
+    dA, dB
+        Optional integrands of the derivatives in u, (q, u, du, v, x) and (u, du, v, x). Without
+        them a complex step is taken (exact for analytic integrands).
+    inputs
+        Names of the channels that forms read as x.inputs["name"].
+
+    `A`, `B`, `f` and `M` may each be a list of terms; `On("left", form)` restricts a term to a named
+    boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time.
+
+    Raises
+    ------
+    ModelError
+        A form cannot be evaluated, has the wrong number of components, or the mass is singular.
+    """
+
+    def __init__(
+        self,
+        state: Field,
+        parameter: Unknown | Mapping[str, Unknown],
+        A: Integrand | On | Sequence[Integrand | On],
+        B: Integrand | On | Sequence[Integrand | On] = _no_term,
+        f: Source | On | Sequence[Source | On] = 0.0,
+        M: Integrand | On | Sequence[Integrand | On] = mass_form,
+        *,
+        dA: Integrand | Sequence[Integrand] | None = None,
+        dB: Integrand | Sequence[Integrand] | None = None,
+        inputs: Sequence[str] = (),
+        time_unit: str = "",
+    ) -> None:
+        self.state = state
+        self.time_unit = time_unit
+        self.state_space = FunctionSpace.of(state, "u")
+        self.parameter_space = FunctionSpace.of(parameter, "q")
+        self.inputs = tuple(inputs)
+        self._check_parameter()
+        x, q = self.state_space, self.parameter_space
+        pair, triple = {"u": x, "v": x}, {"q": q, "u": x, "v": x}
+        self.form_M = self._form("M", M, pair)
+        self.form_B = self._form("B", B, pair, "u", dB)
+        self.form_A = self._form("A", A, triple, "u", dA)
+        sources = f if isinstance(f, Sequence) else [f]
+        self.form_F = self._form("f", [_as_integrand(item) for item in sources], {"v": x})
+        if not self.form_M.constant:
+            raise ModelError("M may not depend on time or inputs: move the change into B or f.")
+
+    def _form(
+        self,
+        name: str,
+        integrands: Any,
+        spaces: Mapping[str, FunctionSpace],
+        nonlinear: str | None = None,
+        derivative: Any = None,
+    ) -> Form:
+        mesh, order = self.state.mesh, self.order
+        return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, self.inputs)
+
+    def _check_parameter(self) -> None:
+        for name, block in self.parameter_space.fields.items():
+            if any(value != 0.0 for value in block.field.dirichlet.values()):
+                raise ModelError(
+                    f"parameter '{name}': only zero boundary values are possible; write a known "
+                    "boundary part of q into B."
+                )
+
+    @cached_property
+    def order(self) -> int:
+        """Quadrature order: the state's, or exact for A(u) q with polynomial factors."""
+        if self.state.quadrature is not None:
+            return self.state.quadrature
+        degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
+        return 2 * int(self.state.element.maxdeg) + max([int(d) for d in degrees], default=0)
+
+    @cached_property
+    def state_block(self) -> FieldBlock:
+        """The state's finite-element functions."""
+        return next(iter(self.state_space.fields.values()))
+
+    @cached_property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all channels the model needs: inputs of forms and Dirichlet channels."""
+        values = self.state.dirichlet.values()
+        boundary = [value.name for value in values if isinstance(value, Channel)]
+        return tuple(dict.fromkeys([*self.inputs, *boundary]))
+
+    @cached_property
+    def mass(self) -> sp.csr_array:
+        """Matrix of M, shape (n, n)."""
+        return self.form_M.matrix("v", "u")
+
+    @cached_property
+    def X(self) -> HilbertSpace:
+        """State space with the inner product of M."""
+        return HilbertSpace(self.mass, "X", self.state_space.fixed)
+
+    @cached_property
+    def Q(self) -> HilbertSpace:
+        """Parameter space; its Gram matrix is the inverse of the prior covariance."""
+        blocks: list[Any] = []
+        for unknown, block in zip(
+            self.parameter_space.unknowns.values(),
+            self.parameter_space.blocks.values(),
+            strict=True,
+        ):
+            if isinstance(unknown, Field):
+                inner = {"L2": mass_form, "H1": h1_form}.get(str(unknown.inner), unknown.inner)
+                gram = self._on_parameter(unknown, inner)
+            else:
+                gram = sp.eye_array(block.size)
+            blocks.append(gram / unknown.std**2)
+        gram = sp.csr_array(sp.block_diag(blocks, format="csr"))
+        return HilbertSpace(gram, "Q", self.parameter_space.fixed)
+
+    @cached_property
+    def parameter_mass(self) -> sp.csr_array:
+        """L2 Gram matrix of the parameter, in which its modes are ordered; identity for numbers."""
+        blocks = [
+            self._on_parameter(unknown, mass_form)
+            if isinstance(unknown, Field)
+            else sp.eye_array(block.size)
+            for unknown, block in zip(
+                self.parameter_space.unknowns.values(),
+                self.parameter_space.blocks.values(),
+                strict=True,
+            )
+        ]
+        return sp.csr_array(sp.block_diag(blocks, format="csr"))
+
+    def _on_parameter(self, field: Field, integrand: Any) -> sp.csr_array:
+        space = FunctionSpace.of(field, "q")
+        order = 2 * int(field.element.maxdeg)
+        pair = {"u": space, "v": space}
+        return Form("inner", integrand, pair, field.mesh, order).matrix("v", "u")
+
+    def bilinear(self, integrand: Integrand | On | Sequence[Integrand | On]) -> sp.csr_array:
+        """Assemble a constant bilinear form (u, v, x) on the state space, shape (n, n)."""
+        form = self._form("operator", integrand, {"u": self.state_space, "v": self.state_space})
+        if not form.constant:
+            raise ModelError("an operator such as M_op may not depend on time or inputs.")
+        return form.matrix("v", "u")
+
+    @cached_property
+    def affine(self) -> bool:
+        """True if A(u) q + B(u) is affine in u, so that a step with known q is one linear solve."""
+        return self.form_A.affine and self.form_B.affine
+
+    @cached_property
+    def constant(self) -> bool:
+        """True if A and B do not depend on time or inputs."""
+        return self.form_A.constant and self.form_B.constant
+
+    def A(self, u: Array, moment: Moment = START) -> DualOperator:
+        """Return A(u): Q -> X*, for coefficients u of shape (n,)."""
+        return DualOperator(self.form_A.matrix("v", "q", moment, u=u), self.Q, self.X)
+
+    def B(self, u: Array, moment: Moment = START) -> Array:
+        """Return B(u) in X*, shape (n,)."""
+        return self.form_B.vector("v", moment, u=u)
+
+    def F(self, moment: Moment = START) -> Array:
+        """Return the source in X*, shape (n,)."""
+        if self.form_F.constant:
+            return self._constant_source
+        return self.form_F.vector("v", moment)
+
+    @cached_property
+    def _constant_source(self) -> Array:
+        return self.form_F.vector("v")
+
+    def impose(self, u: Array, moment: Moment) -> Array:
+        """Return u with the Dirichlet values of a moment."""
+        return self.state_block.impose(u, moment)
+
+    def initial(self, u0: Any, moment: Moment = START) -> Array:
+        """Return coefficients of u0 (a number, a function of x, or coefficients)."""
+        return self.impose(self.state_space.interpolate(u0), moment)
+
+    def initial_parameter(self, q0: Any = None) -> Array:
+        """Return coefficients of q0; None is the prior mean. Fixed coefficients are zero."""
+        q = self.parameter_space.prior if q0 is None else self.parameter_space.interpolate(q0)
+        q = q.copy()
+        q[self.parameter_space.fixed] = 0.0
+        lower, upper = self.parameter_space.bounds
+        if np.any(q < lower) or np.any(q > upper):
+            raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
+        return q
+
+
+def _as_integrand(source: Source | On) -> Integrand | On:
+    """Return the source density as an integrand (v, x)."""
+    if isinstance(source, On):
+        return On(source.name, _as_density(source.form))
+    return _as_density(source)
+
+
+def _as_density(source: Source) -> Integrand:
+    if callable(source):
+        return lambda v, x: source(x, x.t) * v
+    level = float(source)
+    return lambda v, x: level * v

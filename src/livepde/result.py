@@ -1,0 +1,229 @@
+"""Estimates, one at a time and as a table with axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from livepde import plots
+from livepde.laws import Belief, Status
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observed
+
+__all__ = ["Estimate", "Result"]
+
+STATUS_CODES = ("ok", "not_converged", "not_finite", "singular")
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What is known at one time.
+
+    Attributes
+    ----------
+    t
+        Time of the sample.
+    q, u
+        Coefficients of parameter and state, shapes (m,) and (n,).
+    innovation
+        Measured minus expected before the sample was used, shape (sensors,); NaN where missing.
+        For `GradientLaw`, which pulls the state to the sample within the step, the output error
+        that is left after it.
+    withheld_error
+        Measured minus estimated of each withheld channel.
+    status
+        How the step went; unless ok, q and u are those of the last good step.
+    steps
+        Substeps taken.
+    notes
+        Numbers of the law: norm of the residual, theta, innovation statistics.
+    held
+        Input channels whose last value was held because the sample had none.
+    """
+
+    t: float
+    q: Array
+    u: Array
+    belief: Belief
+    innovation: Array
+    withheld_error: Array
+    status: Status
+    steps: int
+    notes: Mapping[str, float]
+    held: tuple[str, ...]
+    labels: Mapping[str, int]
+
+    @property
+    def q_std(self) -> Array | None:
+        """Standard deviation of each coefficient of q, or None if the law has none."""
+        return self.belief.q_std
+
+    @property
+    def u_std(self) -> Array | None:
+        """Standard deviation of each coefficient of u, or None if the law has none."""
+        return self.belief.u_std
+
+    @property
+    def parameters(self) -> dict[str, tuple[float, float]]:
+        """Label of each scalar unknown -> (value, standard deviation; NaN if there is none)."""
+        std = self.q_std
+        return {
+            label: (float(self.q[k]), float(std[k]) if std is not None else np.nan)
+            for label, k in self.labels.items()
+        }
+
+
+class Result:
+    """Estimates of a run, as they are added.
+
+    Scalars, innovations and status are kept for every sample; fields, evaluated at the vertices of
+    the mesh, for every `fields_every`-th and the last.
+    """
+
+    def __init__(
+        self, model: Model, observed: Observed, withheld: Observed | None, fields_every: int
+    ) -> None:
+        self.model = model
+        self.observed = observed
+        self.withheld = withheld
+        self.fields_every = fields_every
+        self.last: Estimate | None = None
+        self._rows: list[tuple[Any, ...]] = []
+        self._fields: list[tuple[float, dict[str, Array]]] = []
+
+    @classmethod
+    def empty(
+        cls, model: Model, observed: Observed, withheld: Observed | None, fields_every: int = 1
+    ) -> Result:
+        """Return a result without estimates."""
+        return cls(model, observed, withheld, fields_every)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, estimate: Estimate) -> None:
+        """Add one estimate."""
+        values = estimate.parameters
+        self._rows.append(
+            (
+                estimate.t,
+                [values[k][0] for k in values],
+                [values[k][1] for k in values],
+                estimate.innovation,
+                estimate.withheld_error,
+                STATUS_CODES.index(estimate.status.code),
+                estimate.notes,
+            )
+        )
+        if (len(self._rows) - 1) % self.fields_every == 0:
+            self._fields.append((estimate.t, self._profiles(estimate)))
+        self.last = estimate
+
+    def _profiles(self, estimate: Estimate) -> dict[str, Array]:
+        """Return values and deviations of all fields at the vertices."""
+        found: dict[str, Array] = {}
+        block, belief = self.model.state_block, estimate.belief
+        name = next(iter(self.model.state_space.blocks))
+        found[name] = block.at_vertices @ estimate.u
+        if belief.u_factor is not None:
+            found[f"{name}_std"] = belief.inflation * np.sqrt(
+                ((block.at_vertices @ belief.u_factor) ** 2).sum(axis=1)
+            )
+        for name, field in self.model.parameter_space.fields.items():
+            part = self.model.parameter_space.part(name)
+            found[name] = field.at_vertices @ estimate.q[part]
+            if belief.q_factor is not None:
+                found[f"{name}_std"] = belief.inflation * np.sqrt(
+                    ((field.at_vertices @ belief.q_factor[part]) ** 2).sum(axis=1)
+                )
+        return found
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return a dataset with dimensions time, snapshot, vertex, sensor, withheld.
+
+        Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
+        variables beside them; innovations over (`time`, `sensor`). Units are attributes.
+        """
+        fields = list(self._fields)
+        if self.last is not None and (not fields or fields[-1][0] != self.last.t):
+            fields.append((self.last.t, self._profiles(self.last)))
+        rows = list(zip(*self._rows, strict=True)) or [()] * 7
+        points = self.model.state.mesh.p
+        order = np.argsort(points[0]) if len(points) == 1 else np.arange(points.shape[1])
+        data = xr.Dataset(
+            coords={
+                "time": ("time", np.array(rows[0], dtype=float), {"units": self.model.time_unit}),
+                "snapshot": np.array([t for t, _ in fields]),
+                "sensor": list(self.observed.names),
+                "withheld": list(self.withheld.names if self.withheld else ()),
+                **{
+                    axis: ("vertex", coordinate[order])
+                    for axis, coordinate in zip("xyz", points, strict=False)
+                },
+            }
+        )
+        units = self._units()
+        for k, label in enumerate(self.model.parameter_space.labels):
+            unit = {"units": units.get(label.split("[")[0], "")}
+            data[label] = ("time", np.array([row[k] for row in rows[1]], dtype=float), unit)
+            data[f"{label}_std"] = ("time", np.array([row[k] for row in rows[2]]), unit)
+        for name in fields[0][1] if fields else ():
+            values = np.array([profile[name][order] for _, profile in fields])
+            unit = {"units": units.get(name.removesuffix("_std"), "")}
+            data[name] = (("snapshot", "vertex"), values, unit)
+        unit = {"units": self.observed.observation.unit}
+        shape = (len(self._rows), -1)
+        data["innovation"] = (("time", "sensor"), np.reshape(rows[3], shape), unit)
+        if self.withheld is not None:
+            data["withheld_error"] = (("time", "withheld"), np.reshape(rows[4], shape), unit)
+        flags = {
+            "flag_values": list(range(len(STATUS_CODES))),
+            "flag_meanings": " ".join(STATUS_CODES),
+        }
+        data["status"] = ("time", np.array(rows[5], dtype=np.int32), flags)
+        for name in dict.fromkeys(key for notes in rows[6] for key in notes):
+            data[name] = ("time", np.array([notes.get(name, np.nan) for notes in rows[6]]))
+        data.attrs["fields"] = " ".join(self.model.parameter_space.fields)
+        data.attrs["scalars"] = "\n".join(self.model.parameter_space.labels)
+        data.attrs["state"] = next(iter(self.model.state_space.blocks))
+        return data
+
+    def _units(self) -> dict[str, str]:
+        unknowns = {**self.model.state_space.unknowns, **self.model.parameter_space.unknowns}
+        return {name: unknown.unit for name, unknown in unknowns.items()}
+
+    def table(self) -> dict[str, dict[str, float]]:
+        """Return the last estimates and the root mean square errors of all sensors.
+
+        Rows are scalar unknowns (value, std) and channels (rmse, count).
+        """
+        return summary(self.to_xarray())
+
+    def plot(self, **options: Any) -> Any:
+        """Draw the run and return the figure; needs the extra `plots`."""
+        return plots.overview(self.to_xarray(), **options)
+
+
+def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
+    """Return the table of a run's dataset: last estimates, and errors of each channel."""
+    rows: dict[str, dict[str, float]] = {}
+    for label in filter(None, data.attrs["scalars"].split("\n")):
+        rows[label] = {
+            "value": float(data[label][-1]),
+            "std": float(data[f"{label}_std"][-1]),
+        }
+    for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+        if variable not in data:
+            continue
+        for name in data[dimension].values:
+            errors = data[variable].sel({dimension: name}).dropna("time")
+            rows[f"{variable}:{name}"] = {
+                "rmse": float(np.sqrt((errors**2).mean())) if len(errors) else np.nan,
+                "count": float(len(errors)),
+            }
+    return rows

@@ -1,0 +1,173 @@
+"""Hilbert spaces by their Gram matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import LinearAlgebraError, SpaceError
+from livepde.linalg import Array, Factor, IntArray, Pattern, analyse
+
+__all__ = ["HilbertSpace"]
+
+LARGEST_CONDITION = 1e14
+
+
+@dataclass(frozen=True, eq=False)
+class HilbertSpace:
+    """Coefficient vectors with the inner product (x, y) = x^T G y.
+
+    Parameters
+    ----------
+    gram
+        Symmetric positive definite Gram matrix G, shape (n, n).
+    name
+        Letter of the space: X, Q, V~, ...
+    fixed
+        Coefficients that essential boundary conditions fix. Elements of the *tangent* space are
+        zero there: `riesz` returns zero for them, and their rows and columns of G do not count.
+
+    Raises
+    ------
+    SpaceError
+        G is not square, not symmetric, or singular on the tangent space.
+    """
+
+    gram: sp.csr_array
+    name: str = "X"
+    fixed: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        rows, cols = self.gram.shape
+        if rows != cols:
+            raise SpaceError(f"Gram matrix of {self.name}: got shape {rows, cols}, needs a square.")
+        scale = abs(self.gram).max() if self.gram.nnz else 0.0
+        if not np.isfinite(scale):
+            raise SpaceError(f"Gram matrix of {self.name}: holds values that are not finite.")
+        if self.gram.nnz and abs(self.gram - self.gram.T).max() > 1e-10 * scale:
+            raise SpaceError(
+                f"Gram matrix of {self.name} is not symmetric: write the inner product as a form "
+                "that does not change when its two arguments are exchanged."
+            )
+
+    @property
+    def dim(self) -> int:
+        """Number of coefficients n."""
+        return int(self.gram.shape[0])
+
+    @cached_property
+    def free(self) -> Array:
+        """One for each free coefficient, zero for each fixed one, shape (n,)."""
+        mask = np.ones(self.dim)
+        mask[self.fixed] = 0.0
+        return mask
+
+    @cached_property
+    def tangent_gram(self) -> sp.csr_array:
+        """G on the free coefficients, the identity on the fixed ones."""
+        free = sp.diags_array(self.free)
+        return sp.csr_array(free @ self.gram @ free + sp.diags_array(1.0 - self.free))
+
+    @cached_property
+    def factor(self) -> Factor:
+        """Factorised `tangent_gram`."""
+        pattern = Pattern.of(self.tangent_gram)
+        singular = (
+            f"The Gram matrix of {self.name} is singular: its inner product does not see every "
+            "element. Add a zero-order term (inner='H1' has one) or fix boundary values."
+        )
+        try:
+            factor = analyse(pattern, symmetric=True).factorise(_data(self.tangent_gram, pattern))
+        except LinearAlgebraError as error:
+            raise SpaceError(singular) from error
+        # Two steps of inverse iteration find a nearly zero eigenvalue that no pivot shows.
+        x = np.random.default_rng(0).standard_normal(self.dim)
+        for _ in range(2):
+            x = factor.solve(x / np.linalg.norm(x))
+        largest = abs(self.tangent_gram).sum(axis=1).max()
+        if not np.isfinite(x).all() or np.linalg.norm(x) * largest > LARGEST_CONDITION:
+            raise SpaceError(singular)
+        y = factor.solve(x)
+        if x @ y <= 0:
+            raise SpaceError(
+                f"The Gram matrix of {self.name} is not positive definite: check the sign of the "
+                "terms of its inner product."
+            )
+        return factor
+
+    def inner(self, x: Array, y: Array) -> float:
+        """Return (x, y) = x^T G y for coefficient vectors of shape (n,)."""
+        return float(x @ (self.gram @ y))
+
+    def norm(self, x: Array) -> float:
+        """Return the norm of a coefficient vector, sqrt((x, x))."""
+        return float(np.sqrt(max(self.inner(x, x), 0.0)))
+
+    def dual(self, x: Array) -> Array:
+        """Return the functional (x, ·) as a dual vector G x."""
+        dual: Array = self.gram @ x
+        return dual
+
+    def riesz(self, functional: Array) -> Array:
+        """Return the Riesz representative of a dual vector: the x of the tangent space with
+        (x, xi) = functional(xi) for every xi of it. Shape (n,) or (n, k).
+        """
+        free = self.free if functional.ndim == 1 else self.free[:, None]
+        return self.factor.solve(functional * free)
+
+    def scaled(self, factor: float) -> HilbertSpace:
+        """Return the same space with its inner product multiplied by `factor`."""
+        return HilbertSpace(sp.csr_array(self.gram * factor), self.name, self.fixed)
+
+    def modes(self, count: int, mass: sp.csr_array) -> tuple[Array, Array]:
+        """Leading modes of the Gaussian measure with covariance G^{-1}.
+
+        Solves mass phi = lambda G phi for the `count` largest lambda; the columns are
+        G-orthonormal, so q = Phi a with a ~ N(0, I) has covariance Phi Phi^T, the best
+        approximation of G^{-1} of that rank in the norm of `mass`.
+
+        Returns
+        -------
+        phi
+            Shape (n, count).
+        variance
+            The lambdas, descending.
+        """
+        from scipy.linalg import eigh
+        from scipy.sparse.linalg import LinearOperator, eigsh
+
+        free = np.flatnonzero(self.free)
+        if not 1 <= count <= len(free):
+            raise SpaceError(f"{self.name} has {len(free)} free coefficients; got modes={count}.")
+        gram = self.tangent_gram[free][:, free]
+        mass = sp.csr_array(mass)[free][:, free]
+        if len(free) <= 400 or count >= len(free) - 1:
+            n = len(free)
+            values, vectors = eigh(
+                mass.toarray(), gram.toarray(), subset_by_index=(n - count, n - 1)
+            )
+        else:
+
+            def solve(b: Array) -> Array:
+                full = np.zeros(self.dim)
+                full[free] = b
+                return self.factor.solve(full)[free]
+
+            inverse = LinearOperator(gram.shape, matvec=solve, dtype=float)
+            start = np.ones(len(free))  # a fixed start: the same modes in every run
+            values, vectors = eigsh(mass, k=count, M=gram, Minv=inverse, v0=start)
+        order = np.argsort(values)[::-1]
+        phi = np.zeros((self.dim, count))
+        phi[free] = vectors[:, order]
+        # Eigenvectors have no sign of their own: fix it, so that runs can be compared.
+        phi *= np.sign(phi[np.abs(phi).argmax(axis=0), np.arange(count)])
+        return phi, values[order]
+
+
+def _data(matrix: sp.csr_array, pattern: Pattern) -> Array:
+    coo = matrix.tocoo()
+    data: Array = pattern.gather(coo.row, coo.col) @ coo.data
+    return data

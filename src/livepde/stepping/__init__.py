@@ -1,0 +1,22 @@
+"""Time schemes, the nonlinear iteration, substeps, and the forward model."""
+
+from __future__ import annotations
+
+from livepde.stepping.interval import Advance, Interval, advance
+from livepde.stepping.newton import Newton, StepFailed
+from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
+from livepde.stepping.state import ForwardStage, simulate
+
+__all__ = [
+    "Advance",
+    "Alexander2",
+    "ForwardStage",
+    "ImplicitEuler",
+    "Interval",
+    "Newton",
+    "Scheme",
+    "Stage",
+    "StepFailed",
+    "advance",
+    "simulate",
+]

@@ -1,0 +1,128 @@
+"""From one sample to the next: the data in between, substeps, and what happens when one fails."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from livepde.fem import Inputs, Moment
+from livepde.linalg import Array
+from livepde.stepping.newton import StepFailed
+from livepde.stepping.schemes import Scheme, Stage
+
+__all__ = ["Advance", "Interval", "advance"]
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """The time between two samples, with inputs and measurements interpolated linearly.
+
+    Attributes
+    ----------
+    t0, t1
+        Times of the last accepted sample and of this one.
+    inputs0, inputs1
+        Input channels at both ends.
+    z0, z1
+        Measurements at both ends, shape (sensors,), NaN where missing.
+    """
+
+    t0: float
+    t1: float
+    inputs0: Mapping[str, float]
+    inputs1: Mapping[str, float]
+    z0: Array
+    z1: Array
+
+    def _weight(self, t: float) -> float:
+        return (t - self.t0) / (self.t1 - self.t0)
+
+    def at(self, t: float) -> Moment:
+        """Return time and inputs at t."""
+        if t == self.t1:
+            return self.end
+        s = self._weight(t)
+        mixed = {k: (1 - s) * self.inputs0[k] + s * v for k, v in self.inputs1.items()}
+        return Moment(t, Inputs(mixed))
+
+    @cached_property
+    def end(self) -> Moment:
+        """Time and inputs at the end."""
+        return Moment(self.t1, Inputs(self.inputs1))
+
+    @cached_property
+    def present(self) -> Array:
+        """Sensors with a value at the end, shape (sensors,)."""
+        return np.isfinite(self.z1)
+
+    def z(self, t: float) -> Array:
+        """Return measurements at t; where the value at t0 is missing, those of t1."""
+        if t == self.t1:
+            return self.z1
+        s = self._weight(t)
+        start = np.where(np.isfinite(self.z0), self.z0, self.z1)
+        return (1 - s) * start + s * self.z1
+
+
+@dataclass(frozen=True)
+class Advance:
+    """How a step is controlled.
+
+    Parameters
+    ----------
+    scheme
+        Time scheme.
+    dt_max
+        Longest substep; a longer interval is divided evenly.
+    halvings
+        A substep that fails is halved at most this often.
+    """
+
+    scheme: Scheme
+    dt_max: float = np.inf
+    halvings: int = 8
+
+    def count(self, interval: Interval) -> int:
+        """Return the number of even substeps of an interval."""
+        ratio = (interval.t1 - interval.t0) / self.dt_max
+        return max(1, int(np.ceil(ratio * (1 - 1e-12))))
+
+
+def advance(
+    control: Advance, stage: Stage, y: Array, interval: Interval
+) -> tuple[Array, int, StepFailed | None]:
+    """Advance y over an interval.
+
+    Times are computed from integer counts, never accumulated.
+
+    Returns
+    -------
+    y
+        At the end of the interval; unchanged from the last good substep if one failed for good.
+    steps
+        Substeps taken.
+    failure
+        None, or why the last halving still failed.
+    """
+    substeps = control.count(interval)
+    finest = substeps << control.halvings
+    width = (interval.t1 - interval.t0) / finest
+    tick, stride, steps = 0, 1 << control.halvings, 0
+    while tick < finest:
+        t = interval.t0 + tick * width
+        stop = interval.t1 if tick + stride == finest else interval.t0 + (tick + stride) * width
+        try:
+            y = control.scheme.advance(stage, y, t, stop - t)
+        except StepFailed as failure:
+            if stride == 1:
+                return y, steps, failure
+            stride >>= 1
+            continue
+        steps += 1
+        tick += stride
+        if stride < 1 << control.halvings and tick % (2 * stride) == 0:
+            stride <<= 1
+    return y, steps, None

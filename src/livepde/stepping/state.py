@@ -1,0 +1,159 @@
+"""The forward model with a known parameter: its implicit stage, its tangent, a simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.fem import START, Moment
+from livepde.linalg import Array, Assembler, Factor, Pattern, Solver, analyse
+from livepde.model import Model
+from livepde.stepping.interval import Advance, Interval, advance
+from livepde.stepping.newton import Newton
+
+__all__ = ["ForwardStage", "simulate"]
+
+
+class ForwardStage:
+    """Solves M (u - c)/h + B(u) + A(u) q = F(t) for u, with Dirichlet values imposed.
+
+    If B and A are affine in u and constant in time, the matrix is factorised once for each (h, q)
+    and a stage is one back-substitution. What is kept never changes the numbers.
+    """
+
+    def __init__(self, model: Model, newton: Newton | None = None) -> None:
+        self.model = model
+        self.newton = newton or Newton()
+        self._kept: tuple[tuple[float, bytes], _System] | None = None
+
+    @cached_property
+    def _assembled(self) -> tuple[Pattern, dict[str, sp.csr_array], Solver]:
+        model = self.model
+        free = sp.diags_array(model.X.free)
+        whole = Assembler(model.X.dim)
+        whole.add("M", model.form_M.pattern("v", "u"), free, free)
+        whole.add("B", model.form_B.pattern("v", "u"), free, free)
+        whole.add("A", model.form_A.pattern("v", "u"), free, free)
+        fixed = Pattern.of(sp.eye_array(model.X.dim))
+        whole.add("fixed", fixed, sp.diags_array(1.0 - model.X.free))
+        pattern, maps = whole.build()
+        return pattern, maps, analyse(pattern)
+
+    def jacobian(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
+        """Return the factorised S = M/h + B'(u) + d(A(u) q)/du on the free coefficients."""
+        _, maps, solver = self._assembled
+        model = self.model
+        data = (
+            maps["M"] @ (model.mass.data / h)
+            + maps["B"] @ model.form_B.data("v", "u", moment, u=u)
+            + maps["A"] @ model.form_A.data("v", "u", moment, u=u, q=q)
+            + maps["fixed"] @ np.ones(model.X.dim)
+        )
+        return solver.factorise(data)
+
+    def system(self, q: Array, h: float) -> _System:
+        """Return matrix and factor of an affine, constant model, kept for the last (q, h)."""
+        key = (h, q.tobytes())
+        if self._kept is None or self._kept[0] != key:
+            model = self.model
+            zero = np.zeros(model.X.dim)
+            slope = model.form_B.matrix("v", "u", u=zero) + model.form_A.matrix("v", "u", q=q)
+            offset = model.B(zero) + model.A(zero)(q)
+            matrix = sp.csr_array(model.mass / h + slope)
+            system = _System(matrix, offset, self.jacobian(zero, q, h, START))
+            self._kept = (key, system)
+        return self._kept[1]
+
+    def solve(self, c: Array, q: Array, h: float, moment: Moment) -> Array:
+        """Return u of one stage; raises `StepFailed`."""
+        model = self.model
+        u = model.impose(c, moment)
+        if model.affine and model.constant:
+            system = self.system(q, h)
+            residual = system.matrix @ u - model.mass @ (c / h) + system.offset - model.F(moment)
+            return u - system.factor.solve(residual * model.X.free)
+        equation = _Equation(self, c, q, h, moment)
+        return self.newton.solve(equation, u, (slice(None),), affine=model.affine)
+
+    def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
+        """Return the factorised Jacobian at a solved stage, for sensitivities."""
+        if self.model.affine and self.model.constant:
+            return self.system(q, h).factor
+        return self.jacobian(u, q, h, moment)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    matrix: sp.csr_array
+    offset: Array
+    factor: Factor
+
+
+@dataclass(frozen=True, eq=False)
+class _Equation:
+    stage: ForwardStage
+    c: Array
+    q: Array
+    h: float
+    moment: Moment
+
+    @cached_property
+    def source(self) -> Array:
+        return self.stage.model.F(self.moment)
+
+    def residual(self, y: Array) -> Array:
+        model = self.stage.model
+        rate = model.mass @ ((y - self.c) / self.h)
+        flux = model.B(y, self.moment) + model.form_A.vector("v", self.moment, q=self.q, u=y)
+        masked: Array = (rate + flux - self.source) * model.X.free
+        return masked
+
+    def factor(self, y: Array) -> Factor:
+        return self.stage.jacobian(y, self.q, self.h, self.moment)
+
+
+def simulate(
+    model: Model,
+    q: Array,
+    u0: Any,
+    times: Sequence[float],
+    control: Advance,
+    inputs: Callable[[float], Any] | None = None,
+) -> Iterator[tuple[float, Array]]:
+    """Yield (t, u) of the forward model at the given times, the first being the initial time.
+
+    Parameters
+    ----------
+    q
+        Coefficients of the parameter, shape (m,).
+    u0
+        Initial state: a number, a function of x, or coefficients.
+    inputs
+        t -> mapping of input channels.
+
+    Raises
+    ------
+    StepFailed
+        A step failed even when halved as often as `control` allows.
+    """
+    values = inputs or (lambda t: {})
+    forward = ForwardStage(model)
+    none = np.zeros(0)
+    u = model.initial(u0, Moment(times[0], values(times[0])))
+    yield times[0], u
+    for t0, t1 in pairwise(times):
+        interval = Interval(t0, t1, values(t0), values(t1), none, none)
+
+        def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:
+            return forward.solve(c, q, h, interval.at(t))
+
+        u, _, failure = advance(control, stage, u, interval)
+        if failure is not None:
+            raise failure
+        yield t1, u
