@@ -200,14 +200,20 @@ class Observed:
         tangent.eliminate_zeros()
         if self.observation.nodal and _is_selection(tangent):
             inverse = sp.csr_array(tangent.T)
+            R = sp.csr_array(inverse @ tangent)
         else:
             rows = tangent.toarray()
             representers = rows.T if self.observation.nodal else self.X.riesz(rows.T)
             values, vectors = np.linalg.eigh(rows @ representers)
             kept = values > DEPENDENT * max(values.max(initial=0.0), 1e-300)
-            core = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-            inverse = sp.csr_array(representers @ core)
-        R = sp.csr_array(inverse @ tangent)
+            C = vectors[:, kept] / np.sqrt(values[kept])
+            # V W is idempotent to rounding only if W V = I to rounding. C alone does not give that
+            # when sensors nearly repeat each other. Sparse W keeps R as narrow as G is.
+            V = representers @ C
+            W = sp.csr_array(C.T) @ tangent
+            W = sp.csr_array(np.linalg.inv(W @ V)) @ W
+            inverse = sp.csr_array(V @ np.linalg.pinv(rows @ V))
+            R = sp.csr_array(V) @ W
         P = sp.csr_array(sp.eye_array(n) - R)
         R.eliminate_zeros()
         P.eliminate_zeros()
