@@ -13,6 +13,7 @@ from skfem import Basis, FacetBasis, Mesh
 from skfem.element import DiscreteField
 
 from livepde.errors import ObservationError, SpaceError
+from livepde.fem.elements import own
 from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Unknown
 from livepde.fem.place import Moment, Place
 from livepde.linalg import Array, IntArray
@@ -37,6 +38,7 @@ class Measure:
 
     def basis(self, element: Any) -> Any:
         """Return scikit-fem's basis of an element on this measure."""
+        element = own(element)
         if self.name is None:
             return Basis(self.mesh, element, intorder=self.order)
         if self.on_boundary:
@@ -167,7 +169,7 @@ class FieldBlock(Block):
 
     def __init__(self, field: Field) -> None:
         self.field = field
-        self.basis = Basis(field.mesh, field.element)
+        self.basis = Basis(field.mesh, own(field.element))
         self.size = int(self.basis.N)
 
     def local(self, measure: Measure) -> Local:
