@@ -21,6 +21,7 @@ __all__ = ["Observation", "Observed", "Split"]
 
 Direct = Callable[[Any, Place], Any]
 DEPENDENT = 1e-12  # eigenvalues of G G* below this share of the largest count as zero
+ROUNDING = 1e-14  # entries of G below this share of the largest of their row count as zero
 LARGEST_MEMO = 64  # splits kept for different patterns of missing samples
 
 
@@ -121,6 +122,13 @@ class Observed:
             )
         if not np.isfinite(self.G.data).all():
             raise ObservationError("The observation matrix holds values that are not finite.")
+        # Shape functions evaluated at a node leave entries of 1e-17: a sensor on the Dirichlet
+        # boundary would seem to see something.
+        largest = abs(self.G).max(axis=1).toarray().ravel()
+        self.G.data[
+            np.abs(self.G.data) <= ROUNDING * np.repeat(largest, np.diff(self.G.indptr))
+        ] = 0.0
+        self.G.eliminate_zeros()
         self.size = int(self.G.shape[0])
         self.names = observation.names(self.size)
         if len(set(self.names)) != self.size:
