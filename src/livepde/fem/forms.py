@@ -155,15 +155,15 @@ class Form:
         if self.nonlinear is None:
             return True
         rng = np.random.default_rng(1)
+        probe = Moment(0.3, self._inputs)
         for term in self.terms:
             values = {
                 key: rng.standard_normal((local.components, *local.shape))
                 for key, local in term.spaces.items()
             }
-            moment = Moment(0.3, self._inputs)
 
             def at(x: Array, term: _Term = term, values: dict[str, Array] = values) -> Array:
-                density, _ = term.evaluate({**values, str(self.nonlinear): x}, moment)
+                density, _ = term.evaluate({**values, str(self.nonlinear): x}, probe)
                 return np.asarray(density)
 
             for scale in (1e-3, 1.0, 1e3):
@@ -198,13 +198,15 @@ class Form:
     def _vector(self, slot: str, moment: Moment, coefficients: Mapping[str, Array]) -> Array:
         result = np.zeros(self.spaces[slot].dim)
         for term in self.terms:
-            values = {
-                key: local.units(0, 1) if key == slot else local.values(coefficients[key])
+            place = Place(term.measure.points, term.measure.normal, moment)
+            jets = [
+                local.unit_jets(0, 1)
+                if key == slot
+                else local.jets(local.values(coefficients[key]))
                 for key, local in term.spaces.items()
-            }
-            density, _ = term.evaluate(values, moment)
+            ]
             local = term.spaces[slot]
-            weighted = term.weighted(density, (local.components,))
+            weighted = term.weighted(term.integrand(*jets, place), (local.components,))
             result += local.evaluation_transposed @ weighted.ravel()
         return result
 
@@ -279,21 +281,20 @@ class Form:
     ) -> Array:
         """Return the integrand's derivative in `rows` and `cols`: (components, components, E, P)."""
         axis = {rows: 0, cols: 1}
-        arguments: list[tuple[LocalSpace, Array]] = []
+        jets: list[Any] = []
         for key, local in term.spaces.items():
-            units = local.units(axis[key], 2) if key in axis else None
-            if units is not None and key != self.nonlinear:
-                arguments.append((local, units))
+            if key in axis and key != self.nonlinear:
+                jets.append(local.unit_jets(axis[key], 2))
                 continue
             here = local.values(coefficients[key]) if key in coefficients else local.zeros()
-            if units is None:
-                arguments.append((local, here))
+            if key not in axis:
+                jets.append(local.jets(here))
             elif given is not None:
-                arguments += [(local, here[:, None, None]), (local, units)]
+                jets += [local.jets(here[:, None, None]), local.unit_jets(axis[key], 2)]
             else:
-                arguments.append((local, here[:, None, None] + 1j * STEP * units))
+                step = 1j * STEP * local.units(axis[key], 2)
+                jets.append(local.jets(here[:, None, None] + step))
         place = Place(term.measure.points, term.measure.normal, moment)
-        jets = [local.jets(values) for local, values in arguments]
         if self.nonlinear not in axis:
             return np.asarray(term.integrand(*jets, place))
         if given is not None:
@@ -307,8 +308,20 @@ class Form:
             self._constants[rows, cols] = self._quadrature(rows, cols, START, {})
         return self._constants[rows, cols]
 
+    def tensor(self, rows: str, cols: str) -> sp.csr_array | None:
+        """Return the matrix T with data(rows, cols) = T @ (coefficients of the third argument).
+
+        None unless the form is trilinear and constant, and T is of reasonable size.
+        """
+        (third,) = [key for key in self.spaces if key not in (rows, cols)]
+        if not (self.affine and self.constant):
+            return None
+        if self.nonlinear is not None and third == self.nonlinear:
+            if np.any(self._constant(rows, cols)):
+                return None
+        return self._tensor(rows, cols, third)
+
     def _tensor(self, rows: str, cols: str, third: str) -> sp.csr_array | None:
-        """Return the matrix third's coefficients -> data(rows, cols), or None if it is too large."""
         if (rows, cols) in self._tensors:
             return self._tensors[rows, cols]
         size = sum(

@@ -33,6 +33,7 @@ class LocalSpace:
             [local.dofs + start for local, start in zip(self.locals, space.starts, strict=True)]
         )
         self.phi = np.zeros((self.components, sum(widths), *self.shape))
+        self._units: dict[tuple[int, int], Any] = {}
         first, left = 0, 0
         for local, count, width in zip(self.locals, counts, widths, strict=True):
             self.phi[first : first + count, left : left + width] = local.phi
@@ -41,7 +42,7 @@ class LocalSpace:
     @cached_property
     def evaluation(self) -> sp.csr_array:
         """Coefficients -> all components at all quadrature points (fact 10 of the design)."""
-        components, width, elements, points = self.phi.shape
+        components, _, elements, points = self.phi.shape
         c, i, e, p = np.nonzero(self.phi)
         rows = (c * elements + e) * points + p
         shape = (components * elements * points, self.space.dim)
@@ -66,6 +67,12 @@ class LocalSpace:
         batch = [1] * axes
         batch[axis] = self.components
         return np.eye(self.components).reshape(self.components, *batch, 1, 1)
+
+    def unit_jets(self, axis: int, axes: int) -> Any:
+        """Return the jets of `units(axis, axes)`, kept: they never change."""
+        if (axis, axes) not in self._units:
+            self._units[axis, axes] = self.jets(self.units(axis, axes))
+        return self._units[axis, axes]
 
     def jets(self, values: Array) -> Any:
         """Return what a form gets for component values of shape (components, ..., E, P)."""
@@ -161,8 +168,15 @@ class FunctionSpace:
         return {n: block for n, block in self.blocks.items() if isinstance(block, FieldBlock)}
 
     def local(self, measure: Measure) -> LocalSpace:
-        """Return the space on a measure."""
-        return LocalSpace(self, measure)
+        """Return the space on a measure, built once: all forms share it."""
+        key = (id(measure.mesh), measure.order, measure.name)
+        if key not in self._locals:
+            self._locals[key] = LocalSpace(self, measure)
+        return self._locals[key]
+
+    @cached_property
+    def _locals(self) -> dict[tuple[int, int, str | None], LocalSpace]:
+        return {}
 
     def interpolate(self, value: Any) -> Array:
         """Return coefficients of a number, a function of x, coefficients, or a mapping by name."""

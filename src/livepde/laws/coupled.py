@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 
+from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array, Assembler, Factor, Pattern, Solver, analyse
@@ -52,7 +52,7 @@ class CoupledStage:
         G_Q (q - c_q)/(gain h) + (sigma/gain) G_Q q - A(w)^T r             = 0
 
     together, so that the two terms with A cancel in the energy as in the paper (align:neplusnr).
-    theta is taken from the iterate before.
+    theta depends on all of r; its derivative is a rank-one term of the Jacobian.
     """
 
     def __init__(self, model: Model, split: Split, gains: Gains, newton: Newton) -> None:
@@ -92,46 +92,55 @@ class CoupledStage:
         return pattern, maps, analyse(pattern)
 
     @cached_property
-    def _static(self) -> Callable[[float], Array]:
-        """H -> data of the part of the Jacobian that no iterate changes, kept for the last h."""
+    def _data(self) -> dict[str, Array]:
+        """Data of the whole for the blocks that never change: M, G, RMR, and the rest."""
         _, maps, _ = self._assembled
         model, g = self.model, self.gains
-        rate_u = maps["M"] @ model.mass.data
-        gram = maps["G"] @ _stored(self.gram)
-        rest = maps["PNP"] @ (g.nu * _stored(self.PNP)) + maps["fixed"] @ np.ones(
-            self.n + model.Q.dim
-        )
-        rest += (g.sigma / g.gain) * gram
-        if model.form_B.affine and model.form_B.constant:
+        gram = maps["G"] @ _stored(self.gram) / g.gain
+        rest = maps["PNP"] @ (g.nu * _stored(self.PNP)) + g.sigma * gram
+        rest += maps["fixed"] @ np.ones(self.n + model.Q.dim)
+        if self._constant_B:
             rest += maps["B"] @ model.form_B.data("v", "u", u=np.zeros(self.n))
+        return {
+            "rate": maps["M"] @ model.mass.data + gram,
+            "pull": maps["RMR"] @ _stored(self.RMR),
+            "rest": rest,
+        }
 
-        kept: dict[float, Array] = {}
-
-        def static(h: float) -> Array:
-            if h not in kept:
-                kept.clear()
-                kept[h] = rate_u / h + gram / (g.gain * h) + rest
-            return kept[h]
-
-        return static
+    @property
+    def _constant_B(self) -> bool:
+        return self.model.form_B.affine and self.model.form_B.constant
 
     @cached_property
-    def _pull(self) -> Array:
-        """Data of R^T M_op R in the whole."""
-        _, maps, _ = self._assembled
-        data: Array = maps["RMR"] @ _stored(self.RMR)
-        return data
+    def bilinear(self) -> _Bilinear | None:
+        """Precomputed products, if A is bilinear and B affine, both constant in time."""
+        form = self.model.form_A
+        tensors = [form.tensor(*pair) for pair in (("v", "q"), ("v", "u"), ("q", "u"))]
+        if not self._constant_B or any(tensor is None for tensor in tensors):
+            return None
+        return _Bilinear(self, *tensors)
 
     def theta(self, r: Array, Mr: Array) -> float:
-        """Return the damping for a residual r, with M r = M_op r given."""
+        """Return the damping for a residual r, with Mr = R^T M_op r given."""
+        return self.gains.damping.theta(self.norms(r, Mr, self.model.mass @ r))
+
+    def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
+        """Return the norms of r that a damping rule may use."""
 
         def V() -> float:
             return float(Mr @ self.model.X.riesz(Mr))
 
-        square = float(r @ (self.model.mass @ r))
-        return self.gains.damping.theta(Residual(square, float(r @ Mr), V))
+        return Residual(float(r @ mass_r), float(r @ Mr), V)
 
-    def solve(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> Array:
+    def slope(self, norms: Residual, Mr: Array, mass_r: Array) -> Array:
+        """Return the derivative of theta in u, shape (n,)."""
+        dX, dVX, dV = self.gains.damping.slopes(norms)
+        row = (2.0 * dX) * mass_r + (2.0 * dVX) * Mr
+        if dV:
+            row += 2.0 * dV * (self.gains.M_op @ self.model.X.riesz(Mr))
+        return self.split.R.T @ row
+
+    def solve(self, c: Array, h: float, moment: Moment, u_alpha: Array, shift: Array) -> Array:
         """Return y = (u, q) of one stage; raises `StepFailed`.
 
         Parameters
@@ -140,11 +149,54 @@ class CoupledStage:
             (c_u, c_q), shape (n + m,).
         u_alpha
             G^+ z at the stage's time, shape (n,).
+        shift
+            Change of u_alpha during the stage: where the iteration starts, no more.
         """
         start = c.copy()
-        start[: self.n] = self.model.impose(c[: self.n], moment)
+        start[: self.n] = self.model.impose(c[: self.n] + shift, moment)
         equation = _Equation(self, c, h, moment, u_alpha)
-        return self.newton.solve(equation, start, self.blocks)
+        return self.newton.solve(equation, start, self.blocks, sweeps=True)
+
+
+class _Bilinear:
+    """What a stage needs if A(u) q is bilinear and everything else linear: a few sparse products.
+
+    Attributes
+    ----------
+    system
+        h -> matrix of the linear part of the residual above R, shape (n + m + n, n + m).
+    lagged
+        w -> data of A(w) in the whole, for sweeps.
+    jacobian
+        (w, q, r) -> data of the part of the Jacobian that changes.
+    """
+
+    def __init__(
+        self, stage: CoupledStage, vq: sp.csr_array, vu: sp.csr_array, qu: sp.csr_array
+    ) -> None:
+        _, maps, _ = stage._assembled
+        self.stage = stage
+        self.tensor = vq
+        self.A = stage.model.form_A.pattern("v", "q").operator()
+        self.lagged = sp.csr_array(maps["A"] @ vq)
+        self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Au"] @ vu, maps["Aq"] @ qu]))
+        self.B = stage.model.form_B.matrix("v", "u", u=np.zeros(stage.n))
+        self.norms = sp.csr_array(sp.vstack([stage.RM, stage.model.mass]))
+        self._systems: dict[float, sp.csr_array] = {}
+
+    def system(self, h: float) -> sp.csr_array:
+        """Return the linear part for a step h, kept for the last one."""
+        if h not in self._systems:
+            self._systems.clear()
+            stage, g = self.stage, self.stage.gains
+            model = stage.model
+            state = model.mass / h + self.B @ stage.split.P + g.nu * stage.PNP
+            state = sp.diags_array(model.X.free) @ state
+            scale = 1.0 / (g.gain * h) + g.sigma / g.gain
+            parameter = sp.diags_array(scale * stage.free_q) @ stage.gram
+            blocks = [[state, None], [None, parameter], [stage.split.R, None]]
+            self._systems[h] = sp.csr_array(sp.block_array(blocks))
+        return self._systems[h]
 
 
 class _Equation:
@@ -158,46 +210,105 @@ class _Equation:
         self.moment = moment
         self.u_alpha = u_alpha
         model, g, n = stage.model, stage.gains, stage.n
-        self.rate_q = 1.0 / (g.gain * h) + g.sigma / g.gain
+        self.fast = stage.bilinear
         self.known_u = model.mass @ (c[:n] / h) + model.F(moment)
         self.known_q = (stage.gram @ c[n:]) / (g.gain * h)
-        self.theta = 0.0
-
-    def _parts(self, y: Array) -> tuple[Array, Array, Array, Array]:
-        stage, n = self.stage, self.stage.n
-        u, q = y[:n], y[n:]
-        r = stage.split.R @ u - self.u_alpha
-        w = u - r  # u_alpha + P u, since P = I - R
-        return u, q, r, w
+        if self.fast is not None:
+            self.system = self.fast.system(h)
+            self.known_u = (self.known_u - model.B(u_alpha, moment)) * model.X.free
+            self.known_q = self.known_q * stage.free_q
 
     def residual(self, y: Array) -> Array:
-        stage, model = self.stage, self.stage.model
-        u, q, r, w = self._parts(y)
-        A = model.form_A.pattern("v", "q")
-        data = model.form_A.data("v", "q", self.moment, u=w)
-        Mr = stage.RM @ r
-        self.theta = stage.theta(r, Mr)
-        flux = model.B(w, self.moment) + A.matrix(data) @ q + self.theta * Mr
-        if stage.gains.nu:
-            flux += stage.gains.nu * (stage.PNP @ u)
+        stage, model, n = self.stage, self.stage.model, self.stage.n
+        u, q = y[:n], y[n:]
         out = np.empty_like(y)
-        out[: stage.n] = (model.mass @ (u / self.h) + flux - self.known_u) * model.X.free
-        drive = self.rate_q * (stage.gram @ q) - self.known_q - A.transposed(data) @ r
-        out[stage.n :] = drive * stage.free_q
+        if self.fast is not None:
+            linear = self.system @ y
+            self.r = r = linear[len(y) :] - self.u_alpha
+            self.w = w = u - r  # u_alpha + P u, since P = I - R
+            products = self.fast.norms @ r
+            self.Mr, self.mass_r = products[:n], products[n:]
+            A = self.fast.A
+            A.set(self.fast.tensor @ w)
+            self.norms = stage.norms(r, self.Mr, self.mass_r)
+            self.theta = stage.gains.damping.theta(self.norms)
+            flux = A.apply(q) + self.theta * self.Mr
+            out[:n] = linear[:n] + flux * model.X.free - self.known_u
+            out[n:] = linear[n : len(y)] - self.known_q - A.apply_transposed(r) * stage.free_q
+            return out
+        self.r = r = stage.split.R @ u - self.u_alpha
+        self.w = w = u - r
+        self.Mr, self.mass_r = stage.RM @ r, model.mass @ r
+        self.norms = stage.norms(r, self.Mr, self.mass_r)
+        self.theta = stage.gains.damping.theta(self.norms)
+        g = stage.gains
+        A_w = model.form_A.matrix("v", "q", self.moment, u=w)
+        flux = model.B(w, self.moment) + A_w @ q + self.theta * self.Mr + g.nu * (stage.PNP @ u)
+        rate = 1.0 / (g.gain * self.h) + g.sigma / g.gain
+        out[:n] = (model.mass @ (u / self.h) + flux - self.known_u) * model.X.free
+        out[n:] = (rate * (stage.gram @ q) - self.known_q - A_w.T @ r) * stage.free_q
         return out
 
-    def factor(self, y: Array) -> Factor:
-        stage, model = self.stage, self.stage.model
+    def factor(self, y: Array, sweep: bool) -> Factor:
+        """Return the factorised Jacobian at the y of the last `residual`.
+
+        In a sweep, A(w), theta and the Jacobian of B are held.
+        """
+        stage, n = self.stage, self.stage.n
         _, maps, solver = stage._assembled
-        _, q, r, w = self._parts(y)
-        form = model.form_A
-        data = stage._static(self.h) + self.theta * stage._pull
-        data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
-        data += maps["A"] @ form.data("v", "q", self.moment, u=w)
-        data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r)
-        if not (model.form_B.affine and model.form_B.constant):
-            data += maps["B"] @ model.form_B.data("v", "u", self.moment, u=w)
-        return solver.factorise(data)
+        q, r, w = y[n:], self.r, self.w
+        fixed = stage._data
+        data = fixed["rate"] / self.h + fixed["rest"] + self.theta * fixed["pull"]
+        if self.fast is not None:
+            data += (
+                self.fast.lagged @ w if sweep else self.fast.jacobian @ np.concatenate([w, q, r])
+            )
+        else:
+            form = stage.model.form_A
+            data += maps["A"] @ form.data("v", "q", self.moment, u=w)
+            if not sweep:
+                data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
+                data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r)
+            if not stage._constant_B:
+                data += maps["B"] @ stage.model.form_B.data("v", "u", self.moment, u=w)
+        factor = solver.factorise(data)
+        if sweep:
+            return factor
+        free = stage.model.X.free
+        row = stage.slope(self.norms, self.Mr, self.mass_r) * free
+        if not row.any():
+            return factor
+        column = np.zeros_like(y)
+        column[:n] = self.Mr * free
+        return _Bordered(factor, factor.solve(column), row)
+
+
+@dataclass(frozen=True, eq=False)
+class _Bordered:
+    """K + b a^T by Sherman and Morrison, from the factor of K: theta depends on all of r."""
+
+    inner: Factor
+    column: Array
+    row: Array
+
+    def solve(self, b: Array) -> Array:
+        """Return the solution for a right-hand side."""
+        x = self.inner.solve(b)
+        n = len(self.row)
+        pivot = 1.0 + float(self.row @ self.column[:n])
+        if pivot == 0.0:
+            raise LinearAlgebraError("The damped system is singular: take less damping.")
+        return x - self.column * (float(self.row @ x[:n]) / pivot)
+
+    def solve_transposed(self, b: Array) -> Array:
+        """Return the solution with the transpose."""
+        x = self.inner.solve_transposed(b)
+        n = len(self.row)
+        border = np.zeros_like(b)
+        border[:n] = self.row
+        border = self.inner.solve_transposed(border)
+        pivot = 1.0 + float(self.row @ self.column[:n])
+        return x - border * (float(self.column @ b) / pivot)
 
 
 def _stored(matrix: sp.csr_array) -> Array:

@@ -46,6 +46,27 @@ class Damping(ABC):
     def theta(self, r: Residual) -> float:
         """Return theta >= 0, in 1/time."""
 
+    def slopes(self, r: Residual) -> tuple[float, float, float]:
+        """Return the derivatives of theta in r.X, r.VX and r.V, for the Newton iteration.
+
+        By difference quotients, good enough for any rule: they change the number of iterations,
+        not the result.
+        """
+        reads: list[bool] = []
+
+        def norm() -> float:
+            reads.append(True)
+            return r.V
+
+        theta = self.theta(Residual(r.X, r.VX, norm))
+        step = 1.0 + 1e-6
+        dX = (self.theta(Residual(step * r.X, r.VX, lambda: r.V)) - theta) if r.X > 0 else 0.0
+        dVX = (self.theta(Residual(r.X, step * r.VX, lambda: r.V)) - theta) if r.VX > 0 else 0.0
+        dV = 0.0
+        if reads and r.V > 0:
+            dV = (self.theta(Residual(r.X, r.VX, lambda: step * r.V)) - theta) / (1e-6 * r.V)
+        return dX / (1e-6 * r.X or 1.0), dVX / (1e-6 * r.VX or 1.0), dV
+
 
 @dataclass(frozen=True)
 class ResidualDamping(Damping):
@@ -64,6 +85,11 @@ class ResidualDamping(Damping):
 
     def theta(self, r: Residual) -> float:
         return self.c1 * r.X / r.VX if r.VX > 0.0 else self.c1
+
+    def slopes(self, r: Residual) -> tuple[float, float, float]:
+        if r.VX <= 0.0:
+            return 0.0, 0.0, 0.0
+        return self.c1 / r.VX, -self.c1 * r.X / r.VX**2, 0.0
 
 
 @dataclass(frozen=True)

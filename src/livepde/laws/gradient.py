@@ -115,8 +115,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
         def stage(c: Array, t: float, h: float) -> Array:
             moment = interval.at(t)
             boundary = model.impose(zero, moment)
-            u_alpha = coupled.split.reconstruct(interval.z(t), boundary)
-            return coupled.solve(c, h, moment, u_alpha)
+            z, before = interval.z(t), interval.z(t - h)
+            u_alpha = coupled.split.reconstruct(z, boundary)
+            shift = coupled.split.reconstruct(z - before, zero)
+            return coupled.solve(c, h, moment, u_alpha, shift)
 
         y = np.concatenate([state.u, state.q])
         y, steps, failure = advance(work.problem.control, stage, y, interval)

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from livepde.linalg.types import Array, IntArray, Sparse
 
-__all__ = ["Pattern", "sandwich"]
+__all__ = ["Pattern", "PatternOperator", "sandwich"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +70,39 @@ class Pattern:
         shape = (self.shape[1], self.shape[0])
         return sp.csc_array((data, self.indices, self.indptr), shape=shape, copy=False)
 
+    def operator(self) -> PatternOperator:
+        """Return a matrix with this pattern whose data are set again and again."""
+        return PatternOperator(self)
+
     def gather(self, rows: IntArray, cols: IntArray) -> sp.csr_array:
         """Return the 0/1 matrix that sums a list of entries into `data`, shape (nnz, entries)."""
         at = self.positions(rows, cols)
         ones = np.ones(len(at))
         return sp.csr_array((ones, (at, np.arange(len(at)))), shape=(self.nnz, len(at)))
+
+
+class PatternOperator:
+    """Products with a matrix and its transpose, for data that change: nothing is built again."""
+
+    def __init__(self, pattern: Pattern) -> None:
+        zeros = np.zeros(pattern.nnz)
+        self._matrix = pattern.matrix(zeros)
+        self._transpose = pattern.transposed(zeros)
+
+    def set(self, data: Array) -> None:
+        """Use these values from now on."""
+        self._matrix.data = data
+        self._transpose.data = data
+
+    def apply(self, x: Array) -> Array:
+        """Return the product with x."""
+        product: Array = self._matrix @ x
+        return product
+
+    def apply_transposed(self, y: Array) -> Array:
+        """Return the product of the transpose with y."""
+        product: Array = self._transpose @ y
+        return product
 
 
 def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any, TypeAlias
 
 import numpy as np
-import scipy.sparse as sp
+
 from numpy.typing import NDArray
 
 __all__ = ["Array", "IntArray", "Sparse"]
 
 Array: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.integer[Any]]
-Sparse: TypeAlias = sp.sparray
+Sparse: TypeAlias = Any  # any SciPy sparse array: the stubs know no common 2D class

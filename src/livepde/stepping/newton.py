@@ -29,14 +29,21 @@ class StageEquation(Protocol):
         """Return the residual at y, shape (n,)."""
         ...
 
-    def factor(self, y: Array) -> Factor:
-        """Return the factorised Jacobian at y."""
+    def factor(self, y: Array, sweep: bool) -> Factor:
+        """Return the factorised Jacobian at the y of the last residual.
+
+        With `sweep`, of the equation in which nonlinear coefficients are held at y (lagged).
+        """
         ...
 
 
 @dataclass(frozen=True)
 class Newton:
-    """Simplified Newton: the factor is kept while the updates shrink fast enough.
+    """Lagged sweeps into the neighbourhood of the solution, then Newton with a kept factor.
+
+    The implicit stage of the paper's law can have several solutions, because theta(r) depends on
+    the direction of r. Sweeps with lagged coefficients go to the same one from any start; Newton
+    goes to the nearest. So sweeps come first, and Newton only polishes.
 
     Parameters
     ----------
@@ -46,14 +53,23 @@ class Newton:
         At most this many updates.
     refresh
         The Jacobian is factorised again when an update is more than this share of the last one.
+    basin
+        Relative update below which Newton takes over from sweeps.
     """
 
     tolerance: float = 1e-9
-    iterations: int = 40
-    refresh: float = 0.2
+    iterations: int = 60
+    refresh: float = 0.05
+    basin: float = 1e-2
 
     def solve(
-        self, equation: StageEquation, y: Array, blocks: tuple[slice, ...], affine: bool = False
+        self,
+        equation: StageEquation,
+        y: Array,
+        blocks: tuple[slice, ...] = (slice(None),),
+        *,
+        affine: bool = False,
+        sweeps: bool = False,
     ) -> Array:
         """Return the solution, starting from y.
 
@@ -63,6 +79,8 @@ class Newton:
             Parts of y measured separately (state and parameter have different units).
         affine
             The equation is affine: one update solves it.
+        sweeps
+            Begin with lagged sweeps.
 
         Raises
         ------
@@ -74,7 +92,7 @@ class Newton:
         for _ in range(self.iterations):
             residual = equation.residual(y)
             try:
-                factor = factor or equation.factor(y)
+                factor = factor or equation.factor(y, sweeps)
                 update = factor.solve(residual)
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
@@ -85,11 +103,16 @@ class Newton:
             if affine:
                 return y
             ratio = size / last
-            if size <= self.tolerance and (
-                size == 0.0 or (ratio < 1.0 and size * ratio <= self.tolerance * (1 - ratio))
-            ):
+            # The error left behind is about ratio/(1 - ratio) times the update.
+            left = size * ratio / (1.0 - ratio) if 0.0 < ratio < 1.0 else np.inf
+            if size == 0.0 or left <= self.tolerance:
                 return y
-            if np.isfinite(last) and ratio > self.refresh:
+            if sweeps:
+                factor = None
+                sweeps = size > self.basin
+            elif ratio > 1.0:  # Newton left the neighbourhood
+                factor, sweeps = None, True
+            elif ratio > self.refresh:
                 factor = None
             last = size
         raise StepFailed(
@@ -99,10 +122,11 @@ class Newton:
 
 
 def _relative(update: Array, y: Array, blocks: tuple[slice, ...]) -> float:
-    """Return the largest update of a block relative to the block."""
+    """Return the largest update of a block relative to the block, in Euclidean norms."""
     worst = 0.0
     for block in blocks:
-        change = float(np.abs(update[block]).max(initial=0.0))
-        if change != 0.0:
-            worst = max(worst, change / max(float(np.abs(y[block]).max()), 1e-300))
-    return worst
+        change, size = update[block], y[block]
+        square = float(change @ change)
+        if square != 0.0:
+            worst = max(worst, square / max(float(size @ size), 1e-300))
+    return float(np.sqrt(worst))

@@ -79,7 +79,7 @@ class ForwardStage:
             residual = system.matrix @ u - model.mass @ (c / h) + system.offset - model.F(moment)
             return u - system.factor.solve(residual * model.X.free)
         equation = _Equation(self, c, q, h, moment)
-        return self.newton.solve(equation, u, (slice(None),), affine=model.affine)
+        return self.newton.solve(equation, u, affine=model.affine)
 
     def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised Jacobian at a solved stage, for sensitivities."""
@@ -114,7 +114,7 @@ class _Equation:
         masked: Array = (rate + flux - self.source) * model.X.free
         return masked
 
-    def factor(self, y: Array) -> Factor:
+    def factor(self, y: Array, sweep: bool) -> Factor:
         return self.stage.jacobian(y, self.q, self.h, self.moment)
 
 
