@@ -62,7 +62,8 @@ class CoupledStage:
         self.newton = newton
         self.n = model.X.dim
         self.blocks = (slice(0, self.n), slice(self.n, self.n + model.Q.dim))
-        self.RM = sp.csr_array(split.R.T @ gains.M_op)
+        self.RT = sp.csr_array(split.R.T)
+        self.RM = sp.csr_array(self.RT @ gains.M_op)
         self.RMR = sp.csr_array(self.RM @ split.R)
         self.PNP = sp.csr_array(split.P.T @ gains.N_op @ split.P)
         self.free_q = model.Q.free
@@ -138,7 +139,8 @@ class CoupledStage:
         row = (2.0 * dX) * mass_r + (2.0 * dVX) * Mr
         if dV:
             row += 2.0 * dV * (self.gains.M_op @ self.model.X.riesz(Mr))
-        return self.split.R.T @ row
+        slope: Array = self.RT @ row
+        return slope
 
     def solve(self, c: Array, h: float, moment: Moment, u_alpha: Array, shift: Array) -> Array:
         """Return y = (u, q) of one stage; raises `StepFailed`.
@@ -163,8 +165,6 @@ class _Bilinear:
 
     Attributes
     ----------
-    system
-        h -> matrix of the linear part of the residual above R, shape (n + m + n, n + m).
     lagged
         w -> data of A(w) in the whole, for sweeps.
     jacobian
@@ -182,21 +182,24 @@ class _Bilinear:
         self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Au"] @ vu, maps["Aq"] @ qu]))
         self.B = stage.model.form_B.matrix("v", "u", u=np.zeros(stage.n))
         self.norms = sp.csr_array(sp.vstack([stage.RM, stage.model.mass]))
-        self._systems: dict[float, sp.csr_array] = {}
+        self._rate, self._rest = self._linear(rate=True), self._linear(rate=False)
+        self._pattern = Pattern.of(abs(self._rate) + abs(self._rest))
+        self._rate_data = _stored(self._rate, self._pattern)
+        self._rest_data = _stored(self._rest, self._pattern)
+
+    def _linear(self, *, rate: bool) -> sp.csr_array:
+        """Return the part of the linear rows that goes with 1/h, or the part that stays."""
+        stage, g = self.stage, self.stage.gains
+        free, free_q = sp.diags_array(stage.model.X.free), sp.diags_array(stage.free_q)
+        state = stage.model.mass if rate else self.B @ stage.split.P + g.nu * stage.PNP
+        weight = (1.0 if rate else g.sigma) / g.gain
+        observed = 0.0 * stage.split.R if rate else stage.split.R
+        blocks = [[free @ state, None], [None, weight * (free_q @ stage.gram)], [observed, None]]
+        return sp.csr_array(sp.block_array(blocks))
 
     def system(self, h: float) -> sp.csr_array:
-        """Return the linear part for a step h, kept for the last one."""
-        if h not in self._systems:
-            self._systems.clear()
-            stage, g = self.stage, self.stage.gains
-            model = stage.model
-            state = model.mass / h + self.B @ stage.split.P + g.nu * stage.PNP
-            state = sp.diags_array(model.X.free) @ state
-            scale = 1.0 / (g.gain * h) + g.sigma / g.gain
-            parameter = sp.diags_array(scale * stage.free_q) @ stage.gram
-            blocks = [[state, None], [None, parameter], [stage.split.R, None]]
-            self._systems[h] = sp.csr_array(sp.block_array(blocks))
-        return self._systems[h]
+        """Return the linear part of the residual above R for a step h."""
+        return self._pattern.matrix(self._rate_data / h + self._rest_data)
 
 
 class _Equation:
@@ -311,8 +314,8 @@ class _Bordered:
         return x - border * (float(self.column @ b) / pivot)
 
 
-def _stored(matrix: sp.csr_array) -> Array:
-    """Return the data of a matrix in the order of `Pattern.of(matrix)`."""
+def _stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
+    """Return the data of a matrix in the order of a pattern, by default its own."""
     coo = sp.coo_array(matrix)
-    data: Array = Pattern.of(matrix).gather(coo.row, coo.col) @ coo.data
+    data: Array = (pattern or Pattern.of(matrix)).gather(coo.row, coo.col) @ coo.data
     return data

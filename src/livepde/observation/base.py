@@ -97,7 +97,10 @@ class Split:
         boundary
             A coefficient vector that holds the Dirichlet values and is zero elsewhere.
         """
-        part: Array = self.inverse @ (z[self.present] - self.G @ boundary)
+        known = z[self.present]
+        if boundary.any():
+            known = known - self.G @ boundary
+        part: Array = self.inverse @ known
         return part
 
 

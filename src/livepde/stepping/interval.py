@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -91,6 +92,17 @@ class Advance:
         return max(1, int(np.ceil(ratio * (1 - 1e-12))))
 
 
+def _width(t: float, stop: float) -> float:
+    """Return stop - t, rounded to what both times resolve.
+
+    Differences of equidistant times differ in their last digits; rounded they are one number, so
+    that what depends on the step alone is computed once.
+    """
+    unit = math.ldexp(1.0, math.frexp(max(abs(t), abs(stop)))[1] - 49)
+    width = stop - t
+    return round(width / unit) * unit if width > 1e6 * unit else width
+
+
 def advance(
     control: Advance, stage: Stage, y: Array, interval: Interval
 ) -> tuple[Array, int, StepFailed | None]:
@@ -115,7 +127,7 @@ def advance(
         t = interval.t0 + tick * width
         stop = interval.t1 if tick + stride == finest else interval.t0 + (tick + stride) * width
         try:
-            y = control.scheme.advance(stage, y, t, stop - t)
+            y = control.scheme.advance(stage, y, t, _width(t, stop))
         except StepFailed as failure:
             if stride == 1:
                 return y, steps, failure
