@@ -1,0 +1,341 @@
+"""Twin experiments: samples of a process whose truth is known, and errors against it.
+
+The only place with `q_true` and `u_true`. An identifier is given the samples, never the twin.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from livepde.errors import ConfigurationError
+from livepde.fem import Moment
+from livepde.identifier import Sample
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Averages, Observation, Observed, Points
+from livepde.result import Estimate
+from livepde.stepping import Advance, ImplicitEuler, Scheme, StepFailed, simulate
+
+__all__ = ["AbsoluteNoise", "Noise", "RelativeNoise", "Truth", "Twin"]
+
+Truth = Literal["analytic", "discrete", "fine"]
+
+
+class Noise(ABC):
+    """Gaussian noise, independent from channel to channel and from sample to sample."""
+
+    @abstractmethod
+    def std(self, z: Array, weights: Array) -> Array:
+        """Return the standard deviation of each channel for exact data z, shape (sensors,).
+
+        Parameters
+        ----------
+        z
+            Exact data, shape (sensors,).
+        weights
+            Gram matrix of Z, shape (sensors, sensors), so that ||z||_Z^2 = z^T weights z.
+        """
+
+
+@dataclass(frozen=True)
+class RelativeNoise(Noise):
+    """Noise of a given size relative to each sample: E ||noise||_Z^2 = level^2 ||z||_Z^2.
+
+    Every channel takes the same share of the mean square, whatever its unit:
+    std_k = level ||z||_Z / sqrt(sensors · weights_kk). In R^k with the Euclidean norm that is
+    level times the root mean square of z; for the slopes of Hermite elements it is about 1/h times
+    the deviation of the values, as if they had been taken by differences of them.
+    """
+
+    level: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.level) and self.level >= 0):
+            raise ConfigurationError(
+                f"RelativeNoise: level must be a number >= 0, 0.01 for 1 %; got {self.level}."
+            )
+
+    def std(self, z: Array, weights: Array) -> Array:
+        size = float(np.sqrt(max(float(z @ weights @ z), 0.0)))
+        std: Array = self.level * size / np.sqrt(len(z) * np.diag(weights))
+        return std
+
+
+@dataclass(frozen=True)
+class AbsoluteNoise(Noise):
+    """Noise with a given standard deviation: one number, or one for each channel."""
+
+    deviation: float | Sequence[float]
+
+    def __post_init__(self) -> None:
+        given = np.asarray(self.deviation, dtype=float)
+        if given.ndim > 1 or not (np.isfinite(given).all() and np.all(given >= 0)):
+            raise ConfigurationError(
+                f"AbsoluteNoise: expected one number >= 0, or one for each channel; got "
+                f"{self.deviation!r}."
+            )
+
+    def std(self, z: Array, weights: Array) -> Array:
+        given = np.asarray(self.deviation, dtype=float)
+        if given.shape not in ((), z.shape):
+            raise ConfigurationError(
+                f"AbsoluteNoise: {given.size} deviations for {len(z)} channels; give one, or one "
+                "each."
+            )
+        return np.broadcast_to(given, z.shape)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Twin:
+    """A process with known truth that yields `Sample`s, apart from the estimator.
+
+    Parameters
+    ----------
+    model, observation
+        As the estimator has them.
+    q_true
+        The exact parameter: a number, a function of x, coefficients, or a mapping by name.
+    times
+        Sample times, increasing; the first is the initial time and its sample describes the start.
+    u_true
+        Formula of the exact state, u(x, t).
+    u0
+        Initial state, if there is no formula: a number, a function of x, or coefficients.
+    truth
+        Where the exact data come from.
+
+        "discrete"
+            The model itself, with q_true, by `scheme` and `dt_max`: what the estimator's own
+            scheme would compute. No truncation error (the "inverse crime", which alone shows what
+            the law can do).
+        "analytic"
+            The formula u_true, projected onto the state space. The data then contain what the
+            estimator's scheme gets wrong.
+        "fine"
+            The model `fine` (a finer mesh, other elements) with steps of at most `fine_dt`.
+            `Points` and `Averages` see the fine state itself; for a `Subdomain`, `Full` or
+            `Matrix`, whose channels belong to the coefficients of the estimator, it is projected
+            onto them.
+    scheme, dt_max
+        Time scheme of the truth, and for "discrete" its longest substep.
+    fine, fine_dt
+        Model (default: `model`) and longest substep of "fine".
+    noise
+        `RelativeNoise`, `AbsoluteNoise` or None. The same seed gives the same noise.
+    seed
+        Of the noise.
+    inputs
+        t -> values of the model's input channels; they are sent with the samples.
+
+    Raises
+    ------
+    ConfigurationError
+        A truth that cannot be made from what was given.
+
+    Examples
+    --------
+    >>> import numpy as np, livepde as lp
+    >>> from skfem import ElementLineP1
+    >>> rod = lp.Field(lp.interval(0, 1, 10), ElementLineP1(), dirichlet={"boundary": 0.0})
+    >>> model = lp.Model(rod, lp.Scalar(1.0), lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)))
+    >>> twin = Twin(
+    ...     model=model,
+    ...     observation=lp.Points([0.3]),
+    ...     q_true=2.0,
+    ...     u0=lambda x: np.sin(np.pi * x[0]),
+    ...     times=[0.0, 0.1, 0.2],
+    ... )
+    >>> [sample.t for sample in twin], twin.baseline()
+    ([0.0, 0.1, 0.2], 0.5)
+    """
+
+    model: Model
+    observation: Observation
+    q_true: Any
+    times: Sequence[float] | Array
+    u_true: Callable[[Any, float], Any] | None = None
+    u0: Any = None
+    truth: Truth = "discrete"
+    scheme: Scheme = field(default_factory=ImplicitEuler)
+    dt_max: float = np.inf
+    fine: Model | None = None
+    fine_dt: float = np.inf
+    noise: Noise | None = None
+    seed: int = 0
+    inputs: Callable[[float], Mapping[str, float]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.truth not in get_args(Truth):
+            raise ConfigurationError(
+                f"truth='{self.truth}': expected one of {', '.join(get_args(Truth))}."
+            )
+        times = np.asarray(self.times, dtype=float)
+        if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
+            raise ConfigurationError("times must be two or more increasing numbers.")
+        if self.truth == "analytic" and self.u_true is None:
+            raise ConfigurationError("truth='analytic' needs the formula u_true(x, t).")
+        if self.u_true is None and self.u0 is None:
+            raise ConfigurationError("give u_true(x, t), or the initial state u0.")
+        if self.truth == "fine" and self.fine is None and not np.isfinite(self.fine_dt):
+            raise ConfigurationError("truth='fine' needs a model `fine`, a `fine_dt`, or both.")
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __iter__(self) -> Iterator[Sample]:
+        rng = np.random.default_rng(self.seed)
+        for t, z in zip(self.times, self.exact_data, strict=True):
+            if self.noise is not None:
+                z = z + self.noise.std(z, self.weights) * rng.standard_normal(len(z))
+            yield Sample(float(t), z.copy(), self._inputs(float(t)) or None)
+
+    def _inputs(self, t: float) -> Mapping[str, float]:
+        return self.inputs(t) if self.inputs is not None else {}
+
+    def _moment(self, t: float) -> Moment:
+        return Moment(t, self._inputs(t))
+
+    @cached_property
+    def observed(self) -> Observed:
+        """The observation bound to the estimator's state space."""
+        return _bound(self.observation, self.model)
+
+    @cached_property
+    def weights(self) -> Array:
+        """Gram matrix of Z, shape (sensors, sensors).
+
+        ||z||_Z = ||G^+ z||_X where z are coefficients of the state on omega, else Euclidean.
+        """
+        if not self.observation.nodal:
+            return np.eye(self.observed.size)
+        inverse = self.observed.split().inverse
+        gram: Array = (inverse.T @ self.model.mass @ inverse).toarray()
+        return gram
+
+    @cached_property
+    def q(self) -> Array:
+        """Coefficients of q_true in the estimator's Q, shape (m,)."""
+        return self.model.parameter_space.interpolate(self.q_true)
+
+    def _start(self) -> Any:
+        formula, t = self.u_true, float(self.times[0])
+        return (lambda x: formula(x, t)) if formula is not None else self.u0
+
+    def _simulated(self, model: Model, control: Advance) -> list[Array]:
+        q = model.parameter_space.interpolate(self.q_true)
+        times = [float(t) for t in self.times]
+        try:
+            run = simulate(model, q, self._start(), times, control, self._inputs)
+            return [u for _, u in run]
+        except StepFailed as failure:
+            raise ConfigurationError(
+                f"the truth of the twin experiment cannot be computed ({failure}): take a smaller "
+                "dt_max, or check q_true and u0."
+            ) from failure
+
+    @cached_property
+    def _fine_states(self) -> list[Array]:
+        control = Advance(self.scheme, min(self.fine_dt, self.dt_max))
+        return self._simulated(self.fine or self.model, control)
+
+    @cached_property
+    def states(self) -> tuple[Array, ...]:
+        """Exact state at each time as coefficients of the estimator, each of shape (n,)."""
+        if self.truth == "discrete":
+            return tuple(self._simulated(self.model, Advance(self.scheme, self.dt_max)))
+        block = self.model.state_block
+        if self.truth == "analytic" and self.u_true is not None:
+            formula = self.u_true
+            return tuple(
+                self.model.impose(block.interpolate(lambda x, t=t: formula(x, t)), self._moment(t))
+                for t in map(float, self.times)
+            )
+        if self.fine is None:
+            return tuple(self._fine_states)
+        points = np.asarray(block.basis.global_coordinates())
+        evaluate = self.fine.state_block.probe(points.reshape(len(points), -1))
+        return tuple(
+            self.model.impose(
+                block.interpolate(lambda x, u=u: (evaluate @ u).reshape(x[0].shape)),
+                self._moment(float(t)),
+            )
+            for t, u in zip(self.times, self._fine_states, strict=True)
+        )
+
+    @cached_property
+    def exact_data(self) -> Array:
+        """Data without noise, shape (times, sensors)."""
+        model, observed, states = self.model, self.observed, self.states
+        if self.truth == "fine" and self.fine is not None and self._sees_any_mesh:
+            model, states = self.fine, tuple(self._fine_states)
+            observed = _bound(self.observation, model)
+        q = model.parameter_space.interpolate(self.q_true)
+        rows = [
+            observed.predict(u, q, self._moment(float(t)))
+            for t, u in zip(self.times, states, strict=True)
+        ]
+        return np.array(rows)
+
+    @property
+    def _sees_any_mesh(self) -> bool:
+        """True if the channels mean the same on every mesh."""
+        return isinstance(self.observation, Points | Averages)
+
+    def u(self, t: float) -> Array:
+        """Return the exact state at a sample time as coefficients of the estimator, shape (n,)."""
+        found = np.flatnonzero(np.isclose(self.times, t, rtol=1e-12, atol=0.0))
+        if not len(found):
+            raise ConfigurationError(f"t = {t} is not a sample time of the twin experiment.")
+        return self.states[int(found[0])]
+
+    def error(self, q: Array, unknown: str | None = None) -> float:
+        """Return the relative L2 error of q, ||q - q_true|| / ||q_true||.
+
+        Parameters
+        ----------
+        q
+            Coefficients in Q, shape (m,).
+        unknown
+            One of several unknowns; default all of them (numbers count with their square).
+        """
+        space = self.model.parameter_space
+        part = slice(None) if unknown is None else space.part(unknown)
+        mass = self.model.parameter_mass[part, part]
+        e, exact = (q - self.q)[part], self.q[part]
+        size = float(exact @ (mass @ exact))
+        if size == 0.0:
+            raise ConfigurationError("q_true is zero, so there is no relative error of q.")
+        return float(np.sqrt(e @ (mass @ e) / size))
+
+    def baseline(self, q0: Any = None, unknown: str | None = None) -> float:
+        """Return the error of knowing nothing: of q0, by default the prior mean."""
+        return self.error(self.model.initial_parameter(q0), unknown)
+
+    def u_error(self, estimate: Estimate) -> float:
+        """Return the relative error of the state in X, ||u - u_true|| / ||u_true||."""
+        exact, X = self.u(estimate.t), self.model.X
+        return X.norm(estimate.u - exact) / X.norm(exact)
+
+    def energy(self, estimate: Estimate, gain: float = 1.0) -> float:
+        """Return ||e||_Q^2 + ||r||_X^2 with e = q - q_true and r = R (u - u_true).
+
+        The quantity that never grows along the exact-data method (align:neplusnr).
+
+        Parameters
+        ----------
+        gain
+            That of the law: it divides the inner product of Q.
+        """
+        e = estimate.q - self.q
+        r = self.observed.split().R @ (estimate.u - self.u(estimate.t))
+        return self.model.Q.inner(e, e) / gain + self.model.X.inner(r, r)
+
+
+def _bound(observation: Observation, model: Model) -> Observed:
+    return observation.bind(model.state_space, model.X, model.parameter_space)
