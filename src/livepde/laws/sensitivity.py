@@ -17,6 +17,8 @@ from livepde.stepping import ForwardStage, Interval, advance
 
 __all__ = ["Replay", "SensitivityLaw", "SensitivityState"]
 
+CONVERGED = 0.5  # standard deviations between reference and estimate at which replays stop
+
 
 @dataclass(frozen=True)
 class Replay:
@@ -25,7 +27,9 @@ class Replay:
     Each plain update u += L K d leaves a second-order error that a state with long memory never
     forgets. With a replay the filter stays linear about one reference, and whenever the number of
     assimilated samples has doubled, the reference is moved to the estimate and the stored samples
-    are run through again: a Gauss-Newton iteration, at less than four times the steps in all.
+    are run through again, until reference and estimate agree within half a standard deviation: a
+    Gauss-Newton iteration. One replay for each doubling makes less than four times the steps in
+    all; more than one is needed mostly while the store is short.
 
     Parameters
     ----------
@@ -34,14 +38,19 @@ class Replay:
         the new start and the store is emptied.
     first
         Number of assimilated samples before the first replay.
+    iterations
+        At most this many replays for each doubling.
     """
 
     window: int = 4096
     first: int = 32
+    iterations: int = 4
 
     def __post_init__(self) -> None:
         if not 1 <= self.first <= self.window:
             raise LawError("Replay: needs 1 <= first <= window.")
+        if self.iterations < 1:
+            raise LawError(f"Replay: iterations must be at least 1; got {self.iterations}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,10 +243,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             return replace(state, now=_recentre(work, point)), report
         state = self._store(work, state, point, interval)
         if state.assimilated >= state.due:
-            replayed, status = self._replayed(work, state)
-            if not status.ok:  # keep the linear estimate, say so, and try again when doubled
-                report = replace(report, notes={**report.notes, "replay_failed": 1.0})
-            state = replace(state, now=replayed, due=2 * state.assimilated)
+            for _ in range(self.replay.iterations):
+                replayed, status = self._replayed(work, state)
+                state = replace(state, now=replayed, due=2 * state.assimilated)
+                if not status.ok:  # keep the linear estimate, say so, and try again when doubled
+                    report = replace(report, notes={**report.notes, "replay_failed": 1.0})
+                if not status.ok or _converged(work, replayed):
+                    break
         if len(state.samples.t) > self.replay.window:
             start = _recentre(work, state.now)
             empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
@@ -260,8 +272,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def _replayed(self, work: SensitivityWork, state: SensitivityState) -> tuple[Point, Status]:
         """Run the stored samples again about the reference q_ref = the estimate now."""
         start, samples = state.start, state.samples
-        shift = state.now.da + _reduced(work, state.now.q - start.q)
-        q = _bounded(work, start.q + work.Phi @ shift)
+        q = _bounded(work, state.now.q + work.Phi @ state.now.da)
         shift = _reduced(work, q - start.q)
         point = replace(
             start,
@@ -344,8 +355,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         root = np.linalg.qr(np.vstack([np.eye(len(point.da)), HC]), mode="r")
         C = scipy.linalg.solve_triangular(root, point.C.T, trans="T").T
         step = C @ (C.T @ (H.T @ (d / noise**2)))
-        q = _bounded(work, point.q + work.Phi @ (point.da + step))
-        da = _reduced(work, q - point.q)
+        da = point.da + step
+        if self.replay is None:
+            # Without replay the reference follows at once. With replay the filter has to stay
+            # linear: to cut it at a bound would spoil all that follows; the bound is imposed on
+            # what is reported and on the next reference.
+            da = _reduced(work, _bounded(work, point.q + work.Phi @ da) - point.q)
         du = point.du + point.L @ (da - point.da)
         return replace(point, da=da, du=du, C=C, consistency=point.consistency.add(e))
 
@@ -376,6 +391,13 @@ def _reduced(work: SensitivityWork, dq: Array) -> Array:
 def _bounded(work: SensitivityWork, q: Array) -> Array:
     lower, upper = work.problem.model.parameter_space.bounds
     return np.clip(q, lower, upper)
+
+
+def _converged(work: SensitivityWork, point: Point) -> bool:
+    """Return true if the estimate is within half a standard deviation of the reference."""
+    shift = _bounded(work, point.q + work.Phi @ point.da) - point.q
+    deviations = np.linalg.solve(point.C, _reduced(work, shift))
+    return bool(np.linalg.norm(deviations) <= CONVERGED * point.consistency.inflation)
 
 
 def _recentre(work: SensitivityWork, point: Point) -> Point:
