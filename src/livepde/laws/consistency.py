@@ -1,4 +1,4 @@
-"""Are the innovations what the filter expects: white, and of the expected size?"""
+"""Whether the innovations are what the filter expects: white, and of the expected size."""
 
 from __future__ import annotations
 
@@ -10,43 +10,45 @@ from livepde.linalg import Array
 
 __all__ = ["Consistency"]
 
+WINDOW = 500  # samples: older innovations fade, so that a poor start is forgotten
 LARGEST_CORRELATION = 0.999
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """Running moments of the normalised innovations e_k = d_k / sqrt(expected variance).
+    """Fading moments of the normalised innovations e_k = d_k / sqrt(expected variance).
 
     Attributes
     ----------
-    count
-        Number of innovations.
-    square, product, pairs
-        Sums of e_k^2 and of e_k e_(k-1), and how many products.
+    count, square
+        Sums of 1 and of e_k^2 over innovations, fading over `WINDOW` samples.
+    pairs, product
+        Sums of 1 and of e_k e_(k-1).
     last
         e of the last sample, shape (sensors,), NaN where missing.
     """
 
-    count: int
+    count: float
     square: float
+    pairs: float
     product: float
-    pairs: int
     last: Array
 
     @classmethod
     def start(cls, sensors: int) -> Consistency:
         """Return the value before any innovation."""
-        return cls(0, 0.0, 0.0, 0, np.full(sensors, np.nan))
+        return cls(0.0, 0.0, 0.0, 0.0, np.full(sensors, np.nan))
 
     def add(self, e: Array) -> Consistency:
         """Return the value after one more vector of normalised innovations."""
         products = e * self.last
         both = np.isfinite(products)
+        fade = 1.0 - 1.0 / WINDOW
         return Consistency(
-            self.count + int(np.isfinite(e).sum()),
-            self.square + float(np.nansum(e**2)),
-            self.product + float(products[both].sum()),
-            self.pairs + int(both.sum()),
+            fade * self.count + float(np.isfinite(e).sum()),
+            fade * self.square + float(np.nansum(e**2)),
+            fade * self.pairs + float(both.sum()),
+            fade * self.product + float(products[both].sum()),
             e,
         )
 
