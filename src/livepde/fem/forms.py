@@ -126,7 +126,8 @@ class Form:
                 for key, local in term.spaces.items()
             }
             try:
-                density, place = term.evaluate(values, Moment(0.0, self._inputs))
+                with np.errstate(all="ignore"):  # roots and logarithms of random numbers
+                    density, place = term.evaluate(values, Moment(0.0, self._inputs))
                 shape = np.broadcast_shapes(np.shape(density), term.measure.weights.shape)
             except LivepdeError:
                 raise
@@ -168,9 +169,11 @@ class Form:
 
             for scale in (1e-3, 1.0, 1e3):
                 a, b = scale * rng.standard_normal((2, *values[self.nonlinear].shape))
-                change = at(a + b) - at(a) - at(b) + at(0 * a)
-                size = max(np.abs(at(a)).max(), np.abs(at(b)).max(), 1e-300)
-                if np.abs(change).max() > 1e-11 * size:
+                with np.errstate(all="ignore"):
+                    change = at(a + b) - at(a) - at(b) + at(0 * a)
+                    size = max(np.abs(at(a)).max(), np.abs(at(b)).max(), 1e-300)
+                # Not a number (a root, a logarithm) counts as not affine.
+                if not np.abs(change).max() <= 1e-11 * size:
                     return False
         return True
 
