@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError, SpaceError
-from livepde.linalg import Array, Factor, IntArray, Pattern, analyse
+from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, positive_definite
 
 __all__ = ["HilbertSpace"]
 
@@ -90,8 +90,7 @@ class HilbertSpace:
         largest = abs(self.tangent_gram).sum(axis=1).max()
         if not np.isfinite(x).all() or np.linalg.norm(x) * largest > LARGEST_CONDITION:
             raise SpaceError(singular)
-        y = factor.solve(x)
-        if x @ y <= 0:
+        if not positive_definite(self.tangent_gram):
             raise SpaceError(
                 f"The Gram matrix of {self.name} is not positive definite: check the sign of the "
                 "terms of its inner product."

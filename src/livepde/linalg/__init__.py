@@ -6,7 +6,7 @@ from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
 from livepde.linalg.pattern import Pattern, sandwich
 from livepde.linalg.protocol import Factor, Solver
-from livepde.linalg.superlu import SuperLUSolver
+from livepde.linalg.superlu import SuperLUSolver, positive_definite
 from livepde.linalg.types import Array, IntArray, Sparse
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Sparse",
     "SuperLUSolver",
     "analyse",
+    "positive_definite",
     "sandwich",
 ]
 

@@ -13,7 +13,13 @@ from livepde.errors import LinearAlgebraError
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.types import Array
 
-__all__ = ["SuperLUSolver"]
+__all__ = ["SuperLUSolver", "positive_definite"]
+
+SYMMETRIC: dict[str, Any] = {
+    "permc_spec": "MMD_AT_PLUS_A",
+    "diag_pivot_thresh": 0.0,
+    "options": {"SymmetricMode": True},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +59,7 @@ class SuperLUSolver:
         if not np.isfinite(data).all():
             raise LinearAlgebraError("The matrix holds values that are not finite.")
         transpose = sp.csc_array(self.pattern.transposed(data))
-        options: dict[str, Any] = {}
-        if self.symmetric:
-            options = {
-                "permc_spec": "MMD_AT_PLUS_A",
-                "diag_pivot_thresh": 0.0,
-                "options": {"SymmetricMode": True},
-            }
+        options = SYMMETRIC if self.symmetric else {}
         try:
             return SuperLUFactor(splu(transpose, **options))
         except RuntimeError as error:
@@ -67,3 +67,15 @@ class SuperLUSolver:
                 f"The {transpose.shape[0]} by {transpose.shape[0]} matrix is singular: check the "
                 "model's forms, or take a smaller time step."
             ) from error
+
+
+def positive_definite(matrix: sp.csr_array) -> bool:
+    """Return whether a symmetric matrix is positive definite: all its pivots are positive.
+
+    By Sylvester's law of inertia, as long as rows and columns are exchanged together.
+    """
+    try:
+        lu = splu(sp.csc_array(matrix), **SYMMETRIC)
+    except RuntimeError:
+        return False
+    return bool(np.array_equal(lu.perm_r, lu.perm_c) and np.all(lu.U.diagonal() > 0))
