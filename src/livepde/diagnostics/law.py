@@ -1,0 +1,286 @@
+"""The contract of an update law: streaming, saving and recovering rest on it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde import checkpoint
+from livepde.diagnostics.report import CheckLine, CheckReport
+from livepde.errors import LawError
+from livepde.identifier import Identifier, Sample
+from livepde.laws import AnyLaw, Belief, Law, Problem, Report
+from livepde.linalg import Array
+from livepde.result import Estimate
+from livepde.stepping import Interval, Scheme, Stage, StepFailed
+
+__all__ = ["check_law"]
+
+
+def check_law(
+    law: AnyLaw,
+    build: Callable[[AnyLaw], Identifier],
+    samples: Iterable[Any],
+) -> CheckReport:
+    """Check an update law on a few samples of a problem.
+
+    It is deterministic; its state is a value of arrays and numbers that no step changes in place;
+    a run continued from a saved state gives bit-identical numbers; estimates are finite and within
+    their bounds; missing samples are no error; a step that fails keeps the state and the stream
+    goes on.
+
+    Parameters
+    ----------
+    law
+        The law.
+    build
+        Function that returns a fresh identifier with the law it is given.
+    samples
+        At least four items of a stream: (t, z), (t, z, inputs), or `Sample`.
+
+    Returns
+    -------
+    CheckReport
+        Print it, or call `raise_if_failed`, which raises `LawError`.
+
+    >>> import numpy as np
+    >>> import livepde as lp
+    >>> from skfem import ElementLineP1
+    >>> mesh = lp.interval(0.0, 1.0, 8)
+    >>> model = lp.Model(
+    ...     lp.Field(mesh, ElementLineP1()), lp.Scalar(prior=1.0), A=lambda q, u, v, x: q * u * v
+    ... )
+    >>> sensors = lp.Points([0.2, 0.7], noise=0.1)
+    >>> report = check_law(
+    ...     lp.SensitivityLaw(),
+    ...     lambda law: lp.Identifier(model, sensors, law, u0=1.0),
+    ...     [(t, np.exp([-t, -t])) for t in (0.1, 0.2, 0.3, 0.4)],
+    ... )
+    >>> report.ok
+    True
+    """
+    items = [item if isinstance(item, Sample) else Sample(*item) for item in samples]
+    if len(items) < 4:
+        raise LawError(f"check_law: needs at least four samples; got {len(items)}.")
+
+    def run(items: list[Sample], law: AnyLaw = law) -> list[Estimate]:
+        identifier = build(law)
+        return [_step(identifier, item) for item in items]
+
+    middle = len(items) // 2
+    lines = [
+        _count(
+            "two runs agree (numbers that differ)",
+            lambda: _differing(run(items), run(items)),
+            "step must depend on its arguments alone: seed every generator from the state, and let "
+            "nothing that prepare returned change the numbers.",
+        ),
+        _count(
+            "the state is a value (violations)",
+            lambda: _violations(law, run, items),
+            "the state must be a frozen dataclass of arrays and numbers, and step must return a "
+            "new one and leave the old one and the interval as they are.",
+        ),
+        _count(
+            "restart equality (numbers that differ)",
+            lambda: _differing(run(items)[middle:], _restarted(law, build, items, middle)),
+            "everything that evolves must be in the state: keep nothing between steps in the law "
+            "or in what prepare returned.",
+        ),
+        _count(
+            "finite estimates (failures)",
+            lambda: sum(map(_unusable, run(items))),
+            "estimates must stay finite and steps must succeed: check gains, bounds and dt_max.",
+        ),
+        _count(
+            "bounds kept (violations)",
+            lambda: _outside(build(law), run(items)),
+            "clip q to problem.model.parameter_space.bounds.",
+        ),
+        _count(
+            "all sensors missing (failures)",
+            lambda: sum(map(_unusable, run(_without(items, middle, build(law), all_of_them=True)))),
+            "with no sensor present a step must predict and not update.",
+        ),
+        _count(
+            "one sensor missing (failures)",
+            lambda: sum(
+                map(_unusable, run(_without(items, middle, build(law), all_of_them=False)))
+            ),
+            "use the sensors of interval.present alone: z is NaN elsewhere.",
+        ),
+        _count(
+            "a failed step keeps the state (violations)",
+            lambda: _failing(law, build, items, middle),
+            "when a step fails, step must return the state it was given and a status that is not "
+            "ok; the next step starts from there.",
+        ),
+    ]
+    return CheckReport(f"law {type(law).__name__}", tuple(lines), LawError)
+
+
+def _step(identifier: Identifier, item: Sample) -> Estimate:
+    return identifier.step(item.t, item.z, item.inputs)
+
+
+def _count(name: str, count: Callable[[], int], remedy: str) -> CheckLine:
+    """Return a line that holds if nothing was counted; a law of the user's may raise anything."""
+    try:
+        return CheckLine.at_most(name, count(), 0, remedy)
+    except Exception as error:  # noqa: BLE001  the report says it, and goes on to the next line
+        return CheckLine(name, np.inf, 0, False, f"{type(error).__name__}: {error} ({remedy})")
+
+
+def _numbers(estimate: Estimate) -> Array:
+    """Return everything that a law believes, in one vector."""
+    belief = estimate.belief
+    parts = [belief.q, belief.u, np.array([belief.inflation])]
+    parts += [factor for factor in (belief.q_factor, belief.u_factor) if factor is not None]
+    return np.concatenate([np.ravel(part) for part in parts])
+
+
+def _differing(first: list[Estimate], second: list[Estimate]) -> int:
+    pairs = zip(map(_numbers, first), map(_numbers, second), strict=True)
+    return sum(int(np.sum((a != b) & ~(np.isnan(a) & np.isnan(b)))) for a, b in pairs)
+
+
+def _unusable(estimate: Estimate) -> int:
+    return int(not estimate.status.ok) + int((~np.isfinite(_numbers(estimate))).sum())
+
+
+def _outside(identifier: Identifier, estimates: list[Estimate]) -> int:
+    lower, upper = identifier.model.parameter_space.bounds
+    return sum(int(((e.q < lower) | (e.q > upper)).sum()) for e in estimates)
+
+
+def _restarted(
+    law: AnyLaw, build: Callable[[AnyLaw], Identifier], items: list[Sample], middle: int
+) -> list[Estimate]:
+    """Return the estimates after a break, from an identifier that loaded the state saved there."""
+    first, second = build(law), build(law)
+    for item in items[:middle]:
+        _step(first, item)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "state.npz"
+        first.save(path)
+        second.load(path)
+    return [_step(second, item) for item in items[middle:]]
+
+
+def _without(
+    items: list[Sample], at: int, identifier: Identifier, *, all_of_them: bool
+) -> list[Sample]:
+    """Return the samples with one or all of the sensors missing in two of them."""
+    names = identifier.observed.names
+    gone = names if all_of_them else names[:1]
+    changed = list(items)
+    for k in (at, at + 1):
+        z = items[k].z
+        if isinstance(z, Mapping):
+            lost: Any = {**z, **{name: np.nan for name in gone if name in z}}
+        else:
+            lost = np.array(z, dtype=float).reshape(len(names))
+            lost[: len(gone)] = np.nan
+        changed[k] = replace(items[k], z=lost)
+    return changed
+
+
+@dataclass(frozen=True)
+class _Wrapped(Law[Any, Any]):
+    """A law that behaves as another; what is asked of it differs in the subclasses."""
+
+    law: AnyLaw
+
+    def prepare(self, problem: Problem) -> Any:
+        return self.law.prepare(problem)
+
+    def init(self, work: Any, q0: Array, u0: Array) -> Any:
+        return self.law.init(work, q0, u0)
+
+    def step(self, work: Any, state: Any, interval: Interval) -> tuple[Any, Report]:
+        return self.law.step(work, state, interval)
+
+    def belief(self, work: Any, state: Any) -> Belief:
+        return self.law.belief(work, state)
+
+
+@dataclass(frozen=True)
+class _Watched(_Wrapped):
+    """Counts states that are not plain values, and arguments changed in place."""
+
+    violations: list[str] = field(default_factory=list)
+
+    def step(self, work: Any, state: Any, interval: Interval) -> tuple[Any, Report]:
+        given = {**checkpoint.flatten(state), "z0": interval.z0, "z1": interval.z1}
+        copies = {name: np.copy(value) for name, value in given.items()}
+        result, report = self.law.step(work, state, interval)
+        now = {**checkpoint.flatten(state), "z0": interval.z0, "z1": interval.z1}
+        for name, value in now.items():
+            if not np.array_equal(value, copies[name], equal_nan=True):
+                self.violations.append(f"{name} changed in place")
+        for name, value in checkpoint.flatten(result).items():
+            if np.asarray(value).dtype.kind not in "biuf":
+                self.violations.append(f"{name} is {type(value).__name__}")
+        return result, report
+
+
+def _violations(
+    law: AnyLaw, run: Callable[[list[Sample], AnyLaw], list[Estimate]], items: list[Sample]
+) -> int:
+    watched = _Watched(law)
+    run(items, watched)
+    return len(watched.violations)
+
+
+@dataclass(frozen=True)
+class _FragileScheme(Scheme):
+    """Takes one substep and fails from then on, while armed."""
+
+    scheme: Scheme
+    calls: list[str]
+
+    def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
+        if self.calls:
+            self.calls.append("called")
+            if len(self.calls) > 2:
+                raise StepFailed("not_converged", "provoked by check_law")
+        return self.scheme.advance(stage, y, t, h)
+
+
+@dataclass(frozen=True)
+class _Fragile(_Wrapped):
+    """Solves with a scheme that fails in the middle of a step, while `calls` holds "armed"."""
+
+    dt_max: float
+    calls: list[str] = field(default_factory=list)
+
+    def prepare(self, problem: Problem) -> Any:
+        control = problem.control
+        scheme = _FragileScheme(control.scheme, self.calls)
+        dt_max = min(control.dt_max, self.dt_max)
+        return self.law.prepare(
+            replace(problem, control=replace(control, scheme=scheme, dt_max=dt_max))
+        )
+
+
+def _failing(
+    law: AnyLaw, build: Callable[[AnyLaw], Identifier], items: list[Sample], middle: int
+) -> int:
+    """Provoke a failure after the first of two substeps; return what was not as it must be."""
+    shortest = float(np.diff([item.t for item in items]).min())
+    fragile = _Fragile(law, dt_max=0.5 * shortest)
+    identifier = build(fragile)
+    before = [_step(identifier, item) for item in items[:middle]][-1]
+    fragile.calls.append("armed")
+    failed = _step(identifier, items[middle])
+    provoked = len(fragile.calls) > 2
+    fragile.calls.clear()
+    after = _step(identifier, items[middle + 1])
+    if not provoked:  # a law that does not step by problem.control: nothing to see
+        return _unusable(after)
+    return int(failed.status.ok) + _differing([before], [failed]) + _unusable(after)

@@ -1,0 +1,322 @@
+"""Weak forms: linear where they must be, with the right derivatives, and a positive mass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from livepde.diagnostics.report import CheckLine, CheckReport
+from livepde.diagnostics.space import definite, largest, relative
+from livepde.errors import ModelError
+from livepde.fem import Form, Inputs, Moment
+from livepde.linalg import Array
+from livepde.model import Model
+
+__all__ = ["check_model"]
+
+ROUNDING = 1e-12  # of identities between sums of products
+LINEARITY = 1e-10  # of the integrand, which may hold functions such as exp
+STEPS = 0.5 ** np.arange(2, 22)  # of the Taylor tests
+FLOOR = 1e-11  # remainders below this share of the function are rounding
+SLOWEST = 1.8  # rate of a remainder of second order
+
+
+def check_model(
+    model: Model,
+    *,
+    q: Any = None,
+    u: Any = 0.0,
+    spread: float | None = None,
+    t: float = 0.0,
+    inputs: Mapping[str, float] | None = None,
+    seed: int = 0,
+) -> CheckReport:
+    """Check a model's forms by random evaluations, at the scale where they will be used.
+
+    Linearity in q and in the test function v, transpose and adjoint
+    (A(u)* r, xi)_Q = <A(u) xi, r>, derivatives by Taylor tests (the remainder
+    f(u + s du) - f(u) - s f'(u) du falls like s^2, or vanishes for affine forms), the assembled
+    matrices against plain quadrature of the integrand, and the mass.
+
+    Parameters
+    ----------
+    model
+        The model.
+    q, u
+        A typical parameter (default the prior mean) and a typical state: numbers, functions of x,
+        or coefficients.
+    spread
+        Size of the random variations of u; default a tenth of the largest |u|, or 1 if u = 0.
+    t, inputs
+        When; channels that are not given are 1.
+    seed
+        Of the random vectors.
+
+    Returns
+    -------
+    CheckReport
+        Print it, or call `raise_if_failed`, which raises `ModelError`.
+
+    >>> import livepde as lp
+    >>> from skfem import ElementLineP1
+    >>> mesh = lp.interval(0.0, 1.0, 8)
+    >>> model = lp.Model(
+    ...     lp.Field(mesh, ElementLineP1()),
+    ...     lp.Scalar(prior=1.0),
+    ...     A=lambda q, u, v, x: q * u * v,
+    ...     B=lambda u, v, x: abs(u) * v,  # has no complex derivative, and no dB= is given
+    ... )
+    >>> [line.name for line in check_model(model).failed]
+    ["B'(u): rate of the Taylor remainder"]
+    """
+    rng = np.random.default_rng(seed)
+    point = _Point.random(model, q, u, spread, t, inputs, rng)
+    lines = [
+        *_finite(model, point),
+        *_linear(model, point),
+        *_agreement(model, point),
+        *_adjoint(model, point),
+        *_derivatives(model, point),
+        *_mass(model),
+    ]
+    return CheckReport("model", tuple(lines), ModelError)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Where a model is checked: random functions of typical size, and directions du, dq."""
+
+    moment: Moment
+    q: Array
+    dq: Array
+    u: Array
+    du: Array
+    r: Array
+
+    @classmethod
+    def random(
+        cls,
+        model: Model,
+        q: Any,
+        u: Any,
+        spread: float | None,
+        t: float,
+        inputs: Mapping[str, float] | None,
+        rng: np.random.Generator,
+    ) -> _Point:
+        unknown = set(inputs or {}) - set(model.channels)
+        if unknown:
+            raise ModelError(
+                f"check_model: no channel is called {sorted(unknown)}; {list(model.channels)} are."
+            )
+        channels = {**dict.fromkeys(model.channels, 1.0), **(inputs or {})}
+        moment = Moment(t, Inputs(channels))
+        n, m = model.X.dim, model.Q.dim
+        centre = model.initial(u, moment)
+        width = spread or 0.1 * float(np.abs(centre).max()) or 1.0
+        space = model.parameter_space
+        std = np.concatenate(
+            [
+                np.full(block.size, unknown.std)
+                for block, unknown in zip(
+                    space.blocks.values(), space.unknowns.values(), strict=True
+                )
+            ]
+        )
+        lower, upper = space.bounds
+        prior = model.initial_parameter(q)
+        varied = np.clip(prior + std * rng.standard_normal(m), lower, upper) * model.Q.free
+        return cls(
+            moment,
+            varied,
+            std * rng.standard_normal(m) * model.Q.free,
+            centre + width * rng.standard_normal(n) * model.X.free,
+            width * rng.standard_normal(n) * model.X.free,
+            rng.standard_normal(n) * model.X.free,
+        )
+
+
+def _densities(form: Form, moment: Moment, **coefficients: Array) -> Array:
+    """Return the weighted integrand at all quadrature points: the form without any shortcut."""
+    found = []
+    for term in form.terms:
+        values = {key: local.values(coefficients[key]) for key, local in term.spaces.items()}
+        density, _ = term.evaluate(values, moment)
+        weights = term.measure.weights
+        found.append(np.broadcast_to(np.asarray(density) * weights, weights.shape).ravel())
+    return np.concatenate(found)
+
+
+def _finite(model: Model, at: _Point) -> list[CheckLine]:
+    values = {
+        "F": model.F(at.moment),
+        "B(u)": model.B(at.u, at.moment),
+        "A(u)": model.A(at.u, at.moment).matrix.data,
+    }
+    return [
+        CheckLine.at_most(
+            f"{name} finite (failures)",
+            int((~np.isfinite(value)).sum()),
+            0,
+            f"{name} holds infinite or undefined values at the u, q and t given: check divisions, "
+            "roots and logarithms, or give a typical u= and q= to check_model.",
+        )
+        for name, value in values.items()
+    ]
+
+
+def _linear(model: Model, at: _Point) -> list[CheckLine]:
+    lines = []
+    in_v = "write each term as a factor times v or grad(v); a term without v belongs nowhere."
+    in_q = (
+        "move the part without q into B; for a law such as 1/q or exp(q) take that expression as "
+        "the unknown."
+    )
+    arguments = {"q": at.q, "u": at.u, "v": at.r}
+    others = {"q": at.dq, "u": at.du, "v": at.du}
+    cases = (
+        (model.form_A, "A", "q", in_q),
+        (model.form_A, "A", "v", in_v),
+        (model.form_B, "B", "v", in_v),
+        (model.form_M, "M", "u", "M(u, v, x) must be bilinear: move what is not into B."),
+        (model.form_M, "M", "v", in_v),
+    )
+    for form, name, slot, remedy in cases:
+        base = {key: arguments[key] for key in form.spaces}
+        a, b = base[slot], others[slot]
+        fa, fb, both, zero = (
+            _densities(form, at.moment, **{**base, slot: x}) for x in (a, b, 2 * a - 3 * b, 0 * a)
+        )
+        error = max(largest(both - 2 * fa + 3 * fb), largest(zero))
+        size = largest(fa) + largest(fb)
+        lines.append(
+            CheckLine.at_most(
+                f"{name} linear in {slot}",
+                error / size if size else error,
+                LINEARITY,
+                f"{name} is not linear in {slot}: {remedy}",
+            )
+        )
+    return lines
+
+
+def _agreement(model: Model, at: _Point) -> list[CheckLine]:
+    """Compare what laws use (assembled, probed to be affine) with plain quadrature."""
+    remedy = (
+        "as it is assembled is not what its integrand gives: it is not linear in v or q, or it looks "
+        "affine in u at moderate values and is not at the u given (a threshold far away: rescale u)."
+    )
+    lines = []
+    for name, form in (("B(u)", model.form_B), ("A(u) q", model.form_A)):
+        given = {key: value for key, value in (("q", at.q), ("u", at.u)) if key in form.spaces}
+        density = _densities(form, at.moment, **given, v=at.r)
+        value = form.vector("v", at.moment, **given) @ at.r
+        size = float(np.abs(density).sum())
+        error = abs(float(value - density.sum()))
+        lines.append(
+            CheckLine.at_most(
+                f"{name} assembled = quadrature",
+                error / size if size else error,
+                LINEARITY,
+                f"{name} {remedy}",
+            )
+        )
+    return lines
+
+
+def _adjoint(model: Model, at: _Point) -> list[CheckLine]:
+    A = model.A(at.u, at.moment)
+    transpose = model.form_A.matrix("q", "v", at.moment, u=at.u)
+    star = A.adjoint(at.r)
+    size = model.Q.norm(star) * model.Q.norm(at.dq)
+    error = abs(model.Q.inner(star, at.dq) - A(at.dq) @ at.r)
+    return [
+        CheckLine.at_most(
+            "A(u)^T = transpose of A(u)",
+            relative(transpose - A.matrix.T, A.matrix),
+            ROUNDING,
+            "A must be linear in q and in v.",
+        ),
+        CheckLine.at_most(
+            "(A(u)* r, xi)_Q = <A(u) xi, r>",
+            float(error / size if size else error),
+            ROUNDING,
+            "The inner product of the parameter is close to singular: use inner='H1', or fix "
+            "boundary values.",
+        ),
+    ]
+
+
+def _derivatives(model: Model, at: _Point) -> list[CheckLine]:
+    A, B, moment = model.form_A, model.form_B, at.moment
+
+    def residual(u: Array) -> Array:
+        return A.matrix("v", "q", moment, u=u).T @ at.r
+
+    return [
+        _taylor(
+            "B'(u)",
+            "dB" if any(B.derivatives) else "",
+            lambda u: B.vector("v", moment, u=u),
+            B.matrix("v", "u", moment, u=at.u) @ at.du,
+            at,
+        ),
+        _taylor(
+            "d(A(u) q)/du",
+            "dA" if any(A.derivatives) else "",
+            lambda u: A.vector("v", moment, q=at.q, u=u),
+            A.matrix("v", "u", moment, u=at.u, q=at.q) @ at.du,
+            at,
+        ),
+        _taylor(
+            "d(A(u)^T r)/du",
+            "dA" if any(A.derivatives) else "",
+            residual,
+            A.matrix("q", "u", moment, u=at.u, v=at.r) @ at.du,
+            at,
+        ),
+    ]
+
+
+def _taylor(
+    name: str, given: str, function: Callable[[Array], Array], slope: Array, at: _Point
+) -> CheckLine:
+    """Return the rate of the Taylor remainder, or its size if it is all rounding."""
+    remedy = (
+        f"{given}= does not belong to {given[1]}: correct it, or leave it out and let a complex "
+        "step take the derivative."
+        if given
+        else f"a complex step cannot see abs, max, min or a comparison of u: give d{name[0]}= with "
+        "the derivative, or write the form without them."
+    )
+    if name.startswith("d("):
+        remedy = remedy.replace("dd=", "dA=")
+    start = function(at.u)
+    remainders = []
+    for step in (1.0, *STEPS):
+        remainder = function(at.u + step * at.du) - start - step * slope
+        remainders.append(largest(remainder))
+    size = largest(start) + largest(slope)
+    if remainders[0] <= FLOOR * size:
+        relative_size = remainders[0] / size if size else remainders[0]
+        return CheckLine.at_most(f"{name}: affine, remainder", relative_size, FLOOR, remedy)
+    small = np.array(remainders[1:])
+    above = small > FLOOR * size
+    rates = np.log2(small[:-1] / np.maximum(small[1:], 1e-300))[above[:-1] & above[1:]]
+    # The smallest steps decide: a wrong slope of size s shows when the step is below s.
+    rate = float(np.median(rates[-3:])) if len(rates) else np.inf
+    return CheckLine.at_least(f"{name}: rate of the Taylor remainder", rate, SLOWEST, remedy)
+
+
+def _mass(model: Model) -> list[CheckLine]:
+    M = model.mass
+    line = definite(model.X)
+    return [
+        CheckLine.at_most(
+            "M = M^T", relative(M - M.T, M), ROUNDING, "M(u, v, x) must be symmetric in u and v."
+        ),
+        CheckLine.at_most("M positive definite (failures)", line.value, 0, line.remedy),
+    ]

@@ -1,0 +1,126 @@
+"""The observation operator and its projections, which must split the state as in the theory."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.diagnostics.report import CheckLine, CheckReport
+from livepde.diagnostics.space import largest, relative
+from livepde.errors import ObservationError
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observation, Observed, Split
+
+__all__ = ["check_observation"]
+
+ROUNDING = 1e-12
+INVERSE = 1e-9  # G^+ of sensors that nearly repeat each other amplifies rounding
+
+
+def check_observation(
+    observed: Observed | Observation, model: Model | None = None, *, seed: int = 0
+) -> CheckReport:
+    """Check the observation operator G and its projections R = G^+ G and P = I - R.
+
+    R and P are idempotent, R P = 0, P maps into the null space of G, G G^+ G = G, R is self-adjoint
+    in the inner product in which G^+ is taken, `reconstruct` returns R u from z = G u, and missing
+    sensors shrink G and nothing else.
+
+    Parameters
+    ----------
+    observed
+        A bound observation (`identifier.observed`), or an observation and its model.
+    seed
+        Of the random vectors.
+
+    Returns
+    -------
+    CheckReport
+        Print it, or call `raise_if_failed`, which raises `ObservationError`.
+
+    >>> import livepde as lp
+    >>> from skfem import ElementLineP1
+    >>> mesh = lp.interval(0.0, 1.0, 8)
+    >>> model = lp.Model(
+    ...     lp.Field(mesh, ElementLineP1()), lp.Scalar(), A=lambda q, u, v, x: q * u * v
+    ... )
+    >>> check_observation(lp.Points([0.25, 0.3, 0.3]), model).ok
+    True
+    """
+    if isinstance(observed, Observation):
+        if model is None:
+            raise ObservationError(
+                "check_observation: an observation alone has no matrix; give its model too."
+            )
+        observed = observed.bind(model.state_space, model.X, model.parameter_space)
+    rng = np.random.default_rng(seed)
+    everything = np.ones(observed.size, dtype=bool)
+    lines = _lines(observed, observed.split(), everything, rng, "")
+    if observed.size > 1:
+        present = everything.copy()
+        present[rng.integers(observed.size)] = False
+        split = observed.split(present)
+        lines += _lines(observed, split, present, rng, "one sensor missing: ")
+        more = split.R.trace() - observed.split().R.trace()
+        lines.append(
+            CheckLine.at_most(
+                "one sensor missing: growth of rank R",
+                more,
+                ROUNDING * observed.X.dim,
+                "split(present) must use the rows of G that are present, and no others.",
+            )
+        )
+    nothing = observed.split(np.zeros(observed.size, dtype=bool))
+    lines.append(
+        CheckLine.at_most(
+            "all sensors missing: |R|",
+            largest(nothing.R),
+            0.0,
+            "split(present) must give R = 0 when nothing is present.",
+        )
+    )
+    return CheckReport("observation", tuple(lines), ObservationError)
+
+
+def _lines(
+    observed: Observed, split: Split, present: Array, rng: np.random.Generator, prefix: str
+) -> list[CheckLine]:
+    X, R, P = observed.X, split.R, split.P
+    free = sp.diags_array(X.free)
+    G = sp.csr_array(observed.G[np.flatnonzero(present)] @ free)
+    gram = sp.eye_array(X.dim) if observed.observation.nodal else X.tangent_gram
+    size = max(largest(R), 1.0)
+    null = "R and P must come from the null space of G (M^-1 M_omega is not a projection)."
+    repeated = null + " Two sensors that differ by less than 1e-6 count as one: give one of them."
+    u = rng.standard_normal(X.dim)
+    boundary = u * (1.0 - X.free)
+    z = observed.G @ u
+    z[np.logical_not(present)] = np.nan
+    rebuilt = split.reconstruct(z, boundary)
+    images = [
+        ("R R = R", largest(R @ R - R) / size, null),
+        ("P P = P", largest(P @ P - P) / size, null),
+        ("R P = 0", largest(R @ P) / size, null),
+        ("G P = 0", relative(G @ free @ P, G), repeated),
+        ("G G^+ G = G", relative(G @ R - G, G), repeated),
+    ]
+    lines = [
+        CheckLine.at_most(prefix + name, value, ROUNDING, text) for name, value, text in images
+    ]
+    dual = gram @ R
+    return [
+        *lines,
+        CheckLine.at_most(
+            prefix + "R self-adjoint",
+            relative(sp.csr_array(dual - dual.T), sp.csr_array(dual)),
+            INVERSE,
+            "R must be orthogonal in X, or for a selection of coefficients symmetric.",
+        ),
+        CheckLine.at_most(
+            prefix + "reconstruct(G u) = R u",
+            relative(rebuilt - R @ u, R @ u),
+            INVERSE,
+            "reconstruct must apply G^+ to the samples present, less the known boundary values.",
+        ),
+    ]
