@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+from livepde.diagnostics import (
+    CheckLine,
+    CheckReport,
+    check_law,
+    check_model,
+    check_observation,
+    check_space,
+)
 from livepde.errors import (
     CaseError,
     ConfigurationError,
@@ -65,6 +73,8 @@ __all__ = [
     "Belief",
     "CaseError",
     "Channel",
+    "CheckLine",
+    "CheckReport",
     "ConfigurationError",
     "ConstantDamping",
     "Damping",
@@ -110,6 +120,10 @@ __all__ = [
     "Status",
     "Subdomain",
     "TimeOrderError",
+    "check_law",
+    "check_model",
+    "check_observation",
+    "check_space",
     "ddot",
     "div",
     "dot",

@@ -206,8 +206,8 @@ def _linear(model: Model, at: _Point) -> list[CheckLine]:
 def _agreement(model: Model, at: _Point) -> list[CheckLine]:
     """Compare what laws use (assembled, probed to be affine) with plain quadrature."""
     remedy = (
-        "as it is assembled is not what its integrand gives: it is not linear in v or q, or it looks "
-        "affine in u at moderate values and is not at the u given (a threshold far away: rescale u)."
+        "as assembled is not what its integrand gives: it is not linear in v or q, or it looks "
+        "affine in u at moderate values and is not at the u given (a threshold far away: rescale)."
     )
     lines = []
     for name, form in (("B(u)", model.form_B), ("A(u) q", model.form_A)):
