@@ -145,6 +145,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     in square-root form. It costs one step and one block of back-substitutions.
 
+    Bounds of numbers hold for the reference about which the filter is linear, and for what is
+    reported; the filter itself stays linear.
+
     Parameters
     ----------
     modes
@@ -303,10 +306,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         """Predict over an interval and update at its end, linear about the reference."""
         model, observed = work.problem.model, work.problem.observed
         k = work.Phi.shape[1]
-        direction = (
-            work.Phi if self.replay is None else np.column_stack([work.Phi, work.Phi @ point.da])
-        )
-        columns = [point.u, point.L] if self.replay is None else [point.u, point.L, point.du]
+        direction = np.column_stack([work.Phi, work.Phi @ point.da])
+        columns = [point.u, point.L, point.du]
 
         def stage(c: Array, t: float, h: float) -> Array:
             moment = interval.at(t)
@@ -323,7 +324,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         h = interval.t1 - interval.t0
         fade = np.exp(-h / self.memory)
         u, L = y[:, 0], fade * y[:, 1 : 1 + k]
-        du = y[:, 1 + k] if self.replay else point.du
+        du = y[:, 1 + k]
         C = point.C
         if self.drift:
             C = _square_root(np.vstack([C.T, np.sqrt(self.drift * h) * np.eye(k)]))
@@ -355,14 +356,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         root = np.linalg.qr(np.vstack([np.eye(len(point.da)), HC]), mode="r")
         C = scipy.linalg.solve_triangular(root, point.C.T, trans="T").T
         step = C @ (C.T @ (H.T @ (d / noise**2)))
-        da = point.da + step
-        if self.replay is None:
-            # Without replay the reference follows at once. With replay the filter has to stay
-            # linear: to cut it at a bound would spoil all that follows; the bound is imposed on
-            # what is reported and on the next reference.
-            da = _reduced(work, _bounded(work, point.q + work.Phi @ da) - point.q)
-        du = point.du + point.L @ (da - point.da)
-        return replace(point, da=da, du=du, C=C, consistency=point.consistency.add(e))
+        return replace(
+            point,
+            da=point.da + step,
+            du=point.du + point.L @ step,
+            C=C,
+            consistency=point.consistency.add(e),
+        )
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         now = state.now
@@ -401,13 +401,19 @@ def _converged(work: SensitivityWork, point: Point) -> bool:
 
 
 def _recentre(work: SensitivityWork, point: Point) -> Point:
-    """Move the reference to the estimate."""
+    """Move the reference to the estimate, within the bounds.
+
+    Bounds hold for references and for what is reported, not for the linear filter: what lies
+    beyond them stays in da and du, so that nothing the data said is lost.
+    """
+    shift = _reduced(work, _bounded(work, point.q + work.Phi @ point.da) - point.q)
+    beyond = point.L @ (point.da - shift)
     return replace(
         point,
-        u=point.u + point.du,
-        q=_bounded(work, point.q + work.Phi @ point.da),
-        du=np.zeros_like(point.du),
-        da=np.zeros_like(point.da),
+        u=point.u + point.du - beyond,
+        q=point.q + work.Phi @ shift,
+        du=beyond,
+        da=point.da - shift,
     )
 
 
