@@ -1,0 +1,135 @@
+"""Meshes, elements and models that several tests use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from skfem import (
+    ElementHex1,
+    ElementLineHermite,
+    ElementLineP1,
+    ElementLineP2,
+    ElementQuad1,
+    ElementQuad2,
+    ElementTetP1,
+    ElementTriP1,
+    ElementTriP2,
+    MeshHex,
+    MeshQuad,
+    MeshTet,
+    MeshTri,
+)
+
+import livepde as lp
+
+
+def line(cells: int = 12) -> Any:
+    return lp.interval(0.0, 1.0, cells)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A mesh with an element for the state and another one for the parameter."""
+
+    mesh: Callable[[], Any]
+    state: Any
+    parameter: Any
+
+    def model(self, **options: Any) -> lp.Model:
+        """Return u_t - div(grad u) + q u = f with these elements."""
+        mesh = self.mesh()
+        return reaction(mesh, self.state, self.parameter, **options)
+
+
+CASES: dict[str, Case] = {
+    "line P1": Case(line, ElementLineP1(), ElementLineP1()),
+    "line P2 / P1": Case(line, ElementLineP2(), ElementLineP1()),
+    "line Hermite": Case(line, ElementLineHermite(), ElementLineHermite()),
+    "triangles P1": Case(lambda: MeshTri().refined(3), ElementTriP1(), ElementTriP1()),
+    "triangles P2 / P1": Case(lambda: MeshTri().refined(2), ElementTriP2(), ElementTriP1()),
+    "quads Q1": Case(lambda: MeshQuad().refined(3), ElementQuad1(), ElementQuad1()),
+    "quads Q2 / Q1": Case(lambda: MeshQuad().refined(2), ElementQuad2(), ElementQuad1()),
+    "tets P1": Case(lambda: MeshTet().refined(2), ElementTetP1(), ElementTetP1()),
+    "hexes Q1": Case(lambda: MeshHex().refined(2), ElementHex1(), ElementHex1()),
+}
+
+
+def product(q: Any, u: Any, v: Any, x: Any) -> Any:
+    return q * u * v
+
+
+def diffusion(q: Any, u: Any, v: Any, x: Any) -> Any:
+    return q * lp.dot(lp.grad(u), lp.grad(v))
+
+
+def laplace(u: Any, v: Any, x: Any) -> Any:
+    return lp.dot(lp.grad(u), lp.grad(v))
+
+
+def reaction(
+    mesh: Any,
+    state: Any,
+    parameter: Any = None,
+    *,
+    dirichlet: Any = None,
+    inner: Any = "H1",
+    q_dirichlet: Any = None,
+    **options: Any,
+) -> lp.Model:
+    """Return u_t - div(grad u) + q(x) u = f, u = 0 on the boundary unless told otherwise."""
+    zero = {"boundary": 0.0}
+    return lp.Model(
+        state=lp.Field(mesh, state, dirichlet=zero if dirichlet is None else dirichlet),
+        parameter=lp.Field(
+            mesh, parameter or state, inner=inner, dirichlet=q_dirichlet or {}, unit="1/s"
+        ),
+        **{"A": product, "B": laplace, **options},
+    )
+
+
+def excited(cells: int = 20, element: Any = None, f: Any = None, **options: Any) -> lp.Model:
+    """Return the excited twin of DESIGN.md, fact 5: its u* is `excited_u`, its q* `excited_q`."""
+    element = element or ElementLineHermite()
+
+    def source(x: Any, t: float) -> Any:
+        s1, s2, pi = np.sin(np.pi * x[0]), np.sin(2 * np.pi * x[0]), np.pi
+        a, b = 1 + np.sin(t) / 2, np.cos(0.7 * t) / 2
+        rate = np.cos(t) / 2 * s1 - 0.35 * np.sin(0.7 * t) * s2
+        return rate + pi**2 * a * s1 + 4 * pi**2 * b * s2 + excited_q(x) * (a * s1 + b * s2)
+
+    return reaction(line(cells), element, f=f or source, **options)
+
+
+def excited_q(x: Any) -> Any:
+    return 2 + 3 * np.sin(np.pi * x[0]) ** 2
+
+
+def excited_u(x: Any, t: float) -> Any:
+    a, b = 1 + np.sin(t) / 2, np.cos(0.7 * t) / 2
+    return a * np.sin(np.pi * x[0]) + b * np.sin(2 * np.pi * x[0])
+
+
+def truth(
+    model: lp.Model,
+    q: np.ndarray,
+    u0: Any,
+    times: Any,
+    scheme: lp.Scheme | None = None,
+    inputs: Any = None,
+) -> list[np.ndarray]:
+    """Return the states of the forward model at all times."""
+    control = lp.Advance(scheme or lp.ImplicitEuler())
+    return [u for _, u in lp.simulate(model, q, u0, list(times), control, inputs)]
+
+
+def observe(model: lp.Model, observation: lp.Observation) -> Any:
+    return observation.bind(model.state_space, model.X, model.parameter_space)
+
+
+def rates(errors: Any) -> np.ndarray:
+    """Return the orders of convergence between errors whose step is halved each time."""
+    errors = np.asarray(errors)
+    return np.log2(errors[:-1] / errors[1:])

@@ -1,0 +1,188 @@
+"""Hilbert spaces: Gram matrix, Riesz map, modes, operators with adjoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from problems import CASES, laplace, line, product, reaction
+from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
+
+import livepde as lp
+from livepde.diagnostics import check_space
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("inner", ["L2", "H1"])
+def test_spaces_of_all_elements(name, inner):
+    model = CASES[name].model(inner=inner)
+    for space in (model.X, model.Q):
+        check_space(space).raise_if_failed()
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("zero", [False, True])
+def test_adjoint_identity(name, zero):
+    """(A(u)* r, xi)_Q = <A(u) xi, r> to 1e-12 for random u, r, xi, with and without H^1_0."""
+    model = CASES[name].model(q_dirichlet={"boundary": 0.0} if zero else None)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        u, r = rng.standard_normal((2, model.X.dim))
+        xi = rng.standard_normal(model.Q.dim) * model.Q.free
+        A = model.A(u)
+        star = A.adjoint(r)
+        assert np.all(star[model.Q.fixed] == 0.0)
+        size = model.Q.norm(star) * model.Q.norm(xi)
+        assert abs(model.Q.inner(star, xi) - A(xi) @ r) <= 1e-12 * size
+        np.testing.assert_allclose(A.transposed(r), A.matrix.T @ r)
+
+
+def test_gain_scales_the_adjoint():
+    model = CASES["line Hermite"].model()
+    rng = np.random.default_rng(2)
+    u, r = rng.standard_normal((2, model.X.dim))
+    A = model.A(u)
+    scaled = lp.DualOperator(A.matrix, model.Q.scaled(1 / 50.0), model.X)
+    np.testing.assert_allclose(scaled.adjoint(r), 50.0 * A.adjoint(r), rtol=1e-9)
+
+
+def test_user_given_inner_product():
+    def inner(u, v, x):
+        return u * v + 0.01 * lp.dot(lp.grad(u), lp.grad(v))
+
+    model = reaction(line(), ElementLineP1(), inner=inner)
+    L2 = reaction(line(), ElementLineP1(), inner="L2").Q.gram
+    H1 = reaction(line(), ElementLineP1(), inner="H1").Q.gram
+    np.testing.assert_allclose(model.Q.gram.toarray(), (L2 + 0.01 * (H1 - L2)).toarray())
+
+
+def test_std_divides_the_inner_product():
+    mesh = line()
+    field = lp.Field(mesh, ElementLineP1(), inner="H1", std=3.0)
+    wide = lp.Model(lp.Field(mesh, ElementLineP1()), field, product)
+    unit = reaction(mesh, ElementLineP1())
+    np.testing.assert_allclose(9 * wide.Q.gram.toarray(), unit.Q.gram.toarray())
+
+
+def test_singular_inner_product_is_one_sentence():
+    model = reaction(line(), ElementLineP1(), inner=laplace)
+    with pytest.raises(lp.SpaceError, match="Gram matrix of Q is singular") as caught:
+        _ = model.Q.factor
+    assert "zero-order term" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    # Fixed boundary values make the same inner product regular.
+    check_space(
+        reaction(line(), ElementLineP1(), inner=laplace, q_dirichlet={"boundary": 0.0}).Q
+    ).raise_if_failed()
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_singularity_does_not_depend_on_units(scale):
+    mesh = line(40)
+    for inner, regular in (("H1", True), (laplace, False)):
+        field = lp.Field(mesh, ElementLineHermite(), inner=inner, std=scale)
+        model = lp.Model(lp.Field(mesh, ElementLineHermite()), field, product)
+        assert check_space(model.Q).ok == regular
+
+
+def test_indefinite_inner_products_are_refused():
+    def negative(u, v, x):
+        return -u * v
+
+    def weak(u, v, x):  # its eigenvalue next to zero is positive
+        return u * v - 0.01 * lp.dot(lp.grad(u), lp.grad(v))
+
+    for inner in (negative, weak):
+        with pytest.raises(lp.SpaceError, match="not positive definite"):
+            _ = reaction(line(30), ElementLineP1(), inner=inner).Q.factor
+
+
+def test_bad_gram_matrices():
+    with pytest.raises(lp.SpaceError, match="square"):
+        lp.HilbertSpace(sp.csr_array((2, 3)))
+    with pytest.raises(lp.SpaceError, match="not symmetric"):
+        lp.HilbertSpace(sp.csr_array([[1.0, 0.5], [0.0, 1.0]]))
+    with pytest.raises(lp.SpaceError, match="not finite"):
+        lp.HilbertSpace(sp.csr_array([[1.0, np.nan], [np.nan, 1.0]]))
+
+
+def test_operator_must_fit_its_spaces():
+    model = CASES["line P2 / P1"].model()
+    A = model.A(np.ones(model.X.dim))
+    with pytest.raises(lp.SpaceError, match=r"shape \(25, 13\).*need \(13, 25\)"):
+        lp.DualOperator(A.matrix, model.X, model.Q)
+
+
+def test_norms_and_duals():
+    model = CASES["triangles P2 / P1"].model()
+    rng = np.random.default_rng(3)
+    x, y = rng.standard_normal((2, model.Q.dim))
+    assert model.Q.inner(x, y) == pytest.approx(model.Q.inner(y, x))
+    assert model.Q.norm(x) ** 2 == pytest.approx(model.Q.inner(x, x))
+    assert model.Q.dual(x) @ y == pytest.approx(model.Q.inner(x, y))
+    assert model.Q.scaled(4.0).norm(x) == pytest.approx(2 * model.Q.norm(x))
+    block = rng.standard_normal((model.Q.dim, 3))
+    columns = np.column_stack([model.Q.riesz(column) for column in block.T])
+    np.testing.assert_allclose(model.Q.riesz(block), columns, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["line Hermite", "triangles P1", "quads Q1"])
+def test_modes(name):
+    """G-orthonormal, descending, and all of them sum to the inverse Gram matrix."""
+    model = CASES[name].model(q_dirichlet={"boundary": 0.0})
+    Q, mass = model.Q, model.parameter_mass
+    count = int(Q.free.sum())
+    phi, variance = Q.modes(count, mass)
+    np.testing.assert_allclose(phi.T @ (Q.gram @ phi), np.eye(count), atol=1e-9)
+    np.testing.assert_allclose(phi.T @ (mass @ phi), np.diag(variance), atol=1e-9)
+    assert np.all(np.diff(variance) <= 1e-14)
+    inverse = Q.riesz(np.eye(Q.dim))
+    np.testing.assert_allclose(phi @ phi.T, inverse, atol=1e-9 * abs(inverse).max())
+    few, few_variance = Q.modes(4, mass)
+    np.testing.assert_allclose(few_variance, variance[:4], rtol=1e-8)
+    assert few.shape == (Q.dim, 4)
+    np.testing.assert_array_equal(few[Q.fixed], 0.0)
+
+
+def test_modes_of_a_large_space_are_those_of_a_dense_solver():
+    model = reaction(MeshTri().refined(5), ElementTriP1())
+    assert model.Q.dim > 400
+    phi, variance = model.Q.modes(5, model.parameter_mass)
+    again, _ = model.Q.modes(5, model.parameter_mass)
+    np.testing.assert_array_equal(phi, again)
+    from scipy.linalg import eigh
+
+    dense = eigh(model.parameter_mass.toarray(), model.Q.gram.toarray(), eigvals_only=True)
+    np.testing.assert_allclose(variance, dense[::-1][:5], rtol=1e-9)
+    np.testing.assert_allclose(phi.T @ (model.Q.gram @ phi), np.eye(5), atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, 14])
+def test_number_of_modes_must_exist(count):
+    model = CASES["line P1"].model()
+    with pytest.raises(lp.SpaceError, match=f"13 free coefficients; got modes={count}"):
+        model.Q.modes(count, model.parameter_mass)
+
+
+def test_bad_unknowns():
+    mesh, element = line(), ElementLineP1()
+    with pytest.raises(lp.SpaceError, match="expected 'L2', 'H1'"):
+        lp.Field(mesh, element, inner="H2")
+    with pytest.raises(lp.SpaceError, match=r"no boundary 'top'.*'left'"):
+        lp.Field(mesh, element, dirichlet={"top": 0.0})
+    for std in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(lp.SpaceError, match="std must be a positive number"):
+            lp.Scalar(std=std)
+    with pytest.raises(lp.SpaceError, match="lower < upper"):
+        lp.Scalar(bounds=(1.0, 1.0))
+    with pytest.raises(lp.SpaceError, match="prior 3.0 lies outside"):
+        lp.Piecewise({"a": lambda x: x[0] < 1}, prior=3.0, bounds=(0.0, 2.0))
+    with pytest.raises(lp.SpaceError, match="at least one region"):
+        lp.Piecewise({})
+    for bad in ((1.0, 0.0, 4), (0.0, 1.0, 0), (0.0, np.nan, 4)):
+        with pytest.raises(lp.SpaceError, match="needs stop > start and cells >= 1"):
+            lp.interval(*bad)
+    with pytest.raises(lp.SpaceError, match="at least one unknown"):
+        lp.Model(lp.Field(mesh, element), {}, product)
+    with pytest.raises(lp.SpaceError, match="'R b': the name must be a Python identifier"):
+        lp.Model(lp.Field(mesh, element), {"R b": lp.Scalar()}, product)
