@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from livepde.errors import ConfigurationError
 from livepde.fem import Moment
@@ -158,7 +159,7 @@ class Twin:
     model: Model
     observation: Observation
     q_true: Any
-    times: Sequence[float] | Array
+    times: Sequence[float] | npt.NDArray[np.floating]
     u_true: Callable[[Any, float], Any] | None = None
     u0: Any = None
     truth: Truth = "discrete"
