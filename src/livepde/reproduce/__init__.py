@@ -1,0 +1,16 @@
+"""Published and stated experiments, each with the numbers it must show.
+
+One file for each experiment, its expected numbers at the end; `livepde reproduce NAME` runs them,
+and so do the tests.
+"""
+
+from __future__ import annotations
+
+from livepde.reproduce.experiment import Experiment
+from livepde.reproduce.seed import SEED
+from livepde.reproduce.seed_excited import SEED_EXCITED
+
+__all__ = ["EXPERIMENTS", "Experiment"]
+
+EXPERIMENTS: dict[str, Experiment] = {item.name: item for item in (SEED, SEED_EXCITED)}
+"""Name -> experiment."""

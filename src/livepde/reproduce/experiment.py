@@ -1,0 +1,108 @@
+"""What an experiment is, and the one loop all of them share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.errors import ConfigurationError
+from livepde.identifier import Identifier
+from livepde.linalg import Array
+from livepde.progress import watched
+from livepde.result import Estimate, Result
+from livepde.runs.outcome import Outcome
+from livepde.streams import Twin
+
+__all__ = ["Experiment", "Track", "track"]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A published or stated experiment.
+
+    Attributes
+    ----------
+    name
+        As the command line calls it.
+    summary
+        One sentence.
+    truths
+        Kinds of truth it can run with (see `Twin`), the default first.
+    conduct
+        (truth, progress) -> outcome.
+    """
+
+    name: str
+    summary: str
+    truths: tuple[str, ...]
+    conduct: Callable[[str, bool], Outcome]
+
+    def run(self, truth: str | None = None, progress: bool = False) -> Outcome:
+        """Run it and return tables, checks and figures.
+
+        Parameters
+        ----------
+        truth
+            Where the data come from; default the first of `truths`.
+        progress
+            Show a bar for every run.
+
+        Raises
+        ------
+        ConfigurationError
+            The experiment has no such truth.
+        """
+        truth = self.truths[0] if truth is None else truth
+        if truth not in self.truths:
+            raise ConfigurationError(
+                f"experiment '{self.name}': truth '{truth}'; expected one of "
+                f"{', '.join(self.truths)}."
+            )
+        return self.conduct(truth, progress)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A run beside its truth.
+
+    Attributes
+    ----------
+    result, last
+        The run, and its last estimate.
+    times, errors
+        Relative L2 error of q after each sample, both of shape (samples,).
+    u_error
+        Relative error of the state in X at the end.
+    divided
+        Samples whose step had to be divided. A divided step has another truncation error than the
+        truth, which is enough to hide a parameter as small as the paper's.
+    """
+
+    result: Result
+    last: Estimate
+    times: Array
+    errors: Array
+    u_error: float
+    divided: int
+
+    def error(self, t: float) -> float:
+        """Return the error of q at the sample nearest to t."""
+        return float(self.errors[np.abs(self.times - t).argmin()])
+
+
+def track(identifier: Identifier, twin: Twin, what: str, progress: bool = False) -> Track:
+    """Run an identifier on the samples of a twin and compare each estimate with the truth."""
+    result = Result.empty(identifier.model, identifier.observed, None)
+    samples = watched(twin, len(twin), what) if progress else twin
+    times, errors, divided = [], [], 0
+    for sample in samples:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        result.add(estimate)
+        times.append(sample.t)
+        errors.append(twin.error(estimate.q) if estimate.status.ok else np.nan)
+        divided += estimate.steps > 1
+    return Track(
+        result, estimate, np.array(times), np.array(errors), twin.u_error(estimate), divided
+    )
