@@ -39,6 +39,7 @@ from livepde.fem import (
     grad,
     hess,
     interval,
+    rectangle,
     trace,
     transpose,
 )
@@ -130,6 +131,7 @@ __all__ = [
     "grad",
     "hess",
     "interval",
+    "rectangle",
     "simulate",
     "trace",
     "transpose",

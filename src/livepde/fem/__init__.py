@@ -15,6 +15,7 @@ from livepde.fem.fields import (
     interval,
 )
 from livepde.fem.forms import Form
+from livepde.fem.meshes import hermite, linear, rectangle
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
 from livepde.fem.space import FunctionSpace
@@ -39,8 +40,11 @@ __all__ = [
     "div",
     "dot",
     "grad",
+    "hermite",
     "hess",
     "interval",
+    "linear",
+    "rectangle",
     "trace",
     "transpose",
 ]

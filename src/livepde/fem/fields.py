@@ -54,9 +54,14 @@ class On:
 
 
 def interval(
-    start: float, stop: float, cells: int, *, regions: Mapping[str, Predicate] | None = None
+    start: float,
+    stop: float,
+    cells: int,
+    *,
+    regions: Mapping[str, Predicate] | None = None,
+    geometric: bool = False,
 ) -> MeshLine:
-    """Return a uniform mesh of [start, stop] with boundaries "left" and "right".
+    """Return a mesh of [start, stop] with boundaries "left" and "right".
 
     Parameters
     ----------
@@ -66,10 +71,15 @@ def interval(
         Number of elements.
     regions
         Named subdomains, each a predicate on the midpoints of the elements.
+    geometric
+        Elements grow by a constant ratio, as radial problems want it; needs start > 0. Else uniform.
     """
     if not stop > start or cells < 1:
         raise SpaceError(f"interval({start}, {stop}, {cells}): needs stop > start and cells >= 1.")
-    mesh = MeshLine(np.linspace(start, stop, cells + 1))
+    if geometric and not start > 0:
+        raise SpaceError(f"interval({start}, {stop}, geometric=True): needs start > 0.")
+    spaced = np.geomspace if geometric else np.linspace
+    mesh = MeshLine(spaced(start, stop, cells + 1))
     mesh = mesh.with_boundaries(
         {"left": lambda x: np.isclose(x[0], start), "right": lambda x: np.isclose(x[0], stop)}
     )

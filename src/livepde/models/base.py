@@ -1,0 +1,82 @@
+"""What a ready-made equation is, for programs, case files and `livepde init`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from livepde.fem import Place
+from livepde.model import Model
+
+__all__ = ["Equation", "Option", "Quantity", "Variable"]
+
+
+@dataclass(frozen=True)
+class Variable:
+    """An unknown, the state, or an input: its unit and what it is."""
+
+    unit: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Option:
+    """A known number of an equation; `default` None means that it must be given."""
+
+    unit: str
+    text: str
+    default: float | None = None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something that is measured and is not simply the state at a point.
+
+    Attributes
+    ----------
+    text
+        What it is.
+    at
+        (left end, right end) of the mesh -> where the state enters.
+    direct
+        Options -> the part (q, x) that depends on the parameter directly, linear in q.
+    """
+
+    text: str
+    at: Callable[[float, float], float]
+    direct: Callable[[Mapping[str, float]], Callable[[Any, Place], Any]]
+
+
+@dataclass(frozen=True)
+class Equation:
+    """A PDE with a name, and what a case file may say about it.
+
+    Attributes
+    ----------
+    name, summary, formula
+        Name in a case file, one line about it, and the equation as text.
+    state
+        Unit and meaning of u.
+    unknowns, inputs, options
+        By name.
+    build
+        (mesh, unknowns, dirichlet, **options) -> `Model`.
+    quantities
+        Measured quantities besides the state itself.
+    element
+        mesh -> element of the state, and of an unknown field.
+    """
+
+    name: str
+    summary: str
+    formula: str
+    state: Variable
+    unknowns: Mapping[str, Variable]
+    build: Callable[..., Model]
+    element: Callable[[Any], Any]
+    inputs: Mapping[str, Variable] = field(default_factory=dict)
+    options: Mapping[str, Option] = field(default_factory=dict)
+    quantities: Mapping[str, Quantity] = field(default_factory=dict)
+    length_unit: str = "m"
+    time_unit: str = "s"

@@ -1,0 +1,96 @@
+"""A borehole heat exchanger in homogeneous ground: the thermal response test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import pi
+from typing import Any
+
+from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
+from livepde.model import Model
+from livepde.models.base import Equation, Option, Quantity, Variable
+
+__all__ = ["BOREHOLE", "borehole", "fluid"]
+
+
+def borehole(
+    mesh: Any, k: Unknown, R_b: Unknown, *, H: float, rho_c: float, T0: float, element: Any = None
+) -> Model:
+    """Return rho_c r T_t - (k r T_r)_r = 0 around a borehole that gives off the power Q(t).
+
+    At the wall -2 pi r k H T_r = Q, far away T = T0. The mean temperature of the fluid is
+    T(wall) + R_b Q/H: observe it with `Points({"T": r_wall}, direct={"T": fluid(H)})`.
+
+    Parameters
+    ----------
+    mesh
+        Radius in m, from the wall ("left") to where the test is not felt ("right"); best graded:
+        `livepde.interval(r_wall, r_far, 40, geometric=True)`.
+    k
+        Conductivity of the ground in W/(m K).
+    R_b
+        Resistance between fluid and wall in m K/W. It does not enter the PDE, only the sensor.
+    H
+        Length of the borehole in m.
+    rho_c
+        Volumetric heat capacity of the ground in J/(m^3 K).
+    T0
+        Undisturbed temperature.
+
+    The power in W is the input channel "Q".
+    """
+    # Of order four: the weight r and the elements of first order are integrated exactly.
+    state = Field(mesh, element or linear(mesh), dirichlet={"right": T0}, unit="degC", quadrature=4)
+    return Model(
+        state,
+        {"k": k, "R_b": R_b},
+        A=lambda q, u, v, x: q.k * x[0] * dot(grad(u), grad(v)),
+        M=lambda u, v, x: rho_c * x[0] * u * v,
+        f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
+        inputs=["Q"],
+        time_unit="s",
+    )
+
+
+def fluid(H: float) -> Callable[[Any, Place], Any]:
+    """Return what the fluid sees beside T(wall): R_b Q/H."""
+    return lambda q, x: q.R_b * x.inputs["Q"] / H
+
+
+def _build(
+    mesh: Any,
+    unknowns: Mapping[str, Unknown],
+    dirichlet: Mapping[str, Any],
+    *,
+    H: float,
+    rho_c: float,
+    T0: float,
+) -> Model:
+    return borehole(mesh, unknowns["k"], unknowns["R_b"], H=H, rho_c=rho_c, T0=T0)
+
+
+BOREHOLE = Equation(
+    name="borehole",
+    summary="thermal response test: radial conduction around a heated borehole",
+    formula="rho_c r T_t = (k r T_r)_r,  -2 pi r k H T_r = Q at the wall,  T = T0 far away",
+    state=Variable("degC", "temperature of the ground"),
+    unknowns={
+        "k": Variable("W/(m K)", "conductivity of the ground"),
+        "R_b": Variable("m K/W", "resistance between fluid and wall of the borehole"),
+    },
+    inputs={"Q": Variable("W", "power given to the fluid")},
+    options={
+        "H": Option("m", "length of the borehole"),
+        "rho_c": Option("J/(m^3 K)", "volumetric heat capacity of the ground", 2.3e6),
+        "T0": Option("degC", "undisturbed temperature of the ground"),
+    },
+    quantities={
+        "fluid": Quantity(
+            "mean temperature of the fluid, T(wall) + R_b Q/H",
+            at=lambda left, right: left,
+            direct=lambda options: fluid(options["H"]),
+        )
+    },
+    build=_build,
+    element=linear,
+)

@@ -1,0 +1,75 @@
+"""The paper's example: an unknown reaction coefficient (section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from livepde.fem import Field, Unknown, dot, grad, hermite
+from livepde.model import Model, Source
+from livepde.models.base import Equation, Option, Variable
+
+__all__ = ["REACTION_DIFFUSION", "reaction_diffusion"]
+
+
+def reaction_diffusion(
+    mesh: Any,
+    q: Unknown,
+    dirichlet: Mapping[str, Any] | None = None,
+    *,
+    D: Any = 1.0,
+    f: Source = 0.0,
+    element: Any = None,
+) -> Model:
+    """Return u_t - div(D grad u) + q u = f with unknown q, without units.
+
+    Parameters
+    ----------
+    mesh
+        Any mesh of scikit-fem, or `livepde.interval(...)`.
+    q
+        Reaction coefficient, usually a `Field`.
+    dirichlet
+        Boundary -> number, function g(x, t), or `Channel`; default zero on all of it.
+    D
+        Diffusivity: a number or a function of x.
+    f
+        Source density: a number or f(x, t).
+    element
+        Element of the state; default cubic Hermite on a line, as in the paper, else first order.
+    """
+    values = {"boundary": 0.0} if dirichlet is None else dict(dirichlet)
+    state = Field(mesh, element or hermite(mesh), dirichlet=values)
+    diffusivity = D if callable(D) else lambda x: D
+    return Model(
+        state,
+        {"q": q},
+        A=lambda q, u, v, x: q.q * u * v,
+        B=lambda u, v, x: diffusivity(x) * dot(grad(u), grad(v)),
+        f=f,
+    )
+
+
+def _build(
+    mesh: Any,
+    unknowns: Mapping[str, Unknown],
+    dirichlet: Mapping[str, Any],
+    *,
+    D: float,
+    f: float,
+) -> Model:
+    return reaction_diffusion(mesh, unknowns["q"], dirichlet or None, D=D, f=f)
+
+
+REACTION_DIFFUSION = Equation(
+    name="reaction_diffusion",
+    summary="the paper's example: unknown reaction coefficient, no units",
+    formula="u_t - div(D grad u) + q u = f",
+    state=Variable("", "state"),
+    unknowns={"q": Variable("", "reaction coefficient")},
+    options={"D": Option("", "diffusivity", 1.0), "f": Option("", "source density", 0.0)},
+    build=_build,
+    element=hermite,
+    length_unit="",
+    time_unit="",
+)
