@@ -2,6 +2,18 @@
 
 from __future__ import annotations
 
+from livepde.streams.table import Clock, Column, JsonLines, Table, read_csv, read_json_lines
 from livepde.streams.twin import AbsoluteNoise, Noise, RelativeNoise, Twin
 
-__all__ = ["AbsoluteNoise", "Noise", "RelativeNoise", "Twin"]
+__all__ = [
+    "AbsoluteNoise",
+    "Clock",
+    "Column",
+    "JsonLines",
+    "Noise",
+    "RelativeNoise",
+    "Table",
+    "Twin",
+    "read_csv",
+    "read_json_lines",
+]

@@ -1,0 +1,368 @@
+"""Samples from a CSV file, and from JSON lines as they come."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from livepde.errors import DataError, SampleError, TimeOrderError
+from livepde.identifier import Sample
+from livepde.linalg import Array
+
+__all__ = ["Clock", "Column", "JsonLines", "Table", "read_csv", "read_json_lines"]
+
+MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "#n/a"})
+Instant: TypeAlias = float | str | date | datetime
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a channel comes from: value = factor * (mean of the columns) + offset.
+
+    Several columns are averaged; where one of them is missing, so is the channel.
+    """
+
+    names: tuple[str, ...]
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How the time column is read, and what of it is used.
+
+    Attributes
+    ----------
+    name
+        The time column: numbers, or dates and times in ISO format.
+    factor
+        Multiplies numbers to give the model's time; dates become seconds divided by `second`.
+    start, stop
+        First and last time used, in the terms of the column: a number (in the model's unit) or
+        a date.
+    second
+        One second in the model's unit of time.
+    """
+
+    name: str
+    factor: float = 1.0
+    start: Instant | None = None
+    stop: Instant | None = None
+    second: float = 1.0
+
+    def bounds(self, dates: bool, where: str) -> tuple[float, float]:
+        """Return start and stop in model time (dates: since 1970)."""
+        low, high = -math.inf, math.inf
+        if self.start is not None:
+            low = self._bound(self.start, dates, f"{where}: start")
+        if self.stop is not None:
+            high = self._bound(self.stop, dates, f"{where}: stop")
+            if dates and _whole_day(self.stop):
+                high += 86399.999 * self.second  # a day includes its hours
+        return low, high
+
+    def _bound(self, value: Instant, dates: bool, what: str) -> float:
+        if dates:
+            stamp = _stamp(value)
+            if stamp is None:
+                raise SampleError(f"{what}: got {value!r}; the times are dates, as 2025-04-01.")
+            return stamp * self.second
+        if isinstance(value, str | date):
+            raise SampleError(f"{what}: got {str(value)!r}; the times are numbers, not dates.")
+        return float(value)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Samples in memory, checked: iterate over it, as often as needed.
+
+    Attributes
+    ----------
+    t
+        Times in the model's unit, shape (samples,); dates count from the first sample.
+    values
+        Channel values, NaN where missing, shape (samples, channels).
+    names
+        Channels.
+    origin
+        The first sample's date, if times are dates.
+    """
+
+    t: Array
+    values: Array
+    names: tuple[str, ...]
+    origin: datetime | None = None
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __iter__(self) -> Iterator[Sample]:
+        for t, row in zip(self.t.tolist(), self.values.tolist(), strict=True):
+            yield Sample(t, dict(zip(self.names, row, strict=True)))
+
+
+def read_csv(
+    path: str | Path,
+    columns: Mapping[str, Column],
+    clock: Clock,
+    *,
+    every: int = 1,
+    missing: Iterable[float] = (),
+) -> Table:
+    """Read channels from a CSV file with one header line.
+
+    Parameters
+    ----------
+    columns
+        Channel -> where it comes from.
+    every
+        Keep every so many rows.
+    missing
+        Numbers that mean a missing sample (-9999). Empty cells and NaN always do.
+
+    Raises
+    ------
+    DataError
+        No such file or column; text or infinity in a channel; times that do not increase. The
+        message names file, row (the header is row 1) and column.
+    """
+    import pandas as pd
+
+    path = Path(path)
+    needed = [clock.name, *(name for column in columns.values() for name in column.names)]
+    try:
+        header = list(pd.read_csv(path, nrows=0, skipinitialspace=True).columns)
+        for name in needed:
+            if name not in header:
+                raise SampleError(f"{path}: there is no column '{name}'{_hint(name, header)}")
+        frame = pd.read_csv(
+            path,
+            usecols=sorted(set(needed)),
+            dtype=str,
+            keep_default_na=False,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+        )
+    except (OSError, pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
+    blank = (frame == "").all(axis=1)
+    rows = np.flatnonzero(~blank.to_numpy()) + 2
+    frame = frame.loc[~blank]
+    if not len(frame):
+        raise DataError(f"{path}: holds no rows beside its header.")
+    times, dates = _times(frame[clock.name].tolist(), rows, clock, str(path))
+    low, high = clock.bounds(dates, str(path))
+    use = np.flatnonzero((times >= low) & (times <= high))
+    if not len(use):
+        raise DataError(f"{path}: no row lies between start and stop; check both.")
+    use = use[::every]
+    late = np.flatnonzero(np.diff(times[use]) <= 0)
+    if len(late):
+        raise _disorder(f"{path}, row {rows[use[late[0] + 1]]}, column '{clock.name}'")
+    holes = tuple(float(number) for number in missing)
+    numbers = {
+        name: _numbers(frame[name].to_numpy()[use], rows[use], f"{path}", name, holes)
+        for name in dict.fromkeys(needed[1:])
+    }
+    values = np.column_stack(
+        [
+            column.factor * np.mean([numbers[name] for name in column.names], axis=0)
+            + column.offset
+            for column in columns.values()
+        ]
+        or [np.zeros((len(use), 0))]
+    )
+    t, origin = times[use], None
+    if dates:
+        origin = datetime.fromtimestamp(float(t[0]) / clock.second, UTC).replace(tzinfo=None)
+        t = t - t[0]
+    return Table(t, values, tuple(columns), origin)
+
+
+class JsonLines:
+    """Samples from JSON lines, one object with column -> value for each moment, as they come."""
+
+    def __init__(
+        self,
+        lines: Iterable[str],
+        columns: Mapping[str, Column],
+        clock: Clock,
+        *,
+        every: int = 1,
+        missing: Iterable[float] = (),
+        where: str = "standard input",
+    ) -> None:
+        self._lines = lines
+        self._columns = columns
+        self._clock = clock
+        self._every = every
+        self._missing = tuple(float(number) for number in missing)
+        self._where = where
+        self.origin: datetime | None = None
+
+    def __iter__(self) -> Iterator[Sample]:
+        clock, kept, last = self._clock, 0, -math.inf
+        zero: float | None = None
+        for number, line in enumerate(self._lines, start=1):
+            if not line.strip():
+                continue
+            where = f"{self._where}, line {number}"
+            row = _object(line, where)
+            if clock.name not in row:
+                raise SampleError(
+                    f"{where}: there is no '{clock.name}'{_hint(clock.name, list(row))}"
+                )
+            times, dates = _times([row[clock.name]], np.array([number]), clock, self._where)
+            t = float(times[0])
+            low, high = clock.bounds(dates, self._where)
+            if t > high:
+                return
+            if t < low:
+                continue
+            kept += 1
+            if (kept - 1) % self._every:
+                continue
+            if t <= last:
+                raise _disorder(where)
+            last = t
+            if zero is None:
+                zero = t if dates else 0.0
+                if dates:
+                    stamp = datetime.fromtimestamp(t / clock.second, UTC)
+                    self.origin = stamp.replace(tzinfo=None)
+            values = {
+                channel: self._value(column, row, where)
+                for channel, column in self._columns.items()
+            }
+            yield Sample(t - zero, values)
+
+    def _value(self, column: Column, row: Mapping[str, Any], where: str) -> float:
+        numbers = []
+        for name in column.names:
+            value = _number(row.get(name), f"{where}, '{name}'")
+            numbers.append(math.nan if value in self._missing else value)
+        return column.factor * sum(numbers) / len(numbers) + column.offset
+
+
+def read_json_lines(path: str | Path, columns: Mapping[str, Column], clock: Clock) -> JsonLines:
+    """Return the samples of a file of JSON lines; see `JsonLines`."""
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read: {error}.") from error
+    return JsonLines(lines, columns, clock, where=str(path))
+
+
+def _object(line: str, where: str) -> dict[str, Any]:
+    try:
+        row = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise SampleError(f"{where}: is not JSON ({error.msg}).") from None
+    if not isinstance(row, dict):
+        raise SampleError(f"{where}: got {row!r}; expected an object, column -> value.")
+    return row
+
+
+def _number(value: Any, where: str) -> float:
+    """Return a float, NaN if it is missing."""
+    if value is None or (isinstance(value, str) and value.strip().lower() in MISSING):
+        return math.nan
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        number = float(value)
+    except (TypeError, ValueError):
+        raise SampleError(
+            f"{where}: got {value!r}; expected a number (leave it empty if it is missing)."
+        ) from None
+    if math.isinf(number):
+        raise SampleError(
+            f"{where}: got {value!r}; a channel must be finite (leave it empty if it is missing)."
+        )
+    return number
+
+
+def _numbers(cells: Any, rows: Any, where: str, name: str, missing: tuple[float, ...]) -> Array:
+    """Return a column of text as numbers; its row is looked for only if one is wrong."""
+    try:
+        found: Array = np.array([c if c else "nan" for c in cells], dtype=float)
+    except ValueError:
+        found = np.full(len(cells), np.inf)
+    if np.isinf(found).any():
+        found = np.array(
+            [
+                _number(cell, f"{where}, row {row}, column '{name}'")
+                for cell, row in zip(cells, rows, strict=True)
+            ]
+        )
+    if missing:
+        found[np.isin(found, missing)] = np.nan
+    return found
+
+
+def _times(cells: list[Any], rows: Any, clock: Clock, where: str) -> tuple[Array, bool]:
+    """Return times in the model's unit, and whether they are dates."""
+    first = cells[0]
+    dates = isinstance(first, str) and not _is_number(first)
+    times = np.empty(len(cells))
+    for k, cell in enumerate(cells):
+        value = _stamp(cell) if dates else _float(cell)
+        if value is None or not math.isfinite(value):
+            raise SampleError(
+                f"{where}, row {rows[k]}, column '{clock.name}': got {cell!r}; expected "
+                + ("a date and time as 2025-04-01 12:00." if dates else "a number, as before.")
+            )
+        times[k] = value
+    return times * (clock.second if dates else clock.factor), dates
+
+
+def _float(cell: Any) -> float | None:
+    try:
+        return None if isinstance(cell, bool) else float(cell)
+    except (TypeError, ValueError):
+        return None
+
+
+def _is_number(cell: str) -> bool:
+    return _float(cell) is not None
+
+
+def _stamp(value: Any) -> float | None:
+    """Return seconds since 1970 of a date; times without a zone are taken as they are."""
+    if isinstance(value, str):
+        try:
+            value = datetime.fromisoformat(value.strip())
+        except ValueError:
+            return None
+    if isinstance(value, date) and not isinstance(value, datetime):
+        value = datetime(value.year, value.month, value.day)
+    if not isinstance(value, datetime):
+        return None
+    return (value if value.tzinfo else value.replace(tzinfo=UTC)).timestamp()
+
+
+def _whole_day(value: Any) -> bool:
+    if isinstance(value, str):
+        return len(value.strip()) == len("2025-04-01")
+    return isinstance(value, date) and not isinstance(value, datetime)
+
+
+def _disorder(where: str) -> TimeOrderError:
+    return TimeOrderError(
+        f"{where}: the time is not later than the one before; sort the rows and drop repeated ones."
+    )
+
+
+def _hint(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1)
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    return f"; there are {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}."
