@@ -175,7 +175,7 @@ def test_bad_unknowns():
             lp.Scalar(std=std)
     with pytest.raises(lp.SpaceError, match="lower < upper"):
         lp.Scalar(bounds=(1.0, 1.0))
-    with pytest.raises(lp.SpaceError, match="prior 3.0 lies outside"):
+    with pytest.raises(lp.SpaceError, match=r"prior 3\.0 lies outside"):
         lp.Piecewise({"a": lambda x: x[0] < 1}, prior=3.0, bounds=(0.0, 2.0))
     with pytest.raises(lp.SpaceError, match="at least one region"):
         lp.Piecewise({})

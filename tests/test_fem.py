@@ -1,0 +1,400 @@
+"""Weak forms against scikit-fem's own assembly, and what a form may not be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import skfem
+from problems import CASES, diffusion, laplace, line, product, reaction
+from skfem import (
+    Basis,
+    BilinearForm,
+    ElementLineHermite,
+    ElementLineP1,
+    ElementLineP2,
+    ElementTriArgyris,
+    ElementTriP1,
+    ElementTriP2,
+    ElementVector,
+    FacetBasis,
+    LinearForm,
+    MeshLine,
+    MeshQuad,
+    MeshTri,
+)
+from skfem.helpers import dot, grad
+
+import livepde as lp
+from livepde.fem import START, Form, FunctionSpace, Moment, Place
+
+ORDER = 6
+
+
+def form(integrand, mesh, element, **options):
+    space = FunctionSpace.of(lp.Field(mesh, element), "u")
+    return Form("test", integrand, {"u": space, "v": space}, mesh, ORDER, **options)
+
+
+def close(found, expected, tolerance=1e-12):
+    found, expected = np.asarray(found.todense()), np.asarray(expected.todense())
+    np.testing.assert_allclose(found, expected, atol=tolerance * abs(expected).max())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_mass_stiffness_and_advection(name):
+    case = CASES[name]
+    mesh = case.mesh()
+    # scikit-fem's own Hermite functions are exact to 1e-11 on a coarse mesh only.
+    tolerance = 1e-9 if isinstance(case.state, ElementLineHermite) else 1e-12
+    basis = Basis(mesh, case.state, intorder=ORDER)
+    direction = np.arange(1.0, mesh.dim() + 1)
+
+    def speed(u):
+        return sum(direction[k] * grad(u)[k] for k in range(mesh.dim()))
+
+    ours = {
+        "mass": lambda u, v, x: u * v,
+        "stiffness": lambda u, v, x: (1 + x[0]) * lp.dot(lp.grad(u), lp.grad(v)),
+        "advection": lambda u, v, x: speed(u) * v,
+    }
+    theirs = {
+        "mass": lambda u, v, w: u * v,
+        "stiffness": lambda u, v, w: (1 + w.x[0]) * dot(grad(u), grad(v)),
+        "advection": lambda u, v, w: speed(u) * v,
+    }
+    for key, integrand in ours.items():
+        expected = BilinearForm(theirs[key]).assemble(basis)
+        close(form(integrand, mesh, case.state).matrix("v", "u"), expected, tolerance)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "element"),
+    [
+        (lp.interval(0, 1, 7), ElementLineP2()),
+        (
+            MeshTri().refined(2).with_boundaries({"left": lambda x: x[0] == 0}),
+            ElementTriP2(),
+        ),
+    ],
+)
+def test_boundary_terms(mesh, element):
+    facets = FacetBasis(mesh, element, facets="left", intorder=ORDER)
+    mass = BilinearForm(lambda u, v, w: u * v).assemble(facets)
+    close(form(lp.On("left", lambda u, v, x: u * v), mesh, element).matrix("v", "u"), mass)
+    flux = BilinearForm(lambda u, v, w: dot(grad(u), w.n) * v).assemble(facets)
+    ours = lp.On("left", lambda u, v, x: lp.dot(lp.grad(u), x.normal) * v)
+    close(form(ours, mesh, element).matrix("v", "u"), flux)
+    inner = BilinearForm(lambda u, v, w: u * v).assemble(Basis(mesh, element, intorder=ORDER))
+    both = form([lambda u, v, x: u * v, ours], mesh, element)
+    close(both.matrix("v", "u"), inner + flux)
+
+
+def test_region_terms():
+    mesh = MeshTri().refined(3).with_subdomains({"core": lambda x: x[0] < 0.5})
+    region = Basis(mesh, ElementTriP1(), elements="core", intorder=ORDER)
+    expected = BilinearForm(lambda u, v, w: w.x[1] * u * v).assemble(region)
+    ours = form(lp.On("core", lambda u, v, x: x[1] * u * v), mesh, ElementTriP1())
+    close(ours.matrix("v", "u"), expected)
+
+
+def test_vector_valued_state():
+    mesh, element = MeshTri().refined(2), ElementVector(ElementTriP1())
+    basis = Basis(mesh, element, intorder=ORDER)
+    expected = BilinearForm(
+        lambda u, v, w: skfem.helpers.ddot(grad(u), grad(v)) + skfem.helpers.div(u) * v[0]
+    ).assemble(basis)
+    ours = form(lambda u, v, x: lp.ddot(lp.grad(u), lp.grad(v)) + lp.div(u) * v[0], mesh, element)
+    close(ours.matrix("v", "u"), expected)
+
+
+def test_second_derivatives():
+    mesh = lp.interval(0, 1, 6)
+    basis = Basis(mesh, ElementLineHermite(), intorder=ORDER)
+    expected = BilinearForm(lambda u, v, w: u.hess[0, 0] * v.hess[0, 0]).assemble(basis)
+    ours = form(lambda u, v, x: lp.ddot(lp.hess(u), lp.hess(v)), mesh, ElementLineHermite())
+    close(ours.matrix("v", "u"), expected, 1e-9)
+
+
+def test_source_vector():
+    mesh = MeshQuad().refined(2)
+    element = skfem.ElementQuad2()
+    model = reaction(mesh, element, dirichlet={}, f=lambda x, t: np.exp(x[0] * t) * x[1])
+    basis = Basis(mesh, element, intorder=model.order)
+    expected = LinearForm(lambda v, w: np.exp(w.x[0] * 0.7) * w.x[1] * v).assemble(basis)
+    np.testing.assert_allclose(model.F(Moment(0.7)), expected, atol=1e-14)
+
+
+def test_spaces_of_equal_size_are_not_confused():
+    """Fact 9: Hermite has 2 (n + 1) unknowns, and so has a product of two P1 fields."""
+    mesh = line(12)
+    nodes, hermite = ElementLineP1(), ElementLineHermite()
+    model = lp.Model(
+        lp.Field(mesh, hermite),
+        {"a": lp.Field(mesh, nodes), "b": lp.Field(mesh, nodes)},
+        A=lambda q, u, v, x: (q.a + x[0] * q.b) * u * v,
+    )
+    assert model.X.dim == model.Q.dim
+    rng = np.random.default_rng(0)
+    q, u = rng.standard_normal((2, model.X.dim))
+    basis_u = Basis(mesh, hermite, intorder=model.order)
+    basis_q = basis_u.with_element(nodes)
+    n = basis_q.N
+    expected = LinearForm(lambda v, w: (w["a"] + w.x[0] * w["b"]) * w["u"] * v).assemble(
+        basis_u,
+        a=basis_q.interpolate(q[:n]),
+        b=basis_q.interpolate(q[n:]),
+        u=basis_u.interpolate(u),
+    )
+    np.testing.assert_allclose(model.A(u)(q), expected, atol=1e-9)
+    swapped = model.form_A.vector("v", q=u, u=q)
+    assert abs(swapped - expected).max() > abs(expected).max()  # the trap is a real one
+
+
+@pytest.mark.parametrize("span", [(0.0, 1.0, 30), (0.0, 1.0, 1000), (100.0, 101.0, 30)])
+def test_hermite_functions_are_exact_far_from_the_origin(span):
+    mesh = lp.interval(*span)
+    start, stop, cells = span
+    model = lp.Model(lp.Field(mesh, ElementLineHermite()), lp.Scalar(), product)
+    slope = 1.0 / (stop - start)
+    u = model.initial(lambda x: (x[0] - start) * slope)
+    nodes = (mesh.p[0] - start) * slope
+    scale = np.tile([1.0, slope], cells + 1)
+    np.testing.assert_allclose(
+        u / scale, np.column_stack([nodes, 1 + 0 * nodes]).ravel(), atol=1e-9
+    )
+    row = model.state_block.probe(np.array([[stop]])).toarray()
+    np.testing.assert_array_equal(np.flatnonzero(row), [2 * cells])
+    mass = model.mass.toarray()
+    h = (stop - start) / cells
+    row = [9 / 70, 13 * h / 420, 26 / 35, 0, 9 / 70, -13 * h / 420]
+    np.testing.assert_allclose(mass[2, :6] / h, row, atol=1e-12)
+
+
+def test_one_element_object_on_two_meshes():
+    """scikit-fem's global elements remember their first mesh."""
+    element, argyris = ElementLineHermite(), ElementTriArgyris()
+    for cells in (30, 7, 12):
+        mass = lp.Model(lp.Field(line(cells), element), lp.Scalar(), product).mass
+        fresh = lp.Model(lp.Field(line(cells), ElementLineHermite()), lp.Scalar(), product).mass
+        np.testing.assert_array_equal(mass.toarray(), fresh.toarray())
+    for refined in (0, 1):
+        mesh = MeshTri().refined(refined)
+        kept = form(lambda u, v, x: u * v, mesh, argyris).matrix("v", "u")
+        fresh = form(lambda u, v, x: u * v, mesh, ElementTriArgyris()).matrix("v", "u")
+        np.testing.assert_array_equal(kept.toarray(), fresh.toarray())
+
+
+def test_reversed_cells():
+    """A mesh whose cells run from right to left has the same functions."""
+    mesh = MeshLine(np.linspace(0, 1, 5), np.array([[1, 1, 3, 3], [0, 2, 2, 4]]))
+    plain = MeshLine(np.linspace(0, 1, 5))
+    for integrand in (laplace, lambda u, v, x: x[0] * u * v):
+        np.testing.assert_allclose(
+            form(integrand, mesh, ElementLineHermite()).matrix("v", "u").toarray(),
+            form(integrand, plain, ElementLineHermite()).matrix("v", "u").toarray(),
+            atol=1e-11,
+        )
+
+
+def nonlinear(**options):
+    return reaction(
+        line(8),
+        ElementLineP2(),
+        B=lambda u, v, x: (1 + u**2) * lp.dot(lp.grad(u), lp.grad(v)) + np.exp(-u) * v,
+        **options,
+    )
+
+
+def test_complex_step_is_the_derivative_by_hand():
+    by_hand = nonlinear(
+        dB=lambda u, du, v, x: (
+            (1 + u**2) * lp.dot(lp.grad(du), lp.grad(v))
+            + 2 * u * du * lp.dot(lp.grad(u), lp.grad(v))
+            - np.exp(-u) * du * v
+        )
+    )
+    model = nonlinear()
+    u = np.random.default_rng(4).standard_normal(model.X.dim)
+    assert not model.form_B.affine
+    close(model.form_B.matrix("v", "u", u=u), by_hand.form_B.matrix("v", "u", u=u), 1e-14)
+
+
+@pytest.mark.parametrize("name", ["line Hermite", "triangles P2 / P1"])
+def test_derivatives_of_a_trilinear_form(name):
+    model = CASES[name].model(A=diffusion)
+    rng = np.random.default_rng(5)
+    u, du, r = rng.standard_normal((3, model.X.dim))
+    q, dq = rng.standard_normal((2, model.Q.dim))
+    form_A = model.form_A
+    assert form_A.affine
+    assert form_A.constant
+    value = model.A(u)(q) @ r
+    assert form_A.matrix("v", "u", q=q) @ u @ r == pytest.approx(value)
+    assert form_A.matrix("q", "u", v=r) @ u @ q == pytest.approx(value)
+    slope = form_A.matrix("q", "u", u=u, v=r) @ du @ dq
+    assert slope == pytest.approx(model.A(du)(dq) @ r)
+    # With a tensor, or by quadrature where it would be too large: the same numbers.
+    plain = form_A._quadrature("v", "q", START, {"u": u})
+    np.testing.assert_allclose(form_A.data("v", "q", u=u), plain, atol=1e-10 * abs(plain).max())
+
+
+def test_large_tensors_are_not_stored(monkeypatch):
+    import livepde.fem.forms as forms
+
+    stored = CASES["quads Q1"].model()
+    monkeypatch.setattr(forms, "LARGEST_TENSOR", 10)
+    model = CASES["quads Q1"].model()
+    u = np.random.default_rng(6).standard_normal(model.X.dim)
+    assert model.form_A.tensor("v", "q") is None
+    np.testing.assert_allclose(model.A(u).matrix.data, stored.A(u).matrix.data, atol=1e-14)
+
+
+def test_affine_and_constant_are_found_out():
+    mesh, element = line(6), ElementLineP1()
+    cases = {
+        "linear": (lambda u, v, x: u * v, True, True),
+        "affine": (lambda u, v, x: (u - 3.0) * v, True, True),
+        "time": (lambda u, v, x: x.t * u * v, True, False),
+        "square": (lambda u, v, x: u * u * v, False, True),
+        "root": (lambda u, v, x: np.sqrt(u) * v, False, True),
+        "exponential": (lambda u, v, x: np.exp(u) * v, False, True),
+        "weak": (lambda u, v, x: (u + 1e-6 * u**3) * v, False, True),
+    }
+    for name, (integrand, affine, constant) in cases.items():
+        found = form(integrand, mesh, element, nonlinear="u")
+        assert (found.affine, found.constant) == (affine, constant), name
+
+
+def test_affine_form_keeps_its_offset():
+    model = reaction(line(6), ElementLineP1(), B=lambda u, v, x: 2.0 * (u - 3.0) * v)
+    u = np.random.default_rng(7).standard_normal(model.X.dim)
+    expected = 2.0 * model.mass @ (u - 3.0)
+    np.testing.assert_allclose(model.B(u), expected, atol=1e-14)
+
+
+def test_failing_forms_speak():
+    def broken(u, v, x):
+        raise KeyError("D")
+
+    with pytest.raises(lp.ModelError, match=r"Form B\(u, v, x\) failed.*KeyError: 'D'"):
+        reaction(line(), ElementLineP1(), B=broken)
+    with pytest.raises(lp.ModelError, match=r"scalar per point.*dot"):
+        reaction(line(), ElementLineP1(), B=lambda u, v, x: lp.grad(u) * v)
+    with pytest.raises(lp.ModelError, match="one derivative for each of its 2 terms"):
+        reaction(line(), ElementLineP1(), B=[laplace, laplace], dB=[laplace])
+    with pytest.raises(lp.SpaceError, match=r"On\('top'.*mesh names \['left', 'right'\]"):
+        reaction(line(), ElementLineP1(), B=lp.On("top", laplace))
+    with pytest.raises(lp.SpaceError, match="the mesh names nothing"):
+        reaction(MeshTri(), ElementTriP1(), B=lp.On("top", laplace))
+    with pytest.raises(lp.ModelError, match=r"x\.normal exists on boundaries only"):
+        reaction(line(), ElementLineP1(), B=lambda u, v, x: x.normal[0] * u * v)
+    with pytest.raises(lp.MissingInputError, match="Input channel 'Q' has no value"):
+        reaction(line(), ElementLineP1(), B=lambda u, v, x: x.inputs["Q"] * u * v)
+
+
+def test_fields_must_share_one_mesh():
+    with pytest.raises(lp.SpaceError, match="one mesh object"):
+        lp.Model(lp.Field(line(), ElementLineP1()), lp.Field(line(), ElementLineP1()), product)
+
+
+def test_piecewise_by_predicate_and_by_subdomain():
+    mesh = lp.interval(0, 1, 10, regions={"top": lambda x: x[0] < 0.4})
+    predicate = lp.Piecewise({"a": lambda x: x[0] < 0.4, "b": lambda x: x[0] >= 0.4})
+    named = lp.Piecewise({"a": "top", "b": lambda x: x[0] >= 0.4})
+    state = lp.Field(mesh, ElementLineP1())
+    u = np.random.default_rng(8).standard_normal(11)
+    both = [
+        lp.Model(state, unknown, diffusion).A(u).matrix.toarray() for unknown in (predicate, named)
+    ]
+    np.testing.assert_array_equal(*both)
+    together = lp.Model(state, lp.Scalar(), diffusion).A(u).matrix.toarray()
+    np.testing.assert_allclose(both[0].sum(axis=1, keepdims=True), together, atol=1e-13)
+
+    On = lp.On("top", lambda q, u, v, x: q * u * v)
+    part = lp.Model(state, named, On).A(u).matrix.toarray()
+    assert abs(part[:, 0]).max() > 0
+    np.testing.assert_array_equal(part[:, 1], 0.0)
+
+    with pytest.raises(lp.SpaceError, match="Region 'a': the mesh has no subdomain 'bottom'"):
+        lp.Model(state, lp.Piecewise({"a": "bottom"}), diffusion)
+    with pytest.raises(lp.SpaceError, match="needed on boundaries"):
+        lp.Model(state, named, lp.On("left", lambda q, u, v, x: q * u * v))
+
+
+def test_product_of_unknowns():
+    mesh = line(9)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        {
+            "D": lp.Scalar(prior=2.0, std=0.5, bounds=(0.0, 9.0), unit="m2/s"),
+            "k": lp.Field(mesh, ElementLineP2(), inner="H1", prior=1.5),
+            "R": lp.Piecewise({"in": lambda x: x[0] < 0.5, "out": lambda x: x[0] >= 0.5}),
+        },
+        A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) + q.k * u * v + q.R * v,
+    )
+    space = model.parameter_space
+    assert space.dim == 1 + 19 + 2
+    assert space.labels == {"D": 0, "R[in]": 20, "R[out]": 21}
+    q = model.initial_parameter({"R": [3.0, 4.0]})
+    assert q[0] == 2.0
+    np.testing.assert_allclose(q[1:20], 1.5, atol=1e-12)
+    np.testing.assert_array_equal(q[20:], [3.0, 4.0])
+    np.testing.assert_array_equal(model.initial_parameter({"R": 5.0})[20:], 5.0)
+    np.testing.assert_array_equal(model.initial_parameter(q), q)
+    assert model.Q.gram.toarray()[0, 0] == pytest.approx(1 / 0.5**2)
+    lower, upper = space.bounds
+    assert (lower[0], upper[0], lower[5], upper[21]) == (0.0, 9.0, -np.inf, np.inf)
+    u = model.initial(lambda x: x[0])
+    expected = (
+        2 * (laplace_matrix(mesh) @ u) + 1.5 * model.mass @ u + model.A(u)(q * (np.arange(22) > 19))
+    )
+    np.testing.assert_allclose(model.A(u)(q), expected, atol=1e-12)
+    with pytest.raises(lp.SpaceError, match=r"no unknown is called \['E'\]"):
+        model.initial_parameter({"E": 1.0})
+    with pytest.raises(lp.SpaceError, match=r"coefficients of shape \(3,\); expected \(22,\)"):
+        model.initial_parameter(np.zeros(3))
+    with pytest.raises(lp.SpaceError, match=r"'R': coefficients of shape \(3,\); expected \(2,\)"):
+        model.initial_parameter({"R": [1.0, 2.0, 3.0]})
+
+
+def test_names_of_single_unknowns():
+    field = lp.Field(line(), ElementLineP1(), name="temperature")
+    model = lp.Model(field, lp.Scalar(), product)
+    assert list(model.state_space.blocks) == ["temperature"]
+    assert list(model.parameter_space.blocks) == ["q"]
+
+
+def test_interpolation_is_exact_in_the_space():
+    for name, case in CASES.items():
+        mesh = case.mesh()
+        model = lp.Model(lp.Field(mesh, case.state), lp.Scalar(), product)
+        u = model.initial(lambda x: 1 + 2 * x[0])
+        inside = np.full((mesh.dim(), 3), 0.2) + 0.1 * np.arange(3)
+        values = model.state_block.probe(inside) @ u
+        np.testing.assert_allclose(values, 1 + 2 * inside[0], atol=1e-11, err_msg=name)
+        constant = model.state_block.at_vertices @ model.initial(4.0)
+        np.testing.assert_allclose(constant, 4.0, atol=1e-11, err_msg=name)
+        np.testing.assert_array_equal(model.initial(0.0), 0.0)
+
+
+def test_probe_outside_of_the_mesh():
+    ring = MeshTri().refined(3)
+    ring = ring.restrict(
+        ring.elements_satisfying(lambda x: (x[0] - 0.5) ** 2 + (x[1] - 0.5) ** 2 > 0.06)
+    )
+    block = lp.Model(lp.Field(ring, ElementTriP1()), lp.Scalar(), product).state_block
+    with pytest.raises(lp.ObservationError, match=r"point 1 at \[0.5, 0.5\] lies outside"):
+        block.probe(np.array([[0.1, 0.5], [0.1, 0.5]]))
+    with pytest.raises(lp.ObservationError, match=r"point 0 at \[1.5, 0.5\].*unit"):
+        block.probe(np.array([[1.5], [0.5]]))
+    with pytest.raises(lp.ObservationError, match="coordinates of dimension 1; the mesh has 2"):
+        block.probe(np.array([[0.5]]))
+
+
+def test_place():
+    place = Place(np.zeros((2, 3, 4)), None, START)
+    assert place[1].shape == (3, 4)
+    assert place.used == set()
+    assert place.t == 0.0
+    assert len(place.inputs) == 0
+    assert place.used == {"t", "inputs"}
