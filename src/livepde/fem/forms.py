@@ -111,6 +111,7 @@ class Form:
         self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
         self._constants: dict[tuple[str, str], Array] = {}
         self._offsets: dict[str, Array] = {}
+        self._slopes: dict[str, sp.csr_array] = {}
         self._tensors: dict[tuple[str, str], sp.csr_array | None] = {}
         self._patterns: dict[tuple[str, str], Pattern] = {}
         self._gathers: dict[tuple[str, str], list[sp.csr_array]] = {}
@@ -183,9 +184,9 @@ class Form:
         if self.affine and self.constant and others:
             linear = [key for key in others if key != self.nonlinear]
             if not linear:  # B(u) = B(0) + B' u
-                matrix = self.matrix(slot, others[0], moment)
-                offset = self._offset(slot)
-                return matrix @ coefficients[others[0]] + offset
+                if slot not in self._slopes:
+                    self._slopes[slot] = self.matrix(slot, others[0], moment)
+                return self._slopes[slot] @ coefficients[others[0]] + self._offset(slot)
             rest = {key: coefficients[key] for key in others if key != linear[0]}
             product: Array = self.matrix(slot, linear[0], moment, **rest) @ coefficients[linear[0]]
             return product

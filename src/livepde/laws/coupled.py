@@ -67,10 +67,11 @@ class CoupledStage:
         self.RMR = sp.csr_array(self.RM @ split.R)
         self.PNP = sp.csr_array(split.P.T @ gains.N_op @ split.P)
         self.free_q = model.Q.free
+        self._constant: tuple[float, Array] | None = None
         self.gram = model.Q.gram
 
     @cached_property
-    def _assembled(self) -> tuple[Pattern, dict[str, sp.csr_array], Solver]:
+    def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:
         model, n = self.model, self.n
         A, P, R = model.form_A, self.split.P, self.split.R
         free = sp.diags_array(model.X.free)
@@ -90,17 +91,26 @@ class CoupledStage:
         fixed = np.concatenate([1.0 - model.X.free, 1.0 - self.free_q])
         whole.add("fixed", Pattern.of(sp.eye_array(len(fixed))), sp.diags_array(fixed))
         pattern, maps = whole.build()
-        return pattern, maps, analyse(pattern)
+        return analyse(pattern), maps
+
+    @property
+    def solver(self) -> Solver:
+        """The engine of the coupled matrix."""
+        return self._assembled[0]
+
+    @property
+    def maps(self) -> dict[str, sp.csr_array]:
+        """Block -> map of its data into the data of the coupled matrix."""
+        return self._assembled[1]
 
     @cached_property
-    def _data(self) -> dict[str, Array]:
-        """Data of the whole for the blocks that never change: M, G, RMR, and the rest."""
-        _, maps, _ = self._assembled
-        model, g = self.model, self.gains
+    def constant_data(self) -> dict[str, Array]:
+        """Data of the coupled matrix that never change: with 1/h, with theta, and the rest."""
+        maps, model, g = self.maps, self.model, self.gains
         gram = maps["G"] @ _stored(self.gram) / g.gain
         rest = maps["PNP"] @ (g.nu * _stored(self.PNP)) + g.sigma * gram
         rest += maps["fixed"] @ np.ones(self.n + model.Q.dim)
-        if self._constant_B:
+        if self.constant_B:
             rest += maps["B"] @ model.form_B.data("v", "u", u=np.zeros(self.n))
         return {
             "rate": maps["M"] @ model.mass.data + gram,
@@ -108,25 +118,28 @@ class CoupledStage:
             "rest": rest,
         }
 
+    def constant(self, h: float) -> Array:
+        """Return the data that depend on h only, kept for the last h."""
+        if self._constant is None or self._constant[0] != h:
+            data = self.constant_data["rate"] / h + self.constant_data["rest"]
+            self._constant = (h, data)
+        return self._constant[1]
+
     @property
-    def _constant_B(self) -> bool:
+    def constant_B(self) -> bool:
+        """True if the Jacobian of B never changes."""
         return self.model.form_B.affine and self.model.form_B.constant
 
     @cached_property
-    def bilinear(self) -> _Bilinear | None:
-        """Precomputed products, if A is bilinear and B affine, both constant in time."""
+    def _bilinear(self) -> _Bilinear | None:
         form = self.model.form_A
         tensors = [form.tensor(*pair) for pair in (("v", "q"), ("v", "u"), ("q", "u"))]
-        if not self._constant_B or any(tensor is None for tensor in tensors):
+        if not self.constant_B or any(tensor is None for tensor in tensors):
             return None
         return _Bilinear(self, *tensors)
 
-    def theta(self, r: Array, Mr: Array) -> float:
-        """Return the damping for a residual r, with Mr = R^T M_op r given."""
-        return self.gains.damping.theta(self.norms(r, Mr, self.model.mass @ r))
-
     def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
-        """Return the norms of r that a damping rule may use."""
+        """Return the norms of r that a damping rule may use; r lies in the range of R."""
 
         def V() -> float:
             return float(Mr @ self.model.X.riesz(Mr))
@@ -138,11 +151,10 @@ class CoupledStage:
         dX, dVX, dV = self.gains.damping.slopes(norms)
         row = (2.0 * dX) * mass_r + (2.0 * dVX) * Mr
         if dV:
-            row += 2.0 * dV * (self.gains.M_op @ self.model.X.riesz(Mr))
-        slope: Array = self.RT @ row
-        return slope
+            row += self.RM @ ((2.0 * dV) * self.model.X.riesz(Mr))
+        return row
 
-    def solve(self, c: Array, h: float, moment: Moment, u_alpha: Array, shift: Array) -> Array:
+    def solve(self, c: Array, h: float, moment: Moment, u_alpha: Array, start: Array) -> Array:
         """Return y = (u, q) of one stage; raises `StepFailed`.
 
         Parameters
@@ -151,139 +163,187 @@ class CoupledStage:
             (c_u, c_q), shape (n + m,).
         u_alpha
             G^+ z at the stage's time, shape (n,).
-        shift
-            Change of u_alpha during the stage: where the iteration starts, no more.
+        start
+            Where the iteration starts, shape (n + m,); it does not change the result.
         """
-        start = c.copy()
-        start[: self.n] = self.model.impose(c[: self.n] + shift, moment)
-        equation = _Equation(self, c, h, moment, u_alpha)
+        start[: self.n] = self.model.impose(start[: self.n], moment)
+        if self._bilinear is not None:
+            equation: _Equation = _BilinearEquation(self._bilinear, self, c, h, moment, u_alpha)
+        else:
+            equation = _Equation(self, c, h, moment, u_alpha)
         return self.newton.solve(equation, start, self.blocks, sweeps=True)
 
 
-class _Bilinear:
-    """What a stage needs if A(u) q is bilinear and everything else linear: a few sparse products.
-
-    Attributes
-    ----------
-    lagged
-        w -> data of A(w) in the whole, for sweeps.
-    jacobian
-        (w, q, r) -> data of the part of the Jacobian that changes.
-    """
-
-    def __init__(
-        self, stage: CoupledStage, vq: sp.csr_array, vu: sp.csr_array, qu: sp.csr_array
-    ) -> None:
-        _, maps, _ = stage._assembled
-        self.stage = stage
-        self.tensor = vq
-        self.A = stage.model.form_A.pattern("v", "q").operator()
-        self.lagged = sp.csr_array(maps["A"] @ vq)
-        self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Au"] @ vu, maps["Aq"] @ qu]))
-        self.B = stage.model.form_B.matrix("v", "u", u=np.zeros(stage.n))
-        self.norms = sp.csr_array(sp.vstack([stage.RM, stage.model.mass]))
-        self._rate, self._rest = self._linear(rate=True), self._linear(rate=False)
-        self._pattern = Pattern.of(abs(self._rate) + abs(self._rest))
-        self._rate_data = _stored(self._rate, self._pattern)
-        self._rest_data = _stored(self._rest, self._pattern)
-
-    def _linear(self, *, rate: bool) -> sp.csr_array:
-        """Return the part of the linear rows that goes with 1/h, or the part that stays."""
-        stage, g = self.stage, self.stage.gains
-        free, free_q = sp.diags_array(stage.model.X.free), sp.diags_array(stage.free_q)
-        state = stage.model.mass if rate else self.B @ stage.split.P + g.nu * stage.PNP
-        weight = (1.0 if rate else g.sigma) / g.gain
-        observed = 0.0 * stage.split.R if rate else stage.split.R
-        blocks = [[free @ state, None], [None, weight * (free_q @ stage.gram)], [observed, None]]
-        return sp.csr_array(sp.block_array(blocks))
-
-    def system(self, h: float) -> sp.csr_array:
-        """Return the linear part of the residual above R for a step h."""
-        return self._pattern.matrix(self._rate_data / h + self._rest_data)
-
-
 class _Equation:
-    """Residual and Jacobian of one stage."""
+    """Residual and Jacobian of one stage.
+
+    `residual` leaves behind what the Jacobian and the damping rule need: r, w, and the dual vectors
+    Mr = R^T M_op r and mass_r = R^T M r.
+    """
 
     def __init__(
         self, stage: CoupledStage, c: Array, h: float, moment: Moment, u_alpha: Array
     ) -> None:
         self.stage = stage
+        self.c = c
         self.h = h
         self.moment = moment
         self.u_alpha = u_alpha
-        model, g, n = stage.model, stage.gains, stage.n
-        self.fast = stage.bilinear
-        self.known_u = model.mass @ (c[:n] / h) + model.F(moment)
-        self.known_q = (stage.gram @ c[n:]) / (g.gain * h)
-        if self.fast is not None:
-            self.system = self.fast.system(h)
-            self.known_u = (self.known_u - model.B(u_alpha, moment)) * model.X.free
-            self.known_q = self.known_q * stage.free_q
+        self.source = stage.model.F(moment)
 
     def residual(self, y: Array) -> Array:
-        stage, model, n = self.stage, self.stage.model, self.stage.n
+        """Return the residual at y = (u, q)."""
+        stage, model, n, g = self.stage, self.stage.model, self.stage.n, self.stage.gains
         u, q = y[:n], y[n:]
-        out = np.empty_like(y)
-        if self.fast is not None:
-            linear = self.system @ y
-            self.r = r = linear[len(y) :] - self.u_alpha
-            self.w = w = u - r  # u_alpha + P u, since P = I - R
-            products = self.fast.norms @ r
-            self.Mr, self.mass_r = products[:n], products[n:]
-            A = self.fast.A
-            A.set(self.fast.tensor @ w)
-            self.norms = stage.norms(r, self.Mr, self.mass_r)
-            self.theta = stage.gains.damping.theta(self.norms)
-            flux = A.apply(q) + self.theta * self.Mr
-            out[:n] = linear[:n] + flux * model.X.free - self.known_u
-            out[n:] = linear[n : len(y)] - self.known_q - A.apply_transposed(r) * stage.free_q
-            return out
         self.r = r = stage.split.R @ u - self.u_alpha
-        self.w = w = u - r
-        self.Mr, self.mass_r = stage.RM @ r, model.mass @ r
-        self.norms = stage.norms(r, self.Mr, self.mass_r)
-        self.theta = stage.gains.damping.theta(self.norms)
-        g = stage.gains
-        A_w = model.form_A.matrix("v", "q", self.moment, u=w)
-        flux = model.B(w, self.moment) + A_w @ q + self.theta * self.Mr + g.nu * (stage.PNP @ u)
-        rate = 1.0 / (g.gain * self.h) + g.sigma / g.gain
-        out[:n] = (model.mass @ (u / self.h) + flux - self.known_u) * model.X.free
-        out[n:] = (rate * (stage.gram @ q) - self.known_q - A_w.T @ r) * stage.free_q
+        self.w = w = u - r  # u_alpha + P u, since P = I - R
+        self.Mr, self.mass_r = stage.RM @ r, stage.RT @ (model.mass @ r)
+        A = model.form_A.matrix("v", "q", self.moment, u=w)
+        flux = model.B(w, self.moment) + A @ q + g.nu * (stage.PNP @ u) - self.source
+        rate = (u - self.c[:n]) / self.h
+        drive = (q - self.c[n:]) / (g.gain * self.h) + (g.sigma / g.gain) * q
+        out = np.empty_like(y)
+        out[:n] = (model.mass @ rate + flux) * model.X.free + self.pull()
+        out[n:] = (stage.gram @ drive - A.T @ r) * stage.free_q
         return out
+
+    def pull(self) -> Array:
+        """Return theta R^T M_op r."""
+        self.norms = self.stage.norms(self.r, self.Mr, self.mass_r)
+        self.theta = self.stage.gains.damping.theta(self.norms)
+        return self.theta * self.Mr
+
+    def changing(self, y: Array, sweep: bool) -> Array:
+        """Return the data of the Jacobian that depend on y; in a sweep, with A(w) held."""
+        stage, form = self.stage, self.stage.model.form_A
+        maps, q, r, w = stage.maps, y[stage.n :], self.r, self.w
+        data: Array = maps["A"] @ form.data("v", "q", self.moment, u=w)
+        if not sweep:
+            data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
+            data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r)
+        if not stage.constant_B:
+            data += maps["B"] @ stage.model.form_B.data("v", "u", self.moment, u=w)
+        return data
 
     def factor(self, y: Array, sweep: bool) -> Factor:
         """Return the factorised Jacobian at the y of the last `residual`.
 
-        In a sweep, A(w), theta and the Jacobian of B are held.
+        In a sweep, A(w) and theta are held.
         """
-        stage, n = self.stage, self.stage.n
-        _, maps, solver = stage._assembled
-        q, r, w = y[n:], self.r, self.w
-        fixed = stage._data
-        data = fixed["rate"] / self.h + fixed["rest"] + self.theta * fixed["pull"]
-        if self.fast is not None:
-            data += (
-                self.fast.lagged @ w if sweep else self.fast.jacobian @ np.concatenate([w, q, r])
-            )
-        else:
-            form = stage.model.form_A
-            data += maps["A"] @ form.data("v", "q", self.moment, u=w)
-            if not sweep:
-                data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
-                data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r)
-            if not stage._constant_B:
-                data += maps["B"] @ stage.model.form_B.data("v", "u", self.moment, u=w)
-        factor = solver.factorise(data)
+        stage = self.stage
+        data = self.changing(y, sweep)
+        data += stage.constant(self.h)
+        data += self.theta * stage.constant_data["pull"]
+        factor = stage.solver.factorise(data)
         if sweep:
             return factor
-        free = stage.model.X.free
-        row = stage.slope(self.norms, self.Mr, self.mass_r) * free
+        row = stage.slope(self.norms, self.Mr, self.mass_r)
         if not row.any():
             return factor
         column = np.zeros_like(y)
-        column[:n] = self.Mr * free
+        column[: stage.n] = self.Mr
         return _Bordered(factor, factor.solve(column), row)
+
+
+class _Bilinear:
+    """Precomputed products for a bilinear A and an affine B, both constant in time.
+
+    A residual is then three sparse products instead of a dozen.
+
+    Attributes
+    ----------
+    coupling
+        w -> data of the block matrix [0, A(w); -A(w)^T, 0].
+    lagged, jacobian
+        w, and (w, q, r) -> data of the part of the stage's Jacobian that changes.
+    rate, rest
+        Linear part of the residual, its share with 1/h and the other, stacked above R, R^T M_op R
+        and R^T M R.
+    known
+        u_alpha -> what it contributes to that stack.
+    """
+
+    def __init__(
+        self, stage: CoupledStage, vq: sp.csr_array, vu: sp.csr_array, qu: sp.csr_array
+    ) -> None:
+        model, g, maps, n, m = stage.model, stage.gains, stage.maps, stage.n, stage.model.Q.dim
+        free, free_q = sp.diags_array(model.X.free), sp.diags_array(stage.free_q)
+        R, P = stage.split.R, stage.split.P
+        pattern = model.form_A.pattern("v", "q")
+        whole = Assembler(n + m)
+        whole.add("A", pattern, free, free_q, at=(0, n))
+        whole.add("A", pattern, -free_q, free, at=(n, 0), transposed=True)
+        block, block_maps = whole.build()
+        self.coupling = sp.csr_array(block_maps["A"] @ vq)
+        self.block = block.operator()
+        self.lagged = sp.csr_array(maps["A"] @ vq)
+        self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Au"] @ vu, maps["Aq"] @ qu]))
+        zero = np.zeros(n)
+        B = model.form_B.matrix("v", "u", u=zero)
+        self.offset = model.B(zero) * model.X.free
+        gram = free_q @ stage.gram / g.gain
+        self.rate = sp.csr_array(sp.block_diag([free @ model.mass, gram]))
+        state = free @ (B @ P + g.nu * stage.PNP)
+        mass = stage.RT @ model.mass
+        observed = sp.vstack([R, stage.RM @ R, mass @ R])
+        rest = sp.block_array([[sp.block_diag([state, g.sigma * gram])], [_widened(observed, m)]])
+        rate = sp.vstack([self.rate, sp.csr_array(observed.shape[:1] + (n + m,))])
+        self._pattern = Pattern.of(abs(rate) + abs(rest))
+        self._rate_data = _stored(rate, self._pattern)
+        self._rest_data = _stored(rest, self._pattern)
+        self._linear: tuple[float, sp.csr_array] | None = None
+        inhomogeneous = [-(free @ B), sp.csr_array((m, n)), sp.eye_array(n), stage.RM, mass]
+        self.known = sp.csr_array(sp.vstack(inhomogeneous))
+
+    def linear(self, h: float) -> sp.csr_array:
+        """Return the linear stack for a step h, kept for the last one."""
+        if self._linear is None or self._linear[0] != h:
+            self._linear = (h, self._pattern.matrix(self._rate_data / h + self._rest_data))
+        return self._linear[1]
+
+
+class _BilinearEquation(_Equation):
+    """The same equation by the precomputed products."""
+
+    def __init__(
+        self,
+        products: _Bilinear,
+        stage: CoupledStage,
+        c: Array,
+        h: float,
+        moment: Moment,
+        u_alpha: Array,
+    ) -> None:
+        super().__init__(stage, c, h, moment, u_alpha)
+        self.products = products
+        self.linear = products.linear(h)
+        self.known = products.known @ u_alpha
+        self.known[: len(c)] += products.rate @ (c / h)
+        self.known[: stage.n] += self.source * stage.model.X.free - products.offset
+
+    def residual(self, y: Array) -> Array:
+        n, size = self.stage.n, len(y)
+        stack = self.linear @ y - self.known
+        self.r = r = stack[size : size + n]
+        self.Mr, self.mass_r = stack[size + n : size + 2 * n], stack[size + 2 * n :]
+        self.w = w = y[:n] - r
+        coupling = self.products.block
+        coupling.set(self.products.coupling @ w)
+        out = stack[:size] + coupling.apply(np.concatenate([r, y[n:]]))
+        out[:n] += self.pull()
+        return out
+
+    def changing(self, y: Array, sweep: bool) -> Array:
+        if sweep:
+            lagged: Array = self.products.lagged @ self.w
+            return lagged
+        data: Array = self.products.jacobian @ np.concatenate([self.w, y[self.stage.n :], self.r])
+        return data
+
+
+def _widened(matrix: sp.csr_array, columns: int) -> sp.csr_array:
+    """Return the matrix with zero columns added on the right."""
+    return sp.csr_array(sp.hstack([matrix, sp.csr_array((matrix.shape[0], columns))]))
 
 
 @dataclass(frozen=True, eq=False)

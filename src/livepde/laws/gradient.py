@@ -21,10 +21,15 @@ __all__ = ["GradientLaw", "GradientState"]
 
 @dataclass(frozen=True, eq=False)
 class GradientState:
-    """Estimates u^ and q^, shapes (n,) and (m,)."""
+    """Estimates u^ and q^, shapes (n,) and (m,), and how fast they moved.
+
+    `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,): where the next
+    iteration starts.
+    """
 
     u: Array
     q: Array
+    rate: Array
 
 
 class GradientWork:
@@ -103,7 +108,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         return GradientWork(problem, gains, self.newton)
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
-        return GradientState(u0, q0)
+        return GradientState(u0, q0, np.zeros(len(u0) + len(q0)))
 
     def step(
         self, work: GradientWork, state: GradientState, interval: Interval
@@ -112,27 +117,35 @@ class GradientLaw(Law[GradientWork, GradientState]):
         coupled = work.stage(interval.present)
         zero = np.zeros(model.X.dim)
 
+        u_alpha = zero
+
         def stage(c: Array, t: float, h: float) -> Array:
+            nonlocal u_alpha
             moment = interval.at(t)
-            boundary = model.impose(zero, moment)
-            z, before = interval.z(t), interval.z(t - h)
-            u_alpha = coupled.split.reconstruct(z, boundary)
-            shift = coupled.split.reconstruct(z - before, zero)
-            return coupled.solve(c, h, moment, u_alpha, shift)
+            u_alpha = coupled.split.reconstruct(interval.z(t), model.impose(zero, moment))
+            # The observed part moves with the data, the rest as in the step before.
+            start = c + h * state.rate
+            start[: model.X.dim] += (
+                coupled.split.inverse @ interval.change(t - h, t)[interval.present]
+            )
+            return coupled.solve(c, h, moment, u_alpha, start)
 
         y = np.concatenate([state.u, state.q])
-        y, steps, failure = advance(work.problem.control, stage, y, interval)
+        end, steps, failure = advance(work.problem.control, stage, y, interval)
         if failure is not None:
             return state, Report(
                 Status.of(failure), observed.predict(state.u, state.q, interval.end)
             )
-        u, q = y[: model.X.dim], y[model.X.dim :]
         lower, upper = model.parameter_space.bounds
-        new = GradientState(u, np.clip(q, lower, upper))
-        boundary = model.impose(zero, interval.end)
-        r = coupled.split.R @ u - coupled.split.reconstruct(interval.z1, boundary)
-        notes = {"residual": model.X.norm(r), "theta": coupled.theta(r, coupled.RM @ r)}
-        return new, Report(Status(), observed.predict(u, new.q, interval.end), steps, notes)
+        u, q = end[: model.X.dim], np.clip(end[model.X.dim :], lower, upper)
+        observed_u = coupled.split.R @ u
+        rate = (end - y) / (interval.t1 - interval.t0)
+        rate[: model.X.dim] -= (observed_u - coupled.split.R @ state.u) / (
+            interval.t1 - interval.t0
+        )
+        notes = {"residual": model.X.norm(observed_u - u_alpha)}
+        predicted = observed.predict(u, q, interval.end)
+        return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

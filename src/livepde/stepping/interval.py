@@ -67,6 +67,13 @@ class Interval:
         start = np.where(np.isfinite(self.z0), self.z0, self.z1)
         return (1 - s) * start + s * self.z1
 
+    def change(self, start: float, stop: float) -> Array:
+        """Return how much z changes between two times; zero where it is missing at t0."""
+        share = (stop - start) / (self.t1 - self.t0)
+        change: Array = share * (self.z1 - self.z0)
+        change[np.isnan(change)] = 0.0
+        return change
+
 
 @dataclass(frozen=True)
 class Advance:

@@ -57,7 +57,7 @@ class Newton:
         Relative update below which Newton takes over from sweeps.
     """
 
-    tolerance: float = 1e-9
+    tolerance: float = 1e-8
     iterations: int = 60
     refresh: float = 0.05
     basin: float = 1e-2
