@@ -1,0 +1,135 @@
+"""The process M u' + B(u) + A(u) q = F, its boundary data, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from problems import CASES, laplace, line, product, reaction
+from skfem import ElementLineHermite, ElementLineP1, ElementLineP2, ElementTriP1, MeshTri
+
+import livepde as lp
+from livepde.fem import Inputs, Moment
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_check_model_passes(name):
+    lp.check_model(CASES[name].model(f=lambda x, t: x[0] * t)).raise_if_failed()
+
+
+def test_dirichlet_constant_function_and_channel():
+    mesh = line(6)
+    dirichlet = {"left": lambda x, t: 3 + x[0] + t, "right": lp.Channel("T_out")}
+    model = reaction(mesh, ElementLineHermite(), dirichlet=dirichlet)
+    assert model.channels == ("T_out",)
+    moment = Moment(0.5, Inputs({"T_out": 7.0}))
+    u = np.full(14, 2.0)
+    imposed = model.impose(u, moment)
+    assert (imposed[0], imposed[12]) == (3.5, 7.0)
+    np.testing.assert_array_equal(np.delete(imposed, [0, 12]), 2.0)  # slopes stay free
+    np.testing.assert_array_equal(u, 2.0)
+    np.testing.assert_array_equal(model.X.fixed, [0, 12])
+    with pytest.raises(lp.MissingInputError, match="'T_out' has no value"):
+        model.impose(u, Moment(0.5))
+
+    level = reaction(MeshTri().refined(2), ElementTriP1(), dirichlet={"boundary": 4.0})
+    start = level.initial(1.0)
+    np.testing.assert_array_equal(start[level.X.fixed], 4.0)
+    np.testing.assert_allclose(np.delete(start, level.X.fixed), 1.0)
+
+
+def test_a_function_of_space_on_a_boundary():
+    mesh = MeshTri().refined(3).with_boundaries({"left": lambda x: x[0] == 0})
+    model = reaction(mesh, ElementTriP1(), dirichlet={"left": lambda x, t: x[1] ** 2 + t})
+    u = model.impose(np.zeros(model.X.dim), Moment(2.0))
+    nodes = model.X.fixed
+    np.testing.assert_allclose(u[nodes], mesh.p[1, nodes] ** 2 + 2.0)
+
+
+def test_channels_of_forms_and_boundaries_in_order():
+    model = reaction(
+        line(),
+        ElementLineP1(),
+        dirichlet={"left": lp.Channel("T_top")},
+        f=lp.On("right", lambda x, t: x.inputs["Q"]),
+        inputs=("Q", "wind"),
+    )
+    assert model.channels == ("Q", "wind", "T_top")
+    flux = model.F(Moment(0.0, Inputs({"Q": 3.0, "wind": 0.0})))
+    np.testing.assert_allclose(flux, 3.0 * (np.arange(13) == 12), atol=1e-15)
+
+
+def test_sources():
+    mesh = line(6)
+    numbers = reaction(mesh, ElementLineP1(), f=2.0)
+    np.testing.assert_allclose(numbers.F(), 2.0 * numbers.mass @ np.ones(7))
+    terms = reaction(mesh, ElementLineP1(), f=[2.0, lambda x, t: x[0] * t, lp.On("left", 5.0)])
+    expected = terms.mass @ (2.0 + 3.0 * mesh.p[0]) + 5.0 * (np.arange(7) == 0)
+    np.testing.assert_allclose(terms.F(Moment(3.0)), expected, atol=1e-14)
+    assert not terms.form_F.constant
+
+
+def test_mass_term():
+    mesh = line(6)
+    heavy = reaction(mesh, ElementLineP1(), M=lambda u, v, x: 3.0 * u * v)
+    unit = reaction(mesh, ElementLineP1())
+    np.testing.assert_allclose(heavy.mass.toarray(), 3 * unit.mass.toarray())
+    np.testing.assert_array_equal(heavy.X.gram.toarray(), heavy.mass.toarray())
+    with pytest.raises(lp.ModelError, match="M may not depend on time"):
+        reaction(mesh, ElementLineP1(), M=lambda u, v, x: (1 + x.t) * u * v)
+    with pytest.raises(lp.SpaceError, match="of X is singular"):
+        _ = reaction(mesh, ElementLineP1(), M=lambda u, v, x: (x[0] > 0.5) * u * v).X.factor
+
+
+def test_affine_and_constant():
+    mesh, element = line(6), ElementLineP1()
+    assert reaction(mesh, element).affine
+    assert reaction(mesh, element).constant
+    assert not reaction(mesh, element, B=lambda u, v, x: u**3 * v).affine
+    assert not reaction(mesh, element, A=lambda q, u, v, x: q * u**2 * v).affine
+    assert not reaction(mesh, element, B=lambda u, v, x: x.t * u * v).constant
+    wind = reaction(mesh, element, B=lambda u, v, x: x.inputs["w"] * u * v, inputs=["w"])
+    assert not wind.constant
+    u = np.ones(7)
+    moment = Moment(0.0, Inputs({"w": 2.0}))
+    np.testing.assert_allclose(wind.B(u, moment), 2.0 * wind.mass @ u)
+
+
+def test_quadrature_order():
+    mesh = line(6)
+    assert reaction(mesh, ElementLineHermite()).order == 9
+    state = lp.Field(mesh, ElementLineP2())
+    assert lp.Model(state, lp.Scalar(), product).order == 4
+    chosen = lp.Field(mesh, ElementLineP2(), quadrature=7)
+    assert lp.Model(chosen, lp.Scalar(), product).order == 7
+
+
+def test_bilinear_operators():
+    model = reaction(line(6), ElementLineP1())
+    stiffness = model.bilinear(laplace)
+    np.testing.assert_allclose(stiffness @ np.ones(7), 0.0, atol=1e-13)
+    with pytest.raises(lp.ModelError, match="may not depend on time"):
+        model.bilinear(lambda u, v, x: x.t * u * v)
+
+
+def test_initial_parameter():
+    mesh = line(6)
+    model = reaction(mesh, ElementLineP1(), q_dirichlet={"boundary": 0.0})
+    q = model.initial_parameter(lambda x: 1 + x[0])
+    assert (q[0], q[-1]) == (0.0, 0.0)
+    np.testing.assert_allclose(q[1:-1], 1 + mesh.p[0, 1:-1], atol=1e-12)
+    bounded = lp.Model(
+        lp.Field(mesh, ElementLineP1()), lp.Scalar(prior=1.0, bounds=(0.0, 2.0)), product
+    )
+    assert bounded.initial_parameter() == [1.0]
+    with pytest.raises(lp.ModelError, match="outside of the bounds"):
+        bounded.initial_parameter(3.0)
+
+
+def test_parameter_boundary_values_must_be_zero():
+    with pytest.raises(lp.ModelError, match="parameter 'q': only zero boundary values"):
+        reaction(line(), ElementLineP1(), q_dirichlet={"boundary": 1.0})
+
+
+def test_initial_state_of_a_wrong_shape():
+    with pytest.raises(lp.SpaceError, match=r"'u': coefficients of shape \(3,\); expected \(13,\)"):
+        reaction(line(), ElementLineP1()).initial(np.zeros(3))
