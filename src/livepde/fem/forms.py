@@ -31,7 +31,7 @@ from livepde.fem.blocks import Measure
 from livepde.fem.fields import Integrand, On
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace
-from livepde.linalg import Array, IntArray, Pattern
+from livepde.linalg import Array, IntArray, Pattern, PatternOperator
 
 __all__ = ["Form"]
 
@@ -112,6 +112,7 @@ class Form:
         self._constants: dict[tuple[str, str], Array] = {}
         self._offsets: dict[str, Array] = {}
         self._slopes: dict[str, sp.csr_array] = {}
+        self._operators: dict[tuple[str, str], PatternOperator] = {}
         self._tensors: dict[tuple[str, str], sp.csr_array | None] = {}
         self._patterns: dict[tuple[str, str], Pattern] = {}
         self._gathers: dict[tuple[str, str], list[sp.csr_array]] = {}
@@ -188,8 +189,7 @@ class Form:
                     self._slopes[slot] = self.matrix(slot, others[0], moment)
                 return self._slopes[slot] @ coefficients[others[0]] + self._offset(slot)
             rest = {key: coefficients[key] for key in others if key != linear[0]}
-            product: Array = self.matrix(slot, linear[0], moment, **rest) @ coefficients[linear[0]]
-            return product
+            return self.product(slot, linear[0], coefficients[linear[0]], moment, **rest)
         return self._vector(slot, moment, coefficients)
 
     def _offset(self, slot: str) -> Array:
@@ -257,6 +257,16 @@ class Form:
     ) -> sp.csr_array:
         """Return `data(...)` as a CSR matrix."""
         return self.pattern(rows, cols).matrix(self.data(rows, cols, moment, **coefficients))
+
+    def product(
+        self, rows: str, cols: str, x: Array, moment: Moment = START, **coefficients: Array
+    ) -> Array:
+        """Return `matrix(...) @ x` without building the matrix again; x of shape (m,) or (m, k)."""
+        if (rows, cols) not in self._operators:
+            self._operators[rows, cols] = self.pattern(rows, cols).operator()
+        operator = self._operators[rows, cols]
+        operator.set(self.data(rows, cols, moment, **coefficients))
+        return operator.apply(x)
 
     def _quadrature(
         self, rows: str, cols: str, moment: Moment, coefficients: Mapping[str, Array]

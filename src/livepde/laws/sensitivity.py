@@ -313,7 +313,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             moment = interval.at(t)
             u = work.forward.solve(c[:, 0], point.q, h, moment)
             factor = work.forward.tangent(u, point.q, h, moment)
-            forcing = model.form_A.matrix("v", "q", moment, u=u) @ direction
+            forcing = model.form_A.product("v", "q", direction, moment, u=u)
             rhs = (model.mass @ c[:, 1:]) / h - forcing
             return np.column_stack([u, factor.solve(rhs * model.X.free[:, None])])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
-from livepde.linalg.pattern import Pattern, sandwich
+from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
 from livepde.linalg.types import Array, IntArray, Sparse
@@ -16,6 +16,7 @@ __all__ = [
     "Factor",
     "IntArray",
     "Pattern",
+    "PatternOperator",
     "Solver",
     "Sparse",
     "SuperLUSolver",

@@ -28,6 +28,11 @@ class Pattern:
     indptr: IntArray
     indices: IntArray
 
+    def __post_init__(self) -> None:
+        # Matrices share these arrays: an operation that would change them in place fails instead.
+        self.indptr.setflags(write=False)
+        self.indices.setflags(write=False)
+
     @classmethod
     def from_entries(cls, rows: IntArray, cols: IntArray, shape: tuple[int, int]) -> Pattern:
         """Return the pattern that holds every (row, column) given; repeated entries are merged."""

@@ -62,6 +62,7 @@ class Newton:
     refresh: float = 0.05
     basin: float = 1e-2
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def solve(
         self,
         equation: StageEquation,
@@ -127,6 +128,8 @@ def _relative(update: Array, y: Array, blocks: tuple[slice, ...]) -> float:
     for block in blocks:
         change, size = update[block], y[block]
         square = float(change @ change)
+        if not np.isfinite(square):  # max() would pass over a value that is not a number
+            return np.inf
         if square != 0.0:
             worst = max(worst, square / max(float(size @ size), 1e-300))
     return float(np.sqrt(worst))

@@ -33,41 +33,56 @@ class ForwardStage:
         self._kept: tuple[tuple[float, bytes], _System] | None = None
 
     @cached_property
-    def _assembled(self) -> tuple[Pattern, dict[str, sp.csr_array], Solver]:
+    def _rows(self) -> tuple[Pattern, dict[str, sp.csr_array]]:
+        """Pattern of M/h + B' + d(A q)/du on the free rows, and the maps of its parts."""
         model = self.model
         free = sp.diags_array(model.X.free)
         whole = Assembler(model.X.dim)
-        whole.add("M", model.form_M.pattern("v", "u"), free, free)
-        whole.add("B", model.form_B.pattern("v", "u"), free, free)
-        whole.add("A", model.form_A.pattern("v", "u"), free, free)
-        fixed = Pattern.of(sp.eye_array(model.X.dim))
-        whole.add("fixed", fixed, sp.diags_array(1.0 - model.X.free))
+        whole.add("M", model.form_M.pattern("v", "u"), free)
+        whole.add("B", model.form_B.pattern("v", "u"), free)
+        whole.add("A", model.form_A.pattern("v", "u"), free)
+        return whole.build()
+
+    @cached_property
+    def _free(self) -> tuple[Solver, sp.csr_array, Array]:
+        """The engine, and the map from the data of the rows to the free part, completed by ones."""
+        model = self.model
+        whole = Assembler(model.X.dim)
+        whole.add("rows", self._rows[0], right=sp.diags_array(model.X.free))
+        whole.add("fixed", Pattern.of(sp.eye_array(model.X.dim)))
         pattern, maps = whole.build()
-        return pattern, maps, analyse(pattern)
+        return analyse(pattern), maps["rows"], maps["fixed"] @ (1.0 - model.X.free)
+
+    def _data(self, u: Array, q: Array, h: float, moment: Moment) -> Array:
+        model, maps = self.model, self._rows[1]
+        data: Array = maps["M"] @ (model.mass.data / h)
+        data += maps["B"] @ model.form_B.data("v", "u", moment, u=u)
+        data += maps["A"] @ model.form_A.data("v", "u", moment, u=u, q=q)
+        return data
 
     def jacobian(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised S = M/h + B'(u) + d(A(u) q)/du on the free coefficients."""
-        _, maps, solver = self._assembled
-        model = self.model
-        data = (
-            maps["M"] @ (model.mass.data / h)
-            + maps["B"] @ model.form_B.data("v", "u", moment, u=u)
-            + maps["A"] @ model.form_A.data("v", "u", moment, u=u, q=q)
-            + maps["fixed"] @ np.ones(model.X.dim)
-        )
-        return solver.factorise(data)
+        return self._factorise(self._data(u, q, h, moment))
+
+    def _factorise(self, data: Array) -> Factor:
+        solver, rows, fixed = self._free
+        return solver.factorise(rows @ data + fixed)
+
+    @cached_property
+    def _offset(self) -> tuple[Array, sp.csr_array]:
+        """B(0) and A(0) of an affine model."""
+        zero = np.zeros(self.model.X.dim)
+        return self.model.B(zero), self.model.A(zero).matrix
 
     def system(self, q: Array, h: float) -> _System:
         """Return matrix and factor of an affine, constant model, kept for the last (q, h)."""
         key = (h, q.tobytes())
         if self._kept is None or self._kept[0] != key:
-            model = self.model
-            zero = np.zeros(model.X.dim)
-            slope = model.form_B.matrix("v", "u", u=zero) + model.form_A.matrix("v", "u", q=q)
-            offset = model.B(zero) + model.A(zero)(q)
-            matrix = sp.csr_array(model.mass / h + slope)
-            system = _System(matrix, offset, self.jacobian(zero, q, h, START))
-            self._kept = (key, system)
+            data = self._data(np.zeros(self.model.X.dim), q, h, START)
+            offset, constant = self._offset
+            if constant.data.any():
+                offset = offset + constant @ q
+            self._kept = (key, _System(self._rows[0].matrix(data), offset, self._factorise(data)))
         return self._kept[1]
 
     def solve(self, c: Array, q: Array, h: float, moment: Moment) -> Array:
