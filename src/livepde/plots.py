@@ -30,6 +30,7 @@ GREY = "#7f7f7f"
 MARKERS = "osD^vP*X"
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
 MOST_LINES = 7  # in one panel; more sensors are drawn as one line with their range
+MOST_POINTS = 20_000  # for which a free place for the legend is looked for
 PANEL = (5.4, 3.4)  # inches
 CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))  # span from which, factor, unit
 
@@ -52,12 +53,16 @@ def figure(rows: int = 1, columns: int = 1, title: str = "") -> tuple[Figure, li
     ConfigurationError
         Matplotlib is not installed.
     """
+    drawn = _empty(rows, columns, title)
+    return drawn, list(drawn.subplots(rows, columns, squeeze=False).ravel())
+
+
+def _empty(rows: int, columns: int, title: str) -> Figure:
     size = (PANEL[0] * columns, PANEL[1] * rows)
     drawn = _figure_class()(figsize=size, layout="constrained")
     if title:
         drawn.suptitle(title)
-    axes = drawn.subplots(rows, columns, squeeze=False)
-    return drawn, list(axes.ravel())
+    return drawn
 
 
 def _panel(ax: Axes | None) -> Axes:
@@ -65,7 +70,8 @@ def _panel(ax: Axes | None) -> Axes:
 
 
 def _labelled(name: str, unit: str) -> str:
-    unit = unit.replace("degC", "°C").replace("**", "^")
+    for plain, pretty in (("degC", "°C"), ("**", "^"), ("^2", "²"), ("^3", "³")):
+        unit = unit.replace(plain, pretty)
     return f"{name} [{unit}]" if unit and unit != "1" else name
 
 
@@ -87,7 +93,10 @@ def _finish(ax: Axes, *, legend: bool = True, outside: bool = False) -> Axes:
         if outside:
             ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False)
         else:
-            ax.legend(fontsize="small", framealpha=0.85, edgecolor="none")
+            # "best" compares with every point drawn: too slow on long runs.
+            points = sum(np.size(line.get_xdata()) for line in ax.lines)
+            place: Any = "best" if points <= MOST_POINTS else "upper right"
+            ax.legend(loc=place, fontsize="small", framealpha=0.85, edgecolor="none")
     return ax
 
 
@@ -100,12 +109,15 @@ def _shades(count: int) -> list[Any]:
 
 
 def _snapshots(data: xr.Dataset, times: Sequence[float] | int) -> list[int]:
-    """Return indices of the snapshots nearest to the times, or of evenly spread ones."""
+    """Return indices of the snapshots nearest to the times, or of some, most of them early.
+
+    An estimate changes most at the start, so the spread is quadratic.
+    """
     available = data["snapshot"].values
     if not len(available):
         raise ConfigurationError("the dataset holds no snapshots: run with at least one sample.")
     if isinstance(times, int):
-        spread = np.linspace(0, len(available) - 1, min(times, len(available)))
+        spread = np.linspace(0, 1, min(times, len(available))) ** 2 * (len(available) - 1)
         return [int(k) for k in np.unique(spread.round())]
     return [int(np.abs(available - t).argmin()) for t in times]
 
@@ -161,7 +173,7 @@ def profiles(
     shades = _shades(len(chosen))
     for order, (k, colour) in enumerate(zip(chosen, shades, strict=True)):
         values = data[name].values[k]
-        label = f"t = {data['snapshot'].values[k] / factor:.4g}{' ' if unit else ''}{unit}"
+        label = f"t = {data['snapshot'].values[k] / factor:.4g} {unit}".rstrip()
         style = {"marker": MARKERS[order % len(MARKERS)], "markersize": 3.5} if markers else {}
         if truth is not None and truth.ndim == 2:
             ax.plot(x, truth[order], color=colour, linewidth=1.0, label="_exact")
@@ -259,11 +271,12 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
                 lambda ax, v=variable, d=dimension, w=what: _residual_panel(data, v, d, w, ax)
             )
     columns = 1 if len(panels) == 1 else 2
-    drawn, axes = figure(math.ceil(len(panels) / columns), columns, title)
-    for ax, panel in zip(axes, panels, strict=False):
-        panel(ax)
-    for ax in axes[len(panels) :]:
-        ax.remove()
+    rows = math.ceil(len(panels) / columns)
+    drawn = _empty(rows, columns, title)
+    grid = drawn.add_gridspec(rows, columns)
+    for k, panel in enumerate(panels):
+        alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
+        panel(drawn.add_subplot(grid[k // columns, slice(None) if alone else k % columns]))
     return drawn
 
 
@@ -354,11 +367,11 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     )
     what = _labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
     ax.figure.colorbar(drawn, ax=ax, label=f"standard deviation of {what}" if spread else what)
-    t = float(data["snapshot"].values[-1]) / factor
-    ax.set_title(
-        f"{'deviation of ' if spread else ''}{name.removesuffix('_std')} at t = {t:.4g} {unit}"
-    )
+    when = f"t = {data['snapshot'].values[-1] / factor:.4g} {unit}".rstrip()
+    whose = f"{'deviation of ' if spread else ''}{name.removesuffix('_std')}"
+    ax.set_title(f"{whose} at {when}")
     ax.set_aspect("equal")
+    ax.margins(0.0)
     ax.set_xlabel("x")
     ax.set_ylabel("y")
     return ax
@@ -389,8 +402,16 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         for k, name in enumerate(names):
             label = f"{name}: RMSE {_rms(errors[:, k]):.3g}"
             colour = PALETTE[k % len(PALETTE)]
-            style = {} if len(t) > 100 else {"marker": ".", "markersize": 3}
-            ax.plot(t, errors[:, k], color=colour, linewidth=0.9, label=label, **style)  # type: ignore[arg-type]
+            marker, width = ("None", 0.6) if len(t) > 100 else (".", 0.9)
+            ax.plot(
+                t,
+                errors[:, k],
+                color=colour,
+                linewidth=width,
+                marker=marker,
+                alpha=0.8,
+                label=label,
+            )
     else:
         some = np.isfinite(errors).any(axis=1)
         t, seen = t[some], errors[some]

@@ -1,0 +1,268 @@
+"""Figures: what is drawn, and what is said where nothing can be."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde import plots
+
+DAY = 86400.0
+
+
+def dataset(
+    *,
+    scalars: dict[str, float] | None = None,
+    fields: tuple[str, ...] = (),
+    points: np.ndarray | None = None,
+    sensors: int = 2,
+    withheld: int = 0,
+    samples: int = 30,
+    span: float = 10.0,
+    unit: str = "",
+    std: float = 0.1,
+) -> xr.Dataset:
+    """A dataset as `Result.to_xarray()` gives it, with made-up numbers."""
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, span, samples)
+    points = np.linspace(0, 1, 11)[None] if points is None else points
+    data = xr.Dataset(
+        coords={
+            "time": ("time", t, {"units": unit}),
+            "snapshot": t[::3],
+            "sensor": [f"s{k}" for k in range(sensors)],
+            "withheld": [f"w{k}" for k in range(withheld)],
+            **{axis: ("vertex", p) for axis, p in zip("xyz", points, strict=False)},
+        }
+    )
+    for label, value in (scalars or {}).items():
+        data[label] = ("time", value + np.exp(-t / span), {"units": "W/(m K)"})
+        data[f"{label}_std"] = ("time", np.full(samples, std), {"units": "W/(m K)"})
+    shape = (len(t[::3]), points.shape[1])
+    for name in (*fields, "u"):
+        data[name] = (("snapshot", "vertex"), rng.standard_normal(shape), {"units": "degC"})
+        if np.isfinite(std):
+            data[f"{name}_std"] = (("snapshot", "vertex"), np.full(shape, std))
+    data["innovation"] = (("time", "sensor"), rng.standard_normal((samples, sensors)))
+    if withheld:
+        data["withheld_error"] = (("time", "withheld"), np.full((samples, withheld), 0.5))
+    data["status"] = ("time", np.zeros(samples, dtype=int))
+    data.attrs = {"fields": " ".join(fields), "scalars": "\n".join(scalars or {}), "state": "u"}
+    return data
+
+
+def texts(ax: Axes) -> list[str]:
+    legend = ax.get_legend()
+    return [text.get_text() for text in legend.get_texts()] if legend else []
+
+
+def panel(figure: Figure, title: str) -> Axes:
+    return next(ax for ax in figure.axes if ax.get_title().startswith(title))
+
+
+def drawn(figure: Figure) -> Figure:
+    figure.canvas.draw()  # layout and text: warnings are errors
+    return figure
+
+
+def test_import_of_livepde_loads_no_matplotlib() -> None:
+    code = "import sys, livepde, livepde.plots; print('matplotlib' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"
+
+
+def test_figures_leave_pyplot_alone() -> None:
+    code = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from test_plots import *;"
+        "drawn(plots.overview(dataset(scalars={'k': 2.0})));"
+        "print('matplotlib.pyplot' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "False"
+
+
+def test_without_matplotlib_one_sentence_tells_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    for draw in (
+        lambda: plots.overview(dataset()),
+        lambda: plots.profiles(dataset(), "u"),
+        lambda: plots.history({}),
+    ):
+        with pytest.raises(lp.ConfigurationError, match=r"pip install 'livepde\[plots\]'"):
+            draw()
+
+
+def test_scalars_have_a_line_and_a_band_each_and_one_panel_for_all_regions() -> None:
+    scalars = {"D[top]": 1.0, "D[bottom]": 2.0, "k": 3.0}
+    figure = drawn(plots.overview(dataset(scalars=scalars), title="A run"))
+    assert figure.get_suptitle() == "A run"
+    regions, k = panel(figure, "D"), panel(figure, "k")
+    assert len(regions.lines) == 2
+    assert len(regions.collections) == 2
+    assert texts(regions) == ["top = 1.368 ± 0.2", "bottom = 2.368 ± 0.2"]
+    assert texts(k) == ["k = 3.368 ± 0.2"]
+    assert k.get_ylabel() == "k [W/(m K)]"
+    assert "95 %" in k.get_title()
+
+
+def test_a_law_without_deviations_gets_no_band() -> None:
+    figure = drawn(plots.overview(dataset(scalars={"k": 3.0}, fields=("q",), std=np.nan)))
+    assert not panel(figure, "k").collections
+    assert texts(panel(figure, "k")) == ["k = 3.368"]
+    assert not panel(figure, "q").collections
+
+
+def test_the_band_of_the_prior_does_not_flatten_the_estimate() -> None:
+    data = dataset(scalars={"k": 3.0})
+    data["k_std"].values[:2] = 1e6
+    low, high = panel(plots.overview(data), "k").get_ylim()
+    assert high - low < 3
+
+
+def test_long_runs_in_seconds_are_shown_in_days() -> None:
+    data = dataset(scalars={"k": 3.0}, span=20 * DAY, unit="s")
+    ax = panel(plots.overview(data), "k")
+    assert ax.get_xlabel() == "t [d]"
+    assert ax.lines[0].get_xdata()[-1] == pytest.approx(20)
+    assert texts(panel(plots.overview(data), "u"))[0] == "t = 0 d"
+    hours = plots.overview(dataset(scalars={"k": 3.0}, span=5 * 3600.0, unit="s"))
+    assert panel(hours, "k").get_xlabel() == "t [h]"
+    seconds = plots.overview(dataset(scalars={"k": 3.0}, span=60.0, unit="s"))
+    assert panel(seconds, "k").get_xlabel() == "t [s]"
+
+
+def test_sensors_are_named_with_their_error() -> None:
+    data = dataset(sensors=3, withheld=1)
+    data["innovation"].values[5:9] = np.nan
+    figure = drawn(plots.overview(data))
+    rms = float(np.sqrt((data["innovation"][:, 1] ** 2).mean()))
+    assert f"s1: RMSE {rms:.3g}" in texts(panel(figure, "innovation"))
+    assert texts(panel(figure, "error of withheld")) == ["w0: RMSE 0.5"]
+
+
+def test_many_sensors_become_one_range() -> None:
+    data = dataset(sensors=40)
+    data["innovation"].values[3] = np.nan
+    ax = panel(drawn(plots.overview(data)), "innovation")
+    assert texts(ax)[0] == "range of 40 channels"
+    assert len(ax.lines) == 2  # zero and the root mean square
+
+
+def test_a_sensor_that_never_spoke() -> None:
+    data = dataset(sensors=2)
+    data["innovation"].values[:, 1] = np.nan
+    assert "s1: RMSE nan" in texts(panel(drawn(plots.overview(data)), "innovation"))
+
+
+def test_failed_steps_are_marked() -> None:
+    data = dataset(scalars={"k": 3.0})
+    data["status"].values[[4, 7]] = 1
+    assert "2 failed steps" in texts(panel(drawn(plots.overview(data)), "k"))
+
+
+def test_a_field_in_the_plane_is_a_map_with_its_deviation() -> None:
+    points = np.array([[0, 1, 0, 1, 0.5], [0, 0, 1, 1, 0.5]], dtype=float)
+    data = dataset(fields=("q",), points=points)
+    figure = drawn(plots.overview(data))
+    titles = [ax.get_title() for ax in figure.axes]
+    assert {"q at t = 9.31", "deviation of q at t = 9.31", "u at t = 9.31"} <= set(titles)
+    data["triangle"] = (("cell", "corner"), np.array([[0, 1, 4], [0, 2, 4]]))
+    given = panel(drawn(plots.overview(data)), "q at").collections[0]
+    assert len(given.get_array()) == 5
+
+
+def test_a_field_in_space_is_its_range() -> None:
+    data = dataset(fields=("q",), points=np.random.default_rng(0).random((3, 8)))
+    assert texts(panel(drawn(plots.overview(data)), "q in space")) == ["range", "median"]
+
+
+def test_profiles_have_a_line_for_each_time_and_the_exact_one() -> None:
+    data = dataset(fields=("q",))
+    exact = np.linspace(0, 1, 11)
+    ax = plots.profiles(data, "q", times=(0, 5, 9.4), exact=exact, observed=(0.3, 0.7))
+    assert texts(ax) == ["observed", "t = 0", "t = 5.172", "t = 9.31", "95 %", "exact"]
+    assert len(ax.lines) == 4
+    marked = [line for line in ax.lines if line.get_marker() != "None"]
+    assert len(marked) == 3
+    assert np.array_equal(marked[-1].get_ydata(), data["q"].values[-1])
+    assert np.array_equal(ax.lines[-1].get_ydata(), exact)
+    assert ax.get_ylabel() == "q [°C]"
+    drawn(ax.figure)  # type: ignore[arg-type]
+
+
+def test_profiles_of_a_state_have_an_exact_line_for_each_time() -> None:
+    data = dataset(std=np.nan)
+    ax = plots.profiles(data, "u", times=2, exact=np.zeros((2, 11)), legend=False)
+    curves = [line for line in ax.lines if len(line.get_xdata())]
+    assert len(curves) == 4
+    assert [line.get_linestyle() for line in curves] == ["-", "--", "-", "--"]
+    assert ax.get_legend() is None
+
+
+def test_profiles_draw_where_they_are_told() -> None:
+    figure, axes = plots.figure(1, 2)
+    assert plots.profiles(dataset(), "u", ax=axes[1]) is axes[1]
+    assert plots.history({"a": ([0, 1], [1, 2])}, ax=axes[0]) is axes[0]
+    assert len(figure.axes) == 2
+
+
+def test_times_that_are_counted_lie_early() -> None:
+    ax = plots.profiles(dataset(std=np.nan), "u", times=4)
+    times = [float(text.removeprefix("t = ")) for text in texts(ax)]
+    assert times[0] == 0
+    assert times[-1] == pytest.approx(9.31)
+    assert times[1] < 9.31 / 3
+
+
+def test_history() -> None:
+    ax = plots.history(
+        {"a": ([0, 1], [1, 0.1]), "b": ([0, 1], [1, 0.2])}, levels={"q = 0": 1.0}, ylabel="error"
+    )
+    assert texts(ax) == ["a", "b", "q = 0"]
+    assert ax.get_yscale() == "log"
+    assert plots.history({"a": ([0, 1], [1, 2])}, log=False).get_yscale() == "linear"
+    drawn(ax.figure)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda: plots.profiles(dataset(), "D"), r"no field 'D'; it has \['u', 'u_std'\]"),
+        (lambda: plots.profiles(dataset(points=np.eye(2)), "u"), "one space dimension"),
+        (lambda: plots.overview(dataset().isel(time=slice(0))), "no samples yet"),
+        (lambda: plots.profiles(dataset().isel(snapshot=slice(0)), "u"), "no snapshots"),
+    ],
+)
+def test_refusals(draw: Any, message: str) -> None:
+    with pytest.raises(lp.ConfigurationError, match=message):
+        draw()
+
+
+def test_colours_differ_in_lightness_too() -> None:
+    shades = [to_hex(colour) for colour in plots._shades(6)]
+    lightness = [sum(int(shade[k : k + 2], 16) for k in (1, 3, 5)) for shade in shades]
+    assert lightness == sorted(lightness)
+    assert len(set(plots.PALETTE)) == len(plots.PALETTE)
+
+
+def test_result_plots_itself() -> None:
+    mesh = lp.interval(0, 1, 4)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
+        lp.Scalar(1.0),
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    identifier = lp.Identifier(model, lp.Points([0.5]), lp.SensitivityLaw(noise=0.1), u0=1.0)
+    result = identifier.run([(0.1 * k, [0.5]) for k in range(4)])
+    assert isinstance(drawn(result.plot(title="rod")), Figure)
