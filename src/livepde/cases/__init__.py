@@ -1,0 +1,7 @@
+"""Case files: a whole identification in one TOML file, units and data checked."""
+
+from __future__ import annotations
+
+from livepde.cases.build import Case, Prepared, load
+
+__all__ = ["Case", "Prepared", "load"]

@@ -1,0 +1,217 @@
+"""What a case file may say, as pydantic models; what it means is in `build`."""
+
+from __future__ import annotations
+
+import re
+from datetime import date, datetime
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, model_validator
+
+__all__ = [
+    "CaseSpec",
+    "ChannelSpec",
+    "DataSpec",
+    "GradientSpec",
+    "MeshSpec",
+    "SensitivitySpec",
+    "StepsSpec",
+    "UnknownSpec",
+]
+
+
+def _quantity(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        message = 'expected a number, or text with a unit as "20 h"'
+        raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
+    return value if isinstance(value, str) else float(value)
+
+
+def _bound(value: Any) -> Any:
+    """[low, high], "<= number" or ">= number" -> (sense, bound)."""
+    if isinstance(value, list) and len(value) == 2:
+        low, high = value
+        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
+            return "in", (float(low), float(high))
+    if isinstance(value, str):
+        match = re.fullmatch(r"\s*(<=|>=)\s*([-+0-9.eE]+)\s*", value)
+        if match:
+            try:
+                return match[1], float(match[2])
+            except ValueError:
+                pass
+    raise ValueError('expected [low, high], "<= number" or ">= number"')
+
+
+Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
+Pair: TypeAlias = tuple[Quantity, Quantity]
+Instant: TypeAlias = date | datetime | float | str
+Name: TypeAlias = Annotated[str, Field(min_length=1)]
+Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+
+
+class Spec(BaseModel):
+    """A table of the case file: unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=False)
+
+
+class MeshSpec(Spec):
+    """An interval (from, to, cells) or a rectangle (x, y, cells)."""
+
+    start: Quantity | None = Field(None, alias="from")
+    stop: Quantity | None = Field(None, alias="to")
+    x: Pair | None = None
+    y: Pair | None = None
+    cells: PositiveInt | tuple[PositiveInt, PositiveInt]
+    spacing: Literal["uniform", "geometric"] = "uniform"
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> MeshSpec:
+        line = self.start is not None and self.stop is not None
+        plane = self.x is not None and self.y is not None
+        if line == plane or (self.start is None) != (self.stop is None):
+            raise ValueError("expected from and to (an interval), or x and y (a rectangle)")
+        if line and not isinstance(self.cells, int):
+            raise ValueError("cells: expected one number for an interval")
+        if plane and (isinstance(self.cells, int) or self.spacing != "uniform"):
+            raise ValueError("expected cells = [nx, ny] and uniform spacing for a rectangle")
+        return self
+
+
+class DataSpec(Spec):
+    """The data file and its time column."""
+
+    file: Name | None = None
+    time: Name
+    time_unit: str | None = None
+    start: Instant | None = None
+    stop: Instant | None = None
+    assimilate_from: Instant | None = None
+    every: PositiveInt = 1
+    missing: tuple[float, ...] = ()
+
+
+class UnknownSpec(Spec):
+    """One unknown: a number, one number for each layer, or a field."""
+
+    prior: Quantity
+    std: Quantity
+    bounds: Pair | None = None
+    unit: str | None = None
+    regions: dict[Name, Pair] | None = None
+    field: bool = False
+    length: Quantity | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> UnknownSpec:
+        if self.field and (self.regions or self.bounds):
+            raise ValueError("a field takes no regions and no bounds")
+        if self.length is not None and not self.field:
+            raise ValueError("length belongs to a field: add field = true")
+        return self
+
+
+class ChannelSpec(Spec):
+    """One channel of the stream and its role."""
+
+    role: Literal["boundary", "sensor", "withheld", "input"]
+    column: Name | None = None
+    columns: tuple[Name, ...] | None = None
+    at: Quantity | tuple[Quantity, ...] | None = None
+    over: Pair | None = None
+    quantity: str | None = None
+    noise: Quantity | None = None
+    unit: str | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ChannelSpec:
+        if (self.column is None) == (not self.columns):
+            raise ValueError("expected column = name, or columns = [names] that are averaged")
+        placed = (self.at is not None) + (self.over is not None) + (self.quantity is not None)
+        if self.role == "input" and placed:
+            raise ValueError("an input has no place: leave out at, over and quantity")
+        if self.role == "boundary" and not isinstance(self.at, str):
+            raise ValueError('a boundary channel needs at = the name of a boundary, as "left"')
+        if self.role in ("sensor", "withheld") and placed != 1:
+            raise ValueError("expected one of: at = position, over = [from, to], quantity = name")
+        if self.role in ("input", "boundary") and self.noise is not None:
+            raise ValueError(f"noise belongs to sensors, not to a channel of role {self.role}")
+        return self
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Columns of the data file."""
+        return self.columns or (str(self.column),)
+
+
+class ReplaySpec(Spec):
+    """Options of the replay."""
+
+    window: PositiveInt = 4096
+    first: PositiveInt = 32
+    iterations: PositiveInt = 4
+
+
+class SensitivitySpec(Spec):
+    """The law for sparse, noisy sensors."""
+
+    kind: Literal["sensitivity"]
+    noise: Quantity | None = None
+    modes: PositiveInt = 12
+    drift: Quantity = 0.0
+    memory: Quantity | None = None
+    replay: bool | ReplaySpec = False
+
+
+class GradientSpec(Spec):
+    """The paper's law, for observed subdomains and averages."""
+
+    kind: Literal["gradient"]
+    gain: float = 1.0
+    c1: float | None = None
+    mu: float | None = None
+    nu: float = 0.0
+    sigma: float = 0.0
+
+    @model_validator(mode="after")
+    def _one_damping(self) -> GradientSpec:
+        if self.c1 is not None and self.mu is not None:
+            raise ValueError("c1 and mu are two damping rules: keep one")
+        return self
+
+
+class StepsSpec(Spec):
+    """Time steps between samples."""
+
+    dt_max: Quantity | None = None
+    scheme: Literal["implicit-euler", "alexander2"] = "implicit-euler"
+
+
+class OutputSpec(Spec):
+    """What is kept of a run."""
+
+    fields_every: PositiveInt = 24
+
+
+Law: TypeAlias = Annotated[SensitivitySpec | GradientSpec, Field(discriminator="kind")]
+
+
+class CaseSpec(Spec):
+    """A whole case file."""
+
+    title: str = ""
+    equation: Name
+    initial: Quantity
+    mesh: MeshSpec
+    options: dict[Identifier, Quantity] = Field(default_factory=dict)
+    boundary: dict[Name, Quantity] = Field(default_factory=dict)
+    data: DataSpec
+    unknowns: dict[Identifier, UnknownSpec] = Field(min_length=1)
+    channels: dict[Name, ChannelSpec] = Field(min_length=1)
+    law: Law
+    steps: StepsSpec = Field(default_factory=StepsSpec)
+    output: OutputSpec = Field(default_factory=OutputSpec)
+    expect: dict[
+        str, Annotated[tuple[str, float | tuple[float, float]], BeforeValidator(_bound)]
+    ] = Field(default_factory=dict)

@@ -1,0 +1,98 @@
+"""Quantities with units, converted to the model's; pint is imported when the first one is met."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from tokenize import TokenError
+from typing import Any
+
+from livepde.errors import CaseError
+
+__all__ = ["Affine", "conversion", "convert"]
+
+# What pint's parser lets through for text that is no unit at all.
+NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
+QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
+
+
+@dataclass(frozen=True)
+class Affine:
+    """value in the model's unit = factor * value + offset."""
+
+    factor: float = 1.0
+    offset: float = 0.0
+
+
+def convert(value: float | str, unit: str, where: str, *, difference: bool = False) -> float:
+    """Return a quantity in the model's unit.
+
+    Parameters
+    ----------
+    value
+        A number, already in that unit, or text such as "20 h".
+    unit
+        The model's unit; empty: a pure number.
+    where
+        File and key, for the message.
+    difference
+        A difference of two values, such as a deviation: the zero of temperature scales drops out.
+
+    Raises
+    ------
+    CaseError
+        Not a quantity, an unknown unit, or one of another dimension.
+    """
+    if not isinstance(value, str):
+        return float(value)
+    match = QUANTITY.match(value)
+    if match is None:
+        raise CaseError(
+            f"{where}: got '{value}'; expected a number"
+            + (f' in {unit}, or text with a unit as "1 {unit}".' if unit else " without a unit.")
+        )
+    number, given = float(match[1]), match[2]
+    if not given:
+        raise CaseError(f"{where}: got '{value}' without a unit; write {match[1]} or add a unit.")
+    rule = conversion(given, unit, where)
+    return rule.factor * number + (0.0 if difference else rule.offset)
+
+
+@cache
+def conversion(given: str, unit: str, where: str) -> Affine:
+    """Return how values in the unit `given` become values in the model's unit."""
+    if given == unit:
+        return Affine()
+    pint = _pint()
+    registry = _registry()
+    try:
+        zero = registry.Quantity(0.0, registry.parse_units(given)).to(unit).magnitude
+        one = registry.Quantity(1.0, registry.parse_units(given)).to(unit).magnitude
+    except pint.UndefinedUnitError as error:
+        raise CaseError(
+            f"{where}: '{error.args[0] if error.args else given}' is not a unit that is known; "
+            f"{_expected(unit)}."
+        ) from None
+    except pint.DimensionalityError:
+        raise CaseError(
+            f"{where}: '{given}' cannot be converted to '{unit or '1'}'; {_expected(unit)}."
+        ) from None
+    except (pint.PintError, *NOT_A_UNIT):
+        raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit)}.") from None
+    return Affine(float(one - zero), float(zero))
+
+
+def _expected(unit: str) -> str:
+    return f"expected one of the kind of '{unit}'" if unit else "expected a number without a unit"
+
+
+def _pint() -> Any:
+    import pint
+
+    return pint
+
+
+@cache
+def _registry() -> Any:
+    return _pint().UnitRegistry()
