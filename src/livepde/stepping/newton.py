@@ -59,8 +59,8 @@ class Newton:
 
     tolerance: float = 1e-8
     iterations: int = 60
-    refresh: float = 0.05
-    basin: float = 1e-2
+    refresh: float = 0.2
+    basin: float = 3e-2
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def solve(
