@@ -1,0 +1,315 @@
+"""Time schemes, the nonlinear iteration, substeps and failures."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from problems import laplace, line, product, rates, reaction, truth
+from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
+
+import livepde as lp
+from livepde.fem import Inputs, Moment
+from livepde.linalg import Pattern, analyse
+from livepde.stepping import ForwardStage, StepFailed, advance
+
+SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
+
+
+def cubic(**options):
+    """u_t - u_xx + q u + u^3 = f with u* = (1 + x) (2 + sin 3t), in every space with P1."""
+
+    def exact(x, t):
+        return (1 + x[0]) * (2 + np.sin(3 * t))
+
+    def source(x, t):
+        u = exact(x, t)
+        return (1 + x[0]) * 3 * np.cos(3 * t) + 1.5 * u + u**3
+
+    model = lp.Model(
+        lp.Field(line(5), ElementLineP1(), dirichlet={"boundary": exact}, quadrature=6),
+        lp.Scalar(prior=1.5),
+        A=product,
+        B=lambda u, v, x: laplace(u, v, x) + u**3 * v,
+        f=source,
+        **options,
+    )
+    return model, exact
+
+
+@pytest.mark.parametrize(("name", "order"), [("euler", 1), ("alexander", 2)])
+def test_order_in_time_with_moving_boundary_data(name, order):
+    """The solution lies in the space, so all of the error is the scheme's."""
+    model, exact = cubic()
+    assert SCHEMES[name].order == order
+    errors = []
+    for steps in (40, 80, 160, 320):
+        times = np.linspace(0.0, 1.0, steps + 1)
+        u = truth(model, np.array([1.5]), lambda x: exact(x, 0.0), times, SCHEMES[name])[-1]
+        errors.append(model.X.norm(u - model.initial(lambda x: exact(x, 1.0), Moment(1.0))))
+    np.testing.assert_allclose(rates(errors), order, atol=0.12)
+    assert errors[-1] < (2e-2 if order == 1 else 2e-4)
+
+
+@pytest.mark.parametrize(
+    ("element", "order"), [(ElementLineP1(), 2), (ElementLineHermite(), 4)], ids=["P1", "Hermite"]
+)
+def test_order_in_space(element, order):
+    """Linear in time, so that implicit Euler is exact there; L2 norm by quadrature."""
+
+    def exact(x, t):
+        return (1 + t) * np.sin(np.pi * x[0])
+
+    def source(x, t):
+        return (1 / (1 + t) + np.pi**2 + 1 + x[0]) * exact(x, t)
+
+    errors = []
+    for cells in (6, 12, 24, 48):
+        mesh = line(cells)
+        model = lp.Model(
+            lp.Field(mesh, element, dirichlet={"boundary": 0.0}, quadrature=12),
+            lp.Field(mesh, element),
+            A=product,
+            B=laplace,
+            f=source,
+        )
+        q = model.initial_parameter(lambda x: 1 + x[0])
+        u = truth(model, q, lambda x: exact(x, 0.0), [0.0, 0.1, 0.2, 0.5])[-1]
+        term = model.form_M.terms[0]
+        values = term.spaces["u"].values(u)[0]
+        difference = values - exact(term.measure.points, 0.5)
+        errors.append(np.sqrt((difference**2 * term.measure.weights).sum()))
+    np.testing.assert_allclose(rates(errors), order, atol=0.15)
+
+
+def test_schemes_are_L_stable():
+    """A stiff decay is damped away within a step, not turned over."""
+    model = reaction(line(8), ElementLineP1(), B=lambda u, v, x: 1e8 * u * v)
+    for scheme in SCHEMES.values():
+        u = truth(model, np.zeros(9), lambda x: np.sin(np.pi * x[0]), [0.0, 1.0], scheme)[-1]
+        assert abs(u).max() < 1e-6
+
+
+def test_irregular_steps_keep_the_order():
+    model, exact = cubic()
+    rng = np.random.default_rng(0)
+    errors = []
+    coarse = np.concatenate([[0.0], np.cumsum(rng.uniform(0.2, 1.0, 20))])
+    coarse /= coarse[-1]
+    for halvings in range(3):
+        times = coarse
+        for _ in range(halvings):
+            times = np.sort(np.concatenate([times, (times[1:] + times[:-1]) / 2]))
+        u = truth(model, np.array([1.5]), lambda x: exact(x, 0.0), times, lp.Alexander2())[-1]
+        errors.append(model.X.norm(u - model.initial(lambda x: exact(x, 1.0), Moment(1.0))))
+    np.testing.assert_allclose(rates(errors), 2.0, atol=0.2)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_substeps_are_the_same_steps_taken_by_hand(scheme):
+    model = reaction(
+        line(8),
+        ElementLineP1(),
+        dirichlet={"left": lp.Channel("T"), "right": lambda x, t: np.sin(t)},
+        f=lambda x, t: x.inputs["Q"] + t,
+        inputs=["Q"],
+    )
+    q = np.full(9, 2.0)
+
+    def inputs(t):
+        return {"T": 3 - 2 * t, "Q": 1 + 4 * t}  # linear: what lies between two samples
+
+    control = lp.Advance(SCHEMES[scheme], dt_max=0.03)
+    once = [u for _, u in lp.simulate(model, q, 1.0, [0.0, 0.05, 0.3], control, inputs)]
+    times = [0.0, 0.025, 0.05, *(0.05 + 0.25 * np.arange(1, 10) / 9)]
+    by_hand = truth(model, q, 1.0, times, SCHEMES[scheme], inputs)
+    np.testing.assert_allclose(once[1], by_hand[2], rtol=1e-12)
+    np.testing.assert_allclose(once[2], by_hand[-1], rtol=1e-12)
+
+
+def interval(t0=1.0, t1=3.0, z0=(2.0, np.nan, 1.0), z1=(4.0, 6.0, np.nan)):
+    inputs = (Inputs({"Q": 10.0}), Inputs({"Q": 20.0}))
+    return lp.Interval(t0, t1, *inputs, np.array(z0), np.array(z1))
+
+
+def test_between_two_samples_data_are_linear():
+    span = interval()
+    np.testing.assert_array_equal(span.present, [True, True, False])
+    np.testing.assert_array_equal(span.z(2.0), [3.0, 6.0, np.nan])  # held where none was before
+    np.testing.assert_array_equal(span.z(3.0), [4.0, 6.0, np.nan])
+    assert span.at(2.0).inputs["Q"] == 15.0
+    assert span.at(3.0) is span.end
+    assert span.end.inputs["Q"] == 20.0
+
+
+def test_number_of_substeps():
+    assert lp.Advance(lp.ImplicitEuler()).count(interval()) == 1
+    assert lp.Advance(lp.ImplicitEuler(), dt_max=2.0).count(interval()) == 1
+    assert lp.Advance(lp.ImplicitEuler(), dt_max=1.999).count(interval()) == 2
+    # 0.1 + 0.2 != 0.3: rounding alone never adds a substep.
+    assert lp.Advance(lp.ImplicitEuler(), dt_max=0.1).count(interval(0.0, 0.1 + 0.2)) == 3
+
+
+def test_a_failing_substep_is_halved_and_grows_again():
+    taken = []
+
+    def stage(c, t, h):
+        if t - h < 1.5 < t and h > 0.11:
+            raise StepFailed("not_converged", "too long")
+        taken.append(h)
+        return c + h
+
+    control = lp.Advance(lp.ImplicitEuler(), dt_max=1.0)
+    y, steps, failure = advance(control, stage, np.zeros(1), interval(0.0, 4.0))
+    assert failure is None
+    assert steps == len(taken) > 4
+    assert max(taken[-2:]) == 1.0
+    np.testing.assert_allclose(y, 4.0)
+
+
+def test_a_substep_that_fails_for_good():
+    def stage(c, t, h):
+        if t > 2.0:
+            raise StepFailed("not_finite", "no way")
+        return c + h
+
+    control = lp.Advance(lp.ImplicitEuler(), dt_max=1.0, halvings=3)
+    y, steps, failure = advance(control, stage, np.zeros(1), interval(0.0, 4.0))
+    assert failure.code == "not_finite"
+    assert str(failure) == "no way"
+    assert steps == 2
+    np.testing.assert_allclose(y, 2.0)
+
+
+def test_equal_steps_are_one_number():
+    """Steps between equidistant times share their factorised matrix."""
+    widths = set()
+
+    def stage(c, t, h):
+        widths.add(h)
+        return c
+
+    times = [k * 0.6 for k in range(200)]
+    for t0, t1 in pairwise(times):
+        advance(lp.Advance(lp.ImplicitEuler()), stage, np.zeros(1), interval(t0, t1))
+    assert len(widths) <= 8
+    np.testing.assert_allclose(list(widths), 0.6, rtol=1e-12)
+
+
+class Equation:
+    """y^3 = a, one unknown each; the Jacobian may be spoiled."""
+
+    def __init__(self, a, slope=3.0):
+        self.a, self.slope = np.asarray(a, dtype=float), slope
+        self.factors = 0
+
+    def residual(self, y):
+        with np.errstate(over="ignore", invalid="ignore"):
+            return y**3 - self.a
+
+    def factor(self, y, sweep=False):
+        self.factors += 1
+        pattern = Pattern.of(np.eye(len(y)))
+        return analyse(pattern).factorise(self.slope * y**2)
+
+
+def test_newton_solves():
+    equation = Equation([8.0, 27.0])
+    y = lp.Newton().solve(equation, np.array([2.5, 2.5]))
+    np.testing.assert_allclose(y, [2.0, 3.0], rtol=1e-9)
+    swept = lp.Newton().solve(Equation([8.0, 27.0]), np.array([2.5, 2.5]), sweeps=True)
+    np.testing.assert_allclose(swept, [2.0, 3.0], rtol=1e-9)
+
+
+def test_newton_keeps_its_factor_while_it_is_good():
+    equation = Equation([8.0])
+    lp.Newton().solve(equation, np.array([2.001]))
+    assert equation.factors == 1
+
+
+@pytest.mark.parametrize(
+    ("equation", "start", "newton", "code"),
+    [
+        (Equation([8.0]), 3.0, lp.Newton(iterations=1), "not_converged"),
+        (Equation([8.0], slope=-3.0), 3.0, lp.Newton(iterations=2000), "not_finite"),
+        (Equation([8.0]), 0.0, lp.Newton(), "singular"),
+        (Equation([np.nan]), 1.0, lp.Newton(), "not_finite"),
+    ],
+)
+def test_newton_says_how_it_failed(equation, start, newton, code):
+    with pytest.raises(StepFailed) as caught:
+        newton.solve(equation, np.array([start]))
+    assert caught.value.code == code
+    assert str(caught.value)
+
+
+def test_tolerance_is_relative_in_each_block():
+    """State and parameter may differ by many orders of magnitude."""
+    equation = Equation([1e-24, 1e24])
+    blocks = (slice(0, 1), slice(1, 2))
+    y = lp.Newton().solve(equation, np.array([1.3e-8, 1.1e8]), blocks)
+    np.testing.assert_allclose(y, [1e-8, 1e8], rtol=1e-8)
+
+
+def test_forward_stage_of_an_affine_model_is_one_factorisation():
+    model = reaction(MeshTri().refined(3), ElementTriP1(), f=lambda x, t: t * x[0])
+    assert model.affine
+    forward = ForwardStage(model)
+    q = np.ones(model.Q.dim)
+    u = np.random.default_rng(1).standard_normal(model.X.dim)
+    first = forward.solve(u, q, 0.1, Moment(0.1))
+    kept = forward.system(q, 0.1)
+    assert forward.system(q.copy(), 0.1) is kept
+    assert forward.system(2 * q, 0.1) is not kept
+    # What is kept never changes the numbers.
+    np.testing.assert_array_equal(ForwardStage(model).solve(u, q, 0.1, Moment(0.1)), first)
+    # And it solves the equation.
+    start = model.impose(u, Moment(0.1))
+    del start
+    residual = model.mass @ (first - u) / 0.1 + model.B(first) + model.A(first)(q)
+    residual = (residual - model.F(Moment(0.1))) * model.X.free
+    np.testing.assert_allclose(residual, 0.0, atol=1e-12)
+
+
+def test_shortcuts_of_affine_models_do_not_change_the_numbers():
+    """The same model, once constant, once made to look time-dependent and nonlinear."""
+    mesh = line(8)
+    plain = reaction(mesh, ElementLineP1(), B=lambda u, v, x: (u - 1.0) * v)
+    timed = reaction(mesh, ElementLineP1(), B=lambda u, v, x: (u - 1.0 + 0 * x.t) * v)
+    curved = reaction(mesh, ElementLineP1(), B=lambda u, v, x: (u - 1.0 + 1e-14 * u**3) * v)
+    assert plain.constant
+    assert not timed.constant
+    q = np.linspace(1, 2, 9)
+    runs = [truth(m, q, 1.0, [0.0, 0.3, 1.0])[-1] for m in (plain, timed, curved)]
+    np.testing.assert_allclose(runs[1], runs[0], atol=1e-12)
+    np.testing.assert_allclose(runs[2], runs[0], atol=1e-11)
+
+
+def test_tangent_is_the_derivative_of_a_stage():
+    """S du = M dc/h: sensitivities are derivatives of the discrete step, not approximations."""
+    model, _ = cubic()
+    forward = ForwardStage(model, lp.Newton(tolerance=1e-13))
+    q = np.array([1.5])
+    rng = np.random.default_rng(2)
+    c, dc = rng.standard_normal((2, model.X.dim))
+    h, moment = 0.2, Moment(0.2)
+    u = forward.solve(c, q, h, moment)
+    factor = forward.tangent(u, q, h, moment)
+    step = 1e-6
+    for direction, rhs in (
+        ((dc, 0.0), model.mass @ dc / h),
+        ((0 * dc, 1.0), -model.form_A.matrix("v", "q", u=u) @ [1.0]),
+    ):
+        ahead = forward.solve(c + step * direction[0], q + step * direction[1], h, moment)
+        back = forward.solve(c - step * direction[0], q - step * direction[1], h, moment)
+        tangent = factor.solve(rhs * model.X.free)
+        np.testing.assert_allclose(tangent, (ahead - back) / (2 * step), atol=1e-7)
+
+
+def test_a_simulation_that_blows_up_says_so():
+    model = reaction(line(6), ElementLineP1(), B=lambda u, v, x: -np.exp(u) * v, dirichlet={})
+    control = lp.Advance(lp.ImplicitEuler(), halvings=2)
+    with pytest.raises(StepFailed) as caught:
+        list(lp.simulate(model, np.zeros(7), 5.0, [0.0, 1.0], control))
+    assert caught.value.code in {"not_converged", "not_finite", "singular"}
