@@ -118,6 +118,7 @@ class Result:
                 estimate.withheld_error,
                 STATUS_CODES.index(estimate.status.code),
                 estimate.notes,
+                estimate.steps,
             )
         )
         if (len(self._rows) - 1) % self.fields_every == 0:
@@ -152,7 +153,7 @@ class Result:
         fields = list(self._fields)
         if self.last is not None and (not fields or fields[-1][0] != self.last.t):
             fields.append((self.last.t, self._profiles(self.last)))
-        rows = list(zip(*self._rows, strict=True)) or [()] * 7
+        rows = list(zip(*self._rows, strict=True)) or [()] * 8
         points = self.model.state.mesh.p
         order = np.argsort(points[0]) if len(points) == 1 else np.arange(points.shape[1])
         data = xr.Dataset(
@@ -186,6 +187,7 @@ class Result:
             "flag_meanings": " ".join(STATUS_CODES),
         }
         data["status"] = ("time", np.array(rows[5], dtype=np.int32), flags)
+        data["steps"] = ("time", np.array(rows[7], dtype=np.int32), {"long_name": "substeps taken"})
         for name in dict.fromkeys(key for notes in rows[6] for key in notes):
             data[name] = ("time", np.array([notes.get(name, np.nan) for notes in rows[6]]))
         data.attrs["fields"] = " ".join(self.model.parameter_space.fields)

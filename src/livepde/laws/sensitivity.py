@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 
 from livepde.errors import LawError
 from livepde.fem import FieldBlock, Inputs, Moment
@@ -354,7 +353,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         e[present] = d / expected
         # C+ C+^T = C (I + HC^T HC)^-1 C^T from a QR factorisation of [I; HC].
         root = np.linalg.qr(np.vstack([np.eye(len(point.da)), HC]), mode="r")
-        C = scipy.linalg.solve_triangular(root, point.C.T, trans="T").T
+        # SciPy's triangular solve would start threads for this small matrix; this one does not.
+        C = np.linalg.solve(root.T, point.C.T).T
         step = C @ (C.T @ (H.T @ (d / noise**2)))
         return replace(
             point,
