@@ -171,7 +171,7 @@ class CoupledStage:
             equation: _Equation = _BilinearEquation(self._bilinear, self, c, h, moment, u_alpha)
         else:
             equation = _Equation(self, c, h, moment, u_alpha)
-        return self.newton.solve(equation, start, self.blocks, sweeps=True)
+        return self.newton.solve(equation, start, self.blocks, lagged=True)
 
 
 class _Equation:

@@ -70,7 +70,7 @@ class Newton:
         blocks: tuple[slice, ...] = (slice(None),),
         *,
         affine: bool = False,
-        sweeps: bool = False,
+        lagged: bool = False,
     ) -> Array:
         """Return the solution, starting from y.
 
@@ -80,7 +80,7 @@ class Newton:
             Parts of y measured separately (state and parameter have different units).
         affine
             The equation is affine: one update solves it.
-        sweeps
+        lagged
             Begin with lagged sweeps.
 
         Raises
@@ -89,7 +89,8 @@ class Newton:
             "not_converged", "not_finite" or "singular".
         """
         factor: Factor | None = None
-        last = np.inf
+        begin = y
+        last, basin, sweeps = np.inf, self.basin, lagged
         for _ in range(self.iterations):
             residual = equation.residual(y)
             try:
@@ -97,25 +98,28 @@ class Newton:
                 update = factor.solve(residual)
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
-            y = y - update
-            size = _relative(update, y, blocks)
+            new = y - update
+            size = _relative(update, new, blocks)
             if not np.isfinite(size):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
             if affine:
-                return y
+                return new
             ratio = size / last
+            if ratio >= 1.0 and lagged and not sweeps:
+                # Newton left the neighbourhood: sweep on from where it began, and come closer.
+                y, factor, sweeps, last, basin = begin, None, True, np.inf, 0.1 * basin
+                continue
+            y = new
             # The error left behind is about ratio/(1 - ratio) times the update.
             left = size * ratio / (1.0 - ratio) if 0.0 < ratio < 1.0 else np.inf
             if size == 0.0 or left <= self.tolerance:
                 return y
-            if sweeps:
-                factor = None
-                sweeps = size > self.basin
-            elif ratio > 1.0:  # Newton left the neighbourhood
-                factor, sweeps = None, True
-            elif ratio > self.refresh:
-                factor = None
             last = size
+            if sweeps and size <= basin:
+                # Newton's first update may be larger: sweeps creep, Newton goes all the way.
+                begin, factor, sweeps, last = y, None, False, np.inf
+            elif sweeps or ratio > self.refresh:
+                factor = None
         raise StepFailed(
             "not_converged",
             f"{self.iterations} iterations left a relative update of {size:.1e}",
