@@ -33,7 +33,7 @@ from livepde.laws import (
 from livepde.model import Model
 from livepde.models import Equation
 from livepde.observation import Averages, Observation, Points
-from livepde.stepping import Alexander2, ImplicitEuler
+from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines
 
 __all__ = ["Case", "Prepared", "load"]
@@ -48,10 +48,10 @@ class Prepared:
 
     Attributes
     ----------
-    identifier, stream
-        What runs, and on what. A `Table` can be iterated again, standard input cannot.
-    law
-        The law, as the identifier has it.
+    first
+        The first sample, which describes the start.
+    stream
+        All samples. A `Table` can be iterated again, standard input cannot.
     assimilate_from
         Model time from which sensors are assimilated; scores count from here, too.
     origin
@@ -59,11 +59,35 @@ class Prepared:
     """
 
     case: Case
-    identifier: Identifier
+    first: Sample
     stream: Iterable[Sample]
-    law: AnyLaw
     assimilate_from: float
     origin: datetime | None
+
+    @property
+    def law(self) -> AnyLaw:
+        """The update law."""
+        return self.case.law
+
+    @cached_property
+    def identifier(self) -> Identifier:
+        """The identifier, before the first sample."""
+        return self.identifier_with(self.law)
+
+    def identifier_with(self, law: AnyLaw) -> Identifier:
+        """Return an identifier for the same case with another law."""
+        case = self.case
+        return Identifier(
+            case.model,
+            case.observation,
+            law,
+            u0=case.initial(self.first),
+            t0=float(self.first.t),
+            withheld=case.withheld,
+            scheme=case.scheme,
+            dt_max=case.dt_max,
+            assimilate_from=self.assimilate_from,
+        )
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -136,6 +160,7 @@ class Case:
     def check(self) -> None:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
+        _ = self.scheme, self.dt_max
 
     def _convert(self, value: Any, unit: str, key: str, *, difference: bool = False) -> float:
         return convert(value, unit, self.where(key), difference=difference)
@@ -561,24 +586,26 @@ class Case:
         if first is None:
             raise DataError(f"{self.path}: the data hold no sample between start and stop.")
         assimilate_from = self._assimilate_from(data.origin)
-        spec = self.spec.steps
-        unit = self.equation.time_unit
-        dt_max = np.inf
-        if spec.dt_max is not None:
-            dt_max = self._convert(spec.dt_max, unit, "steps.dt_max")
-        identifier = Identifier(
-            self.model,
-            self.observation,
-            self.law,
-            u0=self._initial(first),
-            t0=float(first.t),
-            withheld=self.withheld,
-            scheme=Alexander2() if spec.scheme == "alexander2" else ImplicitEuler(),
-            dt_max=dt_max,
-            assimilate_from=assimilate_from,
-        )
         stream = data if isinstance(data, Table) else chain([first], samples)
-        return Prepared(self, identifier, stream, self.law, assimilate_from, data.origin)
+        prepared = Prepared(self, first, stream, assimilate_from, data.origin)
+        _ = prepared.identifier  # raises what does not fit together
+        return prepared
+
+    @cached_property
+    def scheme(self) -> Scheme:
+        """The time scheme."""
+        return Alexander2() if self.spec.steps.scheme == "alexander2" else ImplicitEuler()
+
+    @cached_property
+    def dt_max(self) -> float:
+        """The longest time step."""
+        if self.spec.steps.dt_max is None:
+            return float(np.inf)
+        unit, key = self.equation.time_unit, "steps.dt_max"
+        dt_max = self._convert(self.spec.steps.dt_max, unit, key)
+        if not dt_max > 0:
+            raise CaseError(f"{self.where(key)}: got {dt_max:g} {unit}; expected more than 0.")
+        return dt_max
 
     def _assimilate_from(self, origin: datetime | None) -> float:
         value = self._instant(self.spec.data.assimilate_from, "assimilate_from")
@@ -596,7 +623,7 @@ class Case:
             moment = moment.astimezone(UTC).replace(tzinfo=None)
         return (moment - origin).total_seconds() * self.clock.second
 
-    def _initial(self, first: Sample) -> Any:
+    def initial(self, first: Sample) -> Any:
         """Return the initial state: a number, or the first sample interpolated."""
         if self.spec.initial != "interpolate":
             return self._convert(self.spec.initial, self.equation.state.unit, "initial")

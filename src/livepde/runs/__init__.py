@@ -1,7 +1,24 @@
-"""Runs: what they hand back and the directory they leave."""
+"""Runs: what they hand back, the loop that makes them, and the directory they leave."""
 
 from __future__ import annotations
 
+from livepde.runs.directory import Run, RunWriter, free_path
+from livepde.runs.directory import open_run as open
+from livepde.runs.drive import Driven, drive
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.summary import checks_of, measures, tables
 
-__all__ = ["Check", "Outcome", "Table"]
+__all__ = [
+    "Check",
+    "Driven",
+    "Outcome",
+    "Run",
+    "RunWriter",
+    "Table",
+    "checks_of",
+    "drive",
+    "free_path",
+    "measures",
+    "open",
+    "tables",
+]

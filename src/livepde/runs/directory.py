@@ -1,0 +1,270 @@
+"""The run directory: what a run leaves behind, and its reader.
+
+::
+
+    RUN/run.json          version, command, status, checks, hash of the case
+    RUN/case.toml         a copy of the case
+    RUN/estimates.nc      the dataset (netCDF 3: any netCDF reader opens it)
+    RUN/checkpoint.npz    the identifier's state
+    RUN/report.md         tables
+    RUN/*.png             figures
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from livepde.errors import RunError
+from livepde.identifier import Identifier
+from livepde.runs.outcome import Check, FigureFactory, Table
+from livepde.runs.summary import tables
+
+__all__ = ["Run", "RunWriter", "free_path", "markdown", "open_run", "plain"]
+
+FORMAT = 1
+RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
+CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
+
+
+def free_path(wanted: Path) -> Path:
+    """Return a path that does not exist yet: the wanted one, or with a number appended."""
+    path, number = wanted, 2
+    while path.exists():
+        path = wanted.with_name(f"{wanted.name}-{number}")
+        number += 1
+    return path
+
+
+class RunWriter:
+    """A run directory while it is written; nothing that stands there is ever written over."""
+
+    def __init__(self, path: Path, record: dict[str, Any]) -> None:
+        self.path = path
+        self.record = record
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        *,
+        version: str,
+        command: Sequence[str],
+        title: str,
+        case: str | None = None,
+    ) -> RunWriter:
+        """Make the directory with its record and a copy of the case.
+
+        Raises
+        ------
+        RunError
+            The directory exists and is not empty, or cannot be made.
+        """
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            held = (path / RECORD).exists()
+            if held or any(path.iterdir()):
+                what = "already holds a run" if held else "is not empty"
+                raise RunError(f"{path} {what}: choose another folder, nothing was written.")
+            record = {
+                "format": FORMAT,
+                "livepde": version,
+                "title": title,
+                "command": list(command),
+                "started": _now(),
+                "status": "running",
+            }
+            if case is not None:
+                (path / CASE).write_text(case, encoding="utf-8")
+                record["case_sha256"] = hashlib.sha256(case.encode()).hexdigest()
+            writer = cls(path, record)
+            writer._save_record()
+        except RunError:
+            raise
+        except OSError as error:
+            raise RunError(f"{path}: cannot be made: {error.strerror or error}.") from error
+        return writer
+
+    def finish(
+        self,
+        *,
+        status: str,
+        dataset: xr.Dataset | None = None,
+        identifier: Identifier | None = None,
+        shown: Iterable[Table] = (),
+        checks: Iterable[Check] = (),
+        notes: Iterable[str] = (),
+        figures: Mapping[str, FigureFactory] | None = None,
+    ) -> None:
+        """Write what a run gave: dataset, checkpoint, report, figures; at last the record."""
+        checks, notes = list(checks), list(notes)
+        try:
+            if dataset is not None:
+                write_dataset(dataset, self.path / ESTIMATES)
+            if identifier is not None:
+                identifier.save(self.path / CHECKPOINT)
+            drawn = []
+            for name, draw in (figures or {}).items():
+                draw().savefig(self.path / f"{name}.png", dpi=120)
+                drawn.append(f"{name}.png")
+            text = markdown(str(self.record["title"]), shown, checks, notes, drawn)
+            (self.path / REPORT).write_text(text, encoding="utf-8")
+            self.record |= {
+                "status": status,
+                "ended": _now(),
+                "checks": [check.to_dict() for check in checks],
+                "notes": notes,
+            }
+            if dataset is not None:
+                self.record["samples"] = int(dataset.sizes.get("time", 0))
+            self._save_record()
+        except RunError:
+            raise
+        except OSError as error:
+            raise RunError(f"{self.path}: cannot be written: {error}.") from error
+
+    def _save_record(self) -> None:
+        target = self.path / RECORD
+        partial = target.with_name(RECORD + ".partial")
+        text = json.dumps(plain(self.record), indent=2, ensure_ascii=False)
+        partial.write_text(text + "\n", encoding="utf-8")
+        partial.replace(target)
+
+
+class Run:
+    """A run that was written; open one with `livepde.runs.open(path)`."""
+
+    def __init__(self, path: Path, record: dict[str, Any]) -> None:
+        self.path = path
+        self.record = record
+
+    @property
+    def status(self) -> str:
+        """running, finished, interrupted or failed."""
+        return str(self.record.get("status", ""))
+
+    @property
+    def title(self) -> str:
+        """Title of the case."""
+        return str(self.record.get("title", self.path.name))
+
+    @property
+    def checks(self) -> list[dict[str, Any]]:
+        """Checks as they were when the run ended."""
+        return list(self.record.get("checks", []))
+
+    @cached_property
+    def dataset(self) -> xr.Dataset:
+        """Estimates over time, as `Result.to_xarray` gave them."""
+        path = self.path / ESTIMATES
+        if not path.is_file():
+            raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.")
+        try:
+            return xr.load_dataset(path, engine="scipy")
+        except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+            raise RunError(f"{path} is damaged: {error}.") from error
+
+    def summary(self) -> list[Table]:
+        """Return its tables: estimates ± deviation, errors of each channel."""
+        return tables(self.dataset)
+
+
+def open_run(path: str | os.PathLike[str]) -> Run:
+    """Open a run directory.
+
+    Raises
+    ------
+    RunError
+        There is no run, or its record is damaged.
+    """
+    folder = Path(path)
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunError(
+            f"{folder} holds no run (no {RECORD}); 'livepde run CASE --out {folder}' makes one."
+        ) from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
+    if not isinstance(record, dict) or record.get("format") != FORMAT:
+        raise RunError(f"{folder / RECORD} is not a record of this version of livepde.")
+    return Run(folder, record)
+
+
+def write_dataset(data: xr.Dataset, path: Path) -> None:
+    """Write a dataset as netCDF 3; the file appears whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    # netCDF 3 knows no dimension without members.
+    empty = [name for name, size in data.sizes.items() if size == 0 and name != "time"]
+    kept = data.drop_dims(empty)
+    kept.attrs = {key: plain(value) for key, value in data.attrs.items()}
+    kept.to_netcdf(partial, engine="scipy")
+    partial.replace(path)
+
+
+def markdown(
+    title: str,
+    shown: Iterable[Table],
+    checks: Iterable[Check] = (),
+    notes: Iterable[str] = (),
+    figures: Iterable[str] = (),
+) -> str:
+    """Return a report in Markdown."""
+    parts = [f"# {title}"]
+    parts += [_markdown_table(table) for table in shown]
+    rows = [
+        (
+            check.name,
+            f"{check.value:.5g}",
+            check.sense,
+            _bound(check),
+            "ok" if check.ok else "FAILED",
+        )
+        for check in checks
+    ]
+    if rows:
+        parts.append(_markdown_table(Table("Checks", ("number", "value", "", "bound", ""), rows)))
+    parts += [f"> {note}" for note in notes]
+    parts += [f"![{name.removesuffix('.png')}]({name})" for name in figures]
+    return "\n\n".join(parts) + "\n"
+
+
+def _bound(check: Check) -> str:
+    if isinstance(check.bound, tuple):
+        return f"[{check.bound[0]:g}, {check.bound[1]:g}]"
+    return f"{check.bound:g}"
+
+
+def _markdown_table(table: Table) -> str:
+    def line(cells: Iterable[Any]) -> str:
+        shown = (f"{c:.5g}" if isinstance(c, float) else str(c) for c in cells)
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in shown) + " |"
+
+    rule = "|" + "---|" * len(table.columns)
+    return "\n".join([f"## {table.title}", "", line(table.columns), rule, *map(line, table.rows)])
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON can hold: NaN and infinity become null, NumPy numbers plain ones."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

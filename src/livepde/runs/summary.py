@@ -1,0 +1,134 @@
+"""What a run's dataset says in numbers: estimates, errors of each channel, checks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from livepde.runs.outcome import Check, Sense, Table
+
+__all__ = ["checks_of", "digits", "measures", "tables"]
+
+CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
+
+
+def digits(value: float, std: float) -> tuple[str, str]:
+    """Return value and deviation as text, both to the second digit of the deviation.
+
+    >>> digits(2.7344, 0.0261)
+    ('2.734', '0.026')
+    >>> digits(4.97e-07, 2.07e-08)
+    ('4.97e-07', '0.21e-07')
+    >>> digits(0.5, float("nan"))
+    ('0.5', '–')
+    """
+    if not (math.isfinite(std) and std > 0 and math.isfinite(value)):
+        return f"{value:.5g}", "–"
+    power = 0
+    if value and not 1e-3 <= abs(value) < 1e5:
+        power = math.floor(math.log10(abs(value)))
+    scale = 10.0**power
+    places = max(0, 1 - math.floor(math.log10(std / scale)))
+    exponent = f"e{power:+03d}" if power else ""
+    return f"{value / scale:.{places}f}{exponent}", f"{std / scale:.{places}f}{exponent}"
+
+
+def _scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
+    """Return channel -> (role, errors) from the start of the assimilation on."""
+    start = float(data.attrs.get("assimilate_from", -math.inf))
+    kept = data["time"].values >= start
+    found = {}
+    for variable, dimension, role in CHANNELS:
+        if variable not in data:
+            continue
+        for k, name in enumerate(data[dimension].values):
+            errors = data[variable].values[kept, k]
+            found[str(name)] = (role, errors[np.isfinite(errors)])
+    return found
+
+
+def _rmse(errors: np.ndarray[Any, Any]) -> float:
+    return float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
+
+
+def _scalars(data: xr.Dataset) -> list[str]:
+    return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
+
+
+def measures(data: xr.Dataset) -> dict[str, float]:
+    """Return every number of a run that a case may expect something of, by name.
+
+    Each scalar unknown by its label, with `.std` behind it its deviation; `rmse` one-step, of all
+    sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`, `rmse.CHANNEL`;
+    `failed_steps`.
+    """
+    found: dict[str, float] = {}
+    if data.sizes["time"]:
+        for label in _scalars(data):
+            found[label] = float(data[label][-1])
+            found[f"{label}.std"] = float(data[f"{label}_std"][-1])
+    scored = _scored(data)
+    parts = [errors for _, errors in scored.values()]
+    found["rmse"] = _rmse(np.concatenate(parts)) if parts else math.nan
+    for role in ("assimilated", "withheld"):
+        some = [errors for kind, errors in scored.values() if kind == role]
+        if some:
+            found[f"rmse.{role}"] = _rmse(np.concatenate(some))
+    for name, (_, errors) in scored.items():
+        found[f"rmse.{name}"] = _rmse(errors)
+    found["failed_steps"] = float((data["status"].values != 0).sum())
+    return found
+
+
+def checks_of(
+    expected: Mapping[str, tuple[Sense, float | tuple[float, float]]], data: xr.Dataset
+) -> list[Check]:
+    """Return a check for each expected number; a number that does not exist is NaN, and fails."""
+    found = measures(data)
+    return [
+        Check(name, found.get(name, math.nan), bound, sense)
+        for name, (sense, bound) in expected.items()
+    ]
+
+
+def tables(data: xr.Dataset) -> list[Table]:
+    """Return the tables of a run: estimates, and errors of each channel."""
+    result: list[Table] = []
+    labels = _scalars(data) if data.sizes["time"] else []
+    rows: list[tuple[Any, ...]] = []
+    if labels:
+        for label in labels:
+            value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
+            rows.append((label, *digits(value, std), data[label].attrs.get("units", "")))
+        result.append(Table("Estimates", ("unknown", "value", "± deviation", "unit"), rows))
+    fields = [name for name in str(data.attrs.get("fields", "")).split() if name in data]
+    if fields:
+        rows = []
+        for name in fields:
+            last = data[name].values[-1]
+            known = f"{name}_std" in data
+            deviation = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
+            numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
+            shown = f"{deviation:.2g}" if math.isfinite(deviation) else "–"
+            rows.append((name, *numbers, shown, data[name].attrs.get("units", "")))
+        columns = ("field", "least", "mean", "largest", "mean deviation", "unit")
+        result.append(Table("Estimated fields", columns, rows))
+    unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
+    rows = [
+        (
+            name,
+            role,
+            f"{_rmse(errors):.4g}",
+            f"{errors.mean():+.3g}" if len(errors) else "–",
+            len(errors),
+            unit,
+        )
+        for name, (role, errors) in _scored(data).items()
+    ]
+    columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
+    result.append(Table("Measured minus predicted, one step ahead", columns, rows))
+    return result
