@@ -33,6 +33,7 @@ from livepde.laws import (
 from livepde.model import Model
 from livepde.models import Equation
 from livepde.observation import Averages, Observation, Points
+from livepde.runs.outcome import Bound, Sense
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines
 
@@ -344,9 +345,9 @@ class Case:
     def _roles(self, *roles: str) -> dict[str, ChannelSpec]:
         return {name: item for name, item in self.spec.channels.items() if item.role in roles}
 
-    def _unit(self, name: str, channel: ChannelSpec) -> str:
+    def unit(self, name: str) -> str:
         """Return the model's unit of a channel."""
-        if channel.role == "input":
+        if self.spec.channels[name].role == "input":
             return self.equation.inputs[name].unit
         return self.equation.state.unit
 
@@ -355,7 +356,7 @@ class Case:
         """Channel -> where it comes from in the data."""
         found = {}
         for name, channel in self.spec.channels.items():
-            unit = self._unit(name, channel)
+            unit = self.unit(name)
             rule = conversion(channel.unit or unit, unit, self.where(f"channels.{name}.unit"))
             found[name] = Column(channel.sources, rule.factor, rule.offset)
         return found
@@ -485,6 +486,11 @@ class Case:
         if not isinstance(spec.replay, bool):
             replay = Replay(**spec.replay.model_dump())
         return SensitivityLaw(spec.modes, noise, drift, memory, replay)
+
+    @property
+    def expected(self) -> dict[str, tuple[Sense, Bound]]:
+        """Numbers that the case expects of its run."""
+        return dict(self.spec.expect)
 
     @property
     def notes(self) -> list[str]:

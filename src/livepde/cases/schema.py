@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, model_validator
 
+from livepde.runs.outcome import Bound, Sense
+
 __all__ = [
     "CaseSpec",
     "ChannelSpec",
@@ -212,6 +214,6 @@ class CaseSpec(Spec):
     law: Law
     steps: StepsSpec = Field(default_factory=StepsSpec)
     output: OutputSpec = Field(default_factory=OutputSpec)
-    expect: dict[
-        str, Annotated[tuple[str, float | tuple[float, float]], BeforeValidator(_bound)]
-    ] = Field(default_factory=dict)
+    expect: dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_bound)]] = Field(
+        default_factory=dict
+    )

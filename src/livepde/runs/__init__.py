@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livepde.runs.directory import Run, RunWriter, free_path
+from livepde.runs.directory import Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
 from livepde.runs.drive import Driven, drive
 from livepde.runs.outcome import Check, Outcome, Table
@@ -20,5 +20,6 @@ __all__ = [
     "free_path",
     "measures",
     "open",
+    "refuse_taken",
     "tables",
 ]

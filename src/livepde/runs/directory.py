@@ -29,7 +29,16 @@ from livepde.identifier import Identifier
 from livepde.runs.outcome import Check, FigureFactory, Table
 from livepde.runs.summary import tables
 
-__all__ = ["Run", "RunWriter", "free_path", "markdown", "open_run", "plain"]
+__all__ = [
+    "Run",
+    "RunWriter",
+    "bound_text",
+    "free_path",
+    "markdown",
+    "open_run",
+    "plain",
+    "refuse_taken",
+]
 
 FORMAT = 1
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
@@ -43,6 +52,17 @@ def free_path(wanted: Path) -> Path:
         path = wanted.with_name(f"{wanted.name}-{number}")
         number += 1
     return path
+
+
+def refuse_taken(path: Path) -> None:
+    """Raise `RunError` unless a run may be written here: a folder that is new or empty."""
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise RunError(f"{path} is a file: name a folder for the run, nothing was written.")
+    if any(path.iterdir()):
+        what = "already holds a run" if (path / RECORD).exists() else "is not empty"
+        raise RunError(f"{path} {what}: choose another folder, nothing was written.")
 
 
 class RunWriter:
@@ -70,11 +90,8 @@ class RunWriter:
             The directory exists and is not empty, or cannot be made.
         """
         try:
+            refuse_taken(path)
             path.mkdir(parents=True, exist_ok=True)
-            held = (path / RECORD).exists()
-            if held or any(path.iterdir()):
-                what = "already holds a run" if held else "is not empty"
-                raise RunError(f"{path} {what}: choose another folder, nothing was written.")
             record = {
                 "format": FORMAT,
                 "livepde": version,
@@ -158,9 +175,19 @@ class Run:
         return str(self.record.get("title", self.path.name))
 
     @property
-    def checks(self) -> list[dict[str, Any]]:
+    def notes(self) -> list[str]:
+        """What the run had to say beside its numbers."""
+        return [str(note) for note in self.record.get("notes", [])]
+
+    @property
+    def checks(self) -> list[Check]:
         """Checks as they were when the run ended."""
-        return list(self.record.get("checks", []))
+        found = []
+        for item in self.record.get("checks", []):
+            value = math.nan if item["value"] is None else float(item["value"])
+            bound = tuple(item["bound"]) if isinstance(item["bound"], list) else item["bound"]
+            found.append(Check(item["name"], value, bound, item["sense"]))
+        return found
 
     @cached_property
     def dataset(self) -> xr.Dataset:
@@ -226,7 +253,7 @@ def markdown(
             check.name,
             f"{check.value:.5g}",
             check.sense,
-            _bound(check),
+            bound_text(check),
             "ok" if check.ok else "FAILED",
         )
         for check in checks
@@ -238,7 +265,8 @@ def markdown(
     return "\n\n".join(parts) + "\n"
 
 
-def _bound(check: Check) -> str:
+def bound_text(check: Check) -> str:
+    """Return the bound of a check as text."""
     if isinstance(check.bound, tuple):
         return f"[{check.bound[0]:g}, {check.bound[1]:g}]"
     return f"{check.bound:g}"

@@ -10,7 +10,7 @@ import xarray as xr
 
 from livepde.errors import ConfigurationError
 
-__all__ = ["Check", "Outcome", "Sense", "Table"]
+__all__ = ["Bound", "Check", "FigureFactory", "Outcome", "Sense", "Table"]
 
 Sense: TypeAlias = Literal["<=", ">=", "in"]
 Bound: TypeAlias = float | tuple[float, float]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from livepde.runs.outcome import Check, Sense, Table
+from livepde.runs.outcome import Bound, Check, Sense, Table
 
 __all__ = ["checks_of", "digits", "measures", "tables"]
 
@@ -84,9 +84,7 @@ def measures(data: xr.Dataset) -> dict[str, float]:
     return found
 
 
-def checks_of(
-    expected: Mapping[str, tuple[Sense, float | tuple[float, float]]], data: xr.Dataset
-) -> list[Check]:
+def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> list[Check]:
     """Return a check for each expected number; a number that does not exist is NaN, and fails."""
     found = measures(data)
     return [
