@@ -256,11 +256,10 @@ class _Bilinear:
         w -> data of the block matrix [0, A(w); -A(w)^T, 0].
     lagged, jacobian
         w, and (w, q, r) -> data of the part of the stage's Jacobian that changes.
-    rate, rest
-        Linear part of the residual, its share with 1/h and the other, stacked above R, R^T M_op R
-        and R^T M R.
+    linear
+        h -> the linear part of the residual, stacked above R, R^T M_op R and R^T M R.
     known
-        u_alpha -> what it contributes to that stack.
+        (u_alpha, c/h) -> what they contribute to that stack.
     """
 
     def __init__(
@@ -282,18 +281,18 @@ class _Bilinear:
         B = model.form_B.matrix("v", "u", u=zero)
         self.offset = model.B(zero) * model.X.free
         gram = free_q @ stage.gram / g.gain
-        self.rate = sp.csr_array(sp.block_diag([free @ model.mass, gram]))
+        moving = sp.block_diag([free @ model.mass, gram])
         state = free @ (B @ P + g.nu * stage.PNP)
         mass = stage.RT @ model.mass
         observed = sp.vstack([R, stage.RM @ R, mass @ R])
         rest = sp.block_array([[sp.block_diag([state, g.sigma * gram])], [_widened(observed, m)]])
-        rate = sp.vstack([self.rate, sp.csr_array(observed.shape[:1] + (n + m,))])
+        rate = sp.vstack([moving, sp.csr_array(observed.shape[:1] + (n + m,))])
         self._pattern = Pattern.of(abs(rate) + abs(rest))
         self._rate_data = _stored(rate, self._pattern)
         self._rest_data = _stored(rest, self._pattern)
         self._linear: tuple[float, sp.csr_array] | None = None
-        inhomogeneous = [-(free @ B), sp.csr_array((m, n)), sp.eye_array(n), stage.RM, mass]
-        self.known = sp.csr_array(sp.vstack(inhomogeneous))
+        data = sp.vstack([-(free @ B), sp.csr_array((m, n)), sp.eye_array(n), stage.RM, mass])
+        self.known = sp.csr_array(sp.hstack([data, rate]))
 
     def linear(self, h: float) -> sp.csr_array:
         """Return the linear stack for a step h, kept for the last one."""
@@ -317,8 +316,7 @@ class _BilinearEquation(_Equation):
         super().__init__(stage, c, h, moment, u_alpha)
         self.products = products
         self.linear = products.linear(h)
-        self.known = products.known @ u_alpha
-        self.known[: len(c)] += products.rate @ (c / h)
+        self.known = products.known @ np.concatenate([u_alpha, c / h])
         self.known[: stage.n] += self.source * stage.model.X.free - products.offset
 
     def residual(self, y: Array) -> Array:

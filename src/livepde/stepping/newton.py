@@ -57,7 +57,7 @@ class Newton:
         Relative update below which Newton takes over from sweeps.
     """
 
-    tolerance: float = 1e-8
+    tolerance: float = 1e-7
     iterations: int = 60
     refresh: float = 0.2
     basin: float = 3e-2
