@@ -259,7 +259,7 @@ def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
             item.name,
             f"{item.prior:.3g}",
             f"{item.posterior:.3g}",
-            f"{100 * item.left:.0f} %",
+            f"{100 * item.left:.2g} %",
             item.unit,
             "hardly identified" if item.hardly else "",
         )

@@ -1,0 +1,111 @@
+"""The case that `livepde init` writes: a rod, heated and cooled at one end, made up on the spot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from livepde.errors import RunError
+from livepde.fem import Channel, Scalar, interval
+from livepde.models import heat
+from livepde.stepping import Advance, Alexander2, simulate
+
+__all__ = ["write_template"]
+
+TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
+NOISE = 0.05
+CASE = """\
+# A case of livepde: which process, what is unknown, which channel is what.
+#   livepde check {case}     what is in here, and what its sensors can tell
+#   livepde run {case}       identify; writes a run directory
+# Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
+title = "A metal rod, heated and cooled at its left end"
+equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
+                               # or your own as "file.py:function" (run it with --allow-code)
+initial = "interpolate"        # from the first sample; or a number such as "20 degC"
+
+[mesh]
+from = 0
+to = "40 cm"
+cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
+
+[data]
+file = "{data}"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
+time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
+time_unit = "s"
+# start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
+
+[unknowns.alpha]               # names are those of the equation
+prior = "5e-5 m^2/s"           # what you would have said without data ...
+std = "3e-5 m^2/s"             # ... and how far off that may be
+bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
+# by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
+# as a field: field = true, length = "10 cm"   (and no bounds)
+
+[channels]                     # name = {{ role, column, ... }}; unit = that of the column
+T_left = {{ role = "boundary", column = "T_left", at = "left" }}
+T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "{noise} K" }}
+T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
+T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "{noise} K" }}
+T_right = {{ role = "boundary", column = "T_right", at = "right" }}
+
+[law]
+kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
+replay = true                  # constant unknowns; drifting ones: drift = "0.1 1/h", memory = "1 h"
+
+[steps]
+scheme = "alexander2"          # second order; or "implicit-euler"
+dt_max = "20 s"                # longer intervals between samples are divided
+
+[expect]                       # optional: numbers that run --json checks
+alpha = [9e-5, 1.05e-4]        # the rod's data were made with {alpha:g} m^2/s
+rmse = "<= 0.15"           # its noise is {noise} K; the rest is learning
+"""
+
+
+def write_template(folder: Path) -> tuple[Path, Path]:
+    """Write a commented case and its data into a folder, and return both paths.
+
+    Raises
+    ------
+    RunError
+        One of the files is there already, or the folder cannot be written.
+    """
+    case, data = folder / "case.toml", folder / "rod.csv"
+    for path in (case, data):
+        if path.exists():
+            raise RunError(f"{path} is there already: choose another folder, nothing was written.")
+    text = CASE.format(case=case, data=data.name, noise=NOISE, alpha=TRUE_ALPHA)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        data.write_text(_measurements(), encoding="utf-8")
+        case.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error
+    return case, data
+
+
+def _measurements() -> str:
+    """Return noisy temperatures of a rod, simulated on a finer mesh than the case uses."""
+    times = np.arange(0.0, 3601.0, 20.0)
+
+    def ends(t: float) -> dict[str, float]:
+        left = 20.0 + 15.0 * np.sin(2 * np.pi * t / 1200.0) + 10.0 * (t / 3600.0)
+        return {"T_left": left, "T_right": 20.0 + 1.0 * np.sin(2 * np.pi * t / 3600.0)}
+
+    values = {"left": Channel("T_left"), "right": Channel("T_right")}
+    model = heat(interval(0.0, 0.4, 80), Scalar(TRUE_ALPHA), values)
+    at = {"T_10": 20, "T_20": 40, "T_30": 60}  # vertices
+    rng = np.random.default_rng(1)
+    lines = ["time_s,T_left,T_10,T_20,T_30,T_right"]
+    block, q = model.state_block, model.initial_parameter({"alpha": TRUE_ALPHA})
+    control = Advance(Alexander2(), 5.0)
+    for t, u in simulate(model, q, 20.0, times.tolist(), control, ends):
+        profile = block.at_vertices @ u
+        inner = [profile[k] + NOISE * rng.standard_normal() for k in at.values()]
+        cells = [f"{value:.3f}" for value in (ends(t)["T_left"], *inner, ends(t)["T_right"])]
+        if t in (600.0, 620.0):
+            cells[1] = ""  # a sensor may fail for a while: an empty cell is a missing sample
+        lines.append(",".join([f"{t:g}", *cells]))
+    return "\n".join(lines) + "\n"
