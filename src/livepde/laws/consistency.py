@@ -11,6 +11,7 @@ from livepde.linalg import Array
 __all__ = ["Consistency"]
 
 WINDOW = 500  # samples: older innovations fade, so that a poor start is forgotten
+SLOW = 50  # samples over which innovations are averaged to find errors that hide below the noise
 LARGEST_CORRELATION = 0.999
 
 
@@ -24,32 +25,44 @@ class Consistency:
         Sums of 1 and of e_k^2 over innovations, fading over `WINDOW` samples.
     pairs, product
         Sums of 1 and of e_k e_(k-1).
+    slow_count, slow_square
+        Sums of 1 and of the squared `slow`.
     last
         e of the last sample, shape (sensors,), NaN where missing.
+    slow
+        Exponential average of e over `SLOW` samples, shape (sensors,).
     """
 
     count: float
     square: float
     pairs: float
     product: float
+    slow_count: float
+    slow_square: float
     last: Array
+    slow: Array
 
     @classmethod
     def start(cls, sensors: int) -> Consistency:
         """Return the value before any innovation."""
-        return cls(0.0, 0.0, 0.0, 0.0, np.full(sensors, np.nan))
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.full(sensors, np.nan), np.zeros(sensors))
 
     def add(self, e: Array) -> Consistency:
         """Return the value after one more vector of normalised innovations."""
         products = e * self.last
         both = np.isfinite(products)
+        seen = np.isfinite(e)
+        slow = np.where(seen, self.slow + (e - self.slow) / SLOW, self.slow)
         fade = 1.0 - 1.0 / WINDOW
         return Consistency(
-            fade * self.count + float(np.isfinite(e).sum()),
+            fade * self.count + float(seen.sum()),
             fade * self.square + float(np.nansum(e**2)),
             fade * self.pairs + float(both.sum()),
             fade * self.product + float(products[both].sum()),
+            fade * self.slow_count + float(seen.sum()),
+            fade * self.slow_square + float((slow[seen] ** 2).sum()),
             e,
+            slow,
         )
 
     @property
@@ -66,10 +79,23 @@ class Consistency:
         return float(np.clip(value, -LARGEST_CORRELATION, LARGEST_CORRELATION))
 
     @property
-    def inflation(self) -> float:
-        """Factor on standard deviations: sqrt(ratio (1 + rho)/(1 - rho)), at least 1.
+    def persistence(self) -> float:
+        """Variance of the averaged innovations over that of an average of white noise of size 1.
 
-        The variance of a mean of errors that follow a first-order autoregression.
+        Model errors smaller than the noise hardly correlate one innovation with the next, and yet
+        do not average out.
+        """
+        if not self.slow_count:
+            return 1.0
+        return (2 * SLOW - 1) * self.slow_square / self.slow_count
+
+    @property
+    def inflation(self) -> float:
+        """Factor on standard deviations, at least 1.
+
+        By how much a mean of the innovations is less certain than one of white noise of the stated
+        size. The larger of two variances: ratio (1 + rho)/(1 - rho), of errors that follow a first-order
+        autoregression, and `persistence`.
         """
         rho = max(self.correlation, 0.0)
-        return float(np.sqrt(max(1.0, self.ratio * (1 + rho) / (1 - rho))))
+        return float(np.sqrt(max(1.0, self.ratio * (1 + rho) / (1 - rho), self.persistence)))
