@@ -293,7 +293,8 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
     factor, clock = _clock(data)
     t = data["time"].values / factor
     unit = str(data[labels[0]].attrs.get("units", ""))
-    late = slice(len(t) // 10, None)  # the prior's band would flatten everything that follows
+    # The prior's band would flatten everything that follows.
+    late = slice(max(len(t) // 10, _scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
     for k, label in enumerate(labels):
         value = data[label].values
@@ -397,10 +398,13 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
     t = data["time"].values / factor
     errors = data[variable].transpose("time", dimension).values
     names = [str(name) for name in data[dimension].values]
+    first = _scored_from(data)
     ax.axhline(0.0, color="black", linewidth=0.8)
+    if first:
+        ax.axvline(t[first], color=GREY, linestyle=":", label="assimilated from here")
     if len(names) <= MOST_LINES:
         for k, name in enumerate(names):
-            label = f"{name}: RMSE {_rms(errors[:, k]):.3g}"
+            label = f"{name}: RMSE {_rms(errors[first:, k]):.3g}"
             colour = PALETTE[k % len(PALETTE)]
             marker, width = ("None", 0.6) if len(t) > 100 else (".", 0.9)
             ax.plot(
@@ -419,11 +423,22 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         low, high = np.nanmin(seen, axis=1), np.nanmax(seen, axis=1)
         ax.fill_between(t, low, high, color=PALETTE[0], alpha=0.25, linewidth=0, label=label)
         root = np.sqrt(np.nanmean(seen**2, axis=1))
-        ax.plot(t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors):.3g}")
+        ax.plot(
+            t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors[first:]):.3g}"
+        )
     ax.set_xlabel(_labelled("t", clock))
     ax.set_ylabel(_labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
     ax.set_title(what)
     return _finish(ax)
+
+
+def _scored_from(data: xr.Dataset) -> int:
+    """Return the first sample that was assimilated: what comes before is not scored."""
+    start = data.attrs.get("assimilate_from")
+    if start is None:
+        return 0
+    first = int(np.searchsorted(data["time"].values, float(start)))
+    return first if first < data.sizes["time"] else 0
 
 
 def _rms(errors: Array) -> float:

@@ -94,8 +94,8 @@ class Consistency:
         """Factor on standard deviations, at least 1.
 
         By how much a mean of the innovations is less certain than one of white noise of the stated
-        size. The larger of two variances: ratio (1 + rho)/(1 - rho), of errors that follow a first-order
-        autoregression, and `persistence`.
+        size. The larger of two variances: `persistence`, and ratio (1 + rho)/(1 - rho), of errors
+        that follow a first-order autoregression.
         """
         rho = max(self.correlation, 0.0)
         return float(np.sqrt(max(1.0, self.ratio * (1 + rho) / (1 - rho), self.persistence)))
