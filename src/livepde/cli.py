@@ -269,7 +269,7 @@ def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
 
 def _show_model(console: Console, prepared: Prepared) -> None:
     case, model = prepared.case, prepared.case.model
-    console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.equation.formula)}")
+    console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.frame.equation.formula)}")
     from livepde.linalg import analyse
 
     engine = type(analyse(model.form_M.pattern("v", "u"))).__name__.removesuffix("Solver")
@@ -286,7 +286,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: Sample
     from livepde.runs import Table
 
     steps = np.diff(samples.t)
-    unit = case.equation.time_unit
+    unit = case.frame.equation.time_unit
     begin = f" from {prepared.origin}" if prepared.origin else ""
     text = f"Data: {len(samples)} samples{begin}, t = {samples.t[0]:g} to {samples.t[-1]:g} {unit}"
     if len(steps):
@@ -301,10 +301,10 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: Sample
         rows.append(
             (
                 name,
-                case.spec.channels[name].role,
+                case.frame.spec.channels[name].role,
                 least,
                 largest,
-                case.unit(name),
+                case.frame.unit(name),
                 len(values) - len(present),
                 _longest_gap(np.isfinite(values)),
             )
@@ -328,7 +328,7 @@ def _show_checks(console: Console, prepared: Prepared) -> bool:
     case, first = prepared.case, prepared.first
     values = first.z if isinstance(first.z, Mapping) else {}
     inputs = {name: values[name] for name in case.model.channels if values[name] == values[name]}
-    model = check_model(case.model, u=case.initial(first), t=first.t, inputs=inputs)
+    model = check_model(case.model, u=prepared.u0, t=first.t, inputs=inputs)
     reports = [model, check_observation(prepared.identifier.observed)]
     for item in reports:
         if item.ok:
@@ -383,12 +383,12 @@ def run(
         prepared.stream,
         progress=not as_json,
         total=total,
-        fields_every=loaded.spec.output.fields_every,
+        fields_every=loaded.fields_every,
     )
     dataset = driven.result.to_xarray()
     dataset.attrs |= prepared.attributes
     for axis in set("xyz") & set(dataset.coords):
-        dataset[axis].attrs["units"] = loaded.equation.length_unit
+        dataset[axis].attrs["units"] = loaded.frame.equation.length_unit
     checks = checks_of(loaded.expected, dataset)
     notes = list(loaded.notes)
     if driven.status == "interrupted":

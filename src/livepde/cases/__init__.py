@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from livepde.cases.build import Case, Prepared, load
+from livepde.cases.case import Case, Prepared, load
 
 __all__ = ["Case", "Prepared", "load"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from livepde.cases.build import Prepared
+from livepde.cases.case import Prepared
 from livepde.identifier import Sample
 from livepde.laws import Replay, SensitivityLaw
 from livepde.linalg import Array
@@ -55,7 +55,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> tuple[list[Identif
     reference, and its estimates are thrown away. What is left is the best case: noise as stated,
     and a model without error. Nothing for a law without covariance.
     """
-    law = prepared.law
+    law = prepared.case.law
     if not isinstance(law, SensitivityLaw):
         return [], 0
     linear = SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))

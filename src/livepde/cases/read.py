@@ -116,6 +116,8 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
         shown = "" if isinstance(got, dict) else f"got {got!r}; "
         return f"{key}: {shown}{message}."
     expected = EXPECTED.get(kind)
+    if kind == "greater_than":
+        expected = f"a number greater than {context['gt']}"
     if expected is None:
         message = str(found["msg"])
         expected = message.removeprefix("Input should be ").removeprefix("Value should be ")

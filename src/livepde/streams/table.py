@@ -252,13 +252,15 @@ class JsonLines:
         return column.factor * sum(numbers) / len(numbers) + column.offset
 
 
-def read_json_lines(path: str | Path, columns: Mapping[str, Column], clock: Clock) -> JsonLines:
+def read_json_lines(
+    path: str | Path, columns: Mapping[str, Column], clock: Clock, **options: Any
+) -> JsonLines:
     """Return the samples of a file of JSON lines; see `JsonLines`."""
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read: {error}.") from error
-    return JsonLines(lines, columns, clock, where=str(path))
+    return JsonLines(lines, columns, clock, where=str(path), **options)
 
 
 def _object(line: str, where: str) -> dict[str, Any]:

@@ -1,0 +1,281 @@
+"""From a case file to an identifier and its stream."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde.cases.data import assimilation_start, clock_of, read_data
+from livepde.cases.equations import resolve
+from livepde.cases.frame import Frame
+from livepde.cases.process import mesh_of, model_of, options_of, process_notes
+from livepde.cases.read import read_spec, read_text
+from livepde.cases.schema import GradientSpec, SensitivitySpec
+from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
+from livepde.errors import DataError, LawError
+from livepde.identifier import Identifier, Sample
+from livepde.laws import (
+    AnyLaw,
+    ConstantDamping,
+    Damping,
+    GradientLaw,
+    Replay,
+    ResidualDamping,
+    SensitivityLaw,
+)
+from livepde.model import Model
+from livepde.observation import Observation, Points
+from livepde.runs.outcome import Bound, Sense
+from livepde.stepping import Alexander2, ImplicitEuler, Scheme
+from livepde.streams import Clock, Column, Table
+
+__all__ = ["Case", "Prepared", "load"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A case with its data: ready to run.
+
+    Attributes
+    ----------
+    first
+        The first sample, which describes the start.
+    stream
+        All samples. A `Table` can be iterated again, standard input cannot.
+    assimilate_from
+        Model time from which sensors are assimilated; scores count from here, too.
+    origin
+        Date of t = 0, if the data have dates.
+    """
+
+    case: Case
+    first: Sample
+    stream: Iterable[Sample]
+    assimilate_from: float
+    origin: datetime | None
+
+    @cached_property
+    def identifier(self) -> Identifier:
+        """The identifier, before the first sample."""
+        return self.identifier_with(self.case.law)
+
+    def identifier_with(self, law: AnyLaw) -> Identifier:
+        """Return an identifier for the same case with another law."""
+        case = self.case
+        return Identifier(
+            case.model,
+            case.observation,
+            law,
+            u0=self.u0,
+            t0=float(self.first.t),
+            withheld=case.withheld,
+            scheme=case.scheme,
+            dt_max=case.dt_max,
+            assimilate_from=self.assimilate_from,
+        )
+
+    @cached_property
+    def u0(self) -> Any:
+        """The initial state: a number, or a function of x."""
+        return initial_of(self.case.frame, self.case.mesh, self.first)
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What a dataset of this case should say about itself."""
+        equation = self.case.frame.equation
+        found: dict[str, Any] = {"title": self.case.title, "equation": equation.formula}
+        if np.isfinite(self.assimilate_from):
+            found["assimilate_from"] = self.assimilate_from
+        if self.origin is not None:
+            found["origin"] = self.origin.isoformat(sep=" ")
+        return found
+
+
+def load(path: str | os.PathLike[str], *, allow_code: bool = False) -> Case:
+    """Read and check a case file.
+
+    Parameters
+    ----------
+    path
+        A TOML file.
+    allow_code
+        Load an equation of the user's own ('module:function' or 'file.py:function').
+
+    Raises
+    ------
+    CaseError
+        One sentence: which key, what it got, what was expected, and the remedy.
+    """
+    file = Path(path)
+    text = read_text(file)
+    spec = read_spec(text, str(file))
+    case = Case(Frame(file, spec, resolve(spec, file.parent, str(file), allow_code)), text)
+    case.check()
+    return case
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A case file whose parts fit together; `prepare` adds the data.
+
+    Attributes
+    ----------
+    frame
+        File, specification and equation.
+    text
+        The file's content.
+    """
+
+    frame: Frame
+    text: str
+
+    def check(self) -> None:
+        """Build all that needs no data; raises `CaseError`."""
+        _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
+        _ = self.scheme, self.dt_max
+
+    @property
+    def title(self) -> str:
+        """The title, or the name of the file."""
+        return self.frame.spec.title or self.frame.path.stem
+
+    @property
+    def expected(self) -> dict[str, tuple[Sense, Bound]]:
+        """Numbers that the case expects of its run."""
+        return dict(self.frame.spec.expect)
+
+    @property
+    def fields_every(self) -> int:
+        """Fields of every so many samples are kept."""
+        return self.frame.spec.output.fields_every
+
+    @cached_property
+    def mesh(self) -> Any:
+        """The mesh."""
+        return mesh_of(self.frame)
+
+    @cached_property
+    def options(self) -> dict[str, float]:
+        """Known numbers of the equation."""
+        return options_of(self.frame)
+
+    @cached_property
+    def model(self) -> Model:
+        """The model."""
+        return model_of(self.frame, self.mesh, self.options)
+
+    @cached_property
+    def columns(self) -> dict[str, Column]:
+        """Channel -> where it comes from in the data."""
+        return columns_of(self.frame)
+
+    @cached_property
+    def observation(self) -> Observation:
+        """What is assimilated."""
+        observation = observation_of(self.frame, self.mesh, self.options, "sensor")
+        if observation is None:
+            text = "there is no sensor to learn from; give at least one channel role = 'sensor'."
+            raise self.frame.error("channels", text)
+        return observation
+
+    @cached_property
+    def withheld(self) -> Observation | None:
+        """What is scored only."""
+        return observation_of(self.frame, self.mesh, self.options, "withheld")
+
+    @cached_property
+    def law(self) -> AnyLaw:
+        """The update law."""
+        spec = self.frame.spec.law
+        try:
+            return _gradient(spec) if isinstance(spec, GradientSpec) else self._sensitivity(spec)
+        except LawError as error:
+            raise self.frame.error("law", str(error)) from None
+
+    def _sensitivity(self, spec: SensitivitySpec) -> SensitivityLaw:
+        frame, time = self.frame, self.frame.equation.time_unit
+        noise, memory = None, float(np.inf)
+        if spec.noise is not None:
+            noise = frame.positive(spec.noise, frame.equation.state.unit, "law.noise")
+        elif noise_of(frame, "sensor") is None:
+            raise frame.missing(
+                "law.noise",
+                "the sensitivity law weighs the sensors by their noise (a standard deviation); "
+                "give it here or with every sensor.",
+            )
+        if spec.memory is not None:
+            memory = frame.positive(spec.memory, time, "law.memory")
+        drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
+        replay = Replay() if spec.replay is True else None
+        if not isinstance(spec.replay, bool):
+            replay = Replay(**spec.replay.model_dump())
+        return SensitivityLaw(spec.modes, noise, drift, memory, replay)
+
+    @cached_property
+    def scheme(self) -> Scheme:
+        """The time scheme."""
+        second_order = self.frame.spec.steps.scheme == "alexander2"
+        return Alexander2() if second_order else ImplicitEuler()
+
+    @cached_property
+    def dt_max(self) -> float:
+        """The longest time step."""
+        longest = self.frame.spec.steps.dt_max
+        if longest is None:
+            return float(np.inf)
+        return self.frame.positive(longest, self.frame.equation.time_unit, "steps.dt_max")
+
+    @cached_property
+    def clock(self) -> Clock:
+        """How times are read."""
+        return clock_of(self.frame)
+
+    @property
+    def notes(self) -> list[str]:
+        """What is allowed and yet deserves a word."""
+        found = process_notes(self.frame, self.mesh)
+        if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
+            found.append(
+                "The gradient law is made for observed subdomains and averages; a few noisy point "
+                "sensors mislead it. Use law.kind = 'sensitivity' for points."
+            )
+        return found
+
+    def prepare(self, source: str | Iterable[str] | None = None) -> Prepared:
+        """Return an identifier and its stream.
+
+        Parameters
+        ----------
+        source
+            A file instead of the case's own, or lines of JSON.
+
+        Raises
+        ------
+        DataError
+            The data cannot be used; the message names file, row and column.
+        """
+        data = read_data(self.frame, self.columns, self.clock, source)
+        samples: Iterator[Sample] = iter(data)
+        first = next(samples, None)
+        if first is None:
+            raise DataError(f"{self.frame.path}: the data hold no sample between start and stop.")
+        start = assimilation_start(self.frame, self.clock, data.origin)
+        stream = data if isinstance(data, Table) else chain([first], samples)
+        prepared = Prepared(self, first, stream, start, data.origin)
+        _ = prepared.identifier  # raises what does not fit together
+        return prepared
+
+
+def _gradient(spec: GradientSpec) -> GradientLaw:
+    damping: Damping = ResidualDamping(1.0 if spec.c1 is None else spec.c1)
+    if spec.mu is not None:
+        damping = ConstantDamping(spec.mu)
+    return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)

@@ -1,0 +1,105 @@
+"""The data of a case: which file, which times."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Mapping
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde.cases.frame import Frame
+from livepde.cases.units import conversion
+from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines
+
+__all__ = ["assimilation_start", "clock_of", "read_data"]
+
+DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
+VARIABLE = "${LIVEPDE_DATA}"
+
+
+def clock_of(frame: Frame) -> Clock:
+    """Return how times are read."""
+    data, unit = frame.spec.data, frame.equation.time_unit
+    rule = conversion(data.time_unit or unit, unit, frame.where("data.time_unit"))
+    second = conversion("s", unit, frame.where("data.time")).factor if unit else 1.0
+    start, stop = _instant(frame, data.start, "start"), _instant(frame, data.stop, "stop")
+    return Clock(data.time, rule.factor, start, stop, second)
+
+
+def _instant(frame: Frame, value: Any, key: str) -> Any:
+    """Return a date as it is, a quantity in the model's unit."""
+    if isinstance(value, str) and not DATE.match(value):
+        return frame.convert(value, frame.equation.time_unit, f"data.{key}")
+    return value
+
+
+def read_data(
+    frame: Frame,
+    columns: Mapping[str, Column],
+    clock: Clock,
+    source: str | Iterable[str] | None,
+) -> Table | JsonLines:
+    """Return the data: of the case's file, another file, or lines of JSON as they come."""
+    spec = frame.spec.data
+    if source is not None and not isinstance(source, str):
+        return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
+    path = Path(source) if source is not None else _data_file(frame)
+    if path.suffix in (".jsonl", ".ndjson"):
+        return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
+    return read_csv(path, columns, clock, every=spec.every, missing=spec.missing)
+
+
+def _data_file(frame: Frame) -> Path:
+    """Return the data file; relative names start at the case file."""
+    given = frame.spec.data.file
+    if given is None:
+        raise frame.missing("data.file", "name one, or add --data to the command.")
+    if VARIABLE in given:
+        given = given.replace(VARIABLE, str(_data_folder(frame)))
+    path = frame.path.parent / Path(given).expanduser()
+    if not path.is_file():
+        raise frame.error("data.file", f"there is no file '{path}'.")
+    return path
+
+
+def _data_folder(frame: Frame) -> Path:
+    named = os.environ.get("LIVEPDE_DATA")
+    if named:
+        return Path(named).absolute()
+    for base in (Path.cwd(), *frame.path.absolute().parents):
+        folder = base.parent / "shared" / "data"
+        if folder.is_dir():
+            return folder
+    raise frame.error(
+        "data.file",
+        f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that "
+        "holds the measurements.",
+    )
+
+
+def assimilation_start(frame: Frame, clock: Clock, origin: datetime | None) -> float:
+    """Return the model time from which sensors are assimilated."""
+    value = _instant(frame, frame.spec.data.assimilate_from, "assimilate_from")
+    if value is None:
+        return float(-np.inf)
+    if isinstance(value, float | int):
+        return float(value)
+    if origin is None:
+        text = f"got the date {value}; the times of the data are numbers."
+        raise frame.error("data.assimilate_from", text)
+    moment = value
+    if isinstance(value, str):
+        try:
+            moment = datetime.fromisoformat(value.strip())
+        except ValueError:
+            text = f"got '{value}'; expected a date as 2025-04-01 12:00."
+            raise frame.error("data.assimilate_from", text) from None
+    if isinstance(moment, date) and not isinstance(moment, datetime):
+        moment = datetime(moment.year, moment.month, moment.day)
+    if moment.tzinfo is not None:
+        moment = moment.astimezone(UTC).replace(tzinfo=None)
+    return float((moment - origin).total_seconds() * clock.second)

@@ -1,0 +1,82 @@
+"""What all parts of a case need: file, specification, equation, and conversion with a location."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from livepde.cases.read import did_you_mean
+from livepde.cases.schema import CaseSpec, ChannelSpec
+from livepde.cases.units import convert
+from livepde.errors import CaseError
+from livepde.models import Equation
+
+__all__ = ["Frame"]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A case file's specification and its equation.
+
+    Attributes
+    ----------
+    path
+        The case file.
+    spec
+        Its content, checked key by key.
+    equation
+        The PDE it names.
+    """
+
+    path: Path
+    spec: CaseSpec
+    equation: Equation
+
+    def error(self, key: str, text: str) -> CaseError:
+        """Return an error that names file and key."""
+        return CaseError(f"{self.path}: {key}: {text}")
+
+    def missing(self, key: str, text: str) -> CaseError:
+        """Return an error about a key that is missing."""
+        return CaseError(f"{self.path}: {key} is missing: {text}")
+
+    def where(self, key: str) -> str:
+        """Return file and key for a message."""
+        return f"{self.path}: {key}"
+
+    def convert(self, value: Any, unit: str, key: str, *, difference: bool = False) -> float:
+        """Return a quantity in the model's unit."""
+        return convert(value, unit, self.where(key), difference=difference)
+
+    def positive(self, value: Any, unit: str, key: str) -> float:
+        """Return a difference or duration in the model's unit, which has to be positive."""
+        number = self.convert(value, unit, key, difference=True)
+        if not number > 0:
+            raise self.error(key, f"got {value!r}; expected more than 0.")
+        return number
+
+    def pair(self, pair: tuple[Any, Any], unit: str, key: str) -> tuple[float, float]:
+        """Return an increasing pair in the model's unit."""
+        low, high = (self.convert(value, unit, key) for value in pair)
+        if not low < high:
+            raise self.error(key, f"got [{low:g}, {high:g}] {unit}; needs the lower one first.")
+        return low, high
+
+    def only(self, given: Iterable[str], known: Iterable[str], key: str) -> None:
+        """Raise unless every name given is known to the equation."""
+        for name in given:
+            if name not in known:
+                text = f"the equation '{self.equation.name}' has no '{name}' here; "
+                raise self.error(key, text + did_you_mean(name, known))
+
+    def roles(self, *roles: str) -> dict[str, ChannelSpec]:
+        """Return the channels of some roles."""
+        return {name: item for name, item in self.spec.channels.items() if item.role in roles}
+
+    def unit(self, channel: str) -> str:
+        """Return the model's unit of a channel."""
+        if self.spec.channels[channel].role == "input":
+            return self.equation.inputs[channel].unit
+        return self.equation.state.unit

@@ -1,0 +1,136 @@
+"""The channels of a case: columns, positions, noise, observations, initial state."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from livepde.cases.frame import Frame
+from livepde.cases.read import did_you_mean
+from livepde.cases.schema import ChannelSpec
+from livepde.cases.units import conversion
+from livepde.identifier import Sample
+from livepde.observation import Averages, Observation, Points
+from livepde.streams import Column
+
+__all__ = ["columns_of", "initial_of", "noise_of", "observation_of"]
+
+
+def columns_of(frame: Frame) -> dict[str, Column]:
+    """Return channel -> where it comes from in the data."""
+    found = {}
+    for name, channel in frame.spec.channels.items():
+        unit = frame.unit(name)
+        rule = conversion(channel.unit or unit, unit, frame.where(f"channels.{name}.unit"))
+        found[name] = Column(channel.sources, rule.factor, rule.offset)
+    return found
+
+
+def observation_of(
+    frame: Frame, mesh: Any, options: Mapping[str, float], role: str
+) -> Observation | None:
+    """Return what the channels of a role see; None if there are none."""
+    channels = frame.roles(role)
+    if not channels:
+        return None
+    unit, noise = frame.equation.state.unit, noise_of(frame, role)
+    spans = {
+        name: frame.pair(item.over, frame.equation.length_unit, f"channels.{name}.over")
+        for name, item in channels.items()
+        if item.over is not None
+    }
+    if spans and len(spans) < len(channels):
+        raise frame.error(
+            "channels",
+            "sensors of one role are all points (at) or all averages (over); averages are "
+            f"{', '.join(spans)}.",
+        )
+    if spans:
+        regions = {name: _inside(*span) for name, span in spans.items()}
+        return Averages(regions, noise=noise, unit=unit)
+    points, direct = {}, {}
+    for name, channel in channels.items():
+        points[name] = _position(frame, mesh, name, channel)
+        if channel.quantity is not None:
+            direct[name] = frame.equation.quantities[channel.quantity].direct(options)
+    return Points(points, direct, noise=noise, unit=unit)
+
+
+def _inside(low: float, high: float) -> Any:
+    return lambda x: (x[0] >= low) & (x[0] <= high)
+
+
+def _position(frame: Frame, mesh: Any, name: str, channel: ChannelSpec) -> Any:
+    """Return where a point sensor sits: a number, or a list of coordinates."""
+    key = f"channels.{name}.at"
+    low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+    if channel.quantity is not None:
+        known, asked = frame.equation.quantities, channel.quantity
+        if asked not in known:
+            text = f"'{frame.equation.name}' has no quantity '{asked}'; "
+            raise frame.error(f"channels.{name}.quantity", text + did_you_mean(asked, known))
+        return known[asked].at(float(low[0]), float(high[0]))
+    given = channel.at if isinstance(channel.at, tuple) else (channel.at,)
+    unit = frame.equation.length_unit
+    point = [frame.convert(value, unit, key) for value in given]
+    if len(point) != len(low):
+        raise frame.error(key, f"got {len(point)} coordinates; needs {len(low)}.")
+    for x, left, right in zip(point, low, high, strict=True):
+        slack = 1e-9 * (right - left)
+        if not left - slack <= x <= right + slack:
+            raise frame.error(
+                key,
+                f"{x:g} {unit} lies outside of the mesh, which spans {left:g} to {right:g} {unit}; "
+                "check the position and its unit.",
+            )
+    inside = [float(np.clip(x, a, b)) for x, a, b in zip(point, low, high, strict=True)]
+    return inside[0] if len(inside) == 1 else inside
+
+
+def noise_of(frame: Frame, role: str) -> list[float] | None:
+    """Return the noise of each sensor of a role; None if none is given."""
+    channels, unit = frame.roles(role), frame.equation.state.unit
+    levels = [
+        frame.positive(channel.noise, unit, f"channels.{name}.noise")
+        for name, channel in channels.items()
+        if channel.noise is not None
+    ]
+    if levels and len(levels) < len(channels):
+        missing = next(name for name, item in channels.items() if item.noise is None)
+        text = "give every sensor its noise, or none and law.noise instead."
+        raise frame.missing(f"channels.{missing}.noise", text)
+    return levels or None
+
+
+def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
+    """Return the initial state: a number, or the first sample interpolated.
+
+    Withheld channels take no part.
+    """
+    initial = frame.spec.initial
+    if initial != "interpolate":
+        if isinstance(initial, str) and not any(letter.isdigit() for letter in initial):
+            text = f"got '{initial}'; {did_you_mean(initial, ['interpolate', 'a number'])}"
+            raise frame.error("initial", text)
+        return frame.convert(initial, frame.equation.state.unit, "initial")
+    if len(mesh.p) != 1:
+        raise frame.error("initial", "'interpolate' needs an interval; give a number.")
+    ends = {"left": float(mesh.p.min()), "right": float(mesh.p.max())}
+    values = dict(first.z) if isinstance(first.z, Mapping) else {}
+    pairs = []
+    for name, channel in frame.roles("sensor", "boundary").items():
+        if channel.role == "boundary" and channel.at in ends:
+            pairs.append((ends[str(channel.at)], values[name]))
+        elif channel.role == "sensor" and channel.over is None and channel.quantity is None:
+            pairs.append((_position(frame, mesh, name, channel), values[name]))
+    present = sorted(pair for pair in pairs if np.isfinite(pair[1]))
+    if not present:
+        raise frame.error(
+            "initial",
+            "'interpolate' found no sensor or boundary with a value in the first sample; start "
+            "later, or give a number.",
+        )
+    at, level = zip(*present, strict=True)
+    return lambda x: np.interp(x[0], at, level)
