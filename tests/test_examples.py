@@ -54,7 +54,7 @@ def test_blocks_of_the_pages_run(page):
     """The blocks of a page share one namespace, as a reader types them one after the other."""
     namespace = {}
     for block in BLOCK.findall(page.read_text()):
-        exec(compile(block, str(page), "exec"), namespace)  # noqa: S102
+        exec(compile(block, str(page), "exec"), namespace)
 
 
 def test_the_readme_has_python_to_run():

@@ -73,8 +73,8 @@ class Model:
     inputs
         Names of the channels that forms read as x.inputs["name"].
 
-    `A`, `B`, `f` and `M` may each be a list of terms; `On("left", form)` restricts a term to a named
-    boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time.
+    `A`, `B`, `f` and `M` may each be a list of terms; `On("left", form)` restricts a term to a
+    named boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time.
 
     Raises
     ------
@@ -172,10 +172,9 @@ class Model:
         ):
             if isinstance(unknown, Field):
                 inner = {"L2": mass_form, "H1": h1_form}.get(str(unknown.inner), unknown.inner)
-                gram = self._on_parameter(unknown, inner)
+                blocks.append(self._on_parameter(unknown, inner) / unknown.std**2)
             else:
-                gram = sp.eye_array(block.size)
-            blocks.append(gram / unknown.std**2)
+                blocks.append(sp.eye_array(block.size) / unknown.std**2)
         gram = sp.csr_array(sp.block_diag(blocks, format="csr"))
         return HilbertSpace(gram, "Q", self.parameter_space.fixed)
 

@@ -111,8 +111,9 @@ class HilbertSpace:
         return dual
 
     def riesz(self, functional: Array) -> Array:
-        """Return the Riesz representative of a dual vector: the x of the tangent space with
-        (x, xi) = functional(xi) for every xi of it. Shape (n,) or (n, k).
+        """Return the Riesz representative of a dual vector, of shape (n,) or (n, k).
+
+        That is the x of the tangent space with (x, xi) = functional(xi) for every xi of it.
         """
         free = self.free if functional.ndim == 1 else self.free[:, None]
         return self.factor.solve(functional * free)

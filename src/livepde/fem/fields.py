@@ -72,7 +72,7 @@ def interval(
     regions
         Named subdomains, each a predicate on the midpoints of the elements.
     geometric
-        Elements grow by a constant ratio, as radial problems want it; needs start > 0. Else uniform.
+        Elements grow by a constant ratio, as radial problems want; needs start > 0. Else uniform.
     """
     if not stop > start or cells < 1:
         raise SpaceError(f"interval({start}, {stop}, {cells}): needs stop > start and cells >= 1.")

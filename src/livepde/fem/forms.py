@@ -293,7 +293,7 @@ class Form:
         coefficients: Mapping[str, Array],
         given: Integrand | None,
     ) -> Array:
-        """Return the integrand's derivative in `rows` and `cols`: (components, components, E, P)."""
+        """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P)."""
         axis = {rows: 0, cols: 1}
         jets: list[Any] = []
         for key, local in term.spaces.items():
@@ -330,9 +330,8 @@ class Form:
         (third,) = [key for key in self.spaces if key not in (rows, cols)]
         if not (self.affine and self.constant):
             return None
-        if self.nonlinear is not None and third == self.nonlinear:
-            if np.any(self._constant(rows, cols)):
-                return None
+        if third == self.nonlinear and np.any(self._constant(rows, cols)):
+            return None
         return self._tensor(rows, cols, third)
 
     def _tensor(self, rows: str, cols: str, third: str) -> sp.csr_array | None:

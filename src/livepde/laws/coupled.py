@@ -133,10 +133,10 @@ class CoupledStage:
     @cached_property
     def _bilinear(self) -> _Bilinear | None:
         form = self.model.form_A
-        tensors = [form.tensor(*pair) for pair in (("v", "q"), ("v", "u"), ("q", "u"))]
-        if not self.constant_B or any(tensor is None for tensor in tensors):
+        vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
+        if not self.constant_B or vq is None or vu is None or qu is None:
             return None
-        return _Bilinear(self, *tensors)
+        return _Bilinear(self, vq, vu, qu)
 
     def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
         """Return the norms of r that a damping rule may use; r lies in the range of R."""
@@ -286,7 +286,7 @@ class _Bilinear:
         mass = stage.RT @ model.mass
         observed = sp.vstack([R, stage.RM @ R, mass @ R])
         rest = sp.block_array([[sp.block_diag([state, g.sigma * gram])], [_widened(observed, m)]])
-        rate = sp.vstack([moving, sp.csr_array(observed.shape[:1] + (n + m,))])
+        rate = sp.vstack([moving, sp.csr_array((observed.shape[0], n + m))])
         self._pattern = Pattern.of(abs(rate) + abs(rest))
         self._rate_data = _stored(rate, self._pattern)
         self._rest_data = _stored(rest, self._pattern)
@@ -327,7 +327,7 @@ class _BilinearEquation(_Equation):
         self.w = w = y[:n] - r
         coupling = self.products.block
         coupling.set(self.products.coupling @ w)
-        out = stack[:size] + coupling.apply(np.concatenate([r, y[n:]]))
+        out: Array = stack[:size] + coupling.apply(np.concatenate([r, y[n:]]))
         out[:n] += self.pull()
         return out
 

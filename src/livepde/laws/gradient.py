@@ -74,7 +74,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
     sigma
         Stabilising term of (noisy_q), >= 0.
     M_op, N_op
-        Integrands (u, v, x) of the operators M and N of (MN1), (MN2); default u v + grad u . grad v.
+        Integrands (u, v, x) of M and N of (MN1), (MN2); default u v + grad u . grad v.
     newton
         The nonlinear iteration.
     """

@@ -86,7 +86,7 @@ class Samples:
     Attributes
     ----------
     t, z, inputs
-        Shapes (count + 1,), (count + 1, sensors), (count + 1, channels); the first row is the start.
+        Shapes (count + 1,), (count + 1, sensors), (count + 1, channels); first row: the start.
     """
 
     t: Array
@@ -352,9 +352,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         e = np.full(len(present), np.nan)
         e[present] = d / expected
         # C+ C+^T = C (I + HC^T HC)^-1 C^T from a QR factorisation of [I; HC].
-        root = np.linalg.qr(np.vstack([np.eye(len(point.da)), HC]), mode="r")
+        root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(len(point.da)), HC]), mode="r"))
         # SciPy's triangular solve would start threads for this small matrix; this one does not.
-        C = np.linalg.solve(root.T, point.C.T).T
+        C: Array = np.asarray(np.linalg.solve(root.T, point.C.T).T, dtype=float)
         step = C @ (C.T @ (H.T @ (d / noise**2)))
         return replace(
             point,

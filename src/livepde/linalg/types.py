@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, TypeAlias
 
 import numpy as np
-
 from numpy.typing import NDArray
 
 __all__ = ["Array", "IntArray", "Sparse"]

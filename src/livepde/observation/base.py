@@ -193,7 +193,7 @@ class Observed:
     def split(self, present: Array | None = None) -> Split:
         """Return R, P and G^+ for the sensors present (default all).
 
-        Sensors that repeat others are allowed: they are averaged, as the Moore-Penrose inverse does.
+        Sensors that repeat others are allowed: they are averaged, as by the Moore-Penrose inverse.
         """
         if present is None:
             present = np.ones(self.size, dtype=bool)

@@ -117,7 +117,8 @@ class Matrix(Observation):
         return tuple(self.labels)
 
     def matrix(self, state: FieldBlock) -> sp.csr_array:
-        matrix = sp.csr_array(self.G if sp.issparse(self.G) else np.atleast_2d(self.G))
+        given: Any = self.G if sp.issparse(self.G) else np.atleast_2d(self.G)
+        matrix = sp.csr_array(given)
         if matrix.shape[1] != state.size:
             raise ObservationError(
                 f"Matrix: G has {matrix.shape[1]} columns; the state has {state.size} coefficients."
