@@ -218,7 +218,7 @@ def test_newton_solves():
     equation = Equation([8.0, 27.0])
     y = lp.Newton().solve(equation, np.array([2.5, 2.5]))
     np.testing.assert_allclose(y, [2.0, 3.0], rtol=1e-9)
-    swept = lp.Newton().solve(Equation([8.0, 27.0]), np.array([2.5, 2.5]), sweeps=True)
+    swept = lp.Newton().solve(Equation([8.0, 27.0]), np.array([2.5, 2.5]), lagged=True)
     np.testing.assert_allclose(swept, [2.0, 3.0], rtol=1e-9)
 
 
