@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -158,7 +158,9 @@ def read_csv(
     frame = frame.loc[~blank]
     if not len(frame):
         raise DataError(f"{path}: holds no rows beside its header.")
-    times, dates = _times(frame[clock.name].tolist(), rows, clock, str(path))
+    times, dates = _times(
+        frame[clock.name].tolist(), clock, lambda k: f"{path}, row {rows[k]}, column"
+    )
     low, high = clock.bounds(dates, str(path))
     use = np.flatnonzero((times >= low) & (times <= high))
     if not len(use):
@@ -220,7 +222,11 @@ class JsonLines:
                 raise SampleError(
                     f"{where}: there is no '{clock.name}'{_hint(clock.name, list(row))}"
                 )
-            times, dates = _times([row[clock.name]], np.array([number]), clock, self._where)
+
+            def here(_: int, where: str = where) -> str:
+                return f"{where},"
+
+            times, dates = _times([row[clock.name]], clock, here)
             t = float(times[0])
             low, high = clock.bounds(dates, self._where)
             if t > high:
@@ -310,8 +316,8 @@ def _numbers(cells: Any, rows: Any, where: str, name: str, missing: tuple[float,
     return found
 
 
-def _times(cells: list[Any], rows: Any, clock: Clock, where: str) -> tuple[Array, bool]:
-    """Return times in the model's unit, and whether they are dates."""
+def _times(cells: list[Any], clock: Clock, where: Callable[[int], str]) -> tuple[Array, bool]:
+    """Return times in the model's unit, and whether they are dates; `where` names a cell."""
     first = cells[0]
     dates = isinstance(first, str) and not _is_number(first)
     times = np.empty(len(cells))
@@ -319,7 +325,7 @@ def _times(cells: list[Any], rows: Any, clock: Clock, where: str) -> tuple[Array
         value = _stamp(cell) if dates else _float(cell)
         if value is None or not math.isfinite(value):
             raise SampleError(
-                f"{where}, row {rows[k]}, column '{clock.name}': got {cell!r}; expected "
+                f"{where(k)} '{clock.name}': got {cell!r}; expected "
                 + ("a date and time as 2025-04-01 12:00." if dates else "a number, as before.")
             )
         times[k] = value

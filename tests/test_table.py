@@ -1,0 +1,158 @@
+"""Samples from CSV files and JSON lines."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from livepde.errors import DataError, SampleError, TimeOrderError
+from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines
+
+COLUMNS = {"T": Column(("a",)), "mean": Column(("a", "b"), factor=2.0, offset=1.0)}
+
+
+@pytest.fixture
+def csv(tmp_path):
+    def write(text: str):
+        path = tmp_path / "data.csv"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_reads_scales_and_averages(csv):
+    path = csv("t, a, b, note\n0, 1, 3, x\n10, , 4, y\n20, 5, 7, z\n")
+    table = read_csv(path, COLUMNS, Clock("t", factor=60.0))
+    assert isinstance(table, Table)
+    assert table.t.tolist() == [0.0, 600.0, 1200.0]
+    assert np.allclose(table.values, [[1, 5], [np.nan, np.nan], [5, 13]], equal_nan=True)
+    assert len(table) == 3
+    first, second, _ = table
+    assert first.t == 0.0
+    assert first.z == {"T": 1.0, "mean": 5.0}
+    assert math.isnan(second.z["T"])
+    assert [s.t for s in table] == [s.t for s in table]  # again, as often as needed
+
+
+@pytest.mark.parametrize("missing", ["", "NaN", "nan", "NA", "null", "-9999"])
+def test_what_counts_as_missing(csv, missing):
+    table = read_csv(
+        csv(f"t,a\n0,1\n1,{missing}\n"), {"T": Column(("a",))}, Clock("t"), missing=[-9999]
+    )
+    assert np.isnan(table.values[1, 0])
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("t,a,b\n0,1,1\n1,oops,1\n", "row 3, column 'a': got 'oops'"),
+        ("t,a,b\n0,1,1\n\n1,1,inf\n", "row 4, column 'b': got 'inf'"),
+        ("t,a,b\n0,1,1\n1,1,-Infinity\n", "row 3, column 'b'"),
+        ("t,a,c\n0,1,1\n", "no column 'b'"),
+        ("time,a,b\n0,1,1\n", "did you mean 'time'"),
+        ("t,a,b\n0,1,1\nlater,1,1\n", "row 3, column 't': got 'later'"),
+        ("t,a,b\n0,1,1\n,1,1\n", "row 3, column 't'"),
+        ("t,a,b\n2025-01-01,1,1\n5,1,1\n", "expected a date"),
+        ("t,a,b\n", "no rows"),
+        ("", "cannot be read"),
+    ],
+)
+def test_bad_tables_name_file_row_and_column(csv, text, named):
+    path = csv(text)
+    clock = Clock("time" if text.startswith("t,a,b\n0,1,1\n5") else "t")
+    if "did you mean" in named:
+        clock = Clock("tim")
+    with pytest.raises(DataError) as error:
+        read_csv(path, COLUMNS, clock)
+    assert named in str(error.value)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("times", ["0,2,1", "0,1,1"])
+def test_time_has_to_increase(csv, times):
+    rows = "".join(f"{t},1,1\n" for t in times.split(","))
+    with pytest.raises(TimeOrderError, match="row 4, column 't'"):
+        read_csv(csv("t,a,b\n" + rows), COLUMNS, Clock("t"))
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(DataError, match="cannot be read"):
+        read_csv(tmp_path / "none.csv", COLUMNS, Clock("t"))
+
+
+def dates(csv, **options):
+    rows = [f"2025-04-{day:02d} {hour:02d}:00,1,1" for day in (1, 2, 3) for hour in (0, 12)]
+    clock = Clock("t", **{k: v for k, v in options.items() if k != "every"})
+    every = options.get("every", 1)
+    return read_csv(csv("\n".join(["t,a,b", *rows]) + "\n"), COLUMNS, clock, every=every)
+
+
+def test_dates_count_from_the_first_sample(csv):
+    table = dates(csv)
+    assert table.t.tolist() == [43200.0 * k for k in range(6)]
+    assert str(table.origin) == "2025-04-01 00:00:00"
+
+
+def test_start_stop_every(csv):
+    table = dates(csv, start="2025-04-01 12:00", stop="2025-04-02")  # a day includes its hours
+    assert len(table) == 3
+    assert str(table.origin) == "2025-04-01 12:00:00"
+    assert len(dates(csv, every=4)) == 2
+    assert dates(csv, second=1 / 3600).t[1] == 12.0
+    with pytest.raises(DataError, match="no row lies between"):
+        dates(csv, start="2026-01-01")
+    with pytest.raises(SampleError, match="times are dates"):
+        dates(csv, start=3.0)
+    with pytest.raises(SampleError, match="times are numbers"):
+        read_csv(csv("t,a,b\n0,1,1\n"), COLUMNS, Clock("t", stop="2025-04-01"))
+
+
+def test_json_lines_come_one_at_a_time():
+    def lines():
+        yield '{"t": 0, "a": 1, "b": 3, "more": "text"}\n'
+        yield "\n"
+        yield '{"t": 1, "a": null}\n'
+        raise AssertionError("read ahead")
+
+    stream = iter(JsonLines(lines(), COLUMNS, Clock("t")))
+    assert next(stream).z == {"T": 1.0, "mean": 5.0}
+    assert math.isnan(next(stream).z["mean"])
+
+
+def test_json_lines_with_dates_and_bounds(tmp_path):
+    path = tmp_path / "data.jsonl"
+    rows = [f'{{"t": "2025-04-0{day}", "a": {day}, "b": -9999}}' for day in (1, 2, 3, 4, 5)]
+    path.write_text("\n".join(rows))
+    clock = Clock("t", start="2025-04-02", stop="2025-04-04")
+    stream = read_json_lines(path, COLUMNS, clock, missing=[-9999], every=2)
+    samples = list(stream)
+    assert [s.t for s in samples] == [0.0, 2 * 86400.0]
+    assert [s.z["T"] for s in samples] == [2.0, 4.0]
+    assert math.isnan(samples[0].z["mean"])
+    assert str(stream.origin) == "2025-04-02 00:00:00"
+    with pytest.raises(DataError, match="cannot be read"):
+        read_json_lines(tmp_path / "none.jsonl", COLUMNS, clock)
+
+
+@pytest.mark.parametrize(
+    ("line", "named"),
+    [
+        ("not json", "is not JSON"),
+        ("[1, 2]", "expected an object"),
+        ('{"time": 1}', "there is no 't'"),
+        ('{"t": 1, "a": "warm"}', "line 2, 'a': got 'warm'"),
+        ('{"t": 1, "a": true}', "got True"),
+        ('{"t": 1, "a": 1e999}', "must be finite"),
+        ('{"t": 0, "a": 1}', "not later than the one before"),
+        ('{"t": true, "a": 1}', "got True"),
+    ],
+)
+def test_bad_lines(line, named):
+    stream = JsonLines(['{"t": 0, "a": 1, "b": 1}', line], COLUMNS, Clock("t"))
+    with pytest.raises(DataError) as error:
+        list(stream)
+    assert named in str(error.value)
+    assert "line 2" in str(error.value)
