@@ -119,10 +119,13 @@ class Identifier:
             self._begin(self._inputs)
 
     def _check_names(self) -> None:
-        names = [*self.observed.names, *(self.withheld.names if self.withheld else ())]
-        twice = {name for name in names if names.count(name) > 1}
-        if self.withheld is not None and twice and not twice <= {"z0"}:
-            raise ConfigurationError(f"channels {sorted(twice)} are both assimilated and withheld.")
+        hidden = self.withheld.names if self.withheld else ()
+        both = [name for name in hidden if name in self.observed.names]
+        if both:
+            raise ConfigurationError(
+                f"channels {both} are both assimilated and withheld: give the sensors names of "
+                'their own, as in Points({"T_30": 0.3}).'
+            )
 
     def _begin(self, inputs: Inputs) -> None:
         u0 = self.model.impose(self._u0, Moment(self._t, inputs))
