@@ -123,7 +123,8 @@ def _field(
         unit = frame.equation.length_unit
         length = frame.positive(spec.length, unit, f"unknowns.{name}.length")
 
-    # In one dimension the covariance is exp(-|x - y|/length): std holds at every inner point.
+    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside; near a free end, within
+    # about one length, the deviation grows to sqrt(2) std.
     def inner(u: Any, v: Any, x: Any) -> Any:
         return 0.5 * (u * v / length + length * dot(grad(u), grad(v)))
 

@@ -70,9 +70,10 @@ class MeshSpec(Spec):
 
     @model_validator(mode="after")
     def _one_kind(self) -> MeshSpec:
-        line = self.start is not None and self.stop is not None
-        plane = self.x is not None and self.y is not None
-        if line == plane or (self.start is None) != (self.stop is None):
+        given = {"from": self.start, "to": self.stop, "x": self.x, "y": self.y}
+        names = {name for name, value in given.items() if value is not None}
+        line, plane = names == {"from", "to"}, names == {"x", "y"}
+        if not (line or plane):
             raise ValueError("expected from and to (an interval), or x and y (a rectangle)")
         if line and not isinstance(self.cells, int):
             raise ValueError("cells: expected one number for an interval")

@@ -1,0 +1,541 @@
+"""Case files: what they may say, what is refused, and the shipped ones on real measurements."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde import cases
+from livepde.cases.preview import preview
+from livepde.cases.template import write_template
+from livepde.cases.units import convert
+from livepde.runs import checks_of, measures
+
+SHIPPED = Path(__file__).resolve().parents[1] / "cases"
+
+
+@pytest.fixture
+def rod(tmp_path):
+    """Return (edit the template's text) -> path of a case."""
+    case, _ = write_template(tmp_path / "rod")
+
+    def edited(*changes: tuple[str, str]) -> Path:
+        text = case.read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        case.write_text(text)
+        return case
+
+    return edited
+
+
+def result_of(path, **options):
+    prepared = cases.load(path, **options).prepare()
+    data = prepared.identifier.run(prepared.stream, fields_every=50).to_xarray()
+    data.attrs |= prepared.attributes
+    return prepared, data
+
+
+# --- units -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "expected"),
+    [
+        (3, "m", 3.0),
+        ("20 h", "s", 72000.0),
+        ("6e-7 m^2/s", "m^2/s", 6e-7),
+        ("18.3 m", "m", 18.3),
+        ("2.55 MJ/m^3/K", "J/(m^3 K)", 2.55e6),
+        ("2.5 W/(m*degC)", "W/(m K)", 2.5),
+        ("295.25 K", "degC", 22.1),
+        ("-5 degC", "degC", -5.0),
+        ("10 %", "", 0.1),
+        ("0.01 1/day", "1/s", 0.01 / 86400),
+    ],
+)
+def test_quantities(value, unit, expected):
+    assert convert(value, unit, "key") == pytest.approx(expected, rel=1e-9)
+
+
+def test_deviations_of_temperatures_are_differences():
+    assert convert("0.1 K", "degC", "key", difference=True) == pytest.approx(0.1)
+    assert convert("0.9 degF", "degC", "key", difference=True) == pytest.approx(0.5)
+    assert convert("0.1 degC", "degC", "key", difference=True) == 0.1
+
+
+@pytest.mark.parametrize(
+    ("value", "unit"),
+    [
+        ("20 h", "m"), ("20 hx", "s"), ("5", "s"), ("h", "s"), ("3 m", ""), ("5 m^", "m"),
+        ("5 m/(s", "m"), ("1 $", "m"), ("3 import os", "m"), ("", "m"), ("1 2", "m"),
+    ],
+)  # fmt: skip
+def test_wrong_quantities_name_the_key(value, unit):
+    with pytest.raises(lp.CaseError, match=r"case.toml: mesh.to"):
+        convert(value, unit, "case.toml: mesh.to")
+
+
+def test_pint_is_loaded_only_for_a_case():
+    code = "import sys, livepde, livepde.cli; sys.exit('pint' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# --- what a case may say ---------------------------------------------------------------------
+
+
+def test_template_runs_and_finds_the_truth(rod):
+    prepared, data = result_of(rod())
+    case = prepared.case
+    assert all(check.ok for check in checks_of(case.expected, data))
+    assert not case.notes
+    assert case.title == "A metal rod, heated and cooled at its left end"
+    assert data.sizes["time"] == 181
+    assert int(np.isnan(data.innovation.sel(sensor="T_10")).sum()) == 2
+    assert set(data.withheld.values) == {"T_20"}
+    rows, count = preview(prepared, prepared.stream)
+    assert count == 181
+    (row,) = rows
+    assert row.left < 0.01
+    assert not row.hardly
+
+
+def test_template_is_not_written_over(tmp_path):
+    write_template(tmp_path)
+    (tmp_path / "case.toml").unlink()
+    with pytest.raises(lp.RunError, match="nothing was written"):
+        write_template(tmp_path)
+    assert not (tmp_path / "case.toml").exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(lp.RunError, match="cannot be written"):
+        write_template(tmp_path / "file")
+
+
+def test_units_of_columns(rod, tmp_path):
+    """The same data in Fahrenheit, minutes and with other numbers give the same estimate."""
+    import pandas as pd
+
+    path = rod()
+    _, first = result_of(path)
+    frame = pd.read_csv(path.parent / "rod.csv")
+    frame["time_s"] /= 60.0
+    frame[frame.columns[1:]] = frame[frame.columns[1:]] * 1.8 + 32.0
+    frame.to_csv(path.parent / "rod.csv", index=False)
+    changes = [('time_unit = "s"', 'time_unit = "min"'), ('prior = "5e-5 m^2/s"', "prior = 0.5"),
+               ('std = "3e-5 m^2/s"', 'std = 0.3\nunit = "cm^2/s"'),
+               ("to = \"40 cm\"", "to = 0.4")]  # fmt: skip
+    changes += [(f'column = "{name}"', f'column = "{name}", unit = "degF"')
+                for name in frame.columns[1:]]  # fmt: skip
+    _, second = result_of(rod(*changes))
+    assert float(second.alpha[-1]) == pytest.approx(float(first.alpha[-1]), rel=1e-8)
+    assert float(second.alpha_std[-1]) == pytest.approx(float(first.alpha_std[-1]), rel=1e-6)
+
+
+LAYERS = ("bounds = [", 'regions = { a = [0, "20 cm"], b = ["20 cm", "40 cm"] }\nbounds = [')
+FIELD = ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'field = true\nlength = "20 cm"')
+GRADIENT = ('kind = "sensitivity" ', 'kind = "gradient"\ngain = 1e-12\n#')
+NO_REPLAY = ("replay = true ", "#")
+
+
+def test_layers(rod):
+    prepared, data = result_of(rod(LAYERS))
+    assert {"alpha[a]", "alpha[b]"} <= set(measures(data))
+    assert len(preview(prepared, prepared.stream)[0]) == 2
+
+
+def test_layers_that_end_inside_of_a_cell_get_a_note(rod):
+    path = rod(LAYERS, ("cells = 40 ", "cells = 39 "))
+    assert "ends inside of a cell" in cases.load(path).notes[0]
+
+
+def test_field(rod):
+    prepared, data = result_of(rod(FIELD))
+    assert data.attrs["fields"] == "alpha"
+    best, worst = preview(prepared, prepared.stream)[0]
+    assert best.left < worst.left
+    assert 3e-5 <= best.prior <= 1.01 * np.sqrt(2) * 3e-5  # std inside, more at free ends
+
+
+def test_gradient_law_on_averages(rod):
+    path = rod(GRADIENT, NO_REPLAY,
+               ('at = "10 cm", noise = "0.05 K"', 'over = ["8 cm", "12 cm"]'),
+               ('at = "30 cm", noise = "0.05 K"', 'over = ["28 cm", "32 cm"]'))  # fmt: skip
+    prepared, data = result_of(path)
+    assert isinstance(prepared.case.law, lp.GradientLaw)
+    assert not prepared.case.notes
+    assert preview(prepared, prepared.stream) == ([], 0)
+    assert (data.status == 0).all()
+
+
+def test_gradient_law_on_points_gets_a_note(rod):
+    case = cases.load(rod(GRADIENT, NO_REPLAY))
+    assert "point sensors mislead" in case.notes[0]
+    assert isinstance(cases.load(rod(("gain = 1e-12", "mu = 2"))).law.damping, lp.ConstantDamping)
+
+
+def test_two_damping_rules(rod):
+    with pytest.raises(lp.CaseError, match="c1 and mu are two damping rules"):
+        cases.load(rod(GRADIENT, NO_REPLAY, ("gain = 1e-12", "c1 = 1\nmu = 1")))
+
+
+def test_sensitivity_options(rod):
+    law = cases.load(
+        rod(("replay = true ", 'drift = "0.1 1/h"\nmemory = "1 h"\nnoise = "0.1 K"\n#'))
+    ).law
+    assert (law.modes, law.noise, law.memory, law.replay) == (12, 0.1, 3600.0, None)
+    assert law.drift == pytest.approx(0.1 / 3600)
+    replay = cases.load(rod(('drift = "0.1 1/h"', "replay = {first = 16}"), ('memory = "1 h"', "")))
+    assert replay.law.replay == lp.Replay(first=16)
+
+
+def test_constant_boundary_and_initial_value(rod):
+    path = rod(
+        ('T_right = { role = "boundary", column = "T_right", at = "right" }', ""),
+        ("[data]", '[boundary]\nright = "293.15 K"\n\n[data]'),
+        ('initial = "interpolate"', 'initial = "20 degC"'),
+    )
+    prepared, data = result_of(path)
+    assert prepared.case.model.channels == ("T_left",)
+    assert float(data.u[-1, -1]) == pytest.approx(20.0)
+
+
+def test_every_and_assimilate_from(rod):
+    path = rod(("time_unit = ", 'every = 2\nassimilate_from = "10 min"\ntime_unit = '))
+    prepared, data = result_of(path)
+    assert data.sizes["time"] == 91
+    assert prepared.assimilate_from == 600.0
+    assert float(data.alpha[14]) == 5e-5  # at t = 560 s
+    assert float(data.alpha[16]) != 5e-5
+    assert data.attrs["assimilate_from"] == 600.0
+
+
+def test_reaction_diffusion_without_units(tmp_path):
+    rows = [f"{t / 10},{np.exp(-t / 10)},{np.exp(-t / 10)}" for t in range(30)]
+    (tmp_path / "data.csv").write_text("t,a,b\n" + "\n".join(rows))
+    (tmp_path / "case.toml").write_text("""
+equation = "reaction_diffusion"
+initial = 1.0
+mesh = { x = [0, 1], y = [0, 1], cells = [4, 4] }
+options = { f = 0.0 }
+data = { file = "data.csv", time = "t" }
+unknowns.q = { prior = 1.0, std = 1.0 }
+law = { kind = "sensitivity", noise = 0.1 }
+[channels]
+a = { role = "sensor", column = "a", at = [0.5, 0.5] }
+b = { role = "withheld", column = "b", at = [0.5, 0.75] }
+""")
+    _, data = result_of(tmp_path / "case.toml")
+    assert np.isfinite(data.q).all()
+    assert {"x", "y"} <= set(data.coords)
+
+
+OWN = """
+import livepde as lp
+from livepde.models import HEAT if False else EQUATIONS
+"""
+
+
+def own_code(rod, body: str) -> Path:
+    path = rod(('equation = "heat"  ', 'equation = "own.py:build"  '))
+    (path.parent / "own.py").write_text(body)
+    return path
+
+
+def test_own_equation_needs_permission(rod):
+    path = own_code(rod, "raise SystemExit(3)\n")
+    with pytest.raises(lp.CaseError, match="--allow-code"):
+        cases.load(path)
+
+
+def test_own_function_runs(rod):
+    body = "from livepde.models import heat\n\ndef build(mesh, unknowns, dirichlet):\n"
+    body += "    return heat(mesh, unknowns['alpha'], dirichlet)\n"
+    path = own_code(rod, body)
+    text = path.read_text().replace(" m^2/s", "").replace('"5e-5"', "5e-5")
+    for number in ("3e-5", "1e-6", "1e-3"):
+        text = text.replace(f'"{number}"', number)
+    path.write_text(text.replace(f'"{0.05} K"', "0.05"))
+    _, data = result_of(path, allow_code=True)
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+
+
+def test_own_equation_object_keeps_units(rod):
+    body = "from livepde.models import EQUATIONS\nbuild = EQUATIONS['heat']\n"
+    _, data = result_of(own_code(rod, body), allow_code=True)
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("body", "named"),
+    [
+        ("import nowhere_to_be_found", "ModuleNotFoundError"),
+        ("other = 3", "no function 'build'"),
+        ("def build(mesh, unknowns, dirichlet):\n    return 3", "returned int"),
+        ("def build(mesh, unknowns, dirichlet):\n    return 1 / 0", "ZeroDivisionError"),
+        ("import livepde\nraise livepde.ModelError('mine')", "mine"),
+        (
+            "import livepde\ndef build(mesh, unknowns, dirichlet):\n"
+            "    raise livepde.ModelError('mine')",
+            "mine",
+        ),
+    ],
+)
+def test_own_code_that_fails(rod, body, named):
+    path = own_code(rod, body)
+    text = path.read_text().replace(" m^2/s", "").replace(' K"', '"')
+    for number in ("5e-5", "3e-5", "1e-6", "1e-3", "0.05"):
+        text = text.replace(f'"{number}"', number)
+    path.write_text(text)
+    with pytest.raises(lp.LivepdeError, match=named):
+        cases.load(path, allow_code=True)
+
+
+def test_own_module(rod):
+    path = rod(('equation = "heat"  ', 'equation = "livepde.models.diffusion:HEAT"  '))
+    assert cases.load(path, allow_code=True).frame.equation.name == "heat"
+    path = rod(("livepde.models.diffusion:HEAT", "missing.py:build"))
+    with pytest.raises(lp.CaseError, match=r"loading 'missing\.py' failed"):
+        cases.load(path, allow_code=True)
+
+
+# --- what is refused -------------------------------------------------------------------------
+
+REFUSED = [
+    ("cells = 40", "cels = 40", "no key 'mesh.cels'; did you mean 'cells'?"),
+    ("cells = 40", 'cells = "many"', "mesh.cells: got 'many'; expected a whole number"),
+    ("cells = 40", "cells = -3", "expected a number greater than 0"),
+    ("cells = 40", "cells = [4, 4]", "one number for an interval"),
+    ("cells = 40 ", "x = [0, 1]\ncells = 3 #", "mesh: expected from and to"),
+    ("cells = 40 ", 'spacing = "geometric"\ncells = 40 #', "needs from > 0"),
+    ('to = "40 cm"', 'to = "40 s"', "mesh.to: 's' cannot be converted to 'm'"),
+    ('to = "40 cm"', 'to = "40 cmm"', "'cmm' is not a unit"),
+    ('to = "40 cm"', "to = -1", "needs from < to"),
+    ('to = "40 cm"', "to = [1]", "mesh.to: got [1]"),
+    ('prior = "5e-5 m^2/s"', 'prior = "5e-5 m/s"', "unknowns.alpha.prior"),
+    ('prior = "5e-5 m^2/s"', "prior = true", "unknowns.alpha.prior: got True"),
+    ('prior = "5e-5 m^2/s"', "", "the key 'unknowns.alpha.prior' is missing"),
+    ('prior = "5e-5 m^2/s"', "prior = 1.0", "unknowns.alpha.bounds"),
+    ('std = "3e-5 m^2/s"', "std = 0.0", "unknowns.alpha.std: got 0.0; expected more than 0"),
+    ('bounds = ["1e-6', 'field = true\nbounds = ["1e-6', "a field takes no regions"),
+    ('bounds = ["1e-6', 'length = 1\nbounds = ["1e-6', "length belongs to a field"),
+    ("bounds = [", "regions = { a = [0, 0.3] }\nbounds = [", "lies in 0 layers"),
+    ("bounds = [", "regions = { a = [0, 0.3], b = [0.2, 0.4] }\nbounds = [", "lies in 2 layers"),
+    ("bounds = [", "regions = { a = [3, 4] }\nbounds = [", "holds no cell"),
+    ("bounds = [", "regions = { a = [4, 3] }\nbounds = [", "needs the lower one first"),
+    ("[unknowns.alpha]", "[unknowns.alhpa]", "did you mean 'alpha'?"),
+    ('equation = "heat"', 'equation = "heet"', "did you mean 'heat'?"),
+    ("[law]", "[options]\nD = 1\n[law]", "has no 'D' here; leave it out"),
+    ('kind = "sensitivity"', 'kind = "sensitive"', "law.kind: got 'sensitive'; did you mean"),
+    ('kind = "sensitivity"', "", "'law.kind' is missing"),
+    ("replay = true", "replya = true", "no key 'law.replya'; did you mean 'replay'?"),
+    ("replay = true", "replay = {frist = 3}", "did you mean 'first'?"),
+    ("replay = true", 'replay = true\nmemory = "1 h"', "law: SensitivityLaw: replay"),
+    ("replay = true", "noise = -1", "law.noise: got -1"),
+    ('kind = "sensitivity"', 'kind = "gradient"\nc1 = 1\nmu = 1\n[more]', "no key 'more'"),
+    ('scheme = "alexander2"', 'scheme = "rk4"', "steps.scheme: got 'rk4'"),
+    ('dt_max = "20 s"', 'dt_max = "-20 s"', "steps.dt_max: got '-20 s'"),
+    ('role = "withheld"', 'role = "witheld"', "did you mean 'withheld'?"),
+    ('column = "T_20"', 'colunm = "T_20"', "did you mean 'column'?"),
+    ('column = "T_20"', 'column = "T_20", columns = ["T_10"]', "expected column = name"),
+    ('at = "20 cm"', 'at = "20 m"', "20 m lies outside of the mesh"),
+    ('at = "20 cm"', "at = [0.1, 0.1]", "got 2 coordinates; needs 1"),
+    ('at = "20 cm"', 'quantity = "fluid"', "has no quantity 'fluid'"),
+    (', at = "20 cm"', "", "expected one of: at = position"),
+    ('at = "left"', 'at = "lft"', "did you mean 'left'?"),
+    ('at = "left"', "at = 0.0", "needs at = the name of a boundary"),
+    ('at = "left"', 'at = "right"', "has a value already"),
+    ('at = "left"', 'at = "left", noise = 1', "noise belongs to sensors"),
+    ('role = "boundary", column = "T_left", at = "left"', 'role = "input", column = "T_left"',
+     "has no 'T_left' here"),
+    ('role = "boundary", column = "T_left", at = "left"',
+     'role = "input", column = "T_left", at = 1', "an input has no place"),
+    ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm"', "T_10.noise is missing"),
+    (', noise = "0.05 K"', "", "law.noise is missing"),
+    ('noise = "0.05 K"', 'noise = "0.05 m"', "T_10.noise: 'm' cannot"),
+    ('noise = "0.05 K"', 'noise = "0 K"', "T_10.noise: got '0 K'"),
+    ('at = "10 cm", noise', 'over = [0.1, 0.2], noise', "all points (at) or all averages"),
+    ('role = "sensor"', 'role = "withheld"', "no sensor to learn from"),
+    ("[law]", "[boundary]\nlft = 3\n[law]", "boundary: no boundary 'lft'"),
+    ('rmse = "<= 0.15"', 'rmse = "lots"', "expect.rmse: got 'lots'; expected [low, high]"),
+    ('rmse = "<= 0.15"', 'rmse = "<= 1-2"', "expect.rmse"),
+    ("title =", "titel =", "no key 'titel'; did you mean 'title'?"),
+    ("title =", "title = 3 #", "title: got 3; expected text"),
+    ("[mesh]", "[mesh", "is not valid TOML"),
+    ("T_20 = {", "T_21 = 3 #", "channels.T_21: got 3; expected a table"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "named"), REFUSED)
+def test_what_is_refused_gets_one_sentence(rod, old, new, named):
+    path = rod((old, new))
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(path)
+    message = str(error.value)
+    assert named in message
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+
+
+REFUSED_WITH_DATA = [
+    ('file = "rod.csv"', 'file = "none.csv"', "data.file: there is no file"),
+    ('file = "rod.csv"', "", "data.file is missing"),
+    ('column = "T_20"', 'column = "T_21"', "there is no column 'T_21'; did you mean 'T_20'?"),
+    ('initial = "interpolate"', 'initial = "interplate"', "did you mean 'interpolate'?"),
+    ('initial = "interpolate"', 'initial = "20 m"', "initial: 'm' cannot be converted"),
+    ("time_unit", "start = 2025-01-01\ntime_unit", "the times are numbers"),
+    ("time_unit", 'start = "2 h"\ntime_unit', "no row lies between"),
+    ("time_unit", "assimilate_from = 2025-01-01\ntime_unit", "the times of the data are numbers"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "named"), REFUSED_WITH_DATA)
+def test_what_is_refused_with_data(rod, old, new, named):
+    case = cases.load(rod((old, new)))
+    with pytest.raises(lp.LivepdeError) as error:
+        case.prepare()
+    assert named in str(error.value)
+
+
+def test_interpolation_needs_a_value_in_the_first_sample(rod):
+    path = rod()
+    lines = (path.parent / "rod.csv").read_text().splitlines()
+    lines[1] = "0,,,,,"
+    (path.parent / "rod.csv").write_text("\n".join(lines))
+    with pytest.raises(lp.CaseError, match="found no sensor or boundary"):
+        cases.load(path).prepare()
+
+
+def test_missing_case(tmp_path):
+    with pytest.raises(lp.CaseError, match="livepde init"):
+        cases.load(tmp_path / "case.toml")
+    (tmp_path / "case.toml").write_text("")
+    with pytest.raises(lp.CaseError, match=r"Did you mean '.*case\.toml'"):
+        cases.load(tmp_path / "cas.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(lp.CaseError, match="cannot be read"):
+        cases.load(tmp_path / "bytes.toml")
+
+
+def test_dates(rod):
+    path = rod()
+    lines = (path.parent / "rod.csv").read_text().splitlines()
+    rows = [lines[0]]
+    for line in lines[1:]:
+        t, rest = line.split(",", 1)
+        rows.append(
+            f"2025-04-01 {int(t) // 3600 + 9:02d}:{int(t) // 60 % 60:02d}:{int(t) % 60:02d},{rest}"
+        )
+    (path.parent / "rod.csv").write_text("\n".join(rows))
+    for start in ("2025-04-01T09:10:00", '"2025-04-01 09:10"', '"2025-04-01T09:10:00+00:00"'):
+        text = path.read_text()
+        other = path.with_name("dates.toml")
+        other.write_text(text.replace("time_unit = ", f"assimilate_from = {start}\ntime_unit = "))
+        prepared = cases.load(other).prepare()
+        assert prepared.assimilate_from == 600.0
+    assert str(prepared.origin) == "2025-04-01 09:00:00"
+    other.write_text(text.replace("time_unit = ", "assimilate_from = 2025-04-02\ntime_unit = "))
+    assert cases.load(other).prepare().assimilate_from == 15 * 3600.0
+    other.write_text(text.replace("time_unit = ", 'assimilate_from = "2025-04-99"\ntime_unit = '))
+    with pytest.raises(lp.CaseError, match="expected a date"):
+        cases.load(other).prepare()
+
+
+def test_lines_instead_of_a_file(rod):
+    lines = ['{"time_s": %d, "T_left": %g, "T_right": 20}' % (20 * k, 20 + k) for k in range(5)]  # noqa: UP031
+    prepared = cases.load(rod()).prepare(iter(lines))
+    data = prepared.identifier.run(prepared.stream).to_xarray()
+    assert data.sizes["time"] == 5
+    with pytest.raises(lp.DataError, match="no sample"):
+        cases.load(rod()).prepare(iter(()))
+    path = rod().with_name("lines.jsonl")
+    path.write_text("\n".join(lines))
+    assert len(list(cases.load(rod()).prepare(str(path)).stream)) == 5
+
+
+def test_borehole_needs_its_options_and_input(tmp_path):
+    path = SHIPPED / "thermal_response.toml"
+    text = path.read_text()
+    for old, new, named in (
+        ('H = "18.3 m"', "", "options.H is missing: the length of the borehole"),
+        ('role = "input"', 'role = "boundary"\nat = "left"', "channels.Q is missing"),
+        ("[unknowns.R_b]", "[unknowns.Rb]", "did you mean 'R_b'?"),
+    ):
+        assert old in text
+        other = tmp_path / "case.toml"
+        other.write_text(text.replace(old, new))
+        with pytest.raises(lp.CaseError) as error:
+            cases.load(other)
+        assert named in str(error.value)
+
+
+# --- shipped cases ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda path: path.stem)
+def test_shipped_cases_are_valid_and_short(path):
+    case = cases.load(path)
+    assert not case.notes
+    assert case.expected
+    assert len(case.text.splitlines()) <= 60
+    tomllib.loads(case.text)
+
+
+def shipped(name, tmp_path, *changes):
+    text = (SHIPPED / f"{name}.toml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / f"{name}.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def measured(data_dir, monkeypatch):
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+
+
+@pytest.mark.usefixtures("measured")
+def test_soil_uniform(tmp_path):
+    _, data = result_of(shipped("soil_uniform", tmp_path))
+    found = measures(data)
+    assert 4e-7 <= found["alpha"] <= 7e-7
+    assert found["rmse"] <= 0.32
+    assert {"rmse.T_10", "rmse.T_20", "rmse.T_30", "rmse.T_40", "rmse.T_50"} <= set(found)
+    assert found["failed_steps"] == 0
+
+
+@pytest.mark.usefixtures("measured")
+def test_soil_by_layer(tmp_path):
+    _, data = result_of(shipped("soil_layers", tmp_path))
+    found = measures(data)
+    assert found["rmse"] <= 0.25
+    assert found["rmse.withheld"] <= 0.25
+    # Layers as batch fits of amplitude and phase have them, within the deviations reported.
+    for layer, fit in (("05-10", 4.1e-7), ("10-20", 5.4e-7), ("20-30", 8.1e-7), ("30-40", 7.7e-7)):
+        name = f"alpha[{layer}]"
+        assert abs(found[name] - fit) <= 4 * found[f"{name}.std"]
+
+
+@pytest.mark.usefixtures("measured")
+def test_thermal_response_does_not_depend_on_the_prior(tmp_path):
+    ends = []
+    for prior in (1.5, 2, 4):
+        change = ('prior = "2 W/(m K)"', f'prior = "{prior} W/(m K)"')
+        thin = ("time_unit =", "every = 3\ntime_unit =")
+        prepared, data = result_of(shipped("thermal_response", tmp_path, change, thin))
+        found = measures(data)
+        ends.append(found["k"])
+        assert 2.6 <= found["k"] <= 3.1
+        assert abs(found["k"] - 2.88) <= 2 * found["k.std"]  # measured independently
+        assert 0.05 < found["k.std"] < 0.3
+        early = data.innovation.values[data.time.values < prepared.assimilate_from]
+        assert np.sqrt(np.nanmean(early**2)) > 5 * found["rmse"]  # the model is wrong there
+    assert max(ends) - min(ends) <= 0.05
