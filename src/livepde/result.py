@@ -178,9 +178,10 @@ class Result:
             unit = {"units": units.get(name.removesuffix("_std"), "")}
             data[name] = (("snapshot", "vertex"), values, unit)
         unit = {"units": self.observed.observation.unit}
-        shape = (len(self._rows), -1)
+        shape = (len(self._rows), self.observed.size)
         data["innovation"] = (("time", "sensor"), np.reshape(rows[3], shape), unit)
         if self.withheld is not None:
+            shape = (len(self._rows), self.withheld.size)
             data["withheld_error"] = (("time", "withheld"), np.reshape(rows[4], shape), unit)
         flags = {
             "flag_values": list(range(len(STATUS_CODES))),
