@@ -1,0 +1,307 @@
+"""The loop of a run, its directory, and what it says in numbers."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import livepde as lp
+from livepde import runs
+from livepde.models import heat
+from livepde.runs import Check, Outcome, RunWriter, Table, checks_of, drive, measures, tables
+from livepde.runs.directory import markdown, plain
+from livepde.runs.summary import digits
+
+TIMES = range(6)
+
+
+def identifier(unknown=None, withheld=True):
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = heat(mesh, unknown or lp.Scalar(0.1, 0.05, unit="m^2/s"), {"left": lp.Channel("T0")})
+    return lp.Identifier(
+        model,
+        lp.Points({"a": 0.25}, noise=0.1, unit="degC"),
+        lp.SensitivityLaw(modes=3),
+        withheld=lp.Points({"b": 0.5}) if withheld else None,
+    )
+
+
+def samples(**extra):
+    return [lp.Sample(t, {"T0": 1.0, "a": 0.1 * t, **extra}) for t in TIMES]
+
+
+@pytest.fixture
+def driven():
+    return drive(identifier(), samples(b=0.0))
+
+
+def written(path, driven, **options):
+    writer = RunWriter.create(path, version="1", command=["livepde"], title="A run", **options)
+    data = driven.result.to_xarray()
+    shown = tables(data)
+    checks = [Check("a", 1.0, 2.0, "<="), Check("b", np.nan, (0.0, 1.0), "in")]
+    writer.finish(
+        status=driven.status, dataset=data, shown=shown, checks=checks, notes=["so it is"]
+    )
+    return data
+
+
+# --- outcome ---------------------------------------------------------------------------------
+
+
+def test_checks():
+    assert Check("a", 1.0, 1.0, "<=").ok
+    assert Check("a", 1.0, 1.0, ">=").ok
+    assert Check("a", 1.0, (0.0, 1.0), "in").ok
+    assert not Check("a", np.nan, 1.0, "<=").ok
+    assert Check("a", 1, (0, 2), "in").to_dict() == {
+        "name": "a", "value": 1, "bound": [0, 2], "sense": "in", "ok": True,
+    }  # fmt: skip
+    with pytest.raises(lp.ConfigurationError, match="sense"):
+        Check("a", 1.0, 1.0, "<")  # type: ignore[arg-type]
+    with pytest.raises(lp.ConfigurationError, match="a pair"):
+        Check("a", 1.0, 1.0, "in")
+    with pytest.raises(lp.ConfigurationError, match="one number"):
+        Check("a", 1.0, (0.0, 1.0), "<=")
+
+
+def test_outcome():
+    table = Table("t", ("a",), [(1,)])
+    outcome = Outcome([table], [Check("a", 3.0, 2.0, "<=")], ["n"])
+    assert not outcome.ok
+    content = outcome.to_dict()
+    assert content["tables"] == [{"title": "t", "columns": ["a"], "rows": [[1]]}]
+    assert content["notes"] == ["n"]
+
+
+# --- loop ------------------------------------------------------------------------------------
+
+
+def test_drive_takes_every_sample(driven):
+    assert (driven.status, driven.error, len(driven.result)) == ("finished", None, len(TIMES))
+
+
+def test_drive_keeps_what_it_has_when_a_sample_is_bad():
+    stream = [*samples(), lp.Sample(2.0, {"T0": 1.0, "a": 0.0})]
+    driven = drive(identifier(), stream, progress=True)
+    assert driven.status == "failed"
+    assert isinstance(driven.error, lp.TimeOrderError)
+    assert len(driven.result) == len(TIMES)
+
+
+def test_interrupt_ends_between_samples():
+    """Ctrl-C within a step ends the run behind that step, Ctrl-C while waiting at once."""
+
+    class Slow(lp.Identifier):
+        def step(self, t, z, inputs=None):
+            if t == 3:
+                signal.raise_signal(signal.SIGINT)
+            return super().step(t, z, inputs)
+
+    one = identifier()
+    one.__class__ = Slow
+    before = signal.getsignal(signal.SIGINT)
+    driven = drive(one, samples())
+    assert (driven.status, len(driven.result)) == ("interrupted", 4)
+    assert signal.getsignal(signal.SIGINT) is before
+
+    def waiting():
+        yield from samples()[:2]
+        signal.raise_signal(signal.SIGINT)
+
+    driven = drive(identifier(), waiting())
+    assert (driven.status, len(driven.result)) == ("interrupted", 2)
+
+
+def test_drive_outside_of_the_main_thread():
+    from threading import Thread
+
+    found = []
+    thread = Thread(target=lambda: found.append(drive(identifier(), samples())))
+    thread.start()
+    thread.join()
+    assert found[0].status == "finished"
+
+
+# --- directory -------------------------------------------------------------------------------
+
+
+def test_a_run_comes_back_as_it_was(tmp_path, driven):
+    data = written(tmp_path / "run", driven, case="title = 'x'\n")
+    run = runs.open(tmp_path / "run")
+    assert run.status == "finished"
+    assert run.title == "A run"
+    assert run.notes == ["so it is"]
+    assert [check.ok for check in run.checks] == [True, False]
+    assert (tmp_path / "run" / "case.toml").read_text() == "title = 'x'\n"
+    assert run.record["samples"] == len(TIMES)
+    assert len(run.record["case_sha256"]) == 64
+    for name in data.variables:
+        assert repr(run.dataset[name].values.tolist()) == repr(data[name].values.tolist())
+    assert run.dataset.attrs["scalars"] == data.attrs["scalars"]
+    assert run.dataset.alpha.attrs["units"] == "m^2/s"
+    assert [table.to_dict() for table in run.summary()] == [t.to_dict() for t in tables(data)]
+    assert "| alpha |" in (tmp_path / "run" / "report.md").read_text()
+
+
+@pytest.mark.parametrize("field", [True, False])
+def test_fields_and_runs_without_withheld_channels(tmp_path, field):
+    one = identifier(withheld=False)
+    if field:
+        mesh = lp.interval(0.0, 1.0, 8)
+        from livepde.models import EQUATIONS
+
+        unknown = lp.Field(mesh, EQUATIONS["heat"].element(mesh), inner="H1", prior=0.1, std=0.05)
+        model = heat(mesh, unknown, {"left": lp.Channel("T0")})
+        one = lp.Identifier(model, lp.Points({"a": 0.25}, noise=0.1), lp.SensitivityLaw(modes=3))
+    data = written(tmp_path / "run", drive(one, samples()))
+    back = runs.open(tmp_path / "run").dataset
+    assert np.array_equal(back.u.values, data.u.values)
+    titles = [table.title for table in tables(back)]
+    assert ("Estimated fields" in titles) == field
+
+
+def test_a_run_without_samples(tmp_path):
+    written(tmp_path / "run", drive(identifier(), []))
+    assert runs.open(tmp_path / "run").dataset.sizes["time"] == 0
+
+
+def test_nothing_is_written_over(tmp_path, driven):
+    written(tmp_path / "run", driven)
+    before = (tmp_path / "run" / "run.json").read_text()
+    with pytest.raises(lp.RunError, match="already holds a run"):
+        written(tmp_path / "run", driven)
+    assert (tmp_path / "run" / "run.json").read_text() == before
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("mine")
+    with pytest.raises(lp.RunError, match="is not empty"):
+        written(tmp_path / "other", driven)
+    with pytest.raises(lp.RunError, match="is a file"):
+        written(tmp_path / "other" / "notes.txt", driven)
+    with pytest.raises(lp.RunError, match="cannot be made"):
+        written(tmp_path / "other" / "notes.txt" / "run", driven)
+    (tmp_path / "empty").mkdir()
+    written(tmp_path / "empty", driven)
+
+
+def test_free_path(tmp_path):
+    assert runs.free_path(tmp_path / "demo").name == "demo"
+    (tmp_path / "demo").mkdir()
+    assert runs.free_path(tmp_path / "demo").name == "demo-2"
+    (tmp_path / "demo-2").mkdir()
+    assert runs.free_path(tmp_path / "demo").name == "demo-3"
+
+
+def test_a_folder_that_vanishes(tmp_path, driven):
+    writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")
+    (tmp_path / "run" / "run.json").unlink()
+    (tmp_path / "run").rmdir()
+    with pytest.raises(lp.RunError, match="cannot be written"):
+        writer.finish(status="finished", dataset=driven.result.to_xarray())
+
+
+def test_checkpoint_continues(tmp_path):
+    first = identifier()
+    whole = identifier()
+    drive(first, samples()[:3])
+    writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")
+    writer.finish(status="finished", identifier=first)
+    second = identifier()
+    second.load(tmp_path / "run" / "checkpoint.npz")
+    drive(second, samples()[3:])
+    drive(whole, samples())
+    assert np.array_equal(second.estimate().q, whole.estimate().q)
+
+
+def test_runs_that_cannot_be_opened(tmp_path, driven):
+    with pytest.raises(lp.RunError, match="holds no run"):
+        runs.open(tmp_path)
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(lp.RunError, match="is damaged"):
+        runs.open(tmp_path)
+    (tmp_path / "run.json").write_text('{"format": 99}')
+    with pytest.raises(lp.RunError, match="not a record of this version"):
+        runs.open(tmp_path)
+    (tmp_path / "run.json").write_text(json.dumps({"format": 1, "status": "running"}))
+    run = runs.open(tmp_path)
+    assert run.title == tmp_path.name
+    assert run.checks == []
+    with pytest.raises(lp.RunError, match="holds no estimates; its status is 'running'"):
+        _ = run.dataset
+    (tmp_path / "estimates.nc").write_text("not netCDF")
+    with pytest.raises(lp.RunError, match="is damaged"):
+        _ = run.dataset
+
+
+def test_figures_are_drawn(tmp_path, driven):
+    pytest.importorskip("matplotlib")
+    writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")
+    writer.finish(status="finished", figures={"overview": driven.result.plot})
+    assert (tmp_path / "run" / "overview.png").stat().st_size > 1000
+    assert "![overview](overview.png)" in (tmp_path / "run" / "report.md").read_text()
+
+
+# --- numbers ---------------------------------------------------------------------------------
+
+
+def test_measures_and_checks(driven):
+    data = driven.result.to_xarray()
+    found = measures(data)
+    assert found["alpha"] == float(data.alpha[-1])
+    assert found["alpha.std"] == float(data.alpha_std[-1])
+    both = np.concatenate([data.innovation.values.ravel(), data.withheld_error.values.ravel()])
+    assert found["rmse"] == pytest.approx(np.sqrt(np.mean(both**2)))
+    assert found["rmse.a"] == found["rmse.assimilated"]
+    assert found["rmse.b"] == found["rmse.withheld"]
+    assert found["failed_steps"] == 0
+    checks = checks_of({"alpha": (">=", -9.0), "beta": ("<=", 1.0)}, data)
+    assert [check.ok for check in checks] == [True, False]
+
+
+def test_scores_begin_with_the_assimilation(driven):
+    data = driven.result.to_xarray()
+    data.attrs["assimilate_from"] = 3.0
+    late = data.innovation.sel(sensor="a")[3:]
+    assert measures(data)["rmse.a"] == pytest.approx(float(np.sqrt((late**2).mean())))
+    data.attrs["assimilate_from"] = 99.0
+    assert np.isnan(measures(data)["rmse"])
+    assert any("–" in row for table in tables(data) for row in table.rows)
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "expected"),
+    [
+        (2.7344, 0.0261, ("2.734", "0.026")),
+        (4.97e-7, 2.07e-8, ("4.97e-07", "0.21e-07")),
+        (1234.5, 67.0, ("1234", "67")),
+        (0.0, 0.5, ("0.00", "0.50")),
+        (0.5, np.nan, ("0.5", "–")),
+    ],
+)
+def test_digits(value, std, expected):
+    assert digits(value, std) == expected
+
+
+def test_markdown_and_plain():
+    table = Table("T", ("a|b", "n"), [("x|y", 1.23456789)])
+    text = markdown("Title", [table], [Check("c", 2.0, (0.0, 1.0), "in")], ["note"], ["f.png"])
+    assert "| x\\|y | 1.2346 |" in text
+    assert "FAILED" in text
+    assert "> note" in text
+    assert plain({"a": [np.float64(1.5), np.nan, np.int64(2)], 1: (np.inf,)}) == {
+        "a": [1.5, None, 2], "1": [None],
+    }  # fmt: skip
+    json.dumps(plain({"x": np.float32(0.5)}), allow_nan=False)
+
+
+def test_dataset_is_netcdf_that_others_read(tmp_path, driven):
+    written(tmp_path / "run", driven)
+    from scipy.io import netcdf_file
+
+    with netcdf_file(tmp_path / "run" / "estimates.nc", mmap=False) as file:
+        assert "alpha" in file.variables
+    assert isinstance(runs.open(tmp_path / "run").dataset, xr.Dataset)
