@@ -1,0 +1,375 @@
+"""The command line as users meet it: output, files, exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import livepde
+from livepde import cli
+from livepde.cases.template import write_template
+from livepde.errors import LivepdeError
+from livepde.runs import Check, Outcome, Table
+
+COMMANDS = ("demo", "reproduce", "init", "check", "run", "report", "bench")
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def rod(here):
+    write_template(here / "rod")
+    return "rod/case.toml"
+
+
+def call(*arguments: str, stdin: str | None = None) -> tuple[int, str]:
+    """Return exit code and output of a command that ends as it should."""
+    result = CliRunner().invoke(cli.app, list(arguments), input=stdin)
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.output
+
+
+def shell(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    code = "import sys; from livepde.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, **options)
+
+
+def bad(*arguments: str) -> str:
+    """Return the one sentence of a command that ends with bad input."""
+    with pytest.raises(LivepdeError) as error:
+        call(*arguments)
+    return str(error.value)
+
+
+# --- help and errors -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_teaches(command):
+    code, output = call(command, "--help")
+    assert code == 0
+    assert "Example:" in output or "Live:" in output
+
+
+def test_version():
+    assert call("--version") == (0, f"livepde {livepde.__version__}\n")
+
+
+def test_bad_input_is_one_sentence_and_exit_code_2(here):
+    result = shell("run", "none.toml")
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith("Error: none.toml: there is no such case file")
+    assert result.stderr.count("\n") == 1
+    assert "Traceback" not in result.stderr
+    assert list(here.iterdir()) == []
+
+
+def test_wrong_usage_is_exit_code_2():
+    assert shell("run").returncode == 2
+    assert shell("walk").returncode == 2
+
+
+def test_main_returns_codes(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["livepde", "report", "nowhere"])
+    assert cli.main() == 2
+    assert "[" not in capsys.readouterr().out
+
+    def broken(**_):
+        raise BrokenPipeError
+
+    class Stream:
+        def close(self):
+            self.closed = True
+
+    monkeypatch.setattr(cli, "app", broken)
+    monkeypatch.setattr(sys, "stderr", Stream())
+    assert cli.main() == 0
+
+
+# --- cases -----------------------------------------------------------------------------------
+
+
+def test_init_check_run_report(here):
+    code, output = call("init", "mine")
+    assert code == 0
+    assert "livepde run mine/case.toml" in output
+    assert {p.name for p in (here / "mine").iterdir()} == {"case.toml", "rod.csv"}
+
+    code, output = call("check", "mine/case.toml")
+    assert code == 0
+    assert "181 samples" in output
+    assert "model: ok" in output
+    assert "observation: ok" in output
+    assert "hardly identified" not in output
+    assert {p.name for p in here.iterdir()} == {"mine"}  # nothing is written
+
+    code, output = call("run", "mine/case.toml")
+    assert code == 0
+    assert "alpha" in output
+    assert "runs/case" in output
+    names = {p.name for p in (here / "runs" / "case").iterdir()}
+    assert {"run.json", "case.toml", "estimates.nc", "checkpoint.npz", "report.md"} <= names
+    assert call("run", "mine/case.toml")[1].strip().endswith("runs/case-2")
+
+    before = (here / "runs" / "case" / "report.md").read_text()
+    code, output = call("report", "runs/case")
+    assert code == 0
+    assert "T_20" in output
+    assert (here / "runs" / "case" / "report.md").read_text() == before
+
+
+def test_run_as_json_with_checks(rod):
+    code, output = call("run", rod, "--json", "--out", "out")
+    assert code == 0
+    content = json.loads(output)
+    assert [check["name"] for check in content["checks"]] == ["alpha", "rmse"]
+    assert all(check["ok"] for check in content["checks"])
+    assert content["run"] == "out"
+    assert content["status"] == "finished"
+    assert content["measures"]["failed_steps"] == 0
+    code, again = call("report", "out", "--json")
+    assert code == 0
+    assert json.loads(again)["checks"] == content["checks"]
+
+
+def test_a_failed_check_is_exit_code_1_with_json(rod):
+    path = Path(rod)
+    path.write_text(
+        path.read_text().replace('rmse = "<= 0.15"', 'rmse = "<= 0.001"\nbeta = [0, 1]')
+    )
+    code, output = call("run", rod, "--json", "--out", "out")
+    assert code == 1
+    checks = {check["name"]: check for check in json.loads(output)["checks"]}
+    assert not checks["rmse"]["ok"]
+    assert checks["beta"] == {
+        "name": "beta", "value": None, "bound": [0, 1], "sense": "in", "ok": False,
+    }  # fmt: skip
+    assert call("report", "out", "--json")[0] == 1
+    code, output = call("run", rod, "--out", "other")
+    assert code == 0
+    assert "failed" in output
+
+
+def test_nothing_is_written_over(rod, here):
+    call("run", rod, "--out", "out")
+    before = {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()}
+    assert "already holds a run" in bad("run", rod, "--out", "out")
+    assert {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()} == before
+    assert "is there already" in bad("init", "rod")
+
+
+def test_a_case_that_is_refused_leaves_nothing(rod, here):
+    path = Path(rod)
+    path.write_text(path.read_text().replace("cells", "cels"))
+    assert "did you mean 'cells'?" in bad("run", rod, "--out", "out")
+    assert not (here / "out").exists()
+
+
+def test_data_that_are_refused_leave_nothing(rod, here):
+    data = here / "rod" / "rod.csv"
+    data.write_text(data.read_text().replace("\n40,", "\n40,warm"))
+    assert "row 4, column 'T_left': got 'warm" in bad("run", rod, "--out", "out")
+    assert not (here / "out").exists()
+
+
+def test_check_tells_what_can_hardly_be_identified(rod):
+    path = Path(rod)
+    text = path.read_text().replace("bounds =", "# bounds =")
+    text = text.replace(
+        "# by layer:", 'regions = { near = [0, "39 cm"], far = ["39 cm", "40 cm"] }\n#'
+    )
+    text = text.replace('"0.05 K"', '"5 K"')
+    path.write_text(text)
+    code, output = call("check", rod)
+    assert code == 0
+    assert "hardly identified" in output
+
+
+def test_check_shows_notes_and_failures(rod, monkeypatch):
+    path = Path(rod)
+    path.write_text(path.read_text().replace('kind = "sensitivity"', 'kind = "gradient"')
+                    .replace("replay = true", "#"))  # fmt: skip
+    code, output = call("check", rod)
+    assert code == 0
+    assert "Note: The gradient law" in output
+
+    from livepde import diagnostics
+
+    report = diagnostics.CheckReport(
+        "model", (diagnostics.CheckLine.at_most("transpose", 1.0, 1e-12, "mend it"),)
+    )
+    monkeypatch.setattr(diagnostics, "check_model", lambda *_, **__: report)
+    code, output = call("check", rod)
+    assert code == 1
+    assert "transpose" in output
+
+
+def lines(count: int) -> str:
+    row = '{{"time_s": {t}, "T_left": {v}, "T_10": 20, "T_20": 20, "T_30": 20, "T_right": 20}}\n'
+    return "".join(row.format(t=20 * k, v=20 + k % 7) for k in range(count))
+
+
+def test_standard_input(rod):
+    code, output = call("run", rod, "--data", "-", "--json", "--out", "out", stdin=lines(12))
+    assert code in (0, 1)
+    assert json.loads(output)["tables"][1]["rows"][0][4] == 12
+
+
+def test_a_bad_line_ends_a_run_that_is_kept(rod, here):
+    stdin = lines(5) + '{"time_s": 100, "T_left": "warm"}\n'
+    with pytest.raises(livepde.SampleError, match="line 6, 'T_left': got 'warm'"):
+        call("run", rod, "--data", "-", "--out", "out", stdin=stdin)
+    record = json.loads((here / "out" / "run.json").read_text())
+    assert record["status"] == "failed"
+    assert record["samples"] == 5
+    code, output = call("report", "out")
+    assert code == 0
+    assert "Stopped after 5 samples" in output
+
+
+def test_json_lines_file_can_be_checked(rod, here):
+    (here / "data.jsonl").write_text(lines(30))
+    code, output = call("check", rod, "--data", "data.jsonl")
+    assert code == 0
+    assert "30 samples can tell" in output
+
+
+def test_ctrl_c_keeps_what_there_is(rod, here):
+    code = "import sys; from livepde.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "run", rod, "--data", "-", "--out", "out"]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdin is not None
+    process.stdin.write(lines(8))
+    process.stdin.flush()
+    record = here / "out" / "run.json"
+    for _ in range(300):
+        if record.exists():
+            break
+        signal.sigtimedwait([], 0.05)
+    signal.sigtimedwait([], 1.0)  # the samples are taken; now it waits for more
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors
+    assert json.loads(record.read_text())["status"] == "interrupted"
+    assert json.loads(record.read_text())["samples"] == 8
+
+
+def test_no_figures_without_matplotlib(rod, here, monkeypatch):
+    import importlib.util
+
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *a: None if name == "matplotlib" else found(name, *a),
+    )
+    code, output = call("run", rod, "--out", "out")
+    assert code == 0
+    assert "pip install 'livepde[plots]'" in output
+    assert not list((here / "out").glob("*.png"))
+
+
+def test_silence_in_a_pipe(rod):
+    result = shell("run", rod, "--json", "--out", "out", env={**os.environ, "TERM": "dumb"})
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    json.loads(result.stdout)
+
+
+# --- experiments -----------------------------------------------------------------------------
+
+
+def outcome(value: float) -> Outcome:
+    def draw():
+        from livepde import plots
+
+        return plots.figure()[0]
+
+    return Outcome(
+        [Table("errors", ("gain", "error"), [("1", value)])],
+        [Check("error of q", value, 0.05, "<=")],
+        ["a note"],
+        figures={"parameter": draw},
+    )
+
+
+class Fake:
+    name = "seed"
+    summary = "the first experiment"
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+        self.asked: list[tuple[str | None, bool]] = []
+
+    def run(self, truth=None, progress=False):
+        self.asked.append((truth, progress))
+        return outcome(self.value)
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    from livepde import bench, reproduce
+
+    def install(value: float) -> Fake:
+        one = Fake(value)
+        monkeypatch.setattr(reproduce, "EXPERIMENTS", {"seed": one})
+        monkeypatch.setattr(bench, "BENCHMARKS", {"step": lambda: outcome(value)})
+        return one
+
+    return install
+
+
+def test_demo(fake, here):
+    fake(0.04)
+    code, output = call("demo")
+    assert code == 0
+    assert "errors" in output
+    assert (here / "runs" / "demo" / "parameter.png").is_file()
+    assert output.rstrip().endswith("runs/demo")
+    assert call("demo")[1].rstrip().endswith("runs/demo-2")
+
+
+@pytest.mark.parametrize(("value", "expected"), [(0.04, 0), (0.06, 1)])
+def test_reproduce_and_bench_as_json(fake, value, expected):
+    one = fake(value)
+    code, output = call("reproduce", "seed", "--truth", "analytic", "--json")
+    assert code == expected
+    assert json.loads(output)["checks"] == [
+        {"name": "error of q", "value": value, "bound": 0.05, "sense": "<=", "ok": value < 0.05}
+    ]
+    assert one.asked == [("analytic", False)]
+    code, output = call("bench", "step", "--json")
+    assert code == expected
+    assert json.loads(output)["notes"] == ["a note"]
+
+
+def test_reproduce_and_bench_for_people(fake, here):
+    fake(0.06)
+    code, output = call("reproduce", "seed", "--out", "kept")
+    assert code == 0
+    assert "failed" in output
+    assert (here / "kept" / "parameter.png").is_file()
+    assert call("bench", "step")[0] == 0
+    assert "the first experiment" in call("reproduce", "list")[1]
+    assert "step" in call("bench")[1]
+    assert "did you mean 'seed'?" in bad("reproduce", "sed")
+    assert "expected one of step" in bad("bench", "xyz")
