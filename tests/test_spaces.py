@@ -167,7 +167,7 @@ def test_number_of_modes_must_exist(count):
 def test_bad_unknowns():
     mesh, element = line(), ElementLineP1()
     with pytest.raises(lp.SpaceError, match="expected 'L2', 'H1'"):
-        lp.Field(mesh, element, inner="H2")
+        lp.Field(mesh, element, inner="H3")
     with pytest.raises(lp.SpaceError, match=r"no boundary 'top'.*'left'"):
         lp.Field(mesh, element, dirichlet={"top": 0.0})
     for std in (0.0, -1.0, np.inf, np.nan):

@@ -20,13 +20,14 @@ from livepde.fem import (
     Integrand,
     Moment,
     On,
+    Sobolev,
     Unknown,
     dot,
     grad,
 )
 from livepde.linalg import Array
 from livepde.operators import DualOperator
-from livepde.spaces import HilbertSpace
+from livepde.spaces import BorderedSpace, HilbertSpace, product
 
 __all__ = ["Model", "Source", "h1_form", "mass_form"]
 
@@ -164,19 +165,32 @@ class Model:
     @cached_property
     def Q(self) -> HilbertSpace:
         """Parameter space; its Gram matrix is the inverse of the prior covariance."""
-        blocks: list[Any] = []
-        for unknown, block in zip(
+        pairs = zip(
             self.parameter_space.unknowns.values(),
             self.parameter_space.blocks.values(),
             strict=True,
-        ):
-            if isinstance(unknown, Field):
-                inner = {"L2": mass_form, "H1": h1_form}.get(str(unknown.inner), unknown.inner)
-                blocks.append(self._on_parameter(unknown, inner) / unknown.std**2)
-            else:
-                blocks.append(sp.eye_array(block.size) / unknown.std**2)
-        gram = sp.csr_array(sp.block_diag(blocks, format="csr"))
-        return HilbertSpace(gram, "Q", self.parameter_space.fixed)
+        )
+        parts = [
+            self._field_space(unknown, block)
+            if isinstance(unknown, Field)
+            else HilbertSpace(sp.csr_array(sp.eye_array(block.size) / unknown.std**2), "Q")
+            for unknown, block in pairs
+        ]
+        return product(parts, "Q", self.parameter_space.fixed)
+
+    def _field_space(self, field: Field, block: Any) -> HilbertSpace:
+        inner: Any = Sobolev(2.0) if field.inner == "H2" else field.inner
+        if isinstance(inner, str):
+            inner = {"L2": mass_form, "H1": h1_form}[inner]
+        form = inner.form(field.element) if isinstance(inner, Sobolev) else inner
+        if form is not None:
+            gram = self._on_parameter(field, form) / field.std**2
+            return HilbertSpace(sp.csr_array(gram), "Q", block.fixed)
+        free = np.ones(block.size)
+        free[block.fixed] = 0.0
+        mass, K = (self._on_parameter(field, form) for form in (mass_form, inner.operator))
+        border = inner.border(mass, K, free) / field.std**2
+        return BorderedSpace(sp.csr_array(border), block.size, "Q", block.fixed)
 
     @cached_property
     def parameter_mass(self) -> sp.csr_array:

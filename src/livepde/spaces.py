@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError, SpaceError
-from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, positive_definite
+from livepde.linalg import (
+    Array,
+    Factor,
+    IntArray,
+    Leading,
+    Pattern,
+    analyse,
+    positive_definite,
+)
 
-__all__ = ["HilbertSpace"]
+__all__ = ["BorderedSpace", "HilbertSpace", "product"]
 
 LARGEST_CONDITION = 1e14
+LARGEST_EXPLICIT = 2000  # coefficients up to which a bordered Gram matrix is written out
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +68,11 @@ class HilbertSpace:
     def dim(self) -> int:
         """Number of coefficients n."""
         return int(self.gram.shape[0])
+
+    @property
+    def augmented(self) -> sp.csr_array:
+        """A sparse matrix whose Schur complement on the first `dim` unknowns is G; here G."""
+        return self.gram
 
     @cached_property
     def free(self) -> Array:
@@ -122,6 +138,14 @@ class HilbertSpace:
         """Return the same space with its inner product multiplied by `factor`."""
         return HilbertSpace(sp.csr_array(self.gram * factor), self.name, self.fixed)
 
+    def restricted(self, part: slice, fixed: IntArray) -> HilbertSpace:
+        """Return the space of some of the coefficients, with its own fixed ones."""
+        return HilbertSpace(sp.csr_array(self.gram[part, part]), self.name, fixed)
+
+    def _form(self, free: IntArray) -> Any:
+        """Return G on the free coefficients, as an eigensolver wants it."""
+        return self.tangent_gram[free][:, free]
+
     def modes(self, count: int, mass: sp.csr_array) -> tuple[Array, Array]:
         """Leading modes of the Gaussian measure with covariance G^{-1}.
 
@@ -142,14 +166,14 @@ class HilbertSpace:
         free = np.flatnonzero(self.free)
         if not 1 <= count <= len(free):
             raise SpaceError(f"{self.name} has {len(free)} free coefficients; got modes={count}.")
-        gram = self.tangent_gram[free][:, free]
         mass = sp.csr_array(mass)[free][:, free]
         if len(free) <= 400 or count >= len(free) - 1:
-            n = len(free)
+            n, gram = len(free), self.tangent_gram[free][:, free]
             values, vectors = eigh(
                 mass.toarray(), gram.toarray(), subset_by_index=(n - count, n - 1)
             )
         else:
+            gram = self._form(free)
 
             def solve(b: Array) -> Array:
                 full = np.zeros(self.dim)
@@ -165,6 +189,128 @@ class HilbertSpace:
         # Eigenvectors have no sign of their own: fix it, so that runs can be compared.
         phi *= np.sign(phi[np.abs(phi).argmax(axis=0), np.arange(count)])
         return phi, values[order]
+
+
+class BorderedSpace(HilbertSpace):
+    """A space whose Gram matrix is dense, but a Schur complement of a sparse matrix.
+
+        K = [[E, F], [F^T, H]],    G = E - F H^{-1} F^T
+
+    So G is applied by one sparse solve with H, its Riesz map is one sparse solve with K, and a law
+    that solves a system with G solves one with K and auxiliary unknowns instead. H^s of fractional
+    order, and powers of operators, are of this kind (`livepde.fem.Sobolev`).
+
+    `gram` and `tangent_gram` write G out, which is possible up to 2000 coefficients.
+
+    Parameters
+    ----------
+    border
+        K, symmetric, shape (n + auxiliary, n + auxiliary); G must be positive definite.
+    dim
+        Number of coefficients n.
+    name, fixed
+        As for `HilbertSpace`. Fixed coefficients may not be coupled with others in K.
+    """
+
+    def __init__(
+        self, border: sp.csr_array, dim: int, name: str = "Q", fixed: IntArray | None = None
+    ) -> None:
+        fixed = np.zeros(0, dtype=np.int64) if fixed is None else fixed
+        for key, value in (("border", border), ("count", dim), ("name", name), ("fixed", fixed)):
+            object.__setattr__(self, key, value)
+        scale = abs(border).max() if border.nnz else 0.0
+        if not np.isfinite(scale) or abs(border - border.T).max() > 1e-10 * scale:
+            raise SpaceError(f"Gram matrix of {name}: its bordered form is not symmetric.")
+
+    border: sp.csr_array
+    count: int
+
+    @property
+    def dim(self) -> int:
+        return self.count
+
+    @property
+    def augmented(self) -> sp.csr_array:
+        return self.border
+
+    @cached_property
+    def gram(self) -> sp.csr_array:
+        """G, written out."""
+        if self.dim > LARGEST_EXPLICIT:
+            raise SpaceError(
+                f"The Gram matrix of {self.name} is dense and has {self.dim} rows; it is written "
+                f"out up to {LARGEST_EXPLICIT}. Use inner, dual, riesz and augmented, which are "
+                "sparse."
+            )
+        gram = self.dual(np.eye(self.dim))
+        return sp.csr_array((gram + gram.T) / 2)
+
+    @cached_property
+    def _inner_factor(self) -> tuple[sp.csr_array, sp.csr_array, Factor]:
+        n = self.dim
+        E, F, H = self.border[:n, :n], self.border[:n, n:], sp.csr_array(self.border[n:, n:])
+        return sp.csr_array(E), sp.csr_array(F), self._factorised(H)
+
+    @cached_property
+    def factor(self) -> Factor:
+        """Factorised G on the free coefficients, by that of K."""
+        free = sp.diags_array(np.concatenate([self.free, np.ones(self.border.shape[0] - self.dim)]))
+        fixed = sp.diags_array(1.0 - free.diagonal())
+        factor = self._factorised(sp.csr_array(free @ self.border @ free + fixed))
+        return Leading(factor, self.dim, self.border.shape[0])
+
+    def _factorised(self, matrix: sp.csr_array) -> Factor:
+        pattern = Pattern.of(matrix)
+        try:
+            return analyse(pattern).factorise(_data(matrix, pattern))
+        except LinearAlgebraError as error:
+            raise SpaceError(f"The Gram matrix of {self.name} is singular.") from error
+
+    def dual(self, x: Array) -> Array:
+        E, F, factor = self._inner_factor
+        dual: Array = E @ x - F @ factor.solve(F.T @ x)
+        return dual
+
+    def inner(self, x: Array, y: Array) -> float:
+        return float(x @ self.dual(y))
+
+    def scaled(self, factor: float) -> HilbertSpace:
+        return BorderedSpace(sp.csr_array(self.border * factor), self.dim, self.name, self.fixed)
+
+    def restricted(self, part: slice, fixed: IntArray) -> HilbertSpace:
+        n = self.dim
+        kept = np.arange(n)[part]
+        F = sp.csr_array(self.border[kept][:, n:])
+        if not F.nnz:
+            return HilbertSpace(sp.csr_array(self.border[kept][:, kept]), self.name, fixed)
+        both = np.concatenate([kept, np.arange(n, self.border.shape[0])])
+        return BorderedSpace(sp.csr_array(self.border[both][:, both]), len(kept), self.name, fixed)
+
+    def _form(self, free: IntArray) -> Any:
+        from scipy.sparse.linalg import LinearOperator
+
+        def apply(x: Array) -> Array:
+            full = np.zeros(self.dim)
+            full[free] = x.ravel()
+            return self.dual(full)[free]
+
+        return LinearOperator((len(free), len(free)), matvec=apply, dtype=float)
+
+
+def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> HilbertSpace:
+    """Return the product of spaces, with its own name and fixed coefficients."""
+    whole = sp.csr_array(sp.block_diag([s.augmented for s in spaces], format="csr"))
+    sizes = [s.augmented.shape[0] for s in spaces]
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    leading = [np.arange(k, k + s.dim) for k, s in zip(starts, spaces, strict=True)]
+    rest = [
+        np.arange(k + s.dim, k + size) for k, s, size in zip(starts, spaces, sizes, strict=True)
+    ]
+    dim = sum(s.dim for s in spaces)
+    if dim == whole.shape[0]:
+        return HilbertSpace(whole, name, fixed)
+    order = np.concatenate([*leading, *rest])
+    return BorderedSpace(sp.csr_array(whole[order][:, order]), dim, name, fixed)
 
 
 def _data(matrix: sp.csr_array, pattern: Pattern) -> Array:

@@ -18,6 +18,7 @@ from livepde.fem.forms import Form
 from livepde.fem.meshes import hermite, linear, rectangle
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
+from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "Place",
     "Predicate",
     "Scalar",
+    "Sobolev",
     "Unknown",
     "ddot",
     "div",

@@ -11,6 +11,7 @@ from skfem import Mesh, MeshLine
 from skfem.element import Element
 
 from livepde.errors import SpaceError
+from livepde.fem.sobolev import Sobolev
 from livepde.linalg import Array
 
 __all__ = [
@@ -106,7 +107,8 @@ class Field:
         Any scikit-fem mesh and element; `quadrature` is its integration order (default: exact for
         A(u)q with polynomial factors).
     inner
-        Inner product of a parameter: "L2", "H1", or a symmetric bilinear form (u, v, x).
+        Inner product of a parameter: "L2", "H1", "H2", a `Sobolev(s, length)` for H^s of any order,
+        or a symmetric bilinear form (u, v, x).
     dirichlet
         Essential boundary values: name of a boundary ("boundary" for all of it) -> a number, a
         function g(x, t), or a `Channel` of the stream. For a parameter only 0 (H^1_0).
@@ -119,7 +121,7 @@ class Field:
 
     mesh: Mesh
     element: Element
-    inner: str | Integrand = "L2"
+    inner: str | Sobolev | Integrand = "L2"
     dirichlet: Mapping[str, BoundaryValue] = field(default_factory=dict)
     prior: float = 0.0
     std: float = 1.0
@@ -128,9 +130,10 @@ class Field:
     quadrature: int | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.inner, str) and self.inner not in ("L2", "H1"):
+        if isinstance(self.inner, str) and self.inner not in ("L2", "H1", "H2"):
             raise SpaceError(
-                f"inner='{self.inner}': expected 'L2', 'H1' or a symmetric form (u, v, x)."
+                f"inner='{self.inner}': expected 'L2', 'H1', 'H2', a Sobolev(s) or a symmetric "
+                "form (u, v, x)."
             )
         known = set(self.mesh.boundaries or {}) | {"boundary"}
         for name in self.dirichlet:

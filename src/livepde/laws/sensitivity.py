@@ -209,11 +209,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         for name, block in space.blocks.items():
             part = space.part(name)
             if isinstance(block, FieldBlock):
-                gram, mass = model.Q.gram[part, part], model.parameter_mass[part, part]
-                inner = replace(model.Q, gram=gram, fixed=block.fixed)
+                mass = model.parameter_mass[part, part]
+                inner = model.Q.restricted(part, block.fixed)
                 phi, _ = inner.modes(min(counts[name], int(inner.free.sum())), mass)
             else:
-                phi = np.diag(1.0 / np.sqrt(model.Q.gram[part, part].diagonal()))
+                phi = np.diag(1.0 / np.sqrt(model.Q.augmented[part, part].diagonal()))
             whole = np.zeros((space.dim, phi.shape[1]))
             whole[part] = phi
             columns.append(whole)
@@ -384,7 +384,7 @@ def _output(work: SensitivityWork, L: Array, moment: Moment) -> Array:
 
 def _reduced(work: SensitivityWork, dq: Array) -> Array:
     """Return a with Phi a = dq: the columns of Phi are orthonormal in Q."""
-    a: Array = work.Phi.T @ (work.problem.model.Q.tangent_gram @ dq)
+    a: Array = work.Phi.T @ work.problem.model.Q.dual(dq)
     return a
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
+from livepde.linalg.leading import Leading
 from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
@@ -15,6 +16,7 @@ __all__ = [
     "BandedSolver",
     "Factor",
     "IntArray",
+    "Leading",
     "Pattern",
     "PatternOperator",
     "Solver",
