@@ -5,14 +5,17 @@ from __future__ import annotations
 from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
 from livepde.laws.gradient import GradientLaw
+from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
 from livepde.laws.sensitivity import Replay, SensitivityLaw
 
 __all__ = [
     "AnyLaw",
+    "BaumeisterLaw",
     "Belief",
     "ConstantDamping",
     "Damping",
     "GradientLaw",
+    "KueglerLaw",
     "Law",
     "Problem",
     "Replay",

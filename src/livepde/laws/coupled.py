@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.damping import Damping, Residual
-from livepde.linalg import Array, Assembler, Factor, Pattern, Solver, analyse
+from livepde.linalg import Array, Assembler, Factor, Leading, Pattern, Solver, analyse
 from livepde.model import Model
 from livepde.observation import Split
 from livepde.stepping import Newton
@@ -33,6 +33,8 @@ class Gains:
         Weights of P N P u and of the stabilising term sigma q.
     M_op, N_op
         Matrices of M and N of (MN1), (MN2), shape (n, n).
+    at_estimate
+        Evaluate B and A at w = u^ (Kügler 2010) instead of w = u_alpha + P u^.
     """
 
     gain: float
@@ -41,6 +43,7 @@ class Gains:
     sigma: float
     M_op: sp.csr_array
     N_op: sp.csr_array
+    at_estimate: bool = False
 
 
 class CoupledStage:
@@ -51,8 +54,9 @@ class CoupledStage:
         M (u - c_u)/h + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
         G_Q (q - c_q)/(gain h) + (sigma/gain) G_Q q - A(w)^T r             = 0
 
-    together, so that the two terms with A cancel in the energy as in the paper (align:neplusnr).
-    theta depends on all of r; its derivative is a rank-one term of the Jacobian.
+    together (with w = u if `Gains.at_estimate`), so that the two terms with A cancel in the energy
+    as in the paper (align:neplusnr). theta depends on all of r; its derivative is a rank-one
+    term of the Jacobian.
     """
 
     def __init__(self, model: Model, split: Split, gains: Gains, newton: Newton) -> None:
@@ -66,29 +70,37 @@ class CoupledStage:
         self.RM = sp.csr_array(self.RT @ gains.M_op)
         self.RMR = sp.csr_array(self.RM @ split.R)
         self.PNP = sp.csr_array(split.P.T @ gains.N_op @ split.P)
+        # dw/du: the part of w that is estimated.
+        self.W = sp.csr_array(sp.eye_array(self.n)) if gains.at_estimate else split.P
         self.free_q = model.Q.free
         self._constant: tuple[float, Array] | None = None
-        self.gram = model.Q.gram
+        # G_Q, or where that is dense a sparse matrix of which it is the Schur complement: then
+        # the Jacobian has auxiliary unknowns behind q.
+        self.gram = model.Q.augmented
+        self.auxiliary = self.gram.shape[0] - model.Q.dim
+        self.size = self.n + model.Q.dim
 
     @cached_property
     def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:
         model, n = self.model, self.n
-        A, P, R = model.form_A, self.split.P, self.split.R
+        A, W, R = model.form_A, self.W, self.split.R
         free = sp.diags_array(model.X.free)
         free_q = sp.diags_array(self.free_q)
-        P_free, R_free = sp.csr_array(P @ free), sp.csr_array(R @ free)
-        whole = Assembler(n + model.Q.dim)
+        W_free, R_free = sp.csr_array(W @ free), sp.csr_array(R @ free)
+        whole = Assembler(self.size + self.auxiliary)
         whole.add("M", model.form_M.pattern("v", "u"), free, free)
-        whole.add("B", model.form_B.pattern("v", "u"), free, P_free)
-        whole.add("Au", A.pattern("v", "u"), free, P_free)
+        whole.add("B", model.form_B.pattern("v", "u"), free, W_free)
+        whole.add("Au", A.pattern("v", "u"), free, W_free)
         whole.add("RMR", Pattern.of(self.RMR), free, free)
         whole.add("PNP", Pattern.of(self.PNP), free, free)
         whole.add("A", A.pattern("v", "q"), free, free_q, at=(0, n))
         minus = -free_q
         whole.add("A", A.pattern("v", "q"), minus, R_free, at=(n, 0), transposed=True)
-        whole.add("Aq", A.pattern("q", "u"), minus, P_free, at=(n, 0))
-        whole.add("G", Pattern.of(self.gram), free_q, free_q, at=(n, n))
-        fixed = np.concatenate([1.0 - model.X.free, 1.0 - self.free_q])
+        whole.add("Aq", A.pattern("q", "u"), minus, W_free, at=(n, 0))
+        rest = np.zeros(self.auxiliary)
+        free_g = sp.diags_array(np.concatenate([self.free_q, 1.0 - rest]))
+        whole.add("G", Pattern.of(self.gram), free_g, free_g, at=(n, n))
+        fixed = np.concatenate([1.0 - model.X.free, 1.0 - self.free_q, rest])
         whole.add("fixed", Pattern.of(sp.eye_array(len(fixed))), sp.diags_array(fixed))
         pattern, maps = whole.build()
         return analyse(pattern), maps
@@ -109,7 +121,7 @@ class CoupledStage:
         maps, model, g = self.maps, self.model, self.gains
         gram = maps["G"] @ _stored(self.gram) / g.gain
         rest = maps["PNP"] @ (g.nu * _stored(self.PNP)) + g.sigma * gram
-        rest += maps["fixed"] @ np.ones(self.n + model.Q.dim)
+        rest += maps["fixed"] @ np.ones(self.size + self.auxiliary)
         if self.constant_B:
             rest += maps["B"] @ model.form_B.data("v", "u", u=np.zeros(self.n))
         return {
@@ -134,7 +146,7 @@ class CoupledStage:
     def _bilinear(self) -> _Bilinear | None:
         form = self.model.form_A
         vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
-        if not self.constant_B or vq is None or vu is None or qu is None:
+        if self.auxiliary or not self.constant_B or vq is None or vu is None or qu is None:
             return None
         return _Bilinear(self, vq, vu, qu)
 
@@ -196,7 +208,7 @@ class _Equation:
         stage, model, n, g = self.stage, self.stage.model, self.stage.n, self.stage.gains
         u, q = y[:n], y[n:]
         self.r = r = stage.split.R @ u - self.u_alpha
-        self.w = w = u - r  # u_alpha + P u, since P = I - R
+        self.w = w = u if g.at_estimate else u - r  # u_alpha + P u, since P = I - R
         self.Mr, self.mass_r = stage.RM @ r, stage.RT @ (model.mass @ r)
         A = model.form_A.matrix("v", "q", self.moment, u=w)
         flux = model.B(w, self.moment) + A @ q + g.nu * (stage.PNP @ u) - self.source
@@ -204,7 +216,7 @@ class _Equation:
         drive = (q - self.c[n:]) / (g.gain * self.h) + (g.sigma / g.gain) * q
         out = np.empty_like(y)
         out[:n] = (model.mass @ rate + flux) * model.X.free + self.pull()
-        out[n:] = (stage.gram @ drive - A.T @ r) * stage.free_q
+        out[n:] = (model.Q.dual(drive) - A.T @ r) * stage.free_q
         return out
 
     def pull(self) -> Array:
@@ -234,7 +246,9 @@ class _Equation:
         data = self.changing(y, sweep)
         data += stage.constant(self.h)
         data += self.theta * stage.constant_data["pull"]
-        factor = stage.solver.factorise(data)
+        factor: Factor = stage.solver.factorise(data)
+        if stage.auxiliary:
+            factor = Leading(factor, stage.size, stage.size + stage.auxiliary)
         if sweep:
             return factor
         row = stage.slope(self.norms, self.Mr, self.mass_r)
@@ -267,7 +281,7 @@ class _Bilinear:
     ) -> None:
         model, g, maps, n, m = stage.model, stage.gains, stage.maps, stage.n, stage.model.Q.dim
         free, free_q = sp.diags_array(model.X.free), sp.diags_array(stage.free_q)
-        R, P = stage.split.R, stage.split.P
+        R, W = stage.split.R, stage.W
         pattern = model.form_A.pattern("v", "q")
         whole = Assembler(n + m)
         whole.add("A", pattern, free, free_q, at=(0, n))
@@ -282,7 +296,7 @@ class _Bilinear:
         self.offset = model.B(zero) * model.X.free
         gram = free_q @ stage.gram / g.gain
         moving = sp.block_diag([free @ model.mass, gram])
-        state = free @ (B @ P + g.nu * stage.PNP)
+        state = free @ (B @ W + g.nu * stage.PNP)
         mass = stage.RT @ model.mass
         observed = sp.vstack([R, stage.RM @ R, mass @ R])
         rest = sp.block_array([[sp.block_diag([state, g.sigma * gram])], [_widened(observed, m)]])
@@ -291,7 +305,8 @@ class _Bilinear:
         self._rate_data = _stored(rate, self._pattern)
         self._rest_data = _stored(rest, self._pattern)
         self._linear: tuple[float, sp.csr_array] | None = None
-        data = sp.vstack([-(free @ B), sp.csr_array((m, n)), sp.eye_array(n), stage.RM, mass])
+        fed = sp.csr_array((n, n)) if g.at_estimate else -(free @ B)  # what u_alpha adds to B(w)
+        data = sp.vstack([fed, sp.csr_array((m, n)), sp.eye_array(n), stage.RM, mass])
         self.known = sp.csr_array(sp.hstack([data, rate]))
 
     def linear(self, h: float) -> sp.csr_array:
@@ -324,7 +339,7 @@ class _BilinearEquation(_Equation):
         stack = self.linear @ y - self.known
         self.r = r = stack[size : size + n]
         self.Mr, self.mass_r = stack[size + n : size + 2 * n], stack[size + 2 * n :]
-        self.w = w = y[:n] - r
+        self.w = w = y[:n] if self.stage.gains.at_estimate else y[:n] - r
         coupling = self.products.block
         coupling.set(self.products.coupling @ w)
         out: Array = stack[:size] + coupling.apply(np.concatenate([r, y[n:]]))

@@ -1,0 +1,163 @@
+"""Two older laws that the paper's method grew out of, through the same coupled stage.
+
+Boiger and Kaltenbacher call their method "strongly motivated" by both. Neither article could be
+read in full for this module (their bibliographic data were checked); what is implemented is stated
+as equations below, after what Boiger and Kaltenbacher say of them: Baumeister et al. observe all of
+the state, Kügler demands a monotone C and evaluates it at the estimate.
+
+                  C evaluated at          pull                      q^' = gain A(.)* r, r
+    paper         u_alpha + P u^          mu R M r / ||r||_V~       R u^ - u_alpha
+    Baumeister    z, all of u             A_0 (u^ - z)              u^ - z
+    Kügler        u^                      mu G* (G u^ - z)          R u^ - u_alpha
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.laws.base import Belief, Law, Problem, Report
+from livepde.laws.coupled import Gains
+from livepde.laws.damping import Damping, Residual
+from livepde.laws.gradient import GradientLaw, GradientState, GradientWork
+from livepde.linalg import Array
+from livepde.model import h1_form, mass_form
+from livepde.stepping import Interval, Newton
+
+__all__ = ["BaumeisterLaw", "KueglerLaw"]
+
+
+@dataclass(frozen=True)
+class _Linear(Damping):
+    """A pull that is linear in r: theta is a number."""
+
+    weight: float
+
+    def theta(self, r: Residual) -> float:
+        return self.weight
+
+    def slopes(self, r: Residual) -> tuple[float, float, float]:
+        return 0.0, 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class _Relative(Law[GradientWork, GradientState]):
+    """A law on the coupled stage of the gradient law, with a linear pull."""
+
+    gain: float = 1.0
+    mu: float = 1.0
+    newton: Newton = field(default_factory=Newton)
+
+    def __post_init__(self) -> None:
+        for name, least in (("gain", "> 0"), ("mu", ">= 0")):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0 and (name == "mu" or value > 0)):
+                raise LawError(
+                    f"{type(self).__name__}: {name} must be a number {least}; got {value}."
+                )
+
+    @property
+    def _base(self) -> GradientLaw:
+        return GradientLaw(self.gain, _Linear(self.mu), newton=self.newton)
+
+    def _work(self, problem: Problem, pull: Any, *, at_estimate: bool) -> GradientWork:
+        if problem.observed.sensitivity() is not None:
+            raise LawError(
+                f"{type(self).__name__} cannot use a sensor that sees a parameter directly: use "
+                "SensitivityLaw, or leave out direct=."
+            )
+        M_op = problem.model.bilinear(pull)
+        gains = Gains(self.gain, _Linear(self.mu), 0.0, 0.0, M_op, M_op, at_estimate)
+        return GradientWork(problem, gains, self.newton)
+
+    def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
+        return self._base.init(work, q0, u0)
+
+    def step(
+        self, work: GradientWork, state: GradientState, interval: Interval
+    ) -> tuple[GradientState, Report]:
+        return self._base.step(work, state, interval)
+
+    def belief(self, work: GradientWork, state: GradientState) -> Belief:
+        return self._base.belief(work, state)
+
+
+@dataclass(frozen=True)
+class BaumeisterLaw(_Relative):
+    """The adaptive observer after Baumeister, Scondo, Demetriou and Rosen (1997).
+
+    SIAM Journal on Control and Optimization 35, 678-713. All of the state is measured, z = u:
+
+        q' = gain A(z)* (u^ - z)
+        M u^' + B(z) + A(z) q^ + mu A_0 (u^ - z) = F
+
+    with a coercive operator A_0 that draws u^ to the measured state; both equations are solved
+    together in one implicit step. It is (est_exact_q), (est_exact_u) for R = I, P = 0, with the
+    coercive A_0 in the place of mu M / ||r||_V~: what Boiger and Kaltenbacher added is P u^ where
+    nothing is measured, and a pull whose size mu adapts.
+
+    Parameters
+    ----------
+    gain
+        Scale of the inner product of Q, > 0.
+    mu
+        Weight of A_0, >= 0, in 1/time.
+    newton
+        The nonlinear iteration.
+    A_0
+        Integrand (u, v, x), coercive; default u v + grad u . grad v.
+
+    Raises
+    ------
+    LawError
+        From `prepare`: some of the state is not observed. A sample that lacks sensors is no error:
+        what they do not see is estimated as by the paper's law.
+    """
+
+    A_0: Any = h1_form
+
+    def prepare(self, problem: Problem) -> GradientWork:
+        X, split = problem.model.X, problem.observed.split()
+        free = int(X.free.sum())
+        seen = round(float(split.R.diagonal().sum()))  # trace of a projection: its rank
+        if seen < free:
+            raise LawError(
+                f"BaumeisterLaw needs all of the state; the sensors determine {seen} of its {free} "
+                "coefficients. Use GradientLaw, which estimates what is not observed, KueglerLaw "
+                "if C is monotone, or observe Full()."
+            )
+        return self._work(problem, self.A_0, at_estimate=False)
+
+
+@dataclass(frozen=True)
+class KueglerLaw(_Relative):
+    """The law after Kügler (2010) for monotone C, evaluated at the estimate.
+
+    Inverse Problems 26, 035004: "Online parameter identification without Ricatti-type equations in
+    a class of time-dependent partial differential equations: an extended state approach with
+    potential to partial observations".
+
+        q' = gain A(u^)* r                       r = R u^ - u_alpha
+        M u^' + B(u^) + A(u^) q^ + mu G* (G u^ - z) = F
+
+    both solved together in one implicit step. With ||z||_Z = ||G^+ z||_X the pull mu G* (G u^ - z)
+    is mu R^T M r. Against (est_exact_q), (est_exact_u): u^ stands for u_alpha + P u^, so the data
+    enter through r alone and noise is never differentiated by B; in return the energy balance
+    (align:neplusnr) holds the term (C(q*, u^) - C(q*, u*), u^ - u*), which must not be negative.
+    With partial data (A(u^) e, P u^ - P u*) does not cancel, so nothing is proved then.
+
+    Parameters
+    ----------
+    gain
+        Scale of the inner product of Q, > 0.
+    mu
+        Weight of G* (G u^ - z), >= 0, in 1/time.
+    newton
+        The nonlinear iteration.
+    """
+
+    def prepare(self, problem: Problem) -> GradientWork:
+        return self._work(problem, mass_form, at_estimate=True)
