@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from skfem import Basis, FacetBasis, Mesh
-from skfem.element import DiscreteField
+from skfem.element import DiscreteField, ElementQuadBFS
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elements import own
@@ -230,10 +230,41 @@ class FieldBlock(Block):
         found: IntArray = dofs.all(names)
         return found
 
+    def _slope_dofs(self, name: str, axis: int) -> IntArray:
+        """Return the unknowns of the derivative along a boundary, on its sides along an axis."""
+        if not isinstance(self.field.element, ElementQuadBFS):
+            return np.zeros(0, dtype=np.int64)
+        mesh = self.field.mesh
+        sides = mesh.boundary_facets() if name == "boundary" else mesh.boundaries[name]
+        ends = mesh.p[:, mesh.facets[:, sides]]
+        across = np.abs(ends[1 - axis, 1] - ends[1 - axis, 0])
+        along = np.abs(ends[axis, 1] - ends[axis, 0])
+        sides = np.asarray(sides)[across <= 1e-9 * along]
+        found: IntArray = self.basis.get_dofs(facets=sides).all([("u_x", "u_y")[axis]])
+        return found
+
     @cached_property
     def conditions(self) -> tuple[tuple[IntArray, Any], ...]:
-        """The Dirichlet conditions, in the order given: (coefficients, value)."""
-        return tuple((self._value_dofs(n), value) for n, value in self.field.dirichlet.items())
+        """The Dirichlet conditions, in the order given: (coefficients, value).
+
+        Bogner-Fox-Schmit functions with the values of g at the vertices need its derivative along
+        the boundary, too, to be g on the sides between them.
+        """
+        found: list[tuple[IntArray, Any]] = []
+        for name, value in self.field.dirichlet.items():
+            found.append((self._value_dofs(name), value))
+            for axis in range(self.field.mesh.dim()):
+                dofs = self._slope_dofs(name, axis)
+                if len(dofs):
+                    slope = _slope(value, axis, self.width) if callable(value) else 0.0
+                    found.append((dofs, slope))
+        return tuple(found)
+
+    @cached_property
+    def width(self) -> float:
+        """Length of the shortest side of the mesh."""
+        ends = self.field.mesh.p[:, self.field.mesh.facets]
+        return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=0).min())
 
     @cached_property
     def fixed(self) -> IntArray:
@@ -281,6 +312,20 @@ class FieldBlock(Block):
     def at_vertices(self) -> sp.csr_array:
         """Matrix that evaluates the function at the vertices of the mesh."""
         return self.probe(self.field.mesh.p, "vertex")
+
+
+def _slope(g: Any, axis: int, width: float) -> Any:
+    """Return the derivative of g(x, t) along an axis, by a difference of sixth order."""
+    step = 0.01 * width
+
+    def slope(x: Array, t: float) -> Array:
+        shift = np.zeros((len(x), 1))
+        shift[axis] = step
+        pairs = ((1, 45.0), (2, -9.0), (3, 1.0))
+        total = sum(c * (g(x + k * shift, t) - g(x - k * shift, t)) for k, c in pairs)
+        return np.asarray(total / (60.0 * step) + 0.0 * x[0])
+
+    return slope
 
 
 def block_of(unknown: Unknown) -> Block:
