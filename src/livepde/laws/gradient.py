@@ -13,7 +13,7 @@ from livepde.laws.coupled import CoupledStage, Gains
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.linalg import Array
 from livepde.model import h1_form
-from livepde.observation import Split
+from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval, Newton, advance
 
 __all__ = ["GradientLaw", "GradientState"]
@@ -57,6 +57,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
 
         q' = gain A(w)* r - sigma q,            w = u_alpha + P u,  r = R u - u_alpha
         M u' + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
+
+    u_alpha = G^+ z, or G_alpha z if the observation has a `reconstruction` that regularises: then
+    these are (noisy_q) and (noisy_u), and the notes of each report hold alpha and the misfit
+    ||G u_alpha - z||_Z.
 
     For observed subdomains and averages. A few noisy point sensors mislead it (jumps of the flux at
     the sensors reward a vanishing diffusivity): use `SensitivityLaw` there.
@@ -116,19 +120,29 @@ class GradientLaw(Law[GradientWork, GradientState]):
         model, observed = work.problem.model, work.problem.observed
         coupled = work.stage(interval.present)
         zero = np.zeros(model.X.dim)
+        regularises = observed.observation.reconstruction.regularises
 
-        u_alpha = zero
+        def reconstruct(t: float) -> Reconstructed:
+            boundary = model.impose(zero, interval.at(t))
+            present = interval.present
+            if regularises:
+                return observed.reconstruct(interval.z(t), boundary=boundary, present=present)
+            return Reconstructed(coupled.split.reconstruct(interval.z(t), boundary), 0.0, 0.0, None)
+
+        found = Reconstructed(zero, 0.0, 0.0, None)
 
         def stage(c: Array, t: float, h: float) -> Array:
-            nonlocal u_alpha
-            moment = interval.at(t)
-            u_alpha = coupled.split.reconstruct(interval.z(t), model.impose(zero, moment))
+            nonlocal found
+            found = reconstruct(t)
             # The observed part moves with the data, the rest as in the step before.
             start = c + h * state.rate
-            start[: model.X.dim] += (
-                coupled.split.inverse @ interval.change(t - h, t)[interval.present]
-            )
-            return coupled.solve(c, h, moment, u_alpha, start)
+            if regularises:
+                start[: model.X.dim] += found.u - reconstruct(t - h).u
+            else:
+                start[: model.X.dim] += (
+                    coupled.split.inverse @ interval.change(t - h, t)[interval.present]
+                )
+            return coupled.solve(c, h, interval.at(t), found.u, start)
 
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stage, y, interval)
@@ -143,7 +157,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         rate[: model.X.dim] -= (observed_u - coupled.split.R @ state.u) / (
             interval.t1 - interval.t0
         )
-        notes = {"residual": model.X.norm(observed_u - u_alpha)}
+        notes = {"residual": model.X.norm(observed_u - found.u)}
+        if regularises:
+            notes |= {"alpha": found.alpha, "misfit": found.misfit}
         predicted = observed.predict(u, q, interval.end)
         return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
 

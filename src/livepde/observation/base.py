@@ -4,17 +4,24 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
 from livepde.fem import START, FieldBlock, FunctionSpace, Moment, Place
 from livepde.linalg import Array
+from livepde.observation.reconstruction import (
+    Pseudoinverse,
+    Reconstructed,
+    Reconstruction,
+    Reconstructor,
+)
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Observation", "Observed", "Split"]
@@ -38,10 +45,14 @@ class Observation(ABC):
         sensor. None: not known.
     unit
         Unit of the measured values.
+    reconstruction
+        How the gradient law finds the observed part of the state: `Pseudoinverse`, G^+, or
+        `Tikhonov`, G_alpha (section 3.2).
     """
 
     noise: float | Sequence[float] | None = None
     unit: str = ""
+    reconstruction: Reconstruction = field(default_factory=Pseudoinverse)
 
     @abstractmethod
     def matrix(self, state: FieldBlock) -> sp.csr_array:
@@ -79,6 +90,10 @@ class Split:
         G^+ on the present sensors, shape (n, present).
     present
         Which sensors take part, shape (sensors,).
+    G
+        Their rows of G, shape (present, n).
+    vectors
+        A basis of N(G)^perp, shape (n, k); None if `inverse` is one.
     """
 
     R: sp.csr_array
@@ -86,6 +101,12 @@ class Split:
     inverse: sp.csr_array
     present: Array
     G: sp.csr_array
+    vectors: Array | None = None
+
+    @property
+    def basis(self) -> Array:
+        """A basis of N(G)^perp, shape (n, k)."""
+        return self.inverse.toarray() if self.vectors is None else self.vectors
 
     def reconstruct(self, z: Array, boundary: Array) -> Array:
         """Return the observed part R u* = G^+ z of the state in X, shape (n,).
@@ -115,6 +136,7 @@ class Observed:
         parameter: FunctionSpace,
     ) -> None:
         self.observation = observation
+        self.state = state
         self.X = X
         self.parameter = parameter
         block = next(iter(state.fields.values()))
@@ -140,6 +162,7 @@ class Observed:
             if name not in self.names:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
         self._splits: dict[bytes, Split] = {}
+        self._reconstructors: dict[bytes, Reconstructor] = {}
 
     @cached_property
     def noise(self) -> Array | None:
@@ -204,13 +227,59 @@ class Observed:
             self._splits[key] = self._split(present)
         return self._splits[key]
 
+    def reconstruct(
+        self,
+        z: ArrayLike,
+        delta: float | None = None,
+        *,
+        boundary: Array | None = None,
+        present: Array | None = None,
+    ) -> Reconstructed:
+        """Return the observed part of the state, G^+ z or G_alpha z (section 3.2).
+
+        Parameters
+        ----------
+        z
+            Measurements, shape (sensors,), NaN where missing.
+        delta
+            Noise level ||z^delta - z||_Z; default what the rule for alpha or `noise` says.
+        boundary
+            A coefficient vector that holds the Dirichlet values and is zero elsewhere; default
+            zero.
+        present
+            Which sensors take part; default those with a value.
+
+        Raises
+        ------
+        ObservationError
+            z has another shape, delta is not positive, or no noise level is known where one is
+            needed.
+        """
+        z = np.asarray(z, dtype=float)
+        if z.shape != (self.size,):
+            raise ObservationError(
+                f"reconstruct: z has shape {z.shape}; the observation has {self.size} sensors."
+            )
+        if delta is not None and not (np.isfinite(delta) and delta > 0):
+            raise ObservationError(f"reconstruct: delta must be a positive number; got {delta}.")
+        if present is None:
+            present = np.isfinite(z)
+        if boundary is None:
+            boundary = np.zeros(self.X.dim)
+        key = present.tobytes()
+        if key not in self._reconstructors:
+            if len(self._reconstructors) >= LARGEST_MEMO:
+                self._reconstructors.clear()
+            self._reconstructors[key] = self.observation.reconstruction.prepare(self, present)
+        return self._reconstructors[key](z, boundary, delta)
+
     def _split(self, present: Array) -> Split:
         n = self.X.dim
         G = sp.csr_array(self.G[np.flatnonzero(present)])
         tangent = sp.csr_array(G @ sp.diags_array(self.X.free))
         tangent.eliminate_zeros()
         if self.observation.nodal and _is_selection(tangent):
-            inverse = sp.csr_array(tangent.T)
+            inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
         else:
             rows = tangent.toarray()
@@ -228,7 +297,7 @@ class Observed:
         P = sp.csr_array(sp.eye_array(n) - R)
         R.eliminate_zeros()
         P.eliminate_zeros()
-        return Split(R, P, inverse, present, G)
+        return Split(R, P, inverse, present, G, V)
 
 
 def _is_selection(G: sp.csr_array) -> bool:
