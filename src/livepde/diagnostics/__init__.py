@@ -1,18 +1,51 @@
-"""Checks that a user can run on objects of his own, as the tests run them on ours."""
+"""Checks that a user can run on objects of his own, and the paper's theory made computable."""
 
 from __future__ import annotations
 
+from livepde.diagnostics.bounds import Errors, TwinTracker, bounds, conditions
+from livepde.diagnostics.constants import Part, Spaces, constants
+from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
 from livepde.diagnostics.law import check_law
+from livepde.diagnostics.links import Interpolation, Link, interpolation, link
 from livepde.diagnostics.model import check_model
 from livepde.diagnostics.observation import check_observation
 from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.diagnostics.space import check_space
+from livepde.diagnostics.stopping import (
+    OnlineStopping,
+    StoppingState,
+    noise_size,
+    stopping_time,
+)
+from livepde.diagnostics.theory import OnlineTracker, Sheet, TheoryReport, theory_report
 
 __all__ = [
     "CheckLine",
     "CheckReport",
+    "Errors",
+    "Excitation",
+    "ExcitationState",
+    "Interpolation",
+    "Link",
+    "OnlineStopping",
+    "OnlineTracker",
+    "Part",
+    "Sheet",
+    "Spaces",
+    "Spectrum",
+    "StoppingState",
+    "TheoryReport",
+    "TwinTracker",
+    "bounds",
     "check_law",
     "check_model",
     "check_observation",
     "check_space",
+    "conditions",
+    "constants",
+    "interpolation",
+    "link",
+    "noise_size",
+    "stopping_time",
+    "theory_report",
 ]

@@ -1,0 +1,360 @@
+"""The errors e, r, p of a twin experiment along a run, the paper's conditions and error bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from livepde.diagnostics.constants import Spaces
+from livepde.diagnostics.report import CheckLine, CheckReport
+from livepde.errors import ConfigurationError
+from livepde.fem import Moment
+from livepde.laws.bounds import (
+    Constants,
+    Norms,
+    nu_exact,
+    nu_noisy,
+    theta_exact,
+    theta_noisy,
+    theta_smoothed,
+)
+from livepde.laws.damping import Damping, Residual
+from livepde.linalg import Array
+from livepde.result import Estimate
+from livepde.streams import Twin
+
+__all__ = ["Errors", "TwinTracker", "bounds", "conditions"]
+
+Data = Literal["exact", "noisy", "smoothed"]
+ROUNDING = 1e-9  # of an inequality between norms, relative
+UNUSED = "The hypothesis of the proposition does not hold along the run; see the conditions."
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The norms of one moment of a twin experiment.
+
+    Attributes
+    ----------
+    t
+        Time.
+    e
+        ||q - q*||_Q, gain-scaled.
+    r, p, d, r_alpha
+        Norms of R(u - u*), P(u - u*), u_alpha - R u* and R u - u_alpha.
+    Pu
+        ||P u*||_V^.
+    rate
+        ||d~||_X, the rate of d since the sample before; 0 at the first.
+    theta
+        What the damping rule gives for r_alpha.
+    """
+
+    t: float
+    e: float
+    r: Norms
+    p: Norms
+    d: Norms
+    r_alpha: Norms
+    Pu: float
+    rate: float
+    theta: float
+
+    @property
+    def energy(self) -> float:
+        """||e||_Q^2 + ||r||_X^2, which never grows with exact data (align:neplusnr)."""
+        return self.e**2 + self.r.X**2
+
+    @property
+    def smoothed_energy(self) -> float:
+        """||e||_Q^2 + ||r_alpha||_X^2 of Proposition prop:wellposed_noisesmooth."""
+        return self.e**2 + self.r_alpha.X**2
+
+    @property
+    def margin(self) -> float:
+        """||r||_VX~^2 / (||r||_X ||d||_V~): condition (cond_d) asks for 2 C_M/c_M at least."""
+        if self.d.V == 0.0:
+            return np.inf
+        return self.r.VX**2 / (self.r.X * self.d.V) if self.r.X > 0.0 else 0.0
+
+
+class TwinTracker:
+    """Follows the errors of a run against its twin; gives nothing back to the estimator.
+
+    Parameters
+    ----------
+    twin
+        The truth.
+    spaces
+        Norms; by `Spaces.of(model, observed, law)` those of the law's operators.
+    gain
+        That of the law: ||e||_Q^2 is divided by it.
+    damping
+        The law's rule, for theta.
+    reconstruct
+        z -> u_alpha as the law takes it; default G^+ z.
+
+    Examples
+    --------
+    ::
+
+        tracker = TwinTracker(twin, Spaces.of(model, observed, law), law.gain, law.damping)
+        for sample in twin:
+            tracker.add(identifier.step(sample.t, sample.z), sample.z)
+        print(bounds(tracker.errors, constants(...)))
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        spaces: Spaces,
+        gain: float = 1.0,
+        damping: Damping | None = None,
+        reconstruct: Callable[[Array], Array] | None = None,
+    ) -> None:
+        self.twin = twin
+        self.spaces = spaces
+        self.gain = gain
+        self.damping = damping
+        self.reconstruct = reconstruct
+        self.errors: list[Errors] = []
+        self._last: tuple[float, Array] | None = None
+
+    def add(self, estimate: Estimate, z: Any) -> Errors:
+        """Compare one estimate with the truth.
+
+        Parameters
+        ----------
+        z
+            The sample's measurements, shape (sensors,).
+        """
+        twin, spaces = self.twin, self.spaces
+        exact, split = twin.u(estimate.t), spaces.split
+        boundary = twin.model.impose(np.zeros(len(exact)), Moment(estimate.t))
+        z = np.asarray(z, dtype=float)
+        u_alpha = (
+            self.reconstruct(z) if self.reconstruct is not None else split.reconstruct(z, boundary)
+        )
+        error = estimate.u - exact
+        # Dirichlet values agree, so the error lies in the tangent space.
+        r = split.R @ error
+        d = u_alpha - split.reconstruct(spaces.observed.G @ exact, boundary)
+        residual = r - d
+        seen, hidden = spaces.observed_part, spaces.hidden_part
+        norms = seen.norms(residual)
+        rate = 0.0
+        if self._last is not None:
+            step = estimate.t - self._last[0]
+            rate = twin.model.X.norm(d - self._last[1]) / step
+        self._last = (estimate.t, d)
+        theta = 0.0
+        if self.damping is not None:
+            theta = self.damping.theta(Residual(norms.X**2, norms.VX**2, lambda: norms.V**2))
+        e = estimate.q - twin.q
+        found = Errors(
+            estimate.t,
+            twin.model.Q.norm(e) / float(np.sqrt(self.gain)),
+            seen.norms(r),
+            hidden.norms(error - r),
+            seen.norms(d),
+            norms,
+            hidden.norms((exact - split.R @ exact) * twin.model.X.free).V,
+            rate,
+            theta,
+        )
+        self.errors.append(found)
+        return found
+
+    @property
+    def q_true(self) -> float:
+        """||q*||_Q, gain-scaled."""
+        return self.twin.model.Q.norm(self.twin.q) / float(np.sqrt(self.gain))
+
+
+def _values(errors: Sequence[Errors], get: Callable[[Errors], float]) -> Array:
+    return np.array([get(item) for item in errors])
+
+
+def _integral(errors: Sequence[Errors], get: Callable[[Errors], float]) -> float:
+    times = _values(errors, lambda item: item.t)
+    return float(np.trapezoid(_values(errors, get), times))
+
+
+def conditions(
+    errors: Sequence[Errors],
+    c: Constants,
+    *,
+    data: Data = "exact",
+    nu: float = 0.0,
+    sigma: float = 0.0,
+    c1: float = 0.0,
+    floor: float = 0.0,
+) -> CheckReport:
+    """Say at what share of the samples the paper's conditions on mu, nu and d hold.
+
+    Parameters
+    ----------
+    errors
+        Of a `TwinTracker`.
+    c
+        Constants.
+    data
+        Which section: "exact" (cond:mu_1, cond:mu02, cond:nu), "noisy" (ass:mu_nu, ass:mu_noisy,
+        (cond_d)) or "smoothed" (ass:mu_nu_smooth, cond:mu_smooth_2).
+    nu, sigma
+        Those of the law.
+    c1
+        Of the stronger bound on mu for the convergence of the state.
+    floor
+        Of the damping rule: where the observed residual is smaller, in X, it counts as zero, and a
+        bound on mu as fulfilled (mu r/||r|| is any vector up to mu there).
+    """
+    n = len(errors)
+    if not n:
+        raise ConfigurationError("conditions: the tracker has not seen any estimate.")
+
+    def asked_theta(item: Errors, c1: float) -> float:
+        if data == "exact":
+            return theta_exact(c, item.p.V, item.r, c1)
+        if data == "noisy":
+            return theta_noisy(c, item.e, item.p.V, item.r, item.d, sigma, c1)
+        return theta_smoothed(c, item.p.V, item.r_alpha, item.d.V, item.rate, c1)
+
+    def asked_nu(item: Errors) -> float:
+        if data == "exact":
+            return nu_exact(c, item.e, item.p)
+        return nu_noisy(c, item.e, item.p, item.d.V)
+
+    first, second, third = {
+        "exact": ("cond:mu_1", "cond:mu02", "cond:nu"),
+        "noisy": ("ass:mu_nu, mu", "ass:mu_noisy", "ass:mu_nu, nu"),
+        "smoothed": ("ass:mu_nu_smooth, mu", "cond:mu_smooth_2", "ass:mu_nu_smooth, nu"),
+    }[data]
+
+    def line(name: str, holds: Any, remedy: str) -> CheckLine:
+        return CheckLine.at_least(f"{name} (share of samples)", np.mean(holds), 1.0, remedy)
+
+    theta = _values(errors, lambda item: item.theta) * (1 + ROUNDING)
+    lines = []
+    for name, level in [(first, 0.0), *([(second, c1)] if c1 > 0 else [])]:
+        asked = np.array([asked_theta(item, level) for item in errors])
+        asked[_values(errors, lambda item: item.r_alpha.X) <= floor] = 0.0
+        lines.append(
+            line(
+                name,
+                theta >= asked,
+                f"mu is below the paper's bound: it asks for theta up to {asked.max():.3g}, the "
+                f"rule gave {theta.max():.3g} at most. Take the rule `ExactBound`, `NoisyBound` or "
+                "`SmoothedBound`, or go on: the bound is sufficient, not necessary.",
+            )
+        )
+    asked = _values(errors, asked_nu)
+    lines.append(
+        line(
+            third,
+            nu * (1 + ROUNDING) >= asked,
+            f"nu = {nu:.3g} is below the paper's bound, which asks for up to {asked.max():.3g}; "
+            "take `unobserved_damping`. nu biases the unobserved part: where the process itself "
+            "damps it (D > 0) leave nu = 0.",
+        )
+    )
+    if data == "noisy":
+        need = 2.0 * c.C_M / c.c_M
+        lines.append(
+            line(
+                "(cond_d)",
+                _values(errors, lambda item: item.margin) >= need,
+                "the data error d outweighs the residual r, so T* has passed: smooth the data "
+                "(in V~, not only in L2), or stop learning at `stopping_time_online`.",
+            )
+        )
+    return CheckReport(f"conditions, {data} data", tuple(lines))
+
+
+def bounds(
+    errors: Sequence[Errors],
+    c: Constants,
+    *,
+    data: Data = "exact",
+    nu: float = 0.0,
+    sigma: float = 0.0,
+    q_true: float = 0.0,
+    until: float = np.inf,
+) -> CheckReport:
+    """Evaluate the error bounds of one of the paper's propositions along a run.
+
+    "exact": prop:welldefine; "noisy": well_defined_noisy, up to T*; "smoothed":
+    prop:wellposed_noisesmooth, where r_alpha stands for r.
+
+    1. ||e||_Q^2 + ||r||_X^2 <= its value at the start (sigma > 0: or ||q*||_Q^2 if that is larger).
+    2. ||p||_X^2 <= max{||p(0)||_X^2, 2 b} with b = C_N^2 C^4/c_N^2 sup ||P u*||_V^^2
+       + C_A C^2/(c_N nu) (||e(0)||_Q^2 + ||r(0)||_X^2), C = C_{VX^ X}. The three propositions print
+       this bound in three ways (C_A^2 or C_A, C^2 in the numerator or the denominator, c_N or
+       c_N^2, with and without the factor 2); this is what their proofs give. It needs nu > 0.
+    3. The integral of ||p||_V^ ||r||_X <= (||e(0)||_Q^2 + ||r(0)||_X^2)/(2 L_C), as in the proofs
+       (sigma = 0; prop:welldefine prints twice that).
+
+    Time integrals are trapezoidal sums over the samples.
+
+    Parameters
+    ----------
+    errors
+        Of a `TwinTracker`.
+    nu, sigma
+        Those of the law.
+    q_true
+        ||q*||_Q, gain-scaled, for sigma > 0.
+    until
+        T*, for noisy data.
+
+    Returns
+    -------
+    CheckReport
+        One line each; whether their hypotheses hold is told by `conditions`.
+    """
+    kept = [item for item in errors if item.t < until or item is errors[0]]
+    if not kept:
+        raise ConfigurationError("bounds: the tracker has not seen any estimate.")
+    smoothed = data == "smoothed"
+
+    def energy(item: Errors) -> float:
+        return item.smoothed_energy if smoothed else item.energy
+
+    start = energy(kept[0])
+    label = "r_alpha" if smoothed else "r"
+    limit = max(start, q_true**2) if sigma > 0 else start
+    lines = [
+        CheckLine.at_most(
+            f"1. ||e||^2 + ||{label}||^2",
+            float(_values(kept, energy).max()),
+            limit * (1 + ROUNDING),
+            "The energy grew. " + UNUSED,
+        )
+    ]
+    p0 = kept[0].p.X ** 2
+    largest_p = float(_values(kept, lambda item: item.p.X**2).max())
+    if nu > 0:
+        C = c.hidden_VX_X
+        b = c.C_N**2 * C**4 / c.c_N**2 * float(_values(kept, lambda item: item.Pu**2).max())
+        b += c.C_A * C**2 / (c.c_N * nu) * limit
+        lines.append(
+            CheckLine.at_most(
+                "2. ||p||^2", largest_p, max(p0, 2.0 * b) * (1 + ROUNDING), "p grew. " + UNUSED
+            )
+        )
+    elif largest_p == 0.0:
+        lines.append(CheckLine.at_most("2. ||p||^2 (all observed)", largest_p, 0.0, ""))
+    if sigma == 0 and c.L_C > 0:
+        part = _integral(kept, lambda item: item.p.V * (item.r_alpha.X if smoothed else item.r.X))
+        lines.append(
+            CheckLine.at_most(
+                f"3. integral of ||p||_V ||{label}||_X",
+                part,
+                start / (2.0 * c.L_C) * (1 + ROUNDING),
+                "The unobserved error lasts. " + UNUSED,
+            )
+        )
+    return CheckReport(f"error bounds, {data} data", tuple(lines))

@@ -1,0 +1,225 @@
+"""The windowed excitation Gramian (Assumption asspof): which modes of q the data have pinned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import eigh
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+from livepde.diagnostics.constants import Spaces
+from livepde.errors import ConfigurationError
+from livepde.fem import Inputs, Moment
+from livepde.linalg import Array
+from livepde.spaces import HilbertSpace
+
+__all__ = ["Excitation", "ExcitationState", "Spectrum"]
+
+DENSE = 1000  # parameters up to which the sum over windows is kept as a matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Eigenvalues and modes of an excitation Gramian in the inner product of Q.
+
+    Attributes
+    ----------
+    strength
+        ||integral of R A(w) phi_k||_X for Q-normal modes phi_k, descending; the last one is the
+        epsilon_0 of asspof.
+    modes
+        The phi_k as columns, shape (m, count), in the gain-scaled inner product of Q.
+    windows
+        Over how many windows the squares were summed.
+    """
+
+    strength: Array
+    modes: Array
+    windows: int
+
+    @property
+    def epsilon(self) -> float:
+        """The epsilon_0 of asspof; for a field it tends to zero with the mesh."""
+        return float(self.strength[-1]) if len(self.strength) else 0.0
+
+    def pinned(self, share: float = 1e-2) -> int:
+        """Return how many modes are excited at least `share` as much as the strongest one."""
+        if not len(self.strength) or self.strength[0] <= 0:
+            return 0
+        return int((self.strength >= share * self.strength[0]).sum())
+
+    def error_bounds(self, window: float, rate: float) -> Array:
+        """Return 2 gamma_0 ||d~||_X / epsilon for each mode, as in th:parameter_noisesmooth.
+
+        A mode whose bound exceeds its size in Q (1: the prior deviation, for gain 1) is not pinned
+        by data whose error changes at that rate.
+        """
+        tiny = np.finfo(float).tiny
+        bounds: Array = 2.0 * window * rate / np.maximum(self.strength, tiny)
+        return bounds
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationState:
+    """A plain value: what `Excitation` has accumulated.
+
+    Attributes
+    ----------
+    t
+        Time of the last sample; NaN before the first.
+    begun
+        Where the open window begins.
+    last
+        A(w) at t, dual vectors of X in columns, shape (n, m).
+    integral
+        Over the open window.
+    latest
+        Integral over the last whole window, None before.
+    gram
+        Sum over whole windows of their Gramians, shape (m, m); None beyond 1000 parameters.
+    windows
+        How many.
+    """
+
+    t: float = np.nan
+    begun: float = np.nan
+    last: sp.csr_array | None = None
+    integral: sp.csr_array | None = None
+    latest: sp.csr_array | None = None
+    gram: Array | None = None
+    windows: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """Accumulates integral over [t, t + gamma_0] of R A(w) d tau along a run, window by window.
+
+    w = u_alpha + P u is what the law itself knows, so this needs no truth. The windows are
+    disjoint; a window ends at the first sample at or after its length.
+
+    Parameters
+    ----------
+    spaces
+        Model and projections.
+    window
+        gamma_0, in the unit of time. Contributions that cancel within a window do not count, so
+        take it shorter than the periods of the excitation.
+    gain
+        That of the law.
+
+    >>> import livepde as lp, numpy as np
+    >>> from skfem import ElementLineP1
+    >>> rod = lp.Field(lp.interval(0, 1, 4), ElementLineP1())
+    >>> model = lp.Model(rod, lp.Scalar(std=2.0), A=lambda q, u, v, x: q * u * v)
+    >>> full = lp.Full().bind(model.state_space, model.X, model.parameter_space)
+    >>> excitation = Excitation(Spaces(model, full), window=0.5)
+    >>> state = excitation.init()
+    >>> for t in (0.0, 0.25, 0.5):
+    ...     state = excitation.add(state, t, np.full(5, 3.0))
+    >>> excitation.spectrum(state).strength.round(9)  # 0.5 * 3 * std
+    array([3.])
+    """
+
+    spaces: Spaces
+    window: float
+    gain: float = 1.0
+    count: int | None = field(default=None)
+
+    def __post_init__(self) -> None:
+        if not self.window > 0:
+            raise ConfigurationError(f"Excitation: window must be positive; got {self.window}.")
+
+    def init(self) -> ExcitationState:
+        """Return the state before the first sample."""
+        m = self.spaces.model.Q.dim
+        return ExcitationState(gram=np.zeros((m, m)) if m <= DENSE else None)
+
+    def add(
+        self,
+        state: ExcitationState,
+        t: float,
+        w: Array,
+        inputs: Mapping[str, float] | None = None,
+    ) -> ExcitationState:
+        """Take the state estimate w at a time; return the new state.
+
+        Parameters
+        ----------
+        w
+            u_alpha + P u, or the estimate u where they hardly differ; shape (n,).
+        inputs
+            Input channels at t.
+        """
+        moment = Moment(t, Inputs(inputs or {}))
+        now = self.spaces.model.A(w, moment).matrix
+        if state.last is None or state.integral is None:
+            empty = sp.csr_array(now.shape)
+            return replace(state, t=t, begun=t, last=now, integral=empty)
+        integral = sp.csr_array(state.integral + (0.5 * (t - state.t)) * (state.last + now))
+        if t - state.begun < self.window * (1 - 1e-9):
+            return replace(state, t=t, last=now, integral=integral)
+        gram = state.gram
+        if gram is not None:
+            gram = gram + self._gramian(integral, np.eye(gram.shape[0]))
+        return ExcitationState(
+            t, t, now, sp.csr_array(now.shape), integral, gram, state.windows + 1
+        )
+
+    def _gramian(self, integral: sp.csr_array, x: Array) -> Array:
+        """Return S* S x with S = R M^{-1} integral: Q -> X, as dual vectors of Q."""
+        X, R = self.spaces.model.X, self.spaces.split.R
+        image = R @ X.riesz(integral @ x)
+        back: Array = integral.T @ X.riesz(R.T @ (self.spaces.model.mass @ image))
+        return back
+
+    def spectrum(self, state: ExcitationState, *, latest: bool = False) -> Spectrum:
+        """Return the spectrum of all whole windows so far, or of the latest.
+
+        All modes up to 1000 parameters; beyond, the 20 strongest of the latest window by Lanczos.
+
+        Raises
+        ------
+        ConfigurationError
+            No window is complete yet.
+        """
+        integral = state.latest
+        if integral is None:
+            raise ConfigurationError(
+                f"Excitation: no window of length {self.window:g} is complete yet; add more "
+                "samples, or take a shorter window."
+            )
+        Q = self.spaces.model.Q
+        free = np.flatnonzero(Q.free)
+        gram = sp.csr_array(Q.tangent_gram[free][:, free]) / self.gain
+        if state.gram is not None:
+            m = Q.dim
+            total = self._gramian(integral, np.eye(m)) if latest else state.gram
+            total = total[np.ix_(free, free)]
+            values, vectors = eigh(0.5 * (total + total.T), gram.toarray())
+            windows = 1 if latest else state.windows
+        else:
+
+            def apply(x: Array) -> Array:
+                full = np.zeros(Q.dim)
+                full[free] = x
+                result: Array = self._gramian(integral, full)[free]
+                return result
+
+            shape = (len(free), len(free))
+            inverse = HilbertSpace(sp.csr_array(gram)).riesz
+            start = np.random.default_rng(0).standard_normal(len(free))
+            values, vectors = eigsh(
+                LinearOperator(shape, matvec=apply, dtype=float),
+                k=self.count or 20,
+                M=gram,
+                Minv=LinearOperator(shape, matvec=inverse, dtype=float),
+                v0=start,
+            )
+            windows = 1
+        modes = np.zeros((Q.dim, len(values)))
+        order = np.argsort(values)[::-1]
+        modes[free] = vectors[:, order]
+        return Spectrum(np.sqrt(np.maximum(values[order], 0.0)), modes, windows)

@@ -1,0 +1,128 @@
+"""T*: until when noisy data may be believed, (cond_d) and (Tast); with truth, and online."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.diagnostics.bounds import Errors
+from livepde.diagnostics.constants import Spaces
+from livepde.errors import ConfigurationError
+from livepde.laws.bounds import Constants, Norms
+from livepde.linalg import Array
+
+__all__ = ["OnlineStopping", "StoppingState", "noise_size", "stopping_time"]
+
+
+def stopping_time(errors: Sequence[Errors], c: Constants) -> float:
+    """Return T*: the first sample time that violates (cond_d); infinity if none does.
+
+    ||d||_V~ > c_M/(2 C_M) ||r||_VX~^2/||r||_X, with the true d and r of a `TwinTracker`.
+    """
+    for item in errors:
+        if item.margin < 2.0 * c.C_M / c.c_M:
+            return item.t
+    return np.inf
+
+
+def noise_size(
+    spaces: Spaces,
+    std: Array,
+    reconstruction: Array | sp.csr_array | None = None,
+    u_alpha: Array | None = None,
+) -> Norms:
+    """Return the root mean square of the data error d in X, VX~ and V~, from a noise level.
+
+    d = G_alpha eta + (G_alpha G - R) u*: what is left of the noise, and what G_alpha takes from the
+    exact state. The second part is estimated by taking it from u_alpha once more.
+
+    Parameters
+    ----------
+    spaces
+        Norms.
+    std
+        Standard deviation of each sensor, shape (sensors,); errors are independent.
+    reconstruction
+        Matrix of G_alpha, shape (n, sensors); default G^+. Raw nodal noise is about 1/h^2 times
+        larger in V~ than in X, so without smoothing T* comes at once.
+    u_alpha
+        The sample as reconstructed, shape (n,); None: leave out the second part.
+    """
+    matrix = spaces.split.inverse if reconstruction is None else reconstruction
+    if matrix.shape[1] != len(std):
+        raise ConfigurationError(
+            f"noise_size: {len(std)} deviations for {matrix.shape[1]} sensors."
+        )
+    dense = matrix.toarray() if sp.issparse(matrix) else np.asarray(matrix)
+    factor = dense * np.asarray(std, dtype=float)
+    if u_alpha is not None:
+        lost = dense @ (spaces.observed.G @ u_alpha) - u_alpha
+        factor = np.column_stack([factor, lost])
+    return spaces.observed_part.root_mean_square(factor)
+
+
+@dataclass(frozen=True)
+class StoppingState:
+    """What `OnlineStopping` knows.
+
+    Attributes
+    ----------
+    t
+        Time of the last sample.
+    T
+        First sample at which the surrogate condition was violated; infinity if none yet.
+    margin
+        Of the last sample: right over left side of (cond_d); below 1 it is violated.
+    """
+
+    t: float = -np.inf
+    T: float = np.inf
+    margin: float = np.inf
+
+
+@dataclass(frozen=True)
+class OnlineStopping:
+    """The surrogate of T* without truth.
+
+    (cond_d) holds the unknown d and r. Here ||d||_V~ is its root mean square for the noise level
+    (`noise_size`), and the true residual is what is left of the observed one without the noise:
+    r_alpha = r - d, so for noise that the estimate does not follow yet
+    ||r||^2 = ||r_alpha||^2 - ||d||^2 in the mean, in X as in VX~.
+
+    Parameters
+    ----------
+    constants
+        Of the model; only C_M/c_M enters.
+
+    >>> stop = OnlineStopping(Constants(1.0, 1.0))
+    >>> state = stop.add(stop.init(), 0.0, Norms(1.0, 3.0, 9.0), Norms(0.01, 0.1, 1.0))
+    >>> stop.add(state, 1.0, Norms(0.1, 0.3, 0.9), Norms(0.01, 0.1, 1.0)).T
+    1.0
+    """
+
+    constants: Constants
+
+    def init(self) -> StoppingState:
+        """Return the state before the first sample."""
+        return StoppingState()
+
+    def margin(self, r_alpha: Norms, d: Norms) -> float:
+        """Return c_M/(2 C_M) ||r||_VX~^2/(||r||_X ||d||_V~), with r estimated."""
+        VX = max(r_alpha.VX**2 - d.VX**2, 0.0)
+        X = np.sqrt(max(r_alpha.X**2 - d.X**2, 0.0))
+        if d.V == 0.0:
+            return np.inf
+        # Without ||r||_X nothing of r is left above the noise.
+        if X == 0.0:
+            return 0.0
+        c = self.constants
+        return float(c.c_M / (2.0 * c.C_M) * VX / (X * d.V))
+
+    def add(self, state: StoppingState, t: float, r_alpha: Norms, d: Norms) -> StoppingState:
+        """Take one sample's residual and noise size; return the new state."""
+        margin = self.margin(r_alpha, d)
+        T = t if margin < 1.0 and not np.isfinite(state.T) else state.T
+        return replace(state, t=t, T=T, margin=margin)

@@ -1,0 +1,401 @@
+"""What the theory says about a run: one page, with or without the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from livepde.diagnostics.bounds import TwinTracker, bounds, conditions
+from livepde.diagnostics.constants import Spaces, constants
+from livepde.diagnostics.excitation import Excitation, Spectrum
+from livepde.diagnostics.links import interpolation, link
+from livepde.diagnostics.report import CheckReport
+from livepde.diagnostics.stopping import OnlineStopping, noise_size, stopping_time
+from livepde.errors import ConfigurationError, LivepdeError
+from livepde.fem import Inputs, Moment
+from livepde.identifier import Identifier, Sample
+from livepde.laws.bounds import Constants, Norms
+from livepde.laws.damping import Damping, Residual
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.result import Estimate
+from livepde.streams import Twin
+
+__all__ = ["OnlineTracker", "Sheet", "TheoryReport", "theory_report"]
+
+DEFINITIONS = {
+    "L_C": ("LipschitzC", "|C(q,u+v+w) - C(q,u)|_X <= L_C (|v|_V~ + |w|_V^)"),
+    "C_A": ("AbdX, AbdV, AbdVV", "|A(u+v)|_{Q->X} <= C_A (1 + |v|)"),
+    "c_M": ("ass:equation 5", "(M v, v)_X >= c_M |v|_VX~^2"),
+    "C_M": ("ass:equation 5", "|R M v|_X <= C_M |v|_V~"),
+    "c_N": ("ass:equation 5", "(N v, v)_X >= c_N |v|_VX^^2"),
+    "C_N": ("ass:equation 5", "|P N v|_X <= C_N |v|_V^"),
+    "observed_V_VX": ("embedding", "|v|_VX~ <= C |v|_V~"),
+    "observed_VX_X": ("embedding", "|v|_X <= C |v|_VX~"),
+    "hidden_V_VX": ("embedding", "|v|_VX^ <= C |v|_V^"),
+    "hidden_VX_X": ("embedding", "|v|_X <= C |v|_VX^"),
+    "observed_ratio": ("interpol", "|v|_V~ |v|_X <= C |v|_VX~^2, 1/c_int"),
+    "hidden_ratio": ("interpol", "|v|_V^ |v|_X <= C |v|_VX^^2"),
+}
+NEEDS_TRUTH = (
+    "Without the truth u*, q* these cannot be evaluated: the errors e, r, p and with them the "
+    "conditions on mu and nu (cond:mu_1, cond:mu02, cond:nu, ass:mu_nu, ass:mu_nu_smooth), the "
+    "error bounds of the three propositions, T* itself, and lambda of the link conditions. A twin "
+    "experiment of the same model evaluates them."
+)
+SNAPSHOTS = 6  # states at which C_A is taken
+SHOWN = 8  # modes
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table: title, columns, rows; numbers stay numbers until they are shown."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+    def markdown(self) -> str:
+        """Return it as a Markdown table."""
+
+        def cells(row: Iterable[Any]) -> str:
+            shown = (f"{c:.4g}" if isinstance(c, float) else str(c) for c in row)
+            return "| " + " | ".join(cell.replace("|", "\\|") for cell in shown) + " |"
+
+        rule = "|" + "---|" * len(self.columns)
+        body = [cells(self.columns), rule, *map(cells, self.rows)]
+        return "\n".join([f"## {self.title}", "", *body])
+
+
+@dataclass(frozen=True, eq=False)
+class TheoryReport:
+    """The page of `theory_report`.
+
+    Attributes
+    ----------
+    tables
+        What could be evaluated.
+    reports
+        Conditions and error bounds; with a truth only.
+    notes
+        What could not, and why.
+    constants, spectrum, stopping
+        The numbers behind the tables; None where they could not be computed. `stopping` is the
+        surrogate of T*, infinity if it has not passed.
+    """
+
+    tables: tuple[Sheet, ...]
+    reports: tuple[CheckReport, ...] = ()
+    notes: tuple[str, ...] = ()
+    constants: Constants | None = None
+    spectrum: Spectrum | None = None
+    stopping: float | None = None
+
+    def markdown(self, title: str = "Theory") -> str:
+        """Return the page."""
+        parts = [f"# {title}", *(table.markdown() for table in self.tables)]
+        parts += [f"```\n{report}\n```" for report in self.reports]
+        parts += [f"> {note}" for note in self.notes]
+        return "\n\n".join(parts) + "\n"
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """What is known online at one sample."""
+
+    t: float
+    r: Norms
+    theta: float
+    d: Norms | None
+
+
+class OnlineTracker:
+    """Follows a run without its truth: residual, theta, excitation, surrogate of T*.
+
+    Parameters
+    ----------
+    identifier
+        Whose model, sensors and law are followed; it is not changed.
+    window
+        gamma_0 of the excitation Gramian and the link conditions.
+    noise
+        Standard deviation of the sensors, one number or one each; default those of the observation.
+    """
+
+    def __init__(self, identifier: Identifier, window: float, noise: Any = None) -> None:
+        self.identifier = identifier
+        self.window = window
+        law = identifier.law
+        self.gain = float(getattr(law, "gain", 1.0))
+        damping = getattr(law, "damping", None)
+        self.damping: Damping | None = damping if isinstance(damping, Damping) else None
+        self.spaces = Spaces.of(identifier.model, identifier.observed, law)
+        self.excitation = Excitation(self.spaces, window, self.gain)
+        self.excited = self.excitation.init()
+        self.moments: list[_Moment] = []
+        self.states: list[Array] = []
+        self.inputs: dict[str, float] = {}
+        self.last: Estimate | None = None
+        observed = identifier.observed
+        std = observed.noise
+        if noise is not None:
+            std = np.broadcast_to(np.asarray(noise, dtype=float), (observed.size,))
+        self.noise: Norms | None = None if std is None else noise_size(self.spaces, std)
+        self._every = 1
+
+    def add(self, estimate: Estimate, inputs: Mapping[str, float] | None = None) -> None:
+        """Take one estimate; what failed or held no measurement counts for nothing."""
+        self.inputs |= {k: v for k, v in (inputs or {}).items() if np.isfinite(v)}
+        present = np.isfinite(estimate.innovation)
+        if not estimate.status.ok or not present.any():
+            return
+        # R u - u_alpha = G^+ (G u - z), whatever the boundary values.
+        split = self.identifier.observed.split(present)
+        r = -(split.inverse @ estimate.innovation[present])
+        norms = self.spaces.observed_part.norms(r)
+        theta = np.nan
+        if self.damping is not None:
+            theta = self.damping.theta(Residual(norms.X**2, norms.VX**2, lambda: norms.V**2))
+        self.moments.append(_Moment(estimate.t, norms, theta, self.noise))
+        # Only a law with a damping rule works with u_alpha + P u, and leaves r behind the step.
+        w = estimate.u if self.damping is None else estimate.u - r
+        self.excited = self.excitation.add(self.excited, estimate.t, w, self.inputs)
+        self.last = estimate
+        if (len(self.moments) - 1) % self._every == 0:
+            self.states.append(estimate.u)
+            if len(self.states) > 2 * SNAPSHOTS:
+                self.states = self.states[::2]
+                self._every *= 2
+
+    @property
+    def moment(self) -> Moment:
+        """Time and inputs of the last sample."""
+        t = self.last.t if self.last is not None else 0.0
+        return Moment(t, Inputs(self.inputs))
+
+    def constants(self) -> Constants:
+        """Return the constants at the last q and at states along the run."""
+        if self.last is None:
+            raise ConfigurationError("theory: no sample of the run holds a measurement.")
+        return constants(self.spaces, self.last.q, self.states, moment=self.moment, gain=self.gain)
+
+    def series(self, get: str) -> Array:
+        """Return "t", "theta", "X", "VX" or "V" along the run, shape (samples,)."""
+        if get in ("X", "VX", "V"):
+            return np.array([getattr(item.r, get) for item in self.moments])
+        return np.array([getattr(item, get) for item in self.moments])
+
+
+def _inputs_of(sample: Sample, model: Model) -> dict[str, float]:
+    named = dict(sample.z) if isinstance(sample.z, Mapping) else {}
+    named |= dict(sample.inputs or {})
+    found = {name: named[name] for name in model.channels if name in named}
+    return {name: float(value) for name, value in found.items()}
+
+
+def theory_report(
+    identifier: Identifier,
+    samples: Iterable[Any],
+    *,
+    window: float | None = None,
+    noise: Any = None,
+    twin: Twin | None = None,
+) -> TheoryReport:
+    """Run an identifier and say what the paper's theory has to say about the run.
+
+    Parameters
+    ----------
+    identifier
+        Fresh, as it was before its first sample.
+    samples
+        Items of a stream: `Sample`, (t, z) or (t, z, inputs).
+    window
+        gamma_0; default a twentieth of the run.
+    noise
+        Standard deviation of the sensors, for the surrogate of T*; default that of the observation.
+    twin
+        The truth, if there is one; its samples are taken then.
+
+    Returns
+    -------
+    TheoryReport
+        Tables and a Markdown page. What cannot be evaluated is said in a note, never guessed.
+
+    Raises
+    ------
+    ConfigurationError
+        The stream holds fewer than two samples.
+    """
+    items = [item if isinstance(item, Sample) else Sample(*item) for item in samples]
+    if len(items) < 2:
+        raise ConfigurationError(f"theory: needs at least two samples; got {len(items)}.")
+    if window is None:
+        window = max((items[-1].t - items[0].t) / 20.0, 1e-12)
+    tracker = OnlineTracker(identifier, window, noise)
+    followed = None
+    if twin is not None:
+        followed = TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+    for sample in items:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        tracker.add(estimate, _inputs_of(sample, identifier.model))
+        if followed is not None and estimate.status.ok:
+            followed.add(estimate, sample.z)
+    notes: list[str] = []
+    tables: list[Sheet] = []
+    found: Constants | None = None
+    try:
+        found = tracker.constants()
+        tables.append(_constants_table(found))
+    except LivepdeError as error:
+        notes.append(f"The constants cannot be computed: {error}")
+    tables += _residual_tables(tracker, notes)
+    stopping = None
+    if found is not None:
+        stopping = _stopping(tracker, found, tables, notes)
+    spectrum = _spectrum(tracker, tables, notes)
+    reports: list[CheckReport] = []
+    if followed is None or found is None:
+        notes.append(NEEDS_TRUTH)
+    else:
+        reports = _with_truth(followed, found, identifier.law, tables)
+    return TheoryReport(tuple(tables), tuple(reports), tuple(notes), found, spectrum, stopping)
+
+
+def _constants_table(c: Constants) -> Sheet:
+    rows = [
+        (name, float(getattr(c, name)), text, label, _how(name, c))
+        for name, (label, text) in DEFINITIONS.items()
+    ]
+    columns = ("constant", "value", "definition", "in the paper", "is")
+    return Sheet("Constants of the discretised model", columns, rows)
+
+
+def _how(name: str, c: Constants) -> str:
+    if name in c.sampled:
+        return "estimated from below, by sampling"
+    return "a bound" if name in ("C_A", "observed_ratio", "hidden_ratio") else "an eigenvalue"
+
+
+def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Sheet]:
+    if not tracker.moments:
+        notes.append("No sample holds a measurement, so there is no residual.")
+        return []
+    X, VX, V = (tracker.series(name) for name in ("X", "VX", "V"))
+    theta = tracker.series("theta")
+    rows: list[tuple[Any, ...]] = [
+        _range("||R u - u_alpha||_X", X),
+        _range("||R u - u_alpha||_VX~", VX),
+        _range("||R u - u_alpha||_V~", V),
+    ]
+    if tracker.damping is not None:
+        rows += [_range("theta", theta), _range("mu = theta ||R u - u_alpha||_V~", theta * V)]
+    else:
+        notes.append(
+            "The law has no damping rule, so there is no theta, no mu and no kappa; the residual "
+            "is measured minus expected, one step ahead."
+        )
+    columns = ("along the run", "least", "median", "largest", "last")
+    tables = [Sheet("Residual and damping", columns, rows)]
+    rows = []
+    try:
+        quotients = interpolation([item.r for item in tracker.moments])
+        rows.append(
+            (
+                "interpol",
+                f"c_int = {quotients.c_int:.3g}, C_int = {quotients.C_int:.3g}",
+                "||r||_VX~^2 against ||r||_V~ ||r||_X",
+            )
+        )
+    except ConfigurationError as error:
+        notes.append(str(error))
+    if tracker.damping is not None:
+        try:
+            kappa = link(tracker.series("t"), theta * V, theta * VX**2, tracker.window)
+            rows.append(("cond:link, kappa", str(kappa), "mu^kappa against theta of the paper"))
+        except ConfigurationError as error:
+            notes.append(f"Link condition of kappa: {error}")
+    if rows:
+        tables.append(Sheet("Conditions on the residual", ("label", "measured", "of"), rows))
+    return tables
+
+
+def _range(name: str, values: Array) -> tuple[Any, ...]:
+    numbers = (values.min(), np.median(values), values.max(), values[-1])
+    return (name, *(float(number) for number in numbers))
+
+
+def _stopping(
+    tracker: OnlineTracker, c: Constants, tables: list[Sheet], notes: list[str]
+) -> float | None:
+    if tracker.noise is None or not tracker.moments:
+        notes.append("No noise level is known, so there is no surrogate of T*: give the sensors' ")
+        notes[-1] += "noise."
+        return None
+    rule = OnlineStopping(c)
+    state = rule.init()
+    for item in tracker.moments:
+        state = rule.add(state, item.t, item.r, tracker.noise)
+    d = tracker.noise
+    verdict = f"{state.T:.5g}" if np.isfinite(state.T) else "not reached"
+    tables.append(
+        Sheet(
+            "Surrogate of T*, the first violation of (cond_d)",
+            ("T*", "margin at the end", "||d||_X", "||d||_VX~", "||d||_V~"),
+            [(verdict, state.margin, d.X, d.VX, d.V)],
+        )
+    )
+    return state.T
+
+
+def _spectrum(tracker: OnlineTracker, tables: list[Sheet], notes: list[str]) -> Spectrum | None:
+    try:
+        spectrum = tracker.excitation.spectrum(tracker.excited)
+    except LivepdeError as error:
+        notes.append(f"Excitation Gramian: {error}")
+        return None
+    space = tracker.identifier.model.parameter_space
+    rows = []
+    for k in range(min(SHOWN, len(spectrum.strength))):
+        mode = spectrum.modes[:, k]
+        labels = [name for name in space.blocks if np.abs(mode[space.part(name)]).any()]
+        largest = max(labels, key=lambda name: float(np.linalg.norm(mode[space.part(name)])))
+        first = float(spectrum.strength[0]) or 1.0
+        strength = float(spectrum.strength[k])
+        rows.append((k + 1, strength, strength / first, largest))
+    pinned = spectrum.pinned()
+    title = (
+        f"Excitation (asspof), windows of {tracker.window:.4g}: {pinned} of "
+        f"{len(spectrum.strength)} modes of q within 1 % of the strongest"
+    )
+    tables.append(Sheet(title, ("mode", "strength", "relative", "mostly in"), rows))
+    return spectrum
+
+
+def _with_truth(
+    tracker: TwinTracker, c: Constants, law: Any, tables: list[Sheet]
+) -> list[CheckReport]:
+    nu, sigma = getattr(law, "nu", 0.0), getattr(law, "sigma", 0.0)
+    nu = float(nu) if isinstance(nu, int | float) else 0.0
+    errors = tracker.errors
+    noisy = tracker.twin.noise is not None
+    T = stopping_time(errors, c) if noisy else np.inf
+    first, last = errors[0], errors[-1]
+    rows: list[tuple[Any, ...]] = [
+        ("||e||_Q", first.e, last.e),
+        ("||r||_X", first.r.X, last.r.X),
+        ("||p||_X", first.p.X, last.p.X),
+        ("||p||_V^", first.p.V, last.p.V),
+        ("||e||_Q^2 + ||r||_X^2", first.energy, last.energy),
+    ]
+    if noisy:
+        rows.append(("T* with truth", "", T))
+    tables.append(Sheet("Errors against the truth", ("norm", "start", "end"), rows))
+    data: Any = "noisy" if noisy else "exact"
+    q_true = tracker.q_true
+    return [
+        conditions(errors, c, data=data, nu=nu, sigma=sigma),
+        bounds(errors, c, data=data, nu=nu, sigma=sigma, q_true=q_true, until=T),
+    ]
