@@ -6,11 +6,12 @@ and so do the tests.
 
 from __future__ import annotations
 
+from livepde.reproduce.degenerate import DEGENERATE
 from livepde.reproduce.experiment import Experiment
 from livepde.reproduce.seed import SEED
 from livepde.reproduce.seed_excited import SEED_EXCITED
 
 __all__ = ["EXPERIMENTS", "Experiment"]
 
-EXPERIMENTS: dict[str, Experiment] = {item.name: item for item in (SEED, SEED_EXCITED)}
+EXPERIMENTS: dict[str, Experiment] = {item.name: item for item in (SEED, SEED_EXCITED, DEGENERATE)}
 """Name -> experiment."""

@@ -1,0 +1,51 @@
+"""A model whose source makes a given state the exact solution of the discrete process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from livepde.fem import START, Moment
+from livepde.linalg import Array
+from livepde.model import Model
+
+__all__ = ["Manufactured"]
+
+
+class Manufactured(Model):
+    """A model with a discrete source, F_k = M (U_k - U_{k-1})/h + B(U_k) + A(U_k) q*.
+
+    U_k are the coefficients of u*(t_k), so implicit Euler with step h has exactly U as solution
+    for q = q*, whether the process is well posed or not: with D < 0 one cannot simulate it, but it
+    can be observed.
+
+    Parameters
+    ----------
+    q_true, u_true
+        The exact parameter and state, functions of x and of (x, t).
+    h
+        Step of the estimator.
+    forms
+        As for `Model`, without f.
+    """
+
+    def __init__(
+        self, q_true: Any, u_true: Callable[[Any, float], Any], h: float, **forms: Any
+    ) -> None:
+        super().__init__(**forms)
+        self.h = h
+        self._u_true = u_true
+        self._q = self.parameter_space.interpolate(q_true)
+
+    def exact(self, t: float) -> Array:
+        """Return the coefficients U of the exact state."""
+        return self.initial(lambda x: self._u_true(x, t), Moment(t))
+
+    def F(self, moment: Moment = START) -> Array:
+        """Return the discrete source in X*, shape (n,)."""
+        u = self.exact(moment.t)
+        rate = self.mass @ ((u - self.exact(moment.t - self.h)) / self.h)
+        source: Array = rate + self.B(u, moment)
+        return np.asarray(source + self.form_A.vector("v", moment, q=self._q, u=u))
