@@ -431,13 +431,31 @@ def _must_be_empty(folder: Path) -> None:
 @app.command()
 def report(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")],
+    theory: Annotated[
+        bool,
+        typer.Option(
+            "--theory",
+            help="What the paper's theory says about the run: constants, excitation, conditions, "
+            "T*. Takes the samples again; writes theory.md.",
+        ),
+    ] = False,
+    data: Annotated[
+        str | None,
+        typer.Option(help="With --theory: the run's data, if its case was moved."),
+    ] = None,
     as_json: JsonOption = False,
+    allow_code: CodeOption = False,
 ) -> None:
     """Show what a run found: tables, and figures into the run directory.
 
     Example:  livepde report runs/case
+    Theory:   livepde report runs/case --theory
     """
     from livepde import runs
+
+    if theory:
+        _report_theory(runs.open(folder), data, as_json, allow_code)
+        return
     from livepde.runs.directory import markdown
 
     opened = runs.open(folder)
@@ -463,6 +481,27 @@ def report(
     _show(console, shown, checks, notes)
     for name in drawn:
         console.print(f"Figure: {folder / name}", soft_wrap=True)
+
+
+def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
+    """Take a run's samples again, and print and write what the theory says."""
+    from livepde import cases
+    from livepde.diagnostics import theory_report
+    from livepde.runs import Table
+
+    case = opened.case_file()
+    prepared = cases.load(case, allow_code=allow_code).prepare(data or opened.data_file)
+    found = theory_report(prepared.identifier, prepared.stream)
+    target = opened.path / "theory.md"
+    target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")
+    shown = [Table(table.title, table.columns, table.rows) for table in found.tables]
+    if as_json:
+        _print_json(shown, [], found.notes, run=str(opened.path), theory=str(target))
+        return
+    console = _console()
+    console.print(f"[bold]{escape(opened.title)}[/]  theory")
+    _show(console, shown, [], found.notes)
+    console.print(f"Page: {escape(str(target))}", soft_wrap=True)
 
 
 # --- printing ------------------------------------------------------------------------------------

@@ -200,6 +200,42 @@ class Run:
         except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
             raise RunError(f"{path} is damaged: {error}.") from error
 
+    def case_file(self) -> Path:
+        """Return the case to take a run's samples again: where it was run, if it is unchanged.
+
+        Data files are named relative to the case, so the copy in the run directory serves only if
+        the original is gone or has changed; then the data must be given.
+
+        Raises
+        ------
+        RunError
+            The run was not made from a case (a reproduction), or its case is gone.
+        """
+        copy = self.path / CASE
+        if not copy.is_file():
+            raise RunError(
+                f"{self.path} was not made from a case file: only runs of 'livepde run' can be "
+                "taken again."
+            )
+        for word in self.record.get("command", [])[2:]:
+            original = Path(str(word))
+            if original.suffix == ".toml" and original.is_file():
+                text = original.read_text(encoding="utf-8")
+                if hashlib.sha256(text.encode()).hexdigest() == self.record.get("case_sha256"):
+                    return original
+        return copy
+
+    @property
+    def data_file(self) -> str | None:
+        """What --data named when the run was made; None: the case's own, or standard input."""
+        command = [str(word) for word in self.record.get("command", [])]
+        for k, word in enumerate(command):
+            if word.startswith("--data="):
+                return word.removeprefix("--data=")
+            if word == "--data" and k + 1 < len(command) and command[k + 1] != "-":
+                return command[k + 1]
+        return None
+
     def summary(self) -> list[Table]:
         """Return its tables: estimates ± deviation, errors of each channel."""
         return tables(self.dataset)
