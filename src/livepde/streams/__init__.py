@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from livepde.streams.smoothing import (
+    Exponential,
+    LocalPolynomial,
+    Smoothed,
+    Smoother,
+    WindowAverage,
+)
 from livepde.streams.table import Clock, Column, JsonLines, Table, read_csv, read_json_lines
 from livepde.streams.twin import AbsoluteNoise, Noise, RelativeNoise, Twin
 
@@ -9,11 +16,16 @@ __all__ = [
     "AbsoluteNoise",
     "Clock",
     "Column",
+    "Exponential",
     "JsonLines",
+    "LocalPolynomial",
     "Noise",
     "RelativeNoise",
+    "Smoothed",
+    "Smoother",
     "Table",
     "Twin",
+    "WindowAverage",
     "read_csv",
     "read_json_lines",
 ]

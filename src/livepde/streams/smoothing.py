@@ -1,0 +1,418 @@
+"""Causal smoothers as stages of a stream (section 3.3).
+
+The theory wants data that are smooth in time, ||(z^delta - z)_t||_Z <= delta~(t), "which can be
+achieved by averaging over sufficiently large time intervals". A stage takes samples and yields
+samples, each as soon as it has come:
+
+    smoothed = LocalPolynomial(width=1.0, degree=2)(stream)
+    for sample in smoothed:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        smoothed.std, smoothed.d_rate
+
+What smoothing takes from the noise it may add as a lag: that of each stage is stated.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Sized
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import ConfigurationError, SampleError
+from livepde.identifier import Sample
+from livepde.linalg import Array
+
+__all__ = ["Exponential", "LocalPolynomial", "Smoothed", "Smoother", "WindowAverage"]
+
+LARGEST_MEMO = 256  # weights kept for different spacings and patterns of missing samples
+ROUNDING = 1e-12  # shares of variance below this count as none
+RESOLUTION = 1e-9  # offsets that differ by less than this share of the width have the same weights
+
+
+class Weights(ABC):
+    """What a smoother remembers, and how it weighs it: z~_k = sum_j w_kj z_j, sum_j w_kj = 1."""
+
+    @abstractmethod
+    def add(self, t: float, z: Array) -> tuple[Array, Array, Array, Array]:
+        """Take one sample and return, each of shape (channels,) and NaN where z is missing.
+
+        Returns
+        -------
+        smooth
+            z~_k.
+        variance
+            sum_j w_kj^2: variance of its noise, per variance of the raw noise.
+        change
+            sum_j (w_kj - w_k-1,j)^2: that of z~_k - z~_k-1; NaN for the first.
+        left
+            (1 - w_kk)^2 + sum_j<k w_kj^2: that of z_k - z~_k.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Smoother(ABC):
+    """A causal smoother: call it with a stream and get a stream.
+
+    Parameters
+    ----------
+    noise
+        Standard deviation of the raw noise: one number, or one for each channel. Default: the mean
+        square of z - z~ over all samples so far, divided by what the weights leave of white noise.
+        What a stage smooths away of the signal counts as noise then, so the estimate is too large
+        rather than too small.
+    channels
+        Names of the channels to smooth, for samples by name; default all of the first sample that
+        are not inputs of it. Inputs and other channels pass unchanged, without the lag.
+    """
+
+    noise: float | Sequence[float] | None = None
+    channels: Sequence[str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.noise is not None:
+            noise = np.asarray(self.noise, dtype=float)
+            if noise.ndim > 1 or not (np.isfinite(noise).all() and np.all(noise > 0)):
+                raise ConfigurationError(
+                    f"{type(self).__name__}: noise must be a positive number, or one for each "
+                    f"channel; got {self.noise!r}."
+                )
+
+    @abstractmethod
+    def weights(self) -> Weights:
+        """Return a memory without samples."""
+
+    @abstractmethod
+    def noise_factor(self, h: float) -> float:
+        """Return std / sigma, settled, for samples at a distance h and white noise."""
+
+    def __call__(self, stream: Iterable[Any]) -> Smoothed:
+        """Return the smoothed stream; items are `Sample`, (t, z) or (t, z, inputs)."""
+        return Smoothed(self, stream)
+
+
+class Smoothed(Iterable[Sample]):
+    """A smoothed stream. After each sample it tells about that sample.
+
+    A missing value stays missing: smoothing does not invent data.
+
+    Attributes
+    ----------
+    std
+        Standard deviation of the noise of the smoothed channels, sigma sqrt(sum_j w_kj^2), shape
+        (channels,): what the observation has to be told as `noise`.
+    d_rate
+        The noise part of d~ = (d_alpha^delta)_t for each channel, the root mean square of the rate
+        of the smoothed noise,
+
+            sigma sqrt(sum_j (w_kj - w_k-1,j)^2) / (t_k - t_k-1),
+
+        shape (channels,), NaN for the first sample. What the lag adds, the rate of z~ - z without
+        noise, is not in it.
+    sigma
+        Standard deviation of the raw noise, given or estimated, shape (channels,).
+    """
+
+    def __init__(self, smoother: Smoother, stream: Iterable[Any]) -> None:
+        self.smoother = smoother
+        self.stream = stream
+        self._reset()
+
+    def _reset(self) -> None:
+        nothing = np.zeros(0)
+        self.std = self.d_rate = self.sigma = nothing
+        self._names: tuple[str, ...] | None = None
+        self._squares: Array | None = None
+        self._counts: Array | None = None
+
+    def __iter__(self) -> Iterator[Sample]:
+        self._reset()
+        weights = self.smoother.weights()
+        before = -np.inf
+        for item in self.stream:
+            sample = item if isinstance(item, Sample) else Sample(*item)
+            t = float(sample.t)
+            if not t > before:
+                raise SampleError(
+                    f"smoothing: the sample at t = {t!r} is not later than the one before at "
+                    f"t = {before!r}; sort the stream and drop repeated samples."
+                )
+            z = self._read(sample)
+            smooth, variance, change, left = weights.add(t, z)
+            self._learn(z - smooth, left)
+            self.std = self.sigma * np.sqrt(variance)
+            self.d_rate = self.sigma * np.sqrt(change) / (t - before)
+            before = t
+            yield self._write(sample, smooth)
+
+    def __len__(self) -> int:
+        if not isinstance(self.stream, Sized):
+            raise TypeError(f"a stream of type {type(self.stream).__name__} has no length")
+        return len(self.stream)
+
+    def norm_d_rate(self, gram: Array | None = None) -> float:
+        """Return the root mean square of ||d~||_Z after the last sample, from `d_rate`.
+
+        For `Subdomain` and G^+ that is ||d~||_X; G_alpha only shrinks it in X. The channels are
+        taken as independent. The last theorem of the paper bounds the limit superior of
+        ||q^ - q*||_Q by 2 gamma_0 / epsilon_0 times its supremum over time
+        (th:parameter_noisesmooth).
+
+        Parameters
+        ----------
+        gram
+            Gram matrix of Z, shape (channels, channels); default the identity.
+        """
+        rate = np.nan_to_num(self.d_rate)
+        scale = np.ones_like(rate) if gram is None else np.diag(gram)
+        return float(np.sqrt(scale @ rate**2))
+
+    def _read(self, sample: Sample) -> Array:
+        if not isinstance(sample.z, Mapping):
+            return np.atleast_1d(np.asarray(sample.z, dtype=float))
+        if self._names is None:
+            chosen = self.smoother.channels
+            if chosen is None:
+                chosen = [name for name in sample.z if name not in (sample.inputs or {})]
+            self._names = tuple(chosen)
+        given = [sample.z.get(name) for name in self._names]
+        return np.array([np.nan if value is None else float(value) for value in given])
+
+    def _write(self, sample: Sample, smooth: Array) -> Sample:
+        if not isinstance(sample.z, Mapping):
+            return Sample(sample.t, smooth, sample.inputs)
+        named = dict(sample.z)
+        for name, value in zip(self._names or (), smooth.tolist(), strict=True):
+            if name in named:
+                named[name] = value
+        return Sample(sample.t, named, sample.inputs)
+
+    def _learn(self, rest: Array, left: Array) -> None:
+        if self.smoother.noise is not None:
+            given = np.asarray(self.smoother.noise, dtype=float)
+            if given.ndim == 1 and given.shape != rest.shape:
+                raise ConfigurationError(
+                    f"{type(self.smoother).__name__}: {given.size} values of noise for "
+                    f"{rest.size} channels; give one, or one each."
+                )
+            self.sigma = np.broadcast_to(given, rest.shape)
+            return
+        if self._squares is None or self._counts is None:
+            self._squares, self._counts = np.zeros_like(rest), np.zeros_like(rest)
+        told = np.isfinite(rest) & (left > ROUNDING)
+        self._squares[told] += rest[told] ** 2
+        self._counts[told] += left[told]
+        known = self._counts > 0
+        self.sigma = np.full_like(rest, np.nan)
+        self.sigma[known] = np.sqrt(self._squares[known] / self._counts[known])
+
+
+class _Window(Weights):
+    """Weights from the offsets t_j - t_k of the samples in a window (t_k - width, t_k]."""
+
+    def __init__(self, smoother: _WindowSmoother) -> None:
+        self.smoother = smoother
+        self.times: list[float] = []
+        self.values: list[Array] = []
+        self.last: Array = np.zeros((0, 0))
+        self._memo: dict[bytes, Array] = {}
+
+    def add(self, t: float, z: Array) -> tuple[Array, Array, Array, Array]:
+        if self.values and self.values[-1].shape != z.shape:
+            raise SampleError(
+                f"smoothing: a sample of shape {z.shape} after samples of "
+                f"shape {self.values[-1].shape}."
+            )
+        self.times.append(t)
+        self.values.append(z)
+        width = self.smoother.width
+        gone = 0
+        while self.times[gone] <= t - width * (1 - RESOLUTION):
+            gone += 1
+        del self.times[:gone], self.values[:gone]
+        values = np.array(self.values)
+        weights = self._weights(np.array(self.times) - t, np.isfinite(values))
+        change = np.full(z.shape, np.nan)
+        if len(self.last):
+            kept = self.last[gone:]
+            change = ((weights[: len(kept)] - kept) ** 2).sum(axis=0)
+            change += (self.last[:gone] ** 2).sum(axis=0) + (weights[len(kept) :] ** 2).sum(axis=0)
+        self.last = weights
+        smooth = (weights * np.nan_to_num(values)).sum(axis=0)
+        variance = (weights**2).sum(axis=0)
+        left = variance + 1.0 - 2.0 * weights[-1]
+        return smooth, variance, change, left
+
+    def _weights(self, offsets: Array, present: Any) -> Array:
+        """Return weights of shape (samples, channels), NaN where the newest value is missing."""
+        weights = np.zeros(present.shape)
+        if present.all():
+            weights[:] = self._of(offsets)[:, None]
+            return weights
+        patterns, which = np.unique(present.T, axis=0, return_inverse=True)
+        for k, pattern in enumerate(patterns):
+            column = np.zeros(len(offsets))
+            if pattern[-1]:
+                column[pattern] = self._of(offsets[pattern])
+            else:
+                column[:] = np.nan
+            weights[:, which.ravel() == k] = column[:, None]
+        return weights
+
+    def _of(self, offsets: Array) -> Array:
+        rounded = np.round(offsets / (self.smoother.width * RESOLUTION))
+        key = rounded.tobytes()
+        if key not in self._memo:
+            if len(self._memo) >= LARGEST_MEMO:
+                self._memo.clear()
+            self._memo[key] = self.smoother.window(rounded * RESOLUTION)
+        return self._memo[key]
+
+
+@dataclass(frozen=True)
+class _WindowSmoother(Smoother):
+    """A smoother that sees the samples of (t - width, t]."""
+
+    width: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _positive(self, "width", self.width)
+
+    def weights(self) -> Weights:
+        return _Window(self)
+
+    def noise_factor(self, h: float) -> float:
+        _positive(self, "h", h)
+        count = int(np.ceil(self.width * (1 - RESOLUTION) / h))
+        return float(np.linalg.norm(self.window(-h / self.width * np.arange(count)[::-1])))
+
+    @abstractmethod
+    def window(self, s: Array) -> Array:
+        """Return the weights of samples at t_k + width · s, with -1 < s <= 0 and s[-1] = 0."""
+
+
+def _positive(owner: object, name: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise ConfigurationError(
+            f"{type(owner).__name__}: {name} must be a positive number; got {value}."
+        )
+
+
+@dataclass(frozen=True)
+class WindowAverage(_WindowSmoother):
+    """The mean over the samples of (t - width, t].
+
+    Exact for constants. Lag: t_k minus the mean of their times, half the width for equidistant
+    samples; a linear trend comes late by that much. The deviation of the noise falls with the root
+    of the number of samples.
+
+    >>> stage = WindowAverage(3.0, noise=1.0)([(0, [0.0]), (1, [1.0]), (2, [2.0]), (3, [3.0])])
+    >>> [float(sample.z[0]) for sample in stage], stage.std.round(3).tolist()
+    ([0.0, 0.5, 1.0, 2.0], [0.577])
+    """
+
+    def window(self, s: Array) -> Array:
+        return np.full(len(s), 1.0 / len(s))
+
+
+@dataclass(frozen=True)
+class LocalPolynomial(_WindowSmoother):
+    """The value at t of the polynomial that fits the samples of (t - width, t] best.
+
+    Exact for polynomials up to `degree`, at any spacing of the samples, so it has no lag for a
+    linear trend (degree >= 1); of a smooth signal it misses the order width^(degree + 1). The
+    price is noise: its variance is about (degree + 1)^2 over the number of samples. With fewer than
+    degree + 1 samples the degree falls.
+
+    Parameters
+    ----------
+    width
+        Of the window, in the unit of time.
+    degree
+        Of the polynomial, >= 0; 0 is `WindowAverage`.
+    """
+
+    degree: int = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.degree < 0:
+            raise ConfigurationError(f"LocalPolynomial: degree must be >= 0; got {self.degree}.")
+
+    def window(self, s: Array) -> Array:
+        degree = min(self.degree, len(s) - 1)
+        powers = np.vander(s, degree + 1, increasing=True)
+        fit: Array = np.linalg.pinv(powers)[0]
+        return fit
+
+
+@dataclass(frozen=True)
+class Exponential(Smoother):
+    """Exponential smoothing, z~_k = z~_k-1 + a (z_k - z~_k-1), a = 1 - exp(-(t_k - t_k-1)/time).
+
+    Exact for constants. Lag: h (1 - a)/a for equidistant samples, about `time`. For every channel
+    t_k-1 is its last sample with a value.
+
+    Parameters
+    ----------
+    time
+        Time constant, in the unit of time.
+    """
+
+    time: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _positive(self, "time", self.time)
+
+    def weights(self) -> Weights:
+        return _Fading(self.time)
+
+    def noise_factor(self, h: float) -> float:
+        _positive(self, "h", h)
+        share = float(-np.expm1(-h / self.time))
+        return float(np.sqrt(share / (2.0 - share)))
+
+
+class _Fading(Weights):
+    def __init__(self, time: float) -> None:
+        self.time = time
+        self.state: tuple[Array, Array, Array] | None = None
+        self.seen = np.zeros(0, dtype=bool)
+
+    def add(self, t: float, z: Array) -> tuple[Array, Array, Array, Array]:
+        present = np.isfinite(z)
+        nothing = np.full(z.shape, np.nan)
+        if self.state is None:
+            smooth, variance, times = z.copy(), np.where(present, 1.0, np.nan), nothing.copy()
+            times[present] = t
+            self.state, self.seen = (smooth, variance, times), present
+            return smooth.copy(), variance.copy(), nothing, np.where(present, 0.0, np.nan)
+        smooth, variance, times = self.state
+        if smooth.shape != z.shape:
+            raise SampleError(
+                f"smoothing: a sample of shape {z.shape} after samples of shape {smooth.shape}."
+            )
+        first = present & np.isnan(smooth)
+        share = -np.expm1(-(t - times) / self.time)
+        change = share**2 * (1.0 + variance)
+        left = (1.0 - share) ** 2 * (1.0 + variance)
+        new = np.where(first, z, smooth + share * (z - smooth))
+        spread = np.where(first, 1.0, (1.0 - share) ** 2 * variance + share**2)
+        out = np.where(present, new, np.nan)
+        result = (
+            out,
+            np.where(present, spread, np.nan),
+            np.where(present & self.seen, change, np.nan),
+            np.where(present, np.where(first, 0.0, left), np.nan),
+        )
+        self.state = (
+            np.where(present, new, smooth),
+            np.where(present, spread, variance),
+            np.where(present, t, times),
+        )
+        self.seen = present
+        return result
