@@ -1,0 +1,453 @@
+"""The paper's law: energy, the coupled stage, damping, missing samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from problems import (
+    CASES,
+    excited,
+    excited_q,
+    excited_u,
+    laplace,
+    line,
+    observe,
+    rates,
+    reaction,
+    truth,
+)
+from skfem import ElementLineHermite, ElementLineP1, ElementQuad1, MeshQuad
+
+import livepde as lp
+from livepde.fem import Moment
+from livepde.laws.coupled import CoupledStage, Gains
+from livepde.stepping import ForwardStage, StepFailed
+
+EXACT = lp.Newton(tolerance=1e-13)
+
+
+def identifier(model, law, sensors=None, **options):
+    return lp.Identifier(model, sensors or lp.Full(), law, **options)
+
+
+def energies(model, law, q_true, states, times, **options):
+    """Return ||e||_Q^2/gain + ||r||_X^2 after each sample of exact data on all of the domain."""
+    ident = identifier(model, law, **options)
+    G = ident.observed.G
+    found = []
+    start = ident.estimate()
+    for t, u_true in zip(times, states, strict=True):
+        estimate = start if t == times[0] else ident.step(t, G @ u_true)
+        assert estimate.status.ok
+        e, r = estimate.q - q_true, estimate.u - u_true
+        found.append(model.Q.norm(e) ** 2 / law.gain + model.X.norm(r) ** 2)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("gain", [1.0, 1e1, 1e2, 1e3, 1e4, 1e5])
+@pytest.mark.parametrize(
+    "damping", [lp.ResidualDamping(0.0), lp.ResidualDamping(1.0), lp.ConstantDamping(2.0)]
+)
+def test_energy_never_grows(gain, damping):
+    """The terms with A cancel in every step: DESIGN.md, section 1, and (align:neplusnr).
+
+    `gain` scales the inner product of Q, so ||e||_Q^2 is taken in the scaled one.
+    """
+    model = excited(12)
+    times = 0.2 * np.arange(40)
+    q_true = model.initial_parameter(excited_q)
+    states = truth(model, q_true, lambda x: excited_u(x, 0.0), times)
+    law = lp.GradientLaw(gain=gain, damping=damping, newton=EXACT)
+    energy = energies(model, law, q_true, states, times, q0=5.0, u0=lambda x: 2 * x[0] * (1 - x[0]))
+    assert energy[0] > 1e-3
+    assert np.diff(energy).max() <= 1e-13 * energy[0]
+    assert energy[-1] < energy[0]
+
+
+@pytest.mark.parametrize("gain", [1.0, 1e3, 1e5])
+def test_energy_of_the_papers_example(gain):
+    """Degenerate information: |q*| <= 0.00625, dying excitation, steps of 0.6."""
+
+    def q_exact(x):
+        return 0.025 * x[0] ** 2 - 0.025 * x[0]
+
+    def source(x, t):
+        return (np.pi**2 - 1 / (1 + t) + q_exact(x)) * np.sin(np.pi * x[0]) / (1 + t)
+
+    zero = {"boundary": 0.0}
+    model = reaction(line(30), ElementLineHermite(), f=source, q_dirichlet=zero)
+    times = 0.6 * np.arange(101)
+    q_true = model.initial_parameter(q_exact)
+    states = truth(model, q_true, lambda x: np.sin(np.pi * x[0]), times)
+    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(1.0), newton=EXACT)
+    energy = energies(model, law, q_true, states, times, u0=lambda x: 1.1 * np.sin(np.pi * x[0]))
+    assert np.diff(energy).max() <= 1e-13 * energy[0]
+
+
+@pytest.mark.parametrize("name", ["triangles P1", "quads Q1"])
+def test_energy_in_the_plane_with_irregular_steps(name):
+    model = CASES[name].model(f=lambda x, t: 10 * (1 + np.sin(t) * x[0]))
+    times = np.cumsum([0.0, 0.1, 0.3, 0.05, 0.7, 0.2, 0.2, 0.4, 0.01, 1.0])
+    q_true = model.initial_parameter(lambda x: 1 + x[0] * x[1])
+    states = truth(model, q_true, 0.0, times)
+    law = lp.GradientLaw(gain=1e3, newton=EXACT)
+    energy = energies(model, law, q_true, states, times, q0=2.0, u0=0.3)
+    assert np.diff(energy).max() <= 1e-13 * energy[0]
+
+
+def test_energy_of_a_diffusivity_with_a_time_dependent_model():
+    model = reaction(
+        line(12),
+        ElementLineP1(),
+        dirichlet={"left": lambda x, t: np.sin(t), "right": 1.0},
+        A=lambda q, u, v, x: (1 + 0.2 * np.sin(x.t)) * q * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: 0.1 * laplace(u, v, x) + u * v,
+    )
+    times = 0.3 * np.arange(30)
+    q_true = model.initial_parameter(lambda x: 0.5 + 0.2 * x[0])
+    states = truth(model, q_true, lambda x: x[0], times)
+    law = lp.GradientLaw(gain=10.0, newton=EXACT)
+    energy = energies(model, law, q_true, states, times, q0=0.4, u0=lambda x: x[0] ** 2)
+    assert np.diff(energy).max() <= 1e-13 * energy[0]
+
+
+def test_excited_twin_is_identified():
+    """DESIGN.md, fact 5, a short run: q* between 2 and 5 from q0 = 0."""
+    model = excited(16)
+    times = 0.05 * np.arange(400)
+    q_true = model.initial_parameter(excited_q)
+    states = truth(model, q_true, lambda x: excited_u(x, 0.0), times)
+    ident = identifier(model, lp.GradientLaw(gain=1e3), q0=0.0, u0=lambda x: excited_u(x, 0.0))
+    for t, u in zip(times[1:], states[1:], strict=True):
+        estimate = ident.step(t, ident.observed.G @ u)
+    mass = model.parameter_mass
+    error = estimate.q - q_true
+    assert np.sqrt(error @ mass @ error / (q_true @ mass @ q_true)) < 0.02
+    assert estimate.q_std is None
+    assert estimate.u_std is None
+
+
+def partly_observed(scheme, steps, h_total=1.0, **options):
+    """Run the law on smooth data over [0, 1] and return (u, q) at the end."""
+    model = reaction(
+        line(8),
+        ElementLineP1(),
+        dirichlet={"left": lambda x, t: np.sin(2 * t), "right": 0.0},
+        f=lambda x, t: 5 * x[0] * np.cos(t),
+        **options,
+    )
+    sensors = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8))
+    law = lp.GradientLaw(
+        gain=30.0, damping=lp.ResidualDamping(2.0), nu=0.3, sigma=0.2, newton=EXACT
+    )
+    ident = identifier(model, law, sensors, q0=1.0, u0=lambda x: x[0] * (1 - x[0]), scheme=scheme)
+    nodes = ident.observed.G @ model.state.mesh.p[0]
+
+    def z(t):
+        return (1 - nodes) * (np.sin(2 * t) + nodes * np.cos(t))
+
+    times = h_total * np.arange(steps + 1) / steps
+    for t in times:
+        estimate = ident.step(t, z(t))
+        assert estimate.status.ok
+    return np.concatenate([estimate.u, estimate.q])
+
+
+@pytest.mark.parametrize(
+    ("scheme", "order"), [(lp.ImplicitEuler(), 1), (lp.Alexander2(), 2)], ids=["euler", "alexander"]
+)
+def test_order_in_time_of_the_coupled_step(scheme, order):
+    reference = partly_observed(lp.Alexander2(), 1280)
+    steps = (20, 40, 80, 160)
+    errors = [abs(partly_observed(scheme, n) - reference).max() for n in steps]
+    np.testing.assert_allclose(rates(errors), order, atol=0.2)
+
+
+def test_precomputed_products_do_not_change_the_numbers():
+    """A bilinear model, and the same one made to look time-dependent: two code paths."""
+    fast = partly_observed(lp.ImplicitEuler(), 10)
+    general = partly_observed(
+        lp.ImplicitEuler(), 10, A=lambda q, u, v, x: (1 + 0 * x.t) * q * u * v
+    )
+    curved = partly_observed(
+        lp.ImplicitEuler(), 10, A=lambda q, u, v, x: q * (u + 1e-13 * u**3) * v
+    )
+    np.testing.assert_allclose(general, fast, atol=1e-10)
+    np.testing.assert_allclose(curved, fast, atol=1e-10)
+
+
+def test_stage_solves_its_equations():
+    """The two equations of CoupledStage, written out with dense matrices."""
+    model = excited(8)
+    observed = observe(model, lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8)))
+    split = observed.split()
+    rng = np.random.default_rng(0)
+    M_op = model.bilinear(lambda u, v, x: u * v + laplace(u, v, x))
+    for damping in (lp.ResidualDamping(3.0), lp.ConstantDamping(2.0, floor=0.1)):
+        gains = Gains(50.0, damping, 0.4, 0.3, M_op, model.mass)
+        stage = CoupledStage(model, split, gains, EXACT)
+        n, h, moment = model.X.dim, 0.3, Moment(0.3)
+        c = 0.3 * rng.standard_normal(n + model.Q.dim)
+        c[:n] *= model.X.free
+        u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
+        y = stage.solve(c, h, moment, u_alpha, c.copy())
+        u, q = y[:n], y[n:]
+        r, w = split.R @ u - u_alpha, u_alpha + split.P @ u
+        Mr = split.R.T @ M_op @ r
+        theta = damping.theta(stage.norms(r, Mr, split.R.T @ model.mass @ r))
+        A = model.A(w, moment)
+        PNP = split.P.T @ model.mass @ split.P
+        first = model.mass @ (u - c[:n]) / h + model.B(w, moment) + A(q)
+        first += theta * Mr + 0.4 * PNP @ u - model.F(moment)
+        second = model.Q.gram @ (q - c[n:]) / (50 * h) + 0.3 / 50 * model.Q.gram @ q
+        second -= A.transposed(r)
+        scale = abs(model.F(moment)).max()
+        assert abs(first * model.X.free).max() <= 1e-10 * scale
+        assert abs(second).max() <= 1e-10 * scale
+
+
+@pytest.mark.parametrize("scheme", [lp.ImplicitEuler(), lp.Alexander2()])
+def test_without_samples_the_law_is_the_model(scheme):
+    model = excited(10)
+    law = lp.GradientLaw(gain=1e3, newton=EXACT)
+    ident = identifier(model, law, q0=2.0, u0=1.0, scheme=scheme)
+    q = model.initial_parameter(2.0)
+    states = truth(model, q, 1.0, [0.0, 0.2, 0.5], scheme)
+    for t, u in zip([0.2, 0.5], states[1:], strict=True):
+        estimate = ident.step(t, np.full(ident.observed.size, np.nan))
+        assert estimate.status.ok
+        np.testing.assert_allclose(estimate.u, u, atol=1e-10)
+        np.testing.assert_allclose(estimate.q, q, atol=1e-10)
+    assert np.isnan(estimate.innovation).all()
+
+
+def test_a_missing_sensor_takes_no_part():
+    """With one sensor missing, the step is that of an observation without it."""
+    model = excited(10)
+    omega = lp.Averages({"a": lambda x: x[0] < 0.3, "b": lambda x: x[0] > 0.6})
+    alone = lp.Averages({"a": lambda x: x[0] < 0.3})
+    law = lp.GradientLaw(gain=100.0)
+    both = identifier(model, law, omega, q0=2.0).step(0.1, [0.4, np.nan])
+    one = identifier(model, law, alone, q0=2.0).step(0.1, [0.4])
+    np.testing.assert_array_equal(both.q, one.q)
+    np.testing.assert_array_equal(both.u, one.u)
+
+
+def test_stabilising_term_decays_q():
+    model = excited(6, sigma=None) if False else excited(6)
+    ident = identifier(model, lp.GradientLaw(sigma=0.7, newton=EXACT), q0=3.0)
+    nothing = np.full(ident.observed.size, np.nan)
+    q0 = ident.estimate().q
+    for k in range(1, 4):
+        estimate = ident.step(0.5 * k, nothing)
+        np.testing.assert_allclose(estimate.q, q0 / (1 + 0.7 * 0.5) ** k, atol=1e-9)
+
+
+def test_nu_damps_the_unobserved_part():
+    model = reaction(line(12), ElementLineP1(), B=lambda u, v, x: -0.5 * laplace(u, v, x))
+    sensors = lp.Subdomain(lambda x: x[0] > 0.5)
+    sizes = []
+    for nu in (0.0, 5.0):
+        law = lp.GradientLaw(nu=nu)
+        ident = identifier(model, law, sensors, q0=1.0, u0=lambda x: np.sin(np.pi * x[0]))
+        P = ident.observed.split().P
+        for k in range(1, 6):
+            estimate = ident.step(0.001 * k, np.zeros(ident.observed.size))
+        sizes.append(model.X.norm(P @ estimate.u))
+    assert sizes[1] < sizes[0]
+
+
+def test_operators_are_users_choice():
+    model = excited(8)
+    first = lp.GradientLaw(gain=100.0, M_op=lambda u, v, x: u * v)
+    same = lp.GradientLaw(gain=100.0, M_op=lambda u, v, x: u * v, N_op=lambda u, v, x: 7 * u * v)
+    z = np.ones(identifier(model, first).observed.size)
+    np.testing.assert_array_equal(
+        identifier(model, first).step(0.1, z).q, identifier(model, same).step(0.1, z).q
+    )
+    other = identifier(model, lp.GradientLaw(gain=100.0)).step(0.1, z).q
+    assert abs(identifier(model, first).step(0.1, z).q - other).max() > 1e-6
+
+
+def test_bounds_of_numbers_are_kept():
+    """Data of q = 3 drive q up to its bound, and no further."""
+    model = lp.Model(
+        lp.Field(line(10), ElementLineP1(), dirichlet={"boundary": 0.0}),
+        lp.Scalar(prior=0.5, bounds=(0.0, 1.0)),
+        A=lambda q, u, v, x: q * u * v,
+        B=laplace,
+        f=1.0,
+    )
+    times = 0.1 * np.arange(40)
+    states = truth(model, np.array([3.0]), 0.0, times)
+    ident = identifier(model, lp.GradientLaw(gain=1e6))
+    steps = zip(times[1:], states[1:], strict=True)
+    q = [ident.step(t, ident.observed.G @ u).q[0] for t, u in steps]
+    assert max(q) == 1.0
+    assert min(q) >= 0.0
+
+
+class TestDamping:
+    def test_residual_damping(self):
+        """theta = c1 ||r||_X^2 / ||r||_VX^2: smooth, bounded by c1, never 0/0."""
+        rule = lp.ResidualDamping(2.0)
+        assert rule.theta(lp.Residual(4.0, 16.0, lambda: np.nan)) == 0.5
+        assert rule.theta(lp.Residual(0.0, 0.0, lambda: np.nan)) == 2.0
+        assert rule.slopes(lp.Residual(0.0, 0.0, lambda: np.nan)) == (0.0, 0.0, 0.0)
+
+    def test_constant_damping(self):
+        rule = lp.ConstantDamping(3.0, floor=0.5)
+        assert rule.theta(lp.Residual(0.0, 0.0, lambda: 0.0)) == 6.0
+        assert rule.theta(lp.Residual(1.0, 1.0, lambda: 6.0)) == pytest.approx(3 / 2.5)
+
+    @pytest.mark.parametrize("rule", [lp.ResidualDamping(2.0), lp.ConstantDamping(3.0, floor=0.1)])
+    def test_slopes_are_derivatives(self, rule):
+        at = np.array([0.7, 1.9, 2.3])
+
+        def theta(x):
+            return rule.theta(lp.Residual(x[0], x[1], lambda: x[2]))
+
+        slopes = rule.slopes(lp.Residual(at[0], at[1], lambda: at[2]))
+        for k, slope in enumerate(slopes):
+            step = 1e-6 * np.eye(3)[k]
+            assert slope == pytest.approx((theta(at + step) - theta(at - step)) / 2e-6, abs=1e-5)
+
+    def test_default_slopes_serve_any_rule(self):
+        @dataclass(frozen=True)
+        class Steep(lp.Damping):
+            def theta(self, r):
+                return 0.5 * r.X + r.VX**2 + 0.1 * r.V
+
+        slopes = Steep().slopes(lp.Residual(0.7, 2.0, lambda: 3.0))
+        np.testing.assert_allclose(slopes, [0.5, 4.0, 0.1], rtol=1e-4)
+        model = excited(8)
+        ident = identifier(model, lp.GradientLaw(gain=10.0, damping=Steep()))
+        assert ident.step(0.1, np.ones(ident.observed.size)).status.ok
+
+    def test_norms_of_the_residual(self):
+        """||r||_V~ is the X-norm of the operator M_op r."""
+        model = excited(8)
+        problem = lp.Problem(model, observe(model, lp.Full()), lp.Advance(lp.ImplicitEuler()))
+        law = lp.GradientLaw()
+        stage = law.prepare(problem).stage(np.ones(problem.observed.size, dtype=bool))
+        r = np.random.default_rng(0).standard_normal(model.X.dim) * model.X.free
+        Mr = stage.RM @ r
+        norms = stage.norms(r, Mr, model.mass @ r)
+        assert pytest.approx(model.X.norm(r) ** 2) == norms.X
+        assert pytest.approx(r @ model.bilinear(law.M_op) @ r) == norms.VX
+        assert pytest.approx(model.X.norm(model.X.riesz(Mr)) ** 2) == norms.V
+        assert norms.VX**2 <= norms.X * norms.V * (1 + 1e-12)  # Cauchy and Schwarz
+
+    def test_bad_rules(self):
+        for c1 in (-1.0, np.nan, np.inf):
+            with pytest.raises(lp.LawError, match="c1 must be a number >= 0"):
+                lp.ResidualDamping(c1)
+        for bad in ({"mu": -1.0}, {"mu": np.inf}, {"floor": 0.0}):
+            with pytest.raises(lp.LawError, match="mu >= 0 and floor > 0"):
+                lp.ConstantDamping(**bad)
+
+
+def test_bad_gains():
+    for gain in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(lp.LawError, match="gain must be a positive number"):
+            lp.GradientLaw(gain=gain)
+    for name in ("nu", "sigma"):
+        with pytest.raises(lp.LawError, match=f"{name} must be a number >= 0"):
+            lp.GradientLaw(**{name: -0.1})
+
+
+def test_sensors_that_see_the_parameter_are_refused():
+    model = lp.Model(lp.Field(line(), ElementLineP1()), lp.Scalar(), lambda q, u, v, x: q * u * v)
+    sensors = lp.Points({"a": 0.5}, direct={"a": lambda q, x: q})
+    with pytest.raises(lp.LawError, match="use SensitivityLaw"):
+        identifier(model, lp.GradientLaw(), sensors)
+
+
+def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
+    model = excited(10)
+    ident = identifier(model, lp.GradientLaw(gain=1e4, newton=lp.Newton(iterations=1)), q0=1.0)
+    before = ident.estimate()
+    z = np.full(ident.observed.size, 0.3)
+    failed = ident.step(0.1, z)
+    assert failed.status.code == "not_converged"
+    assert "iterations" in failed.status.detail
+    assert "smaller" in failed.status.remedy
+    assert failed.status.remedy in str(failed.status)
+    np.testing.assert_array_equal(failed.q, before.q)
+    np.testing.assert_array_equal(failed.u, before.u)
+    assert ident.t == 0.0
+    after = ident.step(0.2, np.full(ident.observed.size, np.nan))
+    assert np.isfinite(after.u).all()
+
+
+def test_a_reaction_that_blows_up():
+    """u_t = exp(u) - ... reaches infinity in finite time wherever nothing is observed."""
+    model = reaction(line(10), ElementLineP1(), B=lambda u, v, x: -10 * np.exp(u) * v, dirichlet={})
+    ident = identifier(model, lp.GradientLaw(), lp.Subdomain(lambda x: x[0] < 0.25), u0=1.0)
+    z = np.ones(ident.observed.size)
+    first = ident.step(0.001, z)
+    assert first.status.ok
+    failed = ident.step(1.0, z)
+    assert not failed.status.ok
+    assert failed.status.code in {"not_converged", "not_finite", "singular"}
+    np.testing.assert_array_equal(failed.u, first.u)
+    again = ident.step(1.001, z)
+    assert np.isfinite(again.u).all()
+    assert ident.t == 0.001
+
+
+def test_checked_contract():
+    model = excited(8)
+    times = [0.1, 0.2, 0.35, 0.5, 0.55, 0.7]
+    rng = np.random.default_rng(0)
+    size = observe(model, lp.Full()).size
+    samples = [(t, rng.standard_normal(size)) for t in times]
+    for scheme in (lp.ImplicitEuler(), lp.Alexander2()):
+        lp.check_law(
+            lp.GradientLaw(gain=100.0),
+            lambda law, scheme=scheme: identifier(model, law, scheme=scheme, dt_max=0.08),
+            samples,
+        ).raise_if_failed()
+
+
+def test_forward_stage_agrees_with_the_coupled_stage_without_data():
+    model = excited(8)
+    split = observe(model, lp.Full()).split(np.zeros(14, dtype=bool))
+    mass = model.mass
+    stage = CoupledStage(
+        model, split, Gains(1.0, lp.ResidualDamping(), 0.0, 0.0, mass, mass), EXACT
+    )
+    rng = np.random.default_rng(1)
+    c = rng.standard_normal(model.X.dim + model.Q.dim)
+    c[: model.X.dim] *= model.X.free
+    y = stage.solve(c, 0.1, Moment(0.1), np.zeros(model.X.dim), c.copy())
+    u = ForwardStage(model).solve(c[: model.X.dim], c[model.X.dim :], 0.1, Moment(0.1))
+    np.testing.assert_allclose(y[: model.X.dim], u, atol=1e-9)
+    np.testing.assert_allclose(y[model.X.dim :], c[model.X.dim :], atol=1e-9)
+
+
+def test_a_stage_that_cannot_converge():
+    model = excited(8)
+    split = observe(model, lp.Full()).split()
+    mass = model.mass
+    gains = Gains(1.0, lp.ResidualDamping(), 0.0, 0.0, mass, mass)
+    stage = CoupledStage(model, split, gains, EXACT)
+    c = np.full(model.X.dim + model.Q.dim, np.nan)
+    with pytest.raises(StepFailed):
+        stage.solve(c, 0.1, Moment(0.1), np.zeros(model.X.dim), c.copy())
+
+
+def test_a_model_in_the_plane_is_identified():
+    mesh = MeshQuad().refined(3)
+    model = reaction(mesh, ElementQuad1(), f=lambda x, t: 20 * (1 + np.sin(3 * t) * x[0] + x[1]))
+    q_true = model.initial_parameter(lambda x: 1 + 2 * x[0] * x[1])
+    times = 0.1 * np.arange(60)
+    states = truth(model, q_true, 0.0, times)
+    ident = identifier(model, lp.GradientLaw(gain=1e4))
+    for t, u in zip(times[1:], states[1:], strict=True):
+        estimate = ident.step(t, ident.observed.G @ u)
+    mass = model.parameter_mass
+    error = estimate.q - q_true
+    assert np.sqrt(error @ mass @ error / (q_true @ mass @ q_true)) < 0.1
