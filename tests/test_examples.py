@@ -22,12 +22,16 @@ def load(name):
 
 def test_every_example_is_tested():
     found = {path.stem for path in (ROOT / "examples").glob("*.py")}
-    assert found == {"ten_lines", "own_pde", "own_sensor", "own_law"}
+    assert found == {"ten_lines", "own_pde", "own_sensor", "own_law", "nonlinear_sensor"}
 
 
 @pytest.mark.parametrize(
     ("name", "truth"),
-    [("ten_lines", {"k": 0.8, "s": 1.5}), ("own_pde", {"D": 0.6, "r": 1.4})],
+    [
+        ("ten_lines", {"k": 0.8, "s": 1.5}),
+        ("own_pde", {"D": 0.6, "r": 1.4}),
+        ("nonlinear_sensor", {"k": 0.8, "s": 1.5}),
+    ],
 )
 def test_examples_find_their_truth(name, truth):
     found = load(name).main()

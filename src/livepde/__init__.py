@@ -62,7 +62,7 @@ from livepde.laws import (
     Status,
 )
 from livepde.model import Model
-from livepde.observation import Averages, Full, Matrix, Observation, Points, Subdomain
+from livepde.observation import Averages, Full, Matrix, Observation, Points, Subdomain, Transformed
 from livepde.operators import DualOperator
 from livepde.result import Estimate, Result
 from livepde.spaces import HilbertSpace
@@ -127,6 +127,7 @@ __all__ = [
     "Status",
     "Subdomain",
     "TimeOrderError",
+    "Transformed",
     "check_law",
     "check_model",
     "check_observation",

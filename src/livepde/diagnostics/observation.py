@@ -8,24 +8,31 @@ import scipy.sparse as sp
 from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.diagnostics.space import largest, relative
 from livepde.errors import ObservationError
+from livepde.fem import START
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.observation import Observation, Observed, Split
+from livepde.observation import Observation, Observed, Split, TransformedObserved
 
 __all__ = ["check_observation"]
 
 ROUNDING = 1e-12
+TAYLOR = 1e-6  # of central differences with steps of 1e-5
 INVERSE = 1e-9  # G^+ of sensors that nearly repeat each other amplifies rounding
 
 
 def check_observation(
-    observed: Observed | Observation, model: Model | None = None, *, seed: int = 0
+    observed: Observed | Observation,
+    model: Model | None = None,
+    *,
+    seed: int = 0,
+    at: float = 1.0,
 ) -> CheckReport:
     """Check the observation operator G and its projections R = G^+ G and P = I - R.
 
     R and P are idempotent, R P = 0, P maps into the null space of G, G G^+ G = G, R is self-adjoint
     in the inner product in which G^+ is taken, `reconstruct` returns R u from z = G u, and missing
-    sensors shrink G and nothing else.
+    sensors shrink G and nothing else. For nonlinear sensors all this holds for their linear part
+    G_0, and G'(u) is compared with differences of the readings.
 
     Parameters
     ----------
@@ -33,6 +40,8 @@ def check_observation(
         A bound observation (`identifier.observed`), or an observation and its model.
     seed
         Of the random vectors.
+    at
+        Size of the state at which the derivative of nonlinear sensors is compared with differences.
 
     Returns
     -------
@@ -80,7 +89,26 @@ def check_observation(
             "split(present) must give R = 0 when nothing is present.",
         )
     )
+    if isinstance(observed, TransformedObserved):
+        lines.append(_taylor(observed, at, rng))
     return CheckReport("observation", tuple(lines), ObservationError)
+
+
+def _taylor(observed: TransformedObserved, at: float, rng: np.random.Generator) -> CheckLine:
+    """Compare the derivative of nonlinear sensors with a central difference of their readings."""
+    u = at * (1.0 + 0.1 * rng.uniform(-1.0, 1.0, observed.X.dim))
+    direction = rng.standard_normal(observed.X.dim)
+    q, step = np.zeros(observed.parameter.dim), 1e-5 * max(abs(at), 1e-300)
+    more, less = (observed.predict(u + s * direction, q, START) for s in (step, -step))
+    slope = observed.slope(u, q, START)
+    exact = observed.G @ direction if slope is None else slope * (observed.G @ direction)
+    return CheckLine.at_most(
+        "G'(u) by differences",
+        relative((more - less) / (2.0 * step) - exact, exact),
+        TAYLOR,
+        "derivative= must be that of function=; without it, function must be analytic, and "
+        "defined near the state at= of the check.",
+    )
 
 
 def _lines(

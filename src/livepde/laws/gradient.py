@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -118,6 +118,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         self, work: GradientWork, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         model, observed = work.problem.model, work.problem.observed
+        seen = [observed.linearised(z, state.u) for z in (interval.z0, interval.z1)]
+        interval = replace(interval, z0=seen[0], z1=seen[1])
         coupled = work.stage(interval.present)
         zero = np.zeros(model.X.dim)
         regularises = observed.observation.reconstruction.regularises

@@ -345,7 +345,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if not present.any():
             return point
         noise = work.noise[present]
-        H = _output(work, point.L, interval.end)[present]
+        H = _output(work, point, interval.end)[present]
         d = (interval.z1 - predicted)[present]
         HC = (H @ point.C) / noise[:, None]
         expected = noise * np.sqrt(1.0 + (HC**2).sum(axis=1))
@@ -375,11 +375,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         )
 
 
-def _output(work: SensitivityWork, L: Array, moment: Moment) -> Array:
-    """Return H = G L + D Phi."""
-    H: Array = work.problem.observed.G @ L
-    direct = work.problem.observed.sensitivity(moment)
-    return H if direct is None else H + direct @ work.Phi
+def _output(work: SensitivityWork, point: Point, moment: Moment) -> Array:
+    """Return H = G'(u) L + D Phi, the derivative of the prediction in a."""
+    observed = work.problem.observed
+    H: Array = observed.G @ point.L
+    direct = observed.sensitivity(moment)
+    if direct is not None:
+        H = H + direct @ work.Phi
+    slope = observed.slope(point.u + point.du, point.q + work.Phi @ point.da, moment)
+    return H if slope is None else slope[:, None] * H
 
 
 def _reduced(work: SensitivityWork, dq: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from livepde.observation.base import Observation, Observed, Split
+from livepde.observation.nonlinear import Transformed, TransformedObserved
 from livepde.observation.reconstruction import (
     Alpha,
     Apriori,
@@ -33,4 +34,6 @@ __all__ = [
     "Split",
     "Subdomain",
     "Tikhonov",
+    "Transformed",
+    "TransformedObserved",
 ]

@@ -213,6 +213,14 @@ class Observed:
         direct = self.sensitivity(moment)
         return z if direct is None else z + direct @ q
 
+    def slope(self, u: Array, q: Array, moment: Moment) -> Array | None:
+        """Return the derivative of the readings in G u + D q, shape (sensors,); None if it is 1."""
+        return None
+
+    def linearised(self, z: Array, u: Array) -> Array:
+        """Return z as linear sensors would have shown it, by one Newton step from the state u."""
+        return z
+
     def split(self, present: Array | None = None) -> Split:
         """Return R, P and G^+ for the sensors present (default all).
 

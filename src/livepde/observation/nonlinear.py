@@ -1,0 +1,143 @@
+"""Nonlinear observations, z = g(G_0 u): radiation, thermistors, anything a sensor does to a value.
+
+The paper takes G linear "for simplicity of exposition. Most of what follows can be carried over to
+the case of nonlinear observations" (section 2). Here is how: with the derivative
+G'(u) = diag(g'(G_0 u)) G_0, the null space of G'(u) is that of G_0 wherever g' does not vanish, so
+R and P are those of G_0 and do not move; and the observed part of the state is a step of Newton's
+method from the last estimate u^,
+
+    u_alpha = R u^ - G'(u^)^+ (G(u^) - z) = G_0^+ (y - (g(y) - z)/g'(y)),    y = G_0 u^,
+
+which is R u* up to the square of the error R (u^ - u*), and for a linear g exactly G^+ z. That
+square enters the law through B(w) with two derivatives, as noise does, so the step is repeated from
+its own end a few times, which costs nothing: it goes sensor by sensor, and P u^ takes no part. The
+residual r = R u - u_alpha, A(w)* r and the damping are then those of (est_exact_q), (est_exact_u).
+The sensitivity law predicts with g and linearises about its prediction, H = G'(u) L.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import ObservationError
+from livepde.fem import FieldBlock, FunctionSpace, Moment
+from livepde.linalg import Array
+from livepde.observation.base import Direct, Observation, Observed
+from livepde.spaces import HilbertSpace
+
+__all__ = ["Transformed", "TransformedObserved"]
+
+Reading = Callable[[Array], Array]
+"""What each sensor shows for the value it sees: (sensors,) -> (sensors,), one by one."""
+
+STEP = 1e-30  # of the complex step
+
+
+@dataclass(frozen=True, eq=False)
+class Transformed(Observation):
+    """Sensors that show a function of what they see, z_k = g_k((G_0 u)_k).
+
+    g need not be monotone, but a sensor with g' = 0 at the estimate says nothing there, and counts
+    as missing in `GradientLaw`.
+
+    Parameters
+    ----------
+    base
+        G_0: `Points`, `Averages`, `Subdomain`, ... Its own `noise` and `unit` are not used.
+    function
+        g, from values of shape (sensors,) to readings of the same shape, one by one.
+    derivative
+        g', of the same shape; default by a complex step (for analytic g).
+    iterations
+        Newton steps of `GradientLaw` from the last estimate.
+    reach
+        None of them is longer in y = G_0 u; for strongly curved g far from the truth.
+
+    Notes
+    -----
+    `noise` is that of the readings z. A `reconstruction` by a noise level sees the linearised data
+    y + (z - g(y))/g'(y), whose noise is larger by 1/g'(y).
+
+    >>> import livepde as lp
+    >>> pyrometers = Transformed(lp.Points([0.3, 0.6]), lambda T: T**4, noise=0.01)
+    """
+
+    base: Observation
+    function: Reading
+    derivative: Reading | None = None
+    iterations: int = 5
+    reach: float = np.inf
+
+    def __post_init__(self) -> None:
+        if self.base.noise is not None:
+            raise ObservationError(
+                "Transformed: give noise= to it and not to its base: it is that of the readings."
+            )
+        if self.iterations < 1:
+            raise ObservationError(
+                f"Transformed: iterations must be at least 1; got {self.iterations}."
+            )
+        if not self.reach > 0:
+            raise ObservationError(f"Transformed: reach must be positive; got {self.reach}.")
+
+    def matrix(self, state: FieldBlock) -> sp.csr_array:
+        return self.base.matrix(state)
+
+    def names(self, count: int) -> tuple[str, ...]:
+        return self.base.names(count)
+
+    @property
+    def directs(self) -> Mapping[str, Direct]:
+        return self.base.directs
+
+    @property
+    def nodal(self) -> bool:
+        return self.base.nodal
+
+    def bind(
+        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
+    ) -> TransformedObserved:
+        return TransformedObserved(self, state, X, parameter)
+
+    def read(self, y: Array) -> Array:
+        """Return g(y)."""
+        z = np.asarray(self.function(y), dtype=float)
+        if z.shape != y.shape:
+            raise ObservationError(
+                f"Transformed: function gave shape {z.shape} for values of shape {y.shape}; it "
+                "must act on each sensor by itself."
+            )
+        return z
+
+    def slope(self, y: Array) -> Array:
+        """Return g'(y)."""
+        if self.derivative is not None:
+            slope = np.asarray(self.derivative(y), dtype=float)
+        else:
+            slope = np.imag(self.function(y + 1j * STEP)) / STEP
+        return np.broadcast_to(slope, y.shape)
+
+
+class TransformedObserved(Observed):
+    """The bound observation: G is the linear part G_0, `predict` and `slope` know g."""
+
+    observation: Transformed
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        return self.observation.read(super().predict(u, q, moment))
+
+    def slope(self, u: Array, q: Array, moment: Moment) -> Array | None:
+        return self.observation.slope(super().predict(u, q, moment))
+
+    def linearised(self, z: Array, u: Array) -> Array:
+        sensors, y = self.observation, np.asarray(self.G @ u)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for _ in range(sensors.iterations):
+                step = (z - sensors.read(y)) / sensors.slope(y)
+                step[np.isinf(step)] = np.nan  # an insensitive sensor says nothing
+                y = y + np.clip(step, -sensors.reach, sensors.reach)
+        return y
