@@ -15,6 +15,7 @@ from livepde.diagnostics.stopping import (
     OnlineStopping,
     StoppingState,
     noise_size,
+    reconstruction_matrix,
     stopping_time,
 )
 from livepde.diagnostics.theory import OnlineTracker, Sheet, TheoryReport, theory_report
@@ -46,6 +47,7 @@ __all__ = [
     "interpolation",
     "link",
     "noise_size",
+    "reconstruction_matrix",
     "stopping_time",
     "theory_report",
 ]

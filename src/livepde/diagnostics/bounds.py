@@ -95,7 +95,7 @@ class TwinTracker:
     damping
         The law's rule, for theta.
     reconstruct
-        z -> u_alpha as the law takes it; default G^+ z.
+        z -> u_alpha as the law takes it; default that of the observation.
 
     Examples
     --------
@@ -135,9 +135,10 @@ class TwinTracker:
         exact, split = twin.u(estimate.t), spaces.split
         boundary = twin.model.impose(np.zeros(len(exact)), Moment(estimate.t))
         z = np.asarray(z, dtype=float)
-        u_alpha = (
-            self.reconstruct(z) if self.reconstruct is not None else split.reconstruct(z, boundary)
-        )
+        if self.reconstruct is not None:
+            u_alpha = self.reconstruct(z)
+        else:
+            u_alpha = spaces.observed.reconstruct(z, boundary=boundary).u
         error = estimate.u - exact
         # Dirichlet values agree, so the error lies in the tangent space.
         r = split.R @ error

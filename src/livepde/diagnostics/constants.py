@@ -128,10 +128,12 @@ class Part:
 
     def root_mean_square(self, factor: Array) -> Norms:
         """Return sqrt(E ||v||^2) in the three norms, for v of covariance factor @ factor.T."""
-        each = [self.norms(column) for column in factor.T]
-        X = sum(n.X**2 for n in each)
-        VX, V = sum(n.VX**2 for n in each), sum(n.V**2 for n in each)
-        return Norms(float(np.sqrt(X)), float(np.sqrt(VX)), float(np.sqrt(V)))
+        X, mass = self.model.X, self.model.mass
+        dual = self._tested @ factor
+        V = X.riesz(dual) if self._V is None else self._V @ factor
+        left = dual if self._V is None else factor
+        pairs = ((factor, mass @ factor), (factor, self._VX @ factor), (left, V))
+        return Norms(*(_root(np.ravel(a), np.ravel(b)) for a, b in pairs))
 
     # --- matrices on the basis -------------------------------------------------------------------
 

@@ -13,8 +13,15 @@ from livepde.diagnostics.constants import Spaces
 from livepde.errors import ConfigurationError
 from livepde.laws.bounds import Constants, Norms
 from livepde.linalg import Array
+from livepde.observation import Observed, Tikhonov
 
-__all__ = ["OnlineStopping", "StoppingState", "noise_size", "stopping_time"]
+__all__ = [
+    "OnlineStopping",
+    "StoppingState",
+    "noise_size",
+    "reconstruction_matrix",
+    "stopping_time",
+]
 
 
 def stopping_time(errors: Sequence[Errors], c: Constants) -> float:
@@ -62,6 +69,28 @@ def noise_size(
         lost = dense @ (spaces.observed.G @ u_alpha) - u_alpha
         factor = np.column_stack([factor, lost])
     return spaces.observed_part.root_mean_square(factor)
+
+
+def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Array:
+    """Return the matrix of z -> u_alpha with all sensors present, shape (n, sensors).
+
+    Parameters
+    ----------
+    observed
+        With its rule for reconstruction.
+    alpha
+        Regularisation parameter where the rule has one; for the discrepancy principle, that of the
+        sample (`observed.reconstruct(z).alpha`), about which the map is linear.
+    """
+    rule = observed.observation.reconstruction
+    if not rule.regularises:
+        matrix: Array = observed.split().inverse.toarray()
+        return matrix
+    if alpha is not None and isinstance(rule, Tikhonov):
+        rule = replace(rule, alpha=float(alpha))
+    apply = rule.prepare(observed, np.ones(observed.size, dtype=bool))
+    nothing = np.zeros(observed.X.dim)
+    return np.column_stack([apply(unit, nothing).u for unit in np.eye(observed.size)])
 
 
 @dataclass(frozen=True)

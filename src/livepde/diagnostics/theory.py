@@ -13,7 +13,13 @@ from livepde.diagnostics.constants import Spaces, constants
 from livepde.diagnostics.excitation import Excitation, Spectrum
 from livepde.diagnostics.links import interpolation, link
 from livepde.diagnostics.report import CheckReport
-from livepde.diagnostics.stopping import OnlineStopping, noise_size, stopping_time
+from livepde.diagnostics.stopping import (
+    OnlineStopping,
+    StoppingState,
+    noise_size,
+    reconstruction_matrix,
+    stopping_time,
+)
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
@@ -21,6 +27,7 @@ from livepde.laws.bounds import Constants, Norms
 from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array
 from livepde.model import Model
+from livepde.observation import Observed
 from livepde.result import Estimate
 from livepde.streams import Twin
 
@@ -48,6 +55,8 @@ NEEDS_TRUTH = (
 )
 SNAPSHOTS = 6  # states at which C_A is taken
 SHOWN = 8  # modes
+NORMS = ("X", "VX", "V")
+MATRICES = 16  # of G_alpha kept, for different alpha
 
 
 @dataclass(frozen=True)
@@ -122,7 +131,8 @@ class OnlineTracker:
     window
         gamma_0 of the excitation Gramian and the link conditions.
     noise
-        Standard deviation of the sensors, one number or one each; default those of the observation.
+        Standard deviation of the sensors: one number, one each, or a function of z that returns
+        those; default what the observation says.
     """
 
     def __init__(self, identifier: Identifier, window: float, noise: Any = None) -> None:
@@ -139,28 +149,33 @@ class OnlineTracker:
         self.states: list[Array] = []
         self.inputs: dict[str, float] = {}
         self.last: Estimate | None = None
-        observed = identifier.observed
-        std = observed.noise
-        if noise is not None:
-            std = np.broadcast_to(np.asarray(noise, dtype=float), (observed.size,))
-        self.noise: Norms | None = None if std is None else noise_size(self.spaces, std)
+        self.noise = identifier.observed.noise if noise is None else noise
         self._every = 1
+        self._matrices: dict[int, Array] = {}
+        self._sizes: dict[int, Norms] = {}
 
-    def add(self, estimate: Estimate, inputs: Mapping[str, float] | None = None) -> None:
+    def add(self, estimate: Estimate, sample: Sample) -> None:
         """Take one estimate; what failed or held no measurement counts for nothing."""
-        self.inputs |= {k: v for k, v in (inputs or {}).items() if np.isfinite(v)}
-        present = np.isfinite(estimate.innovation)
-        if not estimate.status.ok or not present.any():
+        model, observed = self.identifier.model, self.identifier.observed
+        self.inputs |= _inputs_of(sample, model)
+        z = _measured(sample, observed)
+        z[~np.isfinite(estimate.innovation)] = np.nan
+        if not estimate.status.ok or not np.isfinite(z).any():
             return
-        # R u - u_alpha = G^+ (G u - z), whatever the boundary values.
-        split = self.identifier.observed.split(present)
-        r = -(split.inverse @ estimate.innovation[present])
+        moment = Moment(estimate.t, Inputs(self.inputs))
+        boundary = model.impose(np.zeros(model.X.dim), moment)
+        direct = observed.sensitivity(moment)
+        if direct is not None:
+            z = z - direct @ estimate.q
+        u_alpha, alpha = self._reconstruct(z, boundary)
+        r = observed.split(np.isfinite(z)).R @ (estimate.u - boundary) - u_alpha
         norms = self.spaces.observed_part.norms(r)
         theta = np.nan
         if self.damping is not None:
             theta = self.damping.theta(Residual(norms.X**2, norms.VX**2, lambda: norms.V**2))
-        self.moments.append(_Moment(estimate.t, norms, theta, self.noise))
-        # Only a law with a damping rule works with u_alpha + P u, and leaves r behind the step.
+        d = self._noise_size(z, u_alpha, alpha)
+        self.moments.append(_Moment(estimate.t, norms, theta, d))
+        # Only a law with a damping rule works with u_alpha + P u.
         w = estimate.u if self.damping is None else estimate.u - r
         self.excited = self.excitation.add(self.excited, estimate.t, w, self.inputs)
         self.last = estimate
@@ -169,6 +184,40 @@ class OnlineTracker:
             if len(self.states) > 2 * SNAPSHOTS:
                 self.states = self.states[::2]
                 self._every *= 2
+
+    def _reconstruct(self, z: Array, boundary: Array) -> tuple[Array, float]:
+        """Return u_alpha and alpha, as a law with a damping rule takes them; else G^+ z."""
+        observed = self.identifier.observed
+        if self.damping is None:
+            return observed.split(np.isfinite(z)).reconstruct(z, boundary), 0.0
+        found = observed.reconstruct(z, boundary=boundary)
+        return found.u, found.alpha
+
+    def _noise_size(self, z: Array, u_alpha: Array, alpha: float) -> Norms | None:
+        """Return the size of d, with G_alpha linearised about an alpha within a factor of 1.5."""
+        if self.noise is None:
+            return None
+        observed, part = self.identifier.observed, self.spaces.observed_part
+        given = self.noise(z) if callable(self.noise) else self.noise
+        std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
+        key = round(float(np.log2(alpha))) if alpha > 0 else 0
+        if key not in self._matrices:
+            if len(self._matrices) >= MATRICES:
+                self._matrices.clear()
+                self._sizes.clear()
+            self._matrices[key] = (
+                reconstruction_matrix(observed, alpha)
+                if alpha > 0
+                else observed.split().inverse.toarray()
+            )
+        matrix = self._matrices[key]
+        noise = None if callable(self.noise) else self._sizes.get(key)
+        if noise is None:
+            noise = self._sizes[key] = noise_size(self.spaces, std, matrix)
+        if alpha == 0:
+            return noise
+        lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
+        return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
 
     @property
     def moment(self) -> Moment:
@@ -182,11 +231,28 @@ class OnlineTracker:
             raise ConfigurationError("theory: no sample of the run holds a measurement.")
         return constants(self.spaces, self.last.q, self.states, moment=self.moment, gain=self.gain)
 
+    def stopping(self, c: Constants) -> StoppingState:
+        """Return the surrogate of T*, which needs a noise level."""
+        rule = OnlineStopping(c)
+        state = rule.init()
+        for item in self.moments:
+            if item.d is not None:
+                state = rule.add(state, item.t, item.r, item.d)
+        return state
+
     def series(self, get: str) -> Array:
         """Return "t", "theta", "X", "VX" or "V" along the run, shape (samples,)."""
         if get in ("X", "VX", "V"):
             return np.array([getattr(item.r, get) for item in self.moments])
         return np.array([getattr(item, get) for item in self.moments])
+
+
+def _measured(sample: Sample, observed: Observed) -> Array:
+    """Return a sample's measurements as an array, NaN where missing."""
+    if not isinstance(sample.z, Mapping):
+        return np.array(sample.z, dtype=float).reshape(observed.size)
+    values = [sample.z.get(name) for name in observed.names]
+    return np.array([np.nan if value is None else value for value in values], dtype=float)
 
 
 def _inputs_of(sample: Sample, model: Model) -> dict[str, float]:
@@ -240,7 +306,7 @@ def theory_report(
         followed = TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
     for sample in items:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        tracker.add(estimate, _inputs_of(sample, identifier.model))
+        tracker.add(estimate, sample)
         if followed is not None and estimate.status.ok:
             followed.add(estimate, sample.z)
     notes: list[str] = []
@@ -293,10 +359,7 @@ def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Sheet]:
     if tracker.damping is not None:
         rows += [_range("theta", theta), _range("mu = theta ||R u - u_alpha||_V~", theta * V)]
     else:
-        notes.append(
-            "The law has no damping rule, so there is no theta, no mu and no kappa; the residual "
-            "is measured minus expected, one step ahead."
-        )
+        notes.append("The law has no damping rule, so there is no theta, no mu and no kappa.")
     columns = ("along the run", "least", "median", "largest", "last")
     tables = [Sheet("Residual and damping", columns, rows)]
     rows = []
@@ -331,14 +394,13 @@ def _stopping(
     tracker: OnlineTracker, c: Constants, tables: list[Sheet], notes: list[str]
 ) -> float | None:
     if tracker.noise is None or not tracker.moments:
-        notes.append("No noise level is known, so there is no surrogate of T*: give the sensors' ")
-        notes[-1] += "noise."
+        notes.append(
+            "No noise level is known, so there is no surrogate of T*: give the noise of the "
+            "sensors."
+        )
         return None
-    rule = OnlineStopping(c)
-    state = rule.init()
-    for item in tracker.moments:
-        state = rule.add(state, item.t, item.r, tracker.noise)
-    d = tracker.noise
+    state = tracker.stopping(c)
+    d = tracker.moments[-1].d or Norms()
     verdict = f"{state.T:.5g}" if np.isfinite(state.T) else "not reached"
     tables.append(
         Sheet(
