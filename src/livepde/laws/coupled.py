@@ -163,7 +163,7 @@ class CoupledStage:
         dX, dVX, dV = self.gains.damping.slopes(norms)
         row = (2.0 * dX) * mass_r + (2.0 * dVX) * Mr
         if dV:
-            row += self.RM @ ((2.0 * dV) * self.model.X.riesz(Mr))
+            row += self.RMR.T @ ((2.0 * dV) * self.model.X.riesz(Mr))
         return row
 
     def solve(self, c: Array, h: float, moment: Moment, u_alpha: Array, start: Array) -> Array:

@@ -13,6 +13,9 @@ from livepde.linalg import Array, Factor
 __all__ = ["Newton", "StepFailed"]
 
 
+ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
+
+
 class StepFailed(Exception):
     """A stage that did not converge; caught by the step control, never seen by users."""
 
@@ -105,9 +108,11 @@ class Newton:
             if affine:
                 return new
             ratio = size / last
+            if ratio >= 0.5 and size <= ROUNDING:
+                return new  # updates that no longer shrink down there are rounding errors
             if ratio >= 1.0 and lagged and not sweeps:
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
-                y, factor, sweeps, last, basin = begin, None, True, np.inf, 0.1 * basin
+                y, factor, sweeps, last, basin = begin, None, True, np.inf, 0.3 * basin
                 continue
             y = new
             # The error left behind is about ratio/(1 - ratio) times the update.

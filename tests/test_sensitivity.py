@@ -1,0 +1,299 @@
+"""The sensitivity law: against closed forms, through replays, bounds, drift and modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from problems import excited, excited_q, excited_u, laplace, line, truth
+from skfem import ElementLineP1, ElementLineP2
+
+import livepde as lp
+from livepde.diagnostics import check_law
+from livepde.laws.consistency import Consistency
+
+
+def source_model(**options):
+    """Two unknown source amplitudes: the output is linear in the parameter."""
+    return lp.Model(
+        lp.Field(line(16), ElementLineP2(), dirichlet={"boundary": 0.0}),
+        {"a": lp.Scalar(0.5, std=2.0), "b": lp.Scalar(-1.0, std=0.5)},
+        A=lambda q, u, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
+        B=laplace,
+        **options,
+    )
+
+
+SENSORS = lp.Points([0.2, 0.5, 0.9], noise=[0.01, 0.02, 0.05])
+
+
+def noisy(model, q_true, times, seed=0, u0=0.0):
+    rng = np.random.default_rng(seed)
+    G = SENSORS.bind(model.state_space, model.X, model.parameter_space).G
+    states = truth(model, np.array(q_true), u0, times)
+    sizes = np.array(SENSORS.noise)
+    return [(t, G @ u + sizes * rng.standard_normal(3)) for t, u in zip(times, states, strict=True)]
+
+
+@pytest.mark.parametrize("replay", [None, lp.Replay(first=5)])
+def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
+    """One batch least squares with the prior, by forward runs for each amplitude."""
+    model = source_model()
+    times = 0.1 * np.arange(21)
+    data = noisy(model, [1.7, -0.4], times)
+    G = SENSORS.matrix(model.state_block)
+    runs = [truth(model, np.array(q), 0.0, times) for q in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])]
+    zero, one, two = (np.concatenate([G @ u for u in run[1:]]) for run in runs)
+    H = np.column_stack([one - zero, two - zero])
+    z = np.concatenate([z for _, z in data[1:]])
+    weights = 1 / np.tile(np.array(SENSORS.noise) ** 2, 20)
+    prior, precision = np.array([0.5, -1.0]), np.diag([1 / 4.0, 1 / 0.25])
+    covariance = np.linalg.inv(precision + H.T @ (weights[:, None] * H))
+    batch = prior + covariance @ (H.T @ (weights * (z - zero - H @ prior)))
+
+    ident = lp.Identifier(model, SENSORS, lp.SensitivityLaw(replay=replay))
+    for t, sample in data[1:]:
+        estimate = ident.step(t, sample)
+    np.testing.assert_allclose(estimate.q, batch, rtol=1e-8)
+    factor = estimate.belief.q_factor
+    np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-8)
+    state = truth(model, batch, 0.0, times)[-1]
+    np.testing.assert_allclose(estimate.u, state, atol=1e-9)
+
+
+def conductivity(prior=1.0, bounds=(0.05, 10.0)):
+    return lp.Model(
+        lp.Field(line(16), ElementLineP2(), dirichlet={"left": 0.0, "right": lp.Channel("T")}),
+        lp.Scalar(prior, std=1.0, bounds=bounds),
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        f=1.0,
+    )
+
+
+def warm(t):
+    return {"T": np.sin(3 * t)}
+
+
+def stream(model, k, times, noise=0.0, seed=0):
+    sensors = lp.Points({"T_1": 0.3, "T_2": 0.7}, noise=0.01)
+    G = sensors.matrix(model.state_block)
+    rng = np.random.default_rng(seed)
+    states = truth(model, np.array([k]), 0.0, times, inputs=warm)
+    samples = [
+        (t, G @ u + noise * rng.standard_normal(2), warm(t))
+        for t, u in zip(times, states, strict=True)
+    ]
+    return sensors, samples
+
+
+def test_replay_makes_the_result_independent_of_the_prior():
+    found = []
+    for prior in (0.5, 1.0, 4.0):
+        model = conductivity(prior)
+        sensors, samples = stream(model, 2.0, 0.05 * np.arange(81), noise=0.01)
+        ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=10)))
+        last = ident.run(samples).last
+        assert abs(last.q[0] - 2.0) < 3 * last.q_std[0]
+        assert last.q_std[0] < 0.03
+        found.append(last.q[0])
+    assert np.ptp(found) < 0.003
+
+
+def test_a_full_window_goes_on_from_the_estimate():
+    model = conductivity()
+    sensors, samples = stream(model, 2.0, 0.05 * np.arange(121), noise=0.01)
+    law = lp.SensitivityLaw(replay=lp.Replay(window=20, first=5))
+    ident = lp.Identifier(model, sensors, law)
+    stored = []
+    for t, z, inputs in samples:
+        estimate = ident.step(t, z, inputs)
+        stored.append(len(ident._state.samples.t))
+    assert max(stored) <= 20
+    assert estimate.q[0] == pytest.approx(2.0, abs=0.03)
+
+
+def test_bounds_are_never_left():
+    model = conductivity(bounds=(0.05, 1.5))
+    sensors, samples = stream(conductivity(), 3.0, 0.05 * np.arange(61), noise=0.01)
+    for replay in (None, lp.Replay(first=4)):
+        ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=replay))
+        found = [ident.step(*sample).q[0] for sample in samples]
+        assert max(found) == 1.5
+        assert min(found) >= 0.05
+
+
+def test_drift_and_memory_follow_a_jump():
+    model = conductivity()
+    times = 0.05 * np.arange(161)
+    sensors, first = stream(model, 1.0, times)
+    _, second = stream(model, 2.0, times)
+    samples = [a if a[0] < 4.0 else b for a, b in zip(first, second, strict=True)]
+    constant = lp.Identifier(model, sensors, lp.SensitivityLaw()).run(samples).last
+    law = lp.SensitivityLaw(drift=0.05, memory=0.5)
+    tracking = lp.Identifier(model, sensors, law).run(samples).last
+    assert tracking.q[0] == pytest.approx(2.0, abs=0.05)
+    assert abs(constant.q[0] - 2.0) > abs(tracking.q[0] - 2.0)
+    assert tracking.q_std[0] > 0
+
+
+def test_uncertainty_grows_with_drift_and_without_data():
+    model = conductivity()
+    sensors, samples = stream(model, 1.0, 0.1 * np.arange(11))
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.1))
+    stds = [ident.step(t, [np.nan, np.nan], inputs).q_std[0] for t, _, inputs in samples]
+    assert np.all(np.diff(stds) > 0)
+    assert stds[-1] == pytest.approx(np.sqrt(1 + 0.1 * 1.0))
+
+
+def test_a_field_by_modes_of_its_prior():
+    """DESIGN.md, fact 5, a short run on clean data."""
+    model = excited(16)
+    times = 0.05 * np.arange(200)
+    q_true = model.initial_parameter(excited_q)
+    states = truth(model, q_true, lambda x: excited_u(x, 0.0), times)
+    law = lp.SensitivityLaw(modes=8, noise=1e-3)
+    ident = lp.Identifier(model, lp.Full(), law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
+    for t, u in zip(times[1:], states[1:], strict=True):
+        estimate = ident.step(t, ident.observed.G @ u)
+    mass = model.parameter_mass
+    error = estimate.q - q_true
+    assert np.sqrt(error @ mass @ error / (q_true @ mass @ q_true)) < 0.005
+    assert estimate.q_std.shape == q_true.shape
+    assert estimate.u_std.shape == estimate.u.shape
+
+
+def test_a_field_beside_a_number():
+    mesh = line(12)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
+        {"c": lp.Scalar(0.0), "s": lp.Field(mesh, ElementLineP1(), inner="H1")},
+        A=lambda q, u, v, x: q.c * u * v - q.s * v,
+        B=laplace,
+    )
+    q_true = model.initial_parameter({"c": 1.0, "s": lambda x: 1 + x[0]})
+    times = 0.05 * np.arange(101)
+    states = truth(model, q_true, 0.0, times)
+    law = lp.SensitivityLaw(modes={"s": 6}, noise=1e-3)
+    ident = lp.Identifier(model, lp.Full(), law)
+    for t, u in zip(times[1:], states[1:], strict=True):
+        estimate = ident.step(t, ident.observed.G @ u)
+    assert ident._work.Phi.shape == (14, 7)
+    predicted = truth(model, estimate.q, 0.0, times)[-1]
+    np.testing.assert_allclose(predicted, states[-1], atol=2e-3)
+
+
+def test_a_sensor_that_sees_a_parameter():
+    model = lp.Model(
+        lp.Field(line(10), ElementLineP1(), dirichlet={"boundary": 0.0}),
+        {"s": lp.Scalar(0.0, std=2.0), "offset": lp.Scalar(0.0, std=1.0)},
+        A=lambda q, u, v, x: -q.s * np.sin(x.t) * v,
+        B=laplace,
+    )
+    sensors = lp.Points(
+        {"plain": 0.3, "shifted": 0.6}, direct={"shifted": lambda q, x: q.offset}, noise=0.001
+    )
+    times = 0.1 * np.arange(41)
+    q_true = np.array([1.5, 0.4])
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw())
+    for t, u in zip(times[1:], truth(model, q_true, 0.0, times)[1:], strict=True):
+        moment = lp.Moment(t)
+        estimate = ident.step(t, ident.observed.predict(u, q_true, moment))
+    assert estimate.parameters["offset"][0] == pytest.approx(0.4, abs=1e-3)
+    assert estimate.parameters["s"][0] == pytest.approx(1.5, abs=1e-2)
+    np.testing.assert_allclose(estimate.innovation, 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay(first=3))])
+@pytest.mark.parametrize("scheme", [lp.ImplicitEuler(), lp.Alexander2()])
+def test_passes_the_shipped_check(law, scheme):
+    model = conductivity()
+    sensors, samples = stream(model, 2.0, 0.1 * np.arange(12))
+    check_law(
+        law, lambda law: lp.Identifier(model, sensors, law, scheme=scheme), samples
+    ).raise_if_failed()
+
+
+def test_a_nonlinear_model_finds_its_rate():
+    model = lp.Model(
+        lp.Field(line(12), ElementLineP2(), quadrature=6),
+        lp.Scalar(1.0, std=1.0),
+        A=lambda q, u, v, x: -q * u * (1 - u) * v,
+        B=lambda u, v, x: 0.1 * laplace(u, v, x),
+    )
+    start = 0.2
+    times = 0.1 * np.arange(31)
+    sensors = lp.Points([0.2, 0.8], noise=0.001)
+    G = sensors.matrix(model.state_block)
+    states = truth(model, np.array([1.6]), start, times)
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=5)), u0=start)
+    for t, u in zip(times[1:], states[1:], strict=True):
+        estimate = ident.step(t, G @ u)
+    assert estimate.q[0] == pytest.approx(1.6, abs=1e-3)
+
+
+def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
+    """Told in the notes; the stream goes on, and the next replay is tried when doubled."""
+    model = conductivity()
+    sensors, samples = stream(model, 2.0, 0.1 * np.arange(12))
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=4)))
+    failing = lambda self, work, state: (state.now, lp.Status("not_converged", "no luck"))  # noqa: E731
+    monkeypatch.setattr(lp.SensitivityLaw, "_replayed", failing)
+    estimates = [ident.step(*sample) for sample in samples]
+    failed = [k for k, estimate in enumerate(estimates) if "replay_failed" in estimate.notes]
+    assert failed == [4, 8]
+    assert all(estimate.status.ok for estimate in estimates)
+    assert estimates[-1].q[0] == pytest.approx(2.0, abs=0.5)
+
+
+class TestRefusals:
+    def test_options(self):
+        with pytest.raises(lp.LawError, match="drift"):
+            lp.SensitivityLaw(drift=-1.0)
+        with pytest.raises(lp.LawError, match="memory"):
+            lp.SensitivityLaw(memory=0.0)
+        with pytest.raises(lp.LawError, match="noise"):
+            lp.SensitivityLaw(noise=0.0)
+        with pytest.raises(lp.LawError, match="choose one"):
+            lp.SensitivityLaw(memory=1.0, replay=lp.Replay())
+        with pytest.raises(lp.LawError, match="first"):
+            lp.Replay(window=5, first=6)
+        with pytest.raises(lp.LawError, match="iterations"):
+            lp.Replay(iterations=0)
+
+    def test_no_noise_level(self):
+        with pytest.raises(lp.LawError, match="noise="):
+            lp.Identifier(conductivity(), lp.Points([0.5]), lp.SensitivityLaw())
+
+    def test_modes_of_an_unknown_field(self):
+        with pytest.raises(lp.LawError, match="modes"):
+            lp.Identifier(
+                excited(4), lp.Points([0.5], noise=0.1), lp.SensitivityLaw(modes={"p": 3})
+            )
+
+
+class TestConsistency:
+    def fed(self, innovations):
+        value = Consistency.start(1)
+        for e in innovations:
+            value = value.add(np.array([e]))
+        return value
+
+    def test_white_innovations_of_the_right_size_change_nothing_much(self):
+        value = self.fed(np.random.default_rng(0).standard_normal(4000))
+        assert value.ratio == pytest.approx(1.0, abs=0.15)
+        assert abs(value.correlation) < 0.15
+        assert 1.0 <= value.inflation < 1.4
+
+    def test_large_innovations_inflate(self):
+        value = self.fed(3.0 * np.random.default_rng(1).standard_normal(2000))
+        assert value.inflation == pytest.approx(3.0, rel=0.3)
+
+    def test_correlated_innovations_inflate(self):
+        rng = np.random.default_rng(2)
+        e, found = 0.0, []
+        for _ in range(4000):
+            e = 0.9 * e + np.sqrt(1 - 0.81) * rng.standard_normal()
+            found.append(e)
+        assert self.fed(found).inflation == pytest.approx(np.sqrt(1.9 / 0.1), rel=0.4)
+
+    def test_before_any_innovation(self):
+        assert Consistency.start(2).inflation == 1.0
