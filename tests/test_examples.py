@@ -46,6 +46,16 @@ def test_examples_pass_their_checks(name):
     load(name).main().raise_if_failed()
 
 
+def test_sensors_that_blur_need_a_regularised_inverse():
+    found = load("smoothing_sensor").main()
+    inverse, *regularised = found.values()
+    assert inverse[0] > 10  # alpha = 0: the reconstructed state is noise
+    assert inverse[1] > 10
+    for state, q in regularised:
+        assert state < 0.02
+        assert q < 0.2
+
+
 def test_a_new_pde_takes_forty_lines():
     lines = (ROOT / "examples" / "own_pde.py").read_text().splitlines()
     start = next(k for k, line in enumerate(lines) if line.startswith("def fisher_kpp"))

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from livepde.reproduce.degenerate import DEGENERATE
 from livepde.reproduce.experiment import Experiment
+from livepde.reproduce.noisy import SEED_EXCITED_NOISE
 from livepde.reproduce.seed import SEED
 from livepde.reproduce.seed_excited import SEED_EXCITED
 
 __all__ = ["EXPERIMENTS", "Experiment"]
 
-EXPERIMENTS: dict[str, Experiment] = {item.name: item for item in (SEED, SEED_EXCITED, DEGENERATE)}
+EXPERIMENTS: dict[str, Experiment] = {
+    item.name: item for item in (SEED, SEED_EXCITED, SEED_EXCITED_NOISE, DEGENERATE)
+}
 """Name -> experiment."""

@@ -287,7 +287,8 @@ class _WindowSmoother(Smoother):
     def noise_factor(self, h: float) -> float:
         _positive(self, "h", h)
         count = int(np.ceil(self.width * (1 - RESOLUTION) / h))
-        return float(np.linalg.norm(self.window(-h / self.width * np.arange(count)[::-1])))
+        offsets: Array = -h / self.width * np.arange(count, dtype=float)[::-1]
+        return float(np.linalg.norm(self.window(offsets)))
 
     @abstractmethod
     def window(self, s: Array) -> Array:
