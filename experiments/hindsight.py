@@ -1,0 +1,118 @@
+"""The grid search of section 4: gains chosen after the fact, by the observed state's true error.
+
+Partial, exact data: min over c_1 of the integral of ||R u - R u*||_X^2. Noisy data: min over
+constant mu and nu. All from 0.1 to 1000 in decimal steps, as in the paper. Nobody can do that
+online. What it shows: the objective rewards a state that is pulled to the data, not a q that is
+learned. With exact data it picks the largest c_1 of the grid, and with it the worst q.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+import livepde as lp
+from livepde.observation import Discrepancy, Tikhonov
+from livepde.reproduce import seed
+from livepde.streams import RelativeNoise, Twin
+
+STEPS = (0.1, 1.0, 10.0, 100.0, 1000.0)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One point of the grid: gains, objective, relative L2 error of q at the end."""
+
+    gains: tuple[float, ...]
+    objective: float
+    error: float
+
+
+def try_out(twin: Twin, law: lp.GradientLaw, gains: tuple[float, ...]) -> Tried:
+    """Run a law and return its objective; infinity if a step failed."""
+    X, R = twin.model.X, twin.observed.split().R
+    identifier = lp.Identifier(
+        twin.model, twin.observation, law, q0=0.0, u0=lambda x: seed.u_true(x, 0.0)
+    )
+    squares = []
+    for sample in twin:
+        estimate = identifier.step(sample.t, sample.z)
+        if not estimate.status.ok:
+            return Tried(gains, np.inf, np.nan)
+        squares.append(X.norm(R @ (estimate.u - twin.u(sample.t))) ** 2)
+    return Tried(gains, float(np.trapezoid(squares, twin.times)), twin.error(estimate.q))
+
+
+def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = STEPS) -> list[Tried]:
+    """Search c_1 for the paper's first experiment."""
+    model, omega = seed.build()
+    twin = Twin(
+        model=model,
+        observation=omega,
+        q_true=seed.q_true,
+        u_true=seed.u_true,
+        times=seed.TIMES[:samples],
+    )
+    laws = {c1: lp.GradientLaw(gain, lp.ResidualDamping(c1)) for c1 in steps}
+    return [try_out(twin, law, (c1,)) for c1, law in laws.items()]
+
+
+def noisy(
+    level: float,
+    gain: float,
+    samples: int = 126,
+    steps: tuple[float, ...] = STEPS,
+    smooth: bool = False,
+) -> list[Tried]:
+    """Search mu and nu for the paper's second experiment, with alpha = 0 or G_alpha in V~."""
+    model, omega = seed.build()
+    if smooth:
+        rule = Tikhonov("V", Discrepancy(level=level))
+        omega = lp.Subdomain(omega.omega, reconstruction=rule)
+    twin = Twin(
+        model=model,
+        observation=omega,
+        q_true=seed.q_true,
+        u_true=seed.u_true,
+        times=0.6 * np.arange(samples),
+        noise=RelativeNoise(level),
+    )
+    found = []
+    for mu, nu in product(steps, steps):
+        law = lp.GradientLaw(gain, lp.ConstantDamping(mu), nu=nu)
+        found.append(try_out(twin, law, (mu, nu)))
+    return found
+
+
+def best(tried: list[Tried]) -> Tried:
+    """Return the point with the least objective."""
+    return min(tried, key=lambda item: item.objective)
+
+
+def show(title: str, names: tuple[str, ...], tried: list[Tried]) -> None:
+    """Print a table."""
+    winner = best(tried)
+    print(f"\n{title}")
+    print("".join(f"{name:>9}" for name in names) + f"{'objective':>13}{'error of q':>12}")
+    for item in tried:
+        gains = "".join(f"{value:9g}" for value in item.gains)
+        mark = "   <- least" if item is winner else ""
+        print(f"{gains}{item.objective:13.4g}{item.error:12.4g}{mark}")
+
+
+def main() -> None:
+    quick = "--quick" in sys.argv
+    for gain in (1.0, 100.0, 1e4):
+        show(f"partial exact data, gain {gain:g}, t = 60", ("c1",), partial(gain))
+    for level in (0.01,) if quick else (0.01, 0.05, 0.1):
+        for smooth in (False, True):
+            tried = noisy(level, 1.0, smooth=smooth)
+            how = "G_alpha in V~" if smooth else "alpha = 0 as in the paper"
+            show(f"noise {level:.0%}, {how}, gain 1, t = 75", ("mu", "nu"), tried)
+
+
+if __name__ == "__main__":
+    main()

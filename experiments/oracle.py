@@ -1,0 +1,134 @@
+"""The paper's lower bounds on mu and nu with the true e and p, beside rules that use no truth.
+
+The bounds of Assumptions cond:mu_1, cond:mu02, cond:nu and ass:mu_nu hold ||e||_Q, ||p||_V^ and
+||d||_V~, which nobody knows online. Here they are taken from the twin after every sample. This must
+never move into the library.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+import livepde as lp
+from livepde.diagnostics import Errors, Spaces, TwinTracker, bounds, conditions, constants
+from livepde.laws.bounds import Constants, ExactBound, Norms, nu_exact, theta_exact, theta_noisy
+from livepde.reproduce import seed
+from livepde.streams import RelativeNoise, Twin
+
+FLOOR = 1e-8
+
+
+@dataclass(frozen=True)
+class Oracle(lp.Damping):
+    """The least theta of the paper for the true errors of the sample before.
+
+    Only r is of now: r_alpha in place of r, as the bound asks, where the data are exact. Below
+    ||r||_X = FLOOR the pull is linear.
+    """
+
+    constants: Constants
+    truth: Errors
+    c1: float = 1.0
+    noisy: bool = False
+    theta_max: float = 1e3
+
+    def theta(self, r: lp.Residual) -> float:
+        size = Norms(float(np.sqrt(r.X)), float(np.sqrt(r.VX)))
+        if self.noisy:
+            t = self.truth
+            asked = theta_noisy(self.constants, t.e, t.p.V, t.r, t.d, c1=self.c1)
+            return min(asked, self.theta_max)
+        if r.VX == 0.0:
+            return self.c1
+        share = min(size.X / FLOOR, 1.0)
+        asked = theta_exact(self.constants, self.truth.p.V, size)
+        return max(share * asked, self.c1 * r.X / r.VX)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A run: its law, errors, and the relative L2 error of q at the end."""
+
+    name: str
+    law: lp.GradientLaw
+    errors: list[Errors]
+    error: float
+    nu: float
+
+
+def follow(name: str, twin: Twin, law: lp.GradientLaw, c: Constants, u0: Any, nu: bool) -> Found:
+    """Run a law on a twin; an oracle, and nu if asked, are renewed after every sample."""
+    spaces = Spaces.of(twin.model, twin.observed, law)
+    samples = list(twin)
+    tracker = TwinTracker(twin, spaces, law.gain, law.damping)
+    identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=u0)
+    estimate = identifier.step(samples[0].t, samples[0].z)
+    errors = tracker.add(estimate, samples[0].z)
+    largest = law.nu
+    for before, sample in pairwise(samples):
+        if isinstance(law.damping, Oracle):
+            law = replace(law, damping=replace(law.damping, truth=errors))
+            if nu:
+                law = replace(law, nu=nu_exact(c, errors.e, errors.p))
+            largest = max(largest, law.nu)
+            identifier = lp.Identifier(
+                twin.model, twin.observation, law, q0=estimate.q, u0=estimate.u, t0=before.t
+            )
+            identifier.step(before.t, before.z)
+            tracker.damping = law.damping
+        estimate = identifier.step(sample.t, sample.z)
+        errors = tracker.add(estimate, sample.z)
+    return Found(name, law, tracker.errors, twin.error(estimate.q), largest)
+
+
+def run(gain: float = 100.0, samples: int = 41, level: float = 0.0) -> list[Found]:
+    """Run all rules on the paper's example, from the exact initial state."""
+    model, omega = seed.build()
+    noise = RelativeNoise(level) if level else None
+    twin = Twin(
+        model=model,
+        observation=omega,
+        q_true=seed.q_true,
+        u_true=seed.u_true,
+        times=seed.TIMES[:samples],
+        noise=noise,
+    )
+    spaces = Spaces(model, twin.observed)
+    c = constants(spaces, twin.q, twin.states[::10], gain=gain)
+    nothing = Errors(0.0, 0.0, *([Norms()] * 4), Pu=0.0, rate=0.0, theta=0.0)
+    rules: dict[str, tuple[lp.Damping, bool]] = {
+        "c1 alone (ResidualDamping)": (lp.ResidualDamping(1.0), False),
+        "ExactBound, ||p|| <= 0.01": (ExactBound(c, 0.01, 1.0, FLOOR), False),
+        "oracle mu": (Oracle(c, nothing, noisy=level > 0), False),
+        "oracle mu and nu": (Oracle(c, nothing, noisy=level > 0), True),
+    }
+    return [
+        follow(name, twin, lp.GradientLaw(gain, rule), c, lambda x: seed.u_true(x, 0.0), nu)
+        for name, (rule, nu) in rules.items()
+    ]
+
+
+def main() -> None:
+    for level in (0.0, 0.01):
+        print(f"\nseed, gain 100, noise {level:.0%}: relative L2 error of q at t = 24 (q = 0: 1)")
+        print(f"{'rule':<28} {'error of q':>10} {'energy end/start':>17} {'largest nu':>11}")
+        for found in run(level=level):
+            energy = found.errors[-1].energy / found.errors[0].energy
+            print(f"{found.name:<28} {found.error:10.4g} {energy:17.4g} {found.nu:11.4g}")
+    found = run()[2]
+    model, omega = seed.build()
+    twin = Twin(
+        model=model, observation=omega, q_true=seed.q_true, u_true=seed.u_true, times=[0, 1]
+    )
+    c = constants(Spaces(model, twin.observed), twin.q, twin.states, gain=100.0)
+    print(f"\n{found.name}:")
+    print(bounds(found.errors, c))
+    print(conditions(found.errors, c, floor=FLOOR))
+
+
+if __name__ == "__main__":
+    main()

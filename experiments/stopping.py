@@ -1,0 +1,101 @@
+"""T* with truth beside its online surrogate: first violation of (cond_d), mean of five seeds.
+
+The excited twin from a wrong initial state (u = 0; from the exact one r = 0 and T* = 0 at once),
+h = 0.01, gain 1000, G_alpha = Tikhonov in V~ by the discrepancy principle or with a fixed alpha.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import livepde as lp
+from livepde.diagnostics import OnlineTracker, TwinTracker, constants, stopping_time
+from livepde.observation import Tikhonov
+from livepde.reproduce import seed_excited as excited
+from livepde.streams import RelativeNoise, Twin
+
+H = 0.01
+SEEDS = range(5)
+WITHIN = 2.0
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One row of the table: noise level, c_1, alpha (None: discrepancy principle)."""
+
+    level: float
+    c1: float
+    alpha: float | None
+
+
+SETTINGS = [
+    Setting(level, c1, alpha)
+    for level in (0.01, 0.05)
+    for c1 in (10.0, 100.0)
+    for alpha in (1e-5, None)
+] + [Setting(0.001, 100.0, 1e-5)]
+
+
+def twin(setting: Setting, seed: int, samples: int) -> Twin:
+    """Return the noisy twin of a setting."""
+    from livepde.observation import Discrepancy
+
+    model, _ = excited.build()
+    rule: Any = Discrepancy(level=setting.level) if setting.alpha is None else setting.alpha
+    full = lp.Full(reconstruction=Tikhonov("V", rule))
+    return Twin(
+        model=model,
+        observation=full,
+        q_true=excited.q_true,
+        u_true=excited.u_true,
+        times=H * np.arange(samples),
+        noise=RelativeNoise(setting.level),
+        seed=seed,
+    )
+
+
+def run(setting: Setting, seed: int, samples: int = 101) -> tuple[float, float]:
+    """Return (T*, its surrogate) of one seed; infinity if not reached."""
+    data = twin(setting, seed, samples)
+    law = lp.GradientLaw(gain=1000.0, damping=lp.ResidualDamping(setting.c1))
+    identifier = lp.Identifier(data.model, data.observation, law, q0=0.0, u0=0.0)
+    noise = RelativeNoise(setting.level)
+    online = OnlineTracker(identifier, 0.1, noise=lambda z: noise.std(z, data.weights))
+    truth = TwinTracker(data, online.spaces, law.gain, law.damping)
+    for sample in data:
+        estimate = identifier.step(sample.t, sample.z)
+        online.add(estimate, sample)
+        truth.add(estimate, sample.z)
+    c = constants(online.spaces, data.q, data.states[::20], gain=law.gain)
+    return stopping_time(truth.errors, c), online.stopping(c).T
+
+
+def table(settings: list[Setting] = SETTINGS, samples: int = 101) -> list[tuple[Any, ...]]:
+    """Return (setting, mean T*, mean surrogate, their quotient, within) for each setting."""
+    rows = []
+    for setting in settings:
+        pairs = np.array([run(setting, seed, samples) for seed in SEEDS])
+        exact, surrogate = pairs.mean(axis=0)
+        if exact == 0.0 or not np.isfinite([exact, surrogate]).all():
+            ratio = 1.0 if exact == surrogate else np.nan
+        else:
+            ratio = surrogate / exact
+        rows.append((setting, exact, surrogate, ratio, 1 / WITHIN <= ratio <= WITHIN))
+    return rows
+
+
+def main() -> None:
+    print(f"{'noise':>6} {'c1':>6} {'alpha':>11} {'T*':>8} {'surrogate':>9} {'quotient':>8}")
+    for setting, exact, surrogate, ratio, within in table():
+        alpha = "discrepancy" if setting.alpha is None else f"{setting.alpha:g}"
+        print(
+            f"{setting.level:6.3f} {setting.c1:6g} {alpha:>11} {exact:8.3f} {surrogate:9.3f} "
+            f"{ratio:8.2f}{'' if within else '   not within a factor of 2'}"
+        )
+
+
+if __name__ == "__main__":
+    main()
