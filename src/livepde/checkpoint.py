@@ -61,7 +61,7 @@ def write(
 def read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return header and leaves of a checkpoint."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
             leaves = {name: archive[name] for name in archive.files}
         header: dict[str, Any] = json.loads(str(leaves.pop("header")))
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:

@@ -1,0 +1,294 @@
+"""The identifier: bad input, inputs that are held, checkpoints, and what a result holds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+from problems import excited, excited_u, laplace, line, truth
+from skfem import ElementLineP1, ElementTriP1, MeshTri
+
+import livepde as lp
+
+
+def rod(**options):
+    return lp.Model(
+        lp.Field(
+            line(10),
+            ElementLineP1(),
+            dirichlet={"left": 0.0, "right": lp.Channel("T_end")},
+            unit="degC",
+        ),
+        {"k": lp.Scalar(1.0, std=0.5, bounds=(0.1, 5.0), unit="m^2/s")},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - x.inputs["heat"] * v * 0,
+        f=lambda x, t: x.inputs["heat"],
+        inputs=("heat",),
+        time_unit="s",
+        **options,
+    )
+
+
+SENSORS = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01, unit="degC")
+HIDDEN = lp.Points({"c": 0.8}, unit="degC")
+
+
+def identifier(**options):
+    options = {"withheld": HIDDEN, **options}
+    return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(), **options)
+
+
+def sample(t=0.1, **changes):
+    return t, {"a": 0.1, "b": 0.2, "c": 0.3, "T_end": 0.5, "heat": 1.0, **changes}
+
+
+def frozen(ident):
+    """Everything that must not change when a sample is refused."""
+    return ident.t, ident._samples, ident._state
+
+
+@pytest.mark.parametrize(
+    ("item", "error", "words"),
+    [
+        ((0.1, [1.0, 2.0, 3.0], {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "needs"),
+        ((0.1, "warm", {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "number"),
+        ((0.1, [[1.0], [2.0, 3.0]], {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "number"),
+        ((0.1, [1.0, np.inf], {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "'b' is infinite"),
+        ((*sample(a="warm"),), lp.SampleError, "channel 'a': got 'warm'"),
+        ((*sample(a=True),), lp.SampleError, "channel 'a'"),
+        ((*sample(a=object()),), lp.SampleError, "channel 'a'"),
+        ((*sample(heat=np.inf),), lp.SampleError, "heat"),
+        ((*sample(d=1.0),), lp.SampleError, "unknown channel 'd'"),
+        ((0.1, [1.0, 2.0], {"cold": 1.0}), lp.SampleError, "unknown input 'cold'"),
+        ((*sample(heat=np.nan),), lp.MissingInputError, "'heat' has no value"),
+        ((*sample(t=-1.0),), lp.TimeOrderError, "not later"),
+        ((*sample(t=np.nan),), lp.SampleError, "time"),
+        ((*sample(t="noon"),), lp.SampleError, "time"),
+    ],
+)
+def test_a_bad_sample_is_one_sentence_and_changes_nothing(item, error, words):
+    ident = identifier()
+    before = frozen(ident)
+    with pytest.raises(error, match=words):
+        ident.step(*item)
+    assert frozen(ident) == before
+    assert ident.step(*sample()).status.ok
+
+
+def test_time_must_go_on():
+    ident = identifier()
+    ident.step(*sample(0.0))  # the start itself
+    ident.step(*sample(0.1))
+    before = frozen(ident)
+    for t in (0.1, 0.05, 0.0):
+        with pytest.raises(lp.TimeOrderError, match="not later"):
+            ident.step(*sample(t))
+    assert frozen(ident) == before
+
+
+def test_a_missing_input_holds_its_last_value():
+    held, sent = identifier(), identifier()
+    for ident in (held, sent):
+        ident.step(*sample(0.1, T_end=0.7))
+    estimate = held.step(*sample(0.2, T_end=None))
+    assert estimate.held == ("T_end",)
+    np.testing.assert_array_equal(estimate.u, sent.step(*sample(0.2, T_end=0.7)).u)
+
+
+def test_nan_and_absent_are_missing_samples():
+    one, two = identifier(), identifier()
+    t, values = sample()
+    first = one.step(t, {**values, "a": np.nan})
+    second = two.step(t, {name: v for name, v in values.items() if name != "a"})
+    np.testing.assert_array_equal(first.q, second.q)
+    assert np.isnan(first.innovation[0])
+    assert np.isfinite(first.innovation[1])
+
+
+def test_withheld_channels_are_scored_and_never_used():
+    one, two = identifier(), identifier()
+    for k in range(1, 5):
+        first = one.step(*sample(0.1 * k, c=0.3))
+        second = two.step(*sample(0.1 * k, c=99.0))
+    np.testing.assert_array_equal(first.q, second.q)
+    assert second.withheld_error[0] - first.withheld_error[0] == pytest.approx(98.7)
+
+
+def test_before_assimilation_begins_data_are_only_scored():
+    ident = identifier(assimilate_from=0.25)
+    first = ident.step(*sample(0.1))
+    assert first.q[0] == 1.0
+    assert np.isfinite(first.innovation).all()
+    ident.step(*sample(0.2))
+    assert ident.step(*sample(0.3)).q[0] != 1.0
+
+
+def test_configurations_that_do_not_fit():
+    with pytest.raises(lp.ConfigurationError, match="both assimilated and withheld"):
+        identifier(withheld=lp.Points({"a": 0.5}))
+    with pytest.raises(lp.ConfigurationError, match="dt_max"):
+        identifier(dt_max=0.0)
+    with pytest.raises(lp.ConfigurationError, match="t0"):
+        identifier(t0=np.nan)
+    with pytest.raises(lp.ModelError, match="bounds"):
+        identifier(q0={"k": 100.0})
+    with pytest.raises(lp.MissingInputError, match="first sample"):
+        identifier().estimate()
+
+
+def test_a_failed_step_reports_and_the_stream_goes_on():
+    """Newton is given one iteration for a nonlinear reaction, then enough."""
+    model = lp.Model(
+        lp.Field(line(6), ElementLineP1(), quadrature=6),
+        lp.Scalar(1.0),
+        A=lambda q, u, v, x: q * u * v,
+        B=lambda u, v, x: u**3 * v,
+    )
+    law = lp.GradientLaw(newton=lp.Newton(iterations=1))
+    ident = lp.Identifier(model, lp.Full(), law, u0=1.0)
+    before = ident.estimate()
+    estimate = ident.step(1.0, np.full(7, 0.5))
+    assert estimate.status.code == "not_converged"
+    assert "dt_max" in estimate.status.remedy
+    assert "not_converged" in str(estimate.status)
+    np.testing.assert_array_equal(estimate.u, before.u)
+    assert ident.t == 0.0
+    good = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=1.0)
+    good._state = ident._state
+    assert good.step(1.5, np.full(7, 0.4)).status.ok
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        lp.GradientLaw(gain=100.0),
+        lp.SensitivityLaw(modes=5, noise=0.01),
+        lp.SensitivityLaw(modes=5, noise=0.01, replay=lp.Replay(window=12, first=4)),
+    ],
+)
+def test_a_continued_run_is_bit_identical(law, tmp_path):
+    model = excited(8)
+    times = 0.1 * np.arange(25)
+    q_true = model.initial_parameter(2.0)
+    states = truth(model, q_true, lambda x: excited_u(x, 0.0), times)
+
+    def build():
+        return lp.Identifier(model, lp.Full(), law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
+
+    whole, first, second = build(), build(), build()
+    G = whole.observed.G
+    for k, t in enumerate(times[1:], start=1):
+        expected = whole.step(t, G @ states[k])
+        if k < 11:
+            first.step(t, G @ states[k])
+        elif k == 11:
+            first.step(t, G @ states[k])
+            first.save(tmp_path / "state.npz")
+            second.load(tmp_path / "state.npz")
+            assert second.t == first.t
+        else:
+            found = second.step(t, G @ states[k])
+            np.testing.assert_array_equal(found.q, expected.q)
+            np.testing.assert_array_equal(found.u, expected.u)
+
+
+def test_saved_before_the_first_sample(tmp_path):
+    one, two = identifier(), identifier()
+    one.save(tmp_path / "state.npz")
+    two.load(tmp_path / "state.npz")
+    np.testing.assert_array_equal(one.step(*sample()).q, two.step(*sample()).q)
+
+
+def test_checkpoints_that_cannot_be_used(tmp_path):
+    ident = identifier()
+    ident.step(*sample())
+    path = tmp_path / "state.npz"
+    ident.save(path)
+    other = lp.Identifier(rod(), lp.Points({"d": 0.5}, noise=0.1), lp.SensitivityLaw())
+    with pytest.raises(lp.RunError, match="sensors"):
+        other.load(path)
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(lp.RunError, match="damaged"):
+        ident.load(path)
+    (tmp_path / "text").write_text("no archive")
+    with pytest.raises(lp.RunError, match="damaged"):
+        ident.load(tmp_path / "text")
+    with pytest.raises(lp.RunError, match="not a checkpoint"):
+        ident.load(tmp_path / "nowhere")
+    with pytest.raises(lp.RunError, match="Cannot write"):
+        ident.save(tmp_path / "no" / "folder" / "state.npz")
+
+
+def stream(n=20):
+    return [lp.Sample(*sample(0.1 * k, a=0.1 + 0.01 * k)) for k in range(n)]
+
+
+def test_a_result_has_named_axes_and_units(tmp_path):
+    result = identifier().run(stream(), fields_every=7)
+    assert len(result) == 20
+    data = result.to_xarray()
+    assert data["k"].dims == ("time",)
+    assert data["k"].attrs["units"] == "m^2/s"
+    assert data["time"].attrs["units"] == "s"
+    assert data["u"].dims == ("snapshot", "vertex")
+    assert data["u"].attrs["units"] == "degC"
+    assert data["snapshot"].values == pytest.approx([0.0, 0.7, 1.4, 1.9])
+    assert list(data["sensor"].values) == ["a", "b"]
+    assert list(data["withheld"].values) == ["c"]
+    assert data["innovation"].shape == (20, 2)
+    assert data["withheld_error"].shape == (20, 1)
+    assert np.all(np.diff(data["x"].values) > 0)
+    assert set(data["status"].values) == {0}
+    assert data["steps"].values[1] == 1
+    assert np.isfinite(data["k_std"].values).all()
+    data.to_netcdf(tmp_path / "run.nc", engine="scipy")
+    with xr.open_dataset(tmp_path / "run.nc", engine="scipy") as again:
+        np.testing.assert_array_equal(again["u"].values, data["u"].values)
+
+
+def test_a_table_of_a_result():
+    result = identifier().run(stream())
+    table = result.table()
+    assert table["k"]["value"] == pytest.approx(float(result.last.q[0]))
+    errors = result.to_xarray()["innovation"].sel(sensor="a").values
+    assert table["innovation:a"]["rmse"] == pytest.approx(np.sqrt(np.mean(errors**2)))
+    assert table["withheld_error:c"]["count"] == 20
+
+
+def test_a_result_can_be_drawn():
+    figure = identifier().run(stream()).plot()
+    assert figure.axes
+
+
+def test_a_field_in_the_plane():
+    mesh = MeshTri().refined(2)
+    model = lp.Model(
+        lp.Field(mesh, ElementTriP1(), dirichlet={"boundary": 0.0}),
+        lp.Field(mesh, ElementTriP1(), inner="H1", name="q"),
+        A=lambda q, u, v, x: q * u * v,
+        B=laplace,
+        f=1.0,
+    )
+    ident = lp.Identifier(model, lp.Full(), lp.GradientLaw())
+    result = ident.run([(0.1 * k, np.zeros(ident.observed.size)) for k in range(1, 4)])
+    data = result.to_xarray()
+    assert data["q"].shape == (3, mesh.p.shape[1])
+    np.testing.assert_array_equal(data["y"].values, mesh.p[1])
+    assert "withheld_error" not in data
+
+
+def test_progress_is_silent_where_nobody_watches(capsys):
+    identifier().run(stream(), progress=True)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_substeps_are_those_made_by_hand():
+    model = excited(8)
+    z = np.zeros(lp.Full().bind(model.state_space, model.X, model.parameter_space).size)
+    divided = lp.Identifier(model, lp.Full(), lp.GradientLaw(), q0=1.0, dt_max=0.1)
+    estimate = divided.step(0.4, z)
+    assert estimate.steps == 4
+    by_hand = lp.Identifier(model, lp.Full(), lp.GradientLaw(), q0=1.0)
+    for k in range(1, 5):
+        found = by_hand.step(0.1 * k, z)
+    np.testing.assert_allclose(estimate.u, found.u, atol=1e-6)
+    np.testing.assert_allclose(estimate.q, found.q, atol=1e-6)
