@@ -1,0 +1,211 @@
+"""The shipped checks pass on good objects and name what is wrong with bad ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from problems import CASES, excited, line, observe, reaction
+from skfem import ElementLineHermite, ElementLineP1
+
+import livepde as lp
+from livepde.diagnostics import (
+    CheckLine,
+    CheckReport,
+    check_law,
+    check_model,
+    check_observation,
+    check_space,
+)
+from livepde.stepping import ForwardStage
+
+
+def failed(report):
+    return [line.name for line in report.failed]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_good_models_pass(name):
+    check_model(CASES[name].model(f=1.0), u=1.0).raise_if_failed()
+
+
+def test_a_wrong_derivative_is_found():
+    model = reaction(
+        line(6),
+        ElementLineP1(),
+        B=lambda u, v, x: u**3 * v,
+        dB=lambda u, du, v, x: 2 * u**2 * du * v,
+    )
+    report = check_model(model, u=1.0)
+    assert not report.ok
+    assert any("B'(u)" in name for name in failed(report))
+    with pytest.raises(lp.ModelError, match="B'"):
+        report.raise_if_failed()
+
+
+def test_a_right_derivative_passes():
+    model = reaction(
+        line(6),
+        ElementLineP1(),
+        B=lambda u, v, x: u**3 * v,
+        dB=lambda u, du, v, x: 3 * u**2 * du * v,
+    )
+    check_model(model, u=1.0).raise_if_failed()
+
+
+def test_a_form_that_is_not_analytic_is_found():
+    report = check_model(reaction(line(6), ElementLineP1(), B=lambda u, v, x: np.abs(u) * v))
+    assert any("B'(u)" in name for name in failed(report))
+
+
+def test_a_form_that_is_not_linear_in_q_is_found():
+    model = lp.Model(
+        lp.Field(line(6), ElementLineP1()),
+        lp.Scalar(1.0),
+        A=lambda q, u, v, x: q**2 * u * v,
+    )
+    assert any("linear in q" in name for name in failed(check_model(model, u=1.0)))
+
+
+def test_an_unsymmetric_mass_is_refused():
+    model = lp.Model(
+        lp.Field(line(6), ElementLineP1(), dirichlet={"boundary": 0.0}),
+        lp.Scalar(1.0),
+        A=lambda q, u, v, x: q * u * v,
+        M=lambda u, v, x: u * v + 0.1 * lp.grad(u)[0] * v,
+    )
+    with pytest.raises(lp.SpaceError, match="not symmetric"):
+        check_model(model, u=1.0)
+
+
+@pytest.mark.parametrize(
+    "observation",
+    [
+        lp.Full(),
+        lp.Subdomain(lambda x: x[0] > 0.4),
+        lp.Points([0.2, 0.2, 0.7]),
+        lp.Averages({"a": lambda x: x[0] < 0.5}),
+    ],
+)
+def test_good_observations_pass(observation):
+    model = excited(8)
+    check_observation(observation, model).raise_if_failed()
+    check_observation(observe(model, observation)).raise_if_failed()
+
+
+def test_a_projection_that_is_none_is_found():
+    """M^-1 M_omega, which the design warns of: not idempotent."""
+    model = excited(8)
+    observed = observe(model, lp.Subdomain(lambda x: x[0] > 0.4))
+    good = observed.split()
+    weight = lambda u, v, x: (x[0] > 0.4) * u * v  # noqa: E731
+    wrong = sp.csr_array(np.linalg.solve(model.mass.toarray(), model.bilinear(weight).toarray()))
+    bad = type(good)(
+        **{
+            **{name: getattr(good, name) for name in good.__dataclass_fields__},
+            "R": wrong,
+            "P": sp.csr_array(sp.eye_array(model.X.dim) - wrong),
+        }
+    )
+    observed._splits = dict.fromkeys(observed._splits, bad)
+    assert "R R = R" in failed(check_observation(observed))
+
+
+def test_spaces():
+    check_space(excited(6).Q).raise_if_failed()
+    check_space(excited(6).X).raise_if_failed()
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    u: np.ndarray
+    q: np.ndarray
+
+
+@dataclass(frozen=True)
+class OpenLoop(lp.Law):
+    """Learns nothing, correctly."""
+
+    def prepare(self, problem):
+        return problem, ForwardStage(problem.model)
+
+    def init(self, work, q0, u0):
+        return State(u0, q0)
+
+    def step(self, work, state, interval):
+        problem, forward = work
+        h = interval.t1 - interval.t0
+        u = forward.solve(state.u, state.q, h, interval.end)
+        predicted = problem.observed.predict(u, state.q, interval.end)
+        return State(u, state.q), lp.Report(lp.Status(), predicted, steps=1)
+
+    def belief(self, work, state):
+        return lp.Belief(state.q, state.u)
+
+
+class Dice(OpenLoop):
+    """Moves q at random."""
+
+    def step(self, work, state, interval):
+        new, report = super().step(work, state, interval)
+        return State(new.u, new.q + np.random.default_rng().standard_normal(len(new.q))), report
+
+
+class Scribbler(OpenLoop):
+    """Changes its old state in place."""
+
+    def step(self, work, state, interval):
+        new, report = super().step(work, state, interval)
+        state.u[:] = new.u
+        return new, report
+
+
+class Fragile(OpenLoop):
+    """Does not think of missing samples."""
+
+    def step(self, work, state, interval):
+        new, report = super().step(work, state, interval)
+        return State(new.u, new.q + 0.0 * interval.z1.sum()), report
+
+
+def build(law):
+    model = reaction(line(6), ElementLineP1())
+    return lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.1), law, u0=lambda x: x[0])
+
+
+SAMPLES = [(0.1 * k, [0.2, 0.1]) for k in range(1, 6)]
+
+
+def test_a_good_law_passes():
+    check_law(OpenLoop(), build, SAMPLES).raise_if_failed()
+
+
+@pytest.mark.parametrize(
+    ("law", "words"), [(Dice(), "two runs"), (Scribbler(), "value"), (Fragile(), "missing")]
+)
+def test_bad_laws_are_found(law, words):
+    report = check_law(law, build, SAMPLES)
+    assert any(words in name for name in failed(report))
+    with pytest.raises(lp.LawError):
+        report.raise_if_failed()
+
+
+def test_a_law_needs_some_samples():
+    with pytest.raises(lp.LawError, match="four samples"):
+        check_law(OpenLoop(), build, SAMPLES[:2])
+
+
+def test_reports_are_read_by_people():
+    bad = CheckLine.at_most("P P = P", 0.5, 1e-12, "make it a projection.")
+    report = CheckReport("observation", (bad,))
+    assert "FAIL" in str(report)
+    assert "make it a projection." in str(report)
+    assert not CheckLine.at_most("x", np.nan, 1.0, "").ok
+    assert not CheckLine.at_least("x", np.nan, 1.0, "").ok
+
+
+def test_hermite_models_at_the_users_scale():
+    model = reaction(line(8), ElementLineHermite(), A=lambda q, u, v, x: q * u**2 * v)
+    check_model(model, u=300.0, spread=5.0).raise_if_failed()
