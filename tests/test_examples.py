@@ -22,7 +22,14 @@ def load(name):
 
 def test_every_example_is_tested():
     found = {path.stem for path in (ROOT / "examples").glob("*.py")}
-    assert found == {"ten_lines", "own_pde", "own_sensor", "own_law", "nonlinear_sensor"}
+    assert found == {
+        "ten_lines",
+        "own_pde",
+        "own_sensor",
+        "own_law",
+        "nonlinear_sensor",
+        "smoothing_sensor",
+    }
 
 
 @pytest.mark.parametrize(

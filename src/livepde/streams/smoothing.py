@@ -28,7 +28,6 @@ from livepde.linalg import Array
 __all__ = ["Exponential", "LocalPolynomial", "Smoothed", "Smoother", "WindowAverage"]
 
 LARGEST_MEMO = 256  # weights kept for different spacings and patterns of missing samples
-ROUNDING = 1e-12  # shares of variance below this count as none
 RESOLUTION = 1e-9  # offsets that differ by less than this share of the width have the same weights
 
 
@@ -36,7 +35,7 @@ class Weights(ABC):
     """What a smoother remembers, and how it weighs it: z~_k = sum_j w_kj z_j, sum_j w_kj = 1."""
 
     @abstractmethod
-    def add(self, t: float, z: Array) -> tuple[Array, Array, Array, Array]:
+    def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
         """Take one sample and return, each of shape (channels,) and NaN where z is missing.
 
         Returns
@@ -47,8 +46,6 @@ class Weights(ABC):
             sum_j w_kj^2: variance of its noise, per variance of the raw noise.
         change
             sum_j (w_kj - w_k-1,j)^2: that of z~_k - z~_k-1; NaN for the first.
-        left
-            (1 - w_kk)^2 + sum_j<k w_kj^2: that of z_k - z~_k.
         """
 
 
@@ -59,10 +56,10 @@ class Smoother(ABC):
     Parameters
     ----------
     noise
-        Standard deviation of the raw noise: one number, or one for each channel. Default: the mean
-        square of z - z~ over all samples so far, divided by what the weights leave of white noise.
-        What a stage smooths away of the signal counts as noise then, so the estimate is too large
-        rather than too small.
+        Standard deviation of the raw noise: one number, or one for each channel. Default: learned
+        from all samples so far, from how far a value lies off the straight line between its two
+        neighbours (Gasser, Sroka and Jennen-Steinmetz 1986). That knows no signal but its
+        curvature, and takes the noise as independent from sample to sample.
     channels
         Names of the channels to smooth, for samples by name; default all of the first sample that
         are not inputs of it. Inputs and other channels pass unchanged, without the lag.
@@ -124,8 +121,7 @@ class Smoothed(Iterable[Sample]):
         nothing = np.zeros(0)
         self.std = self.d_rate = self.sigma = nothing
         self._names: tuple[str, ...] | None = None
-        self._squares: Array | None = None
-        self._counts: Array | None = None
+        self._noise: _NoiseLevel | None = None
 
     def __iter__(self) -> Iterator[Sample]:
         self._reset()
@@ -140,8 +136,8 @@ class Smoothed(Iterable[Sample]):
                     f"t = {before!r}; sort the stream and drop repeated samples."
                 )
             z = self._read(sample)
-            smooth, variance, change, left = weights.add(t, z)
-            self._learn(z - smooth, left)
+            smooth, variance, change = weights.add(t, z)
+            self._learn(t, z)
             self.std = self.sigma * np.sqrt(variance)
             self.d_rate = self.sigma * np.sqrt(change) / (t - before)
             before = t
@@ -189,24 +185,46 @@ class Smoothed(Iterable[Sample]):
                 named[name] = value
         return Sample(sample.t, named, sample.inputs)
 
-    def _learn(self, rest: Array, left: Array) -> None:
+    def _learn(self, t: float, z: Array) -> None:
         if self.smoother.noise is not None:
             given = np.asarray(self.smoother.noise, dtype=float)
-            if given.ndim == 1 and given.shape != rest.shape:
+            if given.ndim == 1 and given.shape != z.shape:
                 raise ConfigurationError(
                     f"{type(self.smoother).__name__}: {given.size} values of noise for "
-                    f"{rest.size} channels; give one, or one each."
+                    f"{z.size} channels; give one, or one each."
                 )
-            self.sigma = np.broadcast_to(given, rest.shape)
+            self.sigma = np.broadcast_to(given, z.shape)
             return
-        if self._squares is None or self._counts is None:
-            self._squares, self._counts = np.zeros_like(rest), np.zeros_like(rest)
-        told = np.isfinite(rest) & (left > ROUNDING)
-        self._squares[told] += rest[told] ** 2
-        self._counts[told] += left[told]
-        known = self._counts > 0
-        self.sigma = np.full_like(rest, np.nan)
-        self.sigma[known] = np.sqrt(self._squares[known] / self._counts[known])
+        if self._noise is None:
+            self._noise = _NoiseLevel(z.shape)
+        self.sigma = self._noise.add(t, z)
+
+
+class _NoiseLevel:
+    """Standard deviation of white noise from values beside the line between their neighbours."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        # The last two values of each channel and their times, the older one first.
+        self.z = np.full((2, *shape), np.nan)
+        self.t = np.full((2, *shape), np.nan)
+        self.squares = np.zeros(shape)
+        self.counts = np.zeros(shape)
+
+    def add(self, t: float, z: Array) -> Array:
+        """Take one sample and return the deviation so far, NaN where it is not known yet."""
+        present = np.isfinite(z)
+        share = (self.t[1] - self.t[0]) / (t - self.t[0])
+        rest = self.z[1] - (1.0 - share) * self.z[0] - share * z
+        told = present & np.isfinite(rest)
+        scale = 1.0 + (1.0 - share) ** 2 + share**2
+        self.squares[told] += rest[told] ** 2 / scale[told]
+        self.counts[told] += 1.0
+        self.z[0, present], self.t[0, present] = self.z[1, present], self.t[1, present]
+        self.z[1, present], self.t[1, present] = z[present], t
+        sigma = np.full(z.shape, np.nan)
+        known = self.counts > 0
+        sigma[known] = np.sqrt(self.squares[known] / self.counts[known])
+        return sigma
 
 
 class _Window(Weights):
@@ -219,7 +237,7 @@ class _Window(Weights):
         self.last: Array = np.zeros((0, 0))
         self._memo: dict[bytes, Array] = {}
 
-    def add(self, t: float, z: Array) -> tuple[Array, Array, Array, Array]:
+    def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
         if self.values and self.values[-1].shape != z.shape:
             raise SampleError(
                 f"smoothing: a sample of shape {z.shape} after samples of "
@@ -242,8 +260,7 @@ class _Window(Weights):
         self.last = weights
         smooth = (weights * np.nan_to_num(values)).sum(axis=0)
         variance = (weights**2).sum(axis=0)
-        left = variance + 1.0 - 2.0 * weights[-1]
-        return smooth, variance, change, left
+        return smooth, variance, change
 
     def _weights(self, offsets: Array, present: Any) -> Array:
         """Return weights of shape (samples, channels), NaN where the newest value is missing."""
@@ -384,14 +401,14 @@ class _Fading(Weights):
         self.state: tuple[Array, Array, Array] | None = None
         self.seen = np.zeros(0, dtype=bool)
 
-    def add(self, t: float, z: Array) -> tuple[Array, Array, Array, Array]:
+    def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
         present = np.isfinite(z)
         nothing = np.full(z.shape, np.nan)
         if self.state is None:
             smooth, variance, times = z.copy(), np.where(present, 1.0, np.nan), nothing.copy()
             times[present] = t
             self.state, self.seen = (smooth, variance, times), present
-            return smooth.copy(), variance.copy(), nothing, np.where(present, 0.0, np.nan)
+            return smooth.copy(), variance.copy(), nothing
         smooth, variance, times = self.state
         if smooth.shape != z.shape:
             raise SampleError(
@@ -400,7 +417,6 @@ class _Fading(Weights):
         first = present & np.isnan(smooth)
         share = -np.expm1(-(t - times) / self.time)
         change = share**2 * (1.0 + variance)
-        left = (1.0 - share) ** 2 * (1.0 + variance)
         new = np.where(first, z, smooth + share * (z - smooth))
         spread = np.where(first, 1.0, (1.0 - share) ** 2 * variance + share**2)
         out = np.where(present, new, np.nan)
@@ -408,7 +424,6 @@ class _Fading(Weights):
             out,
             np.where(present, spread, np.nan),
             np.where(present & self.seen, change, np.nan),
-            np.where(present, np.where(first, 0.0, left), np.nan),
         )
         self.state = (
             np.where(present, new, smooth),
