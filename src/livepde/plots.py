@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["figure", "history", "overview", "profiles"]
+__all__ = ["ensemble", "figure", "history", "overview", "profiles"]
 
 # Okabe and Ito (2008): told apart with every common kind of colour blindness. Yellow is left out:
 # it cannot be seen on white.
@@ -233,6 +233,46 @@ def history(
     ax.set_xlabel(xlabel)
     ax.set_ylabel(ylabel)
     return _finish(ax, outside=True)
+
+
+def ensemble(
+    times: ArrayLike,
+    values: ArrayLike,
+    *,
+    ylabel: str = "",
+    xlabel: str = "t",
+    levels: Mapping[str, float] | None = None,
+    legend: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw several runs over time: each one thin, their mean thick with its least value marked.
+
+    Parameters
+    ----------
+    times
+        Shape (times,).
+    values
+        Positive numbers, shape (runs, times); the scale is logarithmic.
+    levels
+        Label -> constant to compare with, drawn dashed.
+    legend
+        Put a legend beside the panel.
+    """
+    ax = _panel(ax)
+    t, rows = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
+    mean = rows.mean(axis=0)
+    least = int(mean.argmin())
+    for k, row in enumerate(rows):
+        label = "each run" if k == 0 else "_run"
+        ax.plot(t, row, color=PALETTE[5], linewidth=0.6, alpha=0.7, label=label)
+    ax.plot(t, mean, color=PALETTE[0], linewidth=1.8, label="mean")
+    ax.plot(t[least], mean[least], "o", color=PALETTE[1], zorder=3, label="least")
+    for label, level in (levels or {}).items():
+        ax.axhline(level, color=GREY, linestyle="--", linewidth=1.0, label=label)
+    ax.set_yscale("log")
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    return _finish(ax, legend=legend, outside=True)
 
 
 def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int = 5) -> Figure:
