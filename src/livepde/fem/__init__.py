@@ -15,7 +15,7 @@ from livepde.fem.fields import (
     interval,
 )
 from livepde.fem.forms import Form
-from livepde.fem.meshes import hermite, linear, rectangle
+from livepde.fem.meshes import box, hermite, linear, quadratic, rectangle, smooth
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
 from livepde.fem.sobolev import Sobolev
@@ -38,6 +38,7 @@ __all__ = [
     "Scalar",
     "Sobolev",
     "Unknown",
+    "box",
     "ddot",
     "div",
     "dot",
@@ -46,7 +47,9 @@ __all__ = [
     "hess",
     "interval",
     "linear",
+    "quadratic",
     "rectangle",
+    "smooth",
     "trace",
     "transpose",
 ]

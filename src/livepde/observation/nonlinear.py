@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -118,7 +119,7 @@ class Transformed(Observation):
         if self.derivative is not None:
             slope = np.asarray(self.derivative(y), dtype=float)
         else:
-            slope = np.imag(self.function(y + 1j * STEP)) / STEP
+            slope = np.imag(np.asarray(self.function(cast(Array, y + 1j * STEP)))) / STEP
         return np.broadcast_to(slope, y.shape)
 
 
