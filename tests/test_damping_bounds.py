@@ -1,0 +1,117 @@
+"""Lower bounds on mu and nu: formulas against hand calculations, rules against formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.laws.bounds import (
+    Constants,
+    ExactBound,
+    NoisyBound,
+    Norms,
+    SmoothedBound,
+    nu_exact,
+    nu_noisy,
+    theta_exact,
+    theta_noisy,
+    theta_smoothed,
+    unobserved_damping,
+)
+
+C = Constants(L_C=3.0, C_A=2.0, c_M=0.5, C_M=1.5, c_N=0.25, hidden_V_VX=0.4, hidden_VX_X=0.5)
+R = Norms(X=0.2, VX=0.5, V=2.0)
+D = Norms(X=0.01, VX=0.02, V=0.1)
+P = Norms(X=0.03, VX=0.1, V=0.7)
+
+
+def residual(n: Norms) -> lp.Residual:
+    return lp.Residual(n.X**2, n.VX**2, lambda: n.V**2)
+
+
+def mu(theta: float, norm: float) -> float:
+    return theta * norm
+
+
+def test_exact_data():
+    bound = 2 * 3 / 0.5 * P.V * R.X * R.V / R.VX**2  # cond:mu_1
+    assert mu(theta_exact(C, P.V, R), R.V) == pytest.approx(bound)
+    with_c1 = max(2 * 3 / 0.5 * P.V, 100 * R.X) * R.X * R.V / R.VX**2  # cond:mu02
+    assert mu(theta_exact(C, P.V, R, c1=100), R.V) == pytest.approx(with_c1)
+
+
+def test_noisy_data():
+    e, ra_V = 0.3, 1.9
+    first = 4 * 3 / 0.5 * (D.V + P.V) * R.X + 4 * 2 / 0.5 * (1 + D.V + P.V) * e * D.X
+    assert mu(theta_noisy(C, e, P.V, R, D), ra_V) == pytest.approx(first * ra_V / R.VX**2)
+    sigma = 1e3
+    second = 2 * sigma / 0.5 * R.X**2
+    assert theta_noisy(C, e, P.V, R, D, sigma) == pytest.approx(second / R.VX**2)
+    assert theta_noisy(C, e, P.V, R, D, c1=1e5) == pytest.approx(1e5 * R.X**2 / R.VX**2)
+
+
+def test_smoothed_data():
+    bound = 2 / 0.5 * (3 * (D.V + P.V) + 0.6) * R.X / R.VX**2
+    assert theta_smoothed(C, P.V, R, D.V, 0.6) == pytest.approx(bound)
+    assert theta_smoothed(C, 0, R, 0, 0, c1=2) == pytest.approx(2 * R.X**2 / R.VX**2)
+
+
+def test_nu():
+    e = 0.3
+    exact = 4 * (3 + 2 * (e + 0.5 * 0.4 * 0.5)) / 0.25 * P.V * P.X / P.VX**2
+    assert nu_exact(C, e, P) == pytest.approx(exact)
+    rough = 4 * (3 + 2 * e) / 0.25 * (P.V + D.V) + 2 * 2 * 0.4 * 0.5 / 0.25 * P.V
+    assert nu_noisy(C, e, P, D.V) == pytest.approx(rough * P.X / P.VX**2)
+    assert nu_exact(C, e, Norms(), nu_min=0.7) == 0.7
+    assert nu_noisy(C, e, P, 0.0) <= nu_noisy(C, e, P, D.V)
+
+
+def test_the_constant_nu_satisfies_the_bound_for_every_p():
+    ratio = P.V * P.X / P.VX**2
+    c = Constants(L_C=3.0, C_A=2.0, hidden_ratio=ratio, hidden_V_VX=0.4, hidden_VX_X=0.5)
+    assert unobserved_damping(c, 0.3) == pytest.approx(nu_exact(c, 0.3, P))
+
+
+@pytest.mark.parametrize("size", [1e-2, 1.0, 30.0])
+def test_rules_give_what_the_formulas_ask(size):
+    r = Norms(size * R.X, size * R.VX, size * R.V)
+    exact = ExactBound(C, p_bound=P.V, c1=0.5, floor=1e-6)
+    assert exact.theta(residual(r)) == pytest.approx(theta_exact(C, P.V, r, 0.5))
+    smooth = SmoothedBound(C, P.V, D.V, 0.6, c1=0.5, floor=1e-6)
+    assert smooth.theta(residual(r)) == pytest.approx(theta_smoothed(C, P.V, r, D.V, 0.6, 0.5))
+
+
+@pytest.mark.parametrize("size", [0.3, 1.0, 30.0])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_noisy_rule_asks_for_at_least_what_the_true_residual_would(size, sign):
+    true = Norms(size * R.X, size * R.VX, size * R.V)
+    seen = Norms(true.X + sign * D.X, true.VX + sign * D.VX, true.V + sign * D.V)
+    rule = NoisyBound(C, P.V, 0.3, D, sigma=0.1, c1=0.2, theta_max=1e9)
+    asked = theta_noisy(C, 0.3, P.V, true, D, 0.1, 0.2)
+    assert rule.theta(residual(seen)) >= asked * (1 - 1e-12)
+
+
+def test_rules_are_bounded_at_vanishing_residuals():
+    zero = residual(Norms())
+    assert ExactBound(C, 0.1, 1.0, 1e-2).theta(zero) == pytest.approx(2 * 3 / 0.5 * 0.1 / 1e-2)
+    assert ExactBound(C, 0.0, 1.0).theta(zero) == lp.ResidualDamping(1.0).theta(zero)
+    assert SmoothedBound(C, 0, 0, 0, c1=2.0).theta(zero) == 2.0
+    assert NoisyBound(C, 0.1, 0.3, D, theta_max=7.0).theta(zero) == 7.0
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ExactBound(C, -1.0), "p_bound must be a number >= 0"),
+        (lambda: ExactBound(C, 1.0, floor=0.0), "floor must be positive"),
+        (lambda: SmoothedBound(C, 0.0, np.nan, 0.0), "d_bound must be a number >= 0"),
+        (lambda: SmoothedBound(C, 0.0, 0.0, 0.0, floor=-1.0), "floor must be positive"),
+        (lambda: NoisyBound(C, 0.0, np.inf, D), "e_bound must be a number >= 0"),
+        (lambda: Constants(L_C=-1.0, C_A=0.0), "L_C must be a number >= 0"),
+        (lambda: Constants(L_C=1.0, C_A=0.0, c_M=0.0), "c_M must be positive"),
+    ],
+)
+def test_rules_refuse(make, words):
+    with pytest.raises(lp.LawError, match=words):
+        make()
