@@ -40,7 +40,7 @@ __all__ = [
     "Tikhonov",
 ]
 
-SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of trace G*G / trace
+SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
 ROOT = 1e-10  # relative accuracy of that alpha
 
 
@@ -311,7 +311,9 @@ class _Filter(Reconstructor):
         self.rho = float(np.trace(fit) / (np.trace(cost) or 1.0))
         s, phi = sl.eigh(fit, fit + self.rho * cost)
         self.s = np.clip(s, np.finfo(float).tiny, 1.0)
-        self.k = np.clip(1.0 - s, 0.0, None) / self.rho
+        # What |.| does not see must not be seen by rounding: alpha may be large.
+        rest = 1.0 - s
+        self.k = np.where(rest > 10 * len(s) * np.finfo(float).eps, rest, 0.0) / self.rho
         self.phi = basis @ phi
         self.fitted = (self.G @ self.phi).T @ self.weights
         self.pulled = sp.csr_array(penalty.T) @ self.phi

@@ -248,12 +248,14 @@ def _hindsight(progress: bool) -> Table:
 
 def _words(tuned: Table) -> str:
     best = [float(row[-1]) for row in tuned.rows]
+    pairs = ", ".join(
+        f"{tuned.rows[k][0]} noise: {best[k]:.2f} with, {best[k + 1]:.2f} without"
+        for k in range(0, len(best), 2)
+    )
     return (
-        f"At 1 % a law that is told the best c1 of the grid does without smoothing (error "
-        f"{best[1]:.2f} against {best[0]:.2f}): its slow learning averages by itself, without the "
-        f"bias of G_alpha. At 5 % and 10 % it does not ({best[3]:.2f} against {best[2]:.2f}, "
-        f"{best[5]:.2f} against {best[4]:.2f}): the noise of A(w)* r no longer averages out. With "
-        "smoothing one c1 does for all levels."
+        f"Error with the best c1 of the grid, chosen by the truth ({pairs}). Little noise averages "
+        "out by itself where the law learns slowly, without the bias of G_alpha; more of it does "
+        "not, since A(w)* r is quadratic in it. With smoothing one c1 does for all levels."
     )
 
 
