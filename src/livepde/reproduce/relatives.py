@@ -109,6 +109,8 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
             "Kügler's law evaluates C at u^, not at the data: the diffusion itself damps the error "
             "of the state, so its mu hardly matters, and u is estimated better; q learns from "
             "smaller residuals, hence more slowly.",
+            "At mu = 1 the two relatives nearly coincide when D = 1: B(z) + A_0(u^ - z) = "
+            "B(u^) + (u^ - z) for A_0 = B + 1; what remains is A(z) against A(u^).",
             f"Refused: {refusal}",
         ],
         dataset=next(iter(tracks.values())).result.to_xarray(),

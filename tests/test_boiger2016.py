@@ -1,0 +1,85 @@
+"""Both figures of the paper: reduced runs; `livepde reproduce boiger2016` makes all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from livepde import plots
+from livepde.reproduce import boiger2016, seed, seed_excited
+from livepde.reproduce.boiger2016 import LEVELS, PAPER, Ensemble
+
+SEEDS = (0, 1)
+
+
+@pytest.fixture(scope="module")
+def excited() -> boiger2016.Runs:
+    return boiger2016.excited_noise(seeds=SEEDS, kinds=("band",))[0]
+
+
+@pytest.fixture(scope="module")
+def paper() -> tuple[boiger2016.Runs, dict[float, float]]:
+    runs, table, alone = boiger2016.paper_noise(seeds=SEEDS)
+    assert len(table.rows) == len(PAPER) * len(LEVELS)
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    return runs, alone
+
+
+def test_first_figure() -> None:
+    plain, biased, table = boiger2016.first()
+    assert plain.error(60.0) <= boiger2016.CLOSE
+    assert plain.u_error <= boiger2016.TRACKED
+    assert biased.error(60.0) >= 1.0  # nu > 0 biases P u^
+    assert [row[0] for row in table.rows] == list(seed.SHOWN)
+    drawn = boiger2016._first(plain)
+    assert [ax.get_ylabel() for ax in drawn.axes] == ["q", "u"]
+
+
+def test_semiconvergence(excited: boiger2016.Runs) -> None:
+    """The error falls, then rises, earlier for more noise."""
+    checks = boiger2016.semiconvergence(excited, LEVELS)
+    assert all(check.ok for check in checks), [c.name for c in checks if not c.ok]
+    assert not any(found.failed for found in excited.values())
+
+
+def test_noise_hides_the_papers_parameter(
+    paper: tuple[boiger2016.Runs, dict[float, float]],
+) -> None:
+    checks = boiger2016._hidden(*paper)
+    assert all(check.ok for check in checks), [c.name for c in checks if not c.ok]
+
+
+def test_second_figure(excited: boiger2016.Runs) -> None:
+    drawn = boiger2016._second(excited, "band, mu = 1", seed_excited, None)
+    assert len(drawn.axes) == 2 * len(LEVELS)
+    assert drawn.axes[3].get_yscale() == "log"
+
+
+def noisy(kind: boiger2016.Kind, number: int) -> Iterator[np.ndarray]:
+    case = boiger2016.paper_case()
+    for sample, exact in zip(case.samples(kind, 0.05, number), case.twin.exact_data, strict=True):
+        yield sample.z - exact
+
+
+@pytest.mark.parametrize("kind", ["nodal", "band"])
+def test_size_of_the_noise(kind: boiger2016.Kind) -> None:
+    """E ||d||_Z^2 = level^2 ||z||_Z^2, and the same seed gives the same noise."""
+    twin = boiger2016.paper_case().twin
+    ratios = [
+        (d @ twin.weights @ d) / (z @ twin.weights @ z)
+        for d, z in zip(noisy(kind, 0), twin.exact_data, strict=True)
+    ]
+    assert np.sqrt(np.mean(ratios)) == pytest.approx(0.05, rel=0.2)
+    assert np.array_equal(next(noisy(kind, 3)), next(noisy(kind, 3)))
+
+
+def test_ensemble_figure() -> None:
+    t = np.linspace(0.0, 1.0, 5)
+    ax = plots.ensemble(t, np.array([[3.0, 2, 1, 2, 3], [3.0, 1, 2, 3, 4]]), levels={"q = 0": 3.0})
+    assert len(ax.lines) == 5
+    mean = np.array([3.0, 1.5, 1.5, 2.5, 3.5])
+    runs = Ensemble(t, np.array([mean, mean]), np.array([mean]), mean[None], None, 0)  # type: ignore[arg-type]
+    assert np.allclose(runs.turning, 0.25)
+    assert np.allclose(runs.mean, mean)

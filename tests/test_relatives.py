@@ -1,0 +1,134 @@
+"""Baumeister et al. (1997) and Kügler (2010) as laws."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from problems import excited, excited_q, excited_u, laplace, reaction
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde.laws.coupled import CoupledStage, Gains
+from livepde.laws.relatives import _Linear
+from livepde.model import mass_form
+from livepde.reproduce.relatives import EXPECTED, LAWS, law
+from livepde.stepping import Newton
+from livepde.streams import Twin
+
+PART = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87))
+H = 0.1
+TIMES = H * np.arange(60)
+
+
+def twin(model: lp.Model, observation: lp.Observation) -> Twin:
+    return Twin(
+        model=model,
+        observation=observation,
+        q_true=excited_q,
+        u0=lambda x: excited_u(x, 0.0),
+        times=TIMES,
+    )
+
+
+def identifier(model: lp.Model, observation: lp.Observation, law: Any) -> lp.Identifier:
+    return lp.Identifier(model, observation, law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("law", "observation"),
+    [
+        (lp.BaumeisterLaw(100.0), lp.Full()),
+        (lp.KueglerLaw(100.0), lp.Full()),
+        (lp.KueglerLaw(100.0), PART),
+    ],
+)
+def test_contract(law: Any, observation: lp.Observation) -> None:
+    model = excited(10)
+    samples = list(twin(model, observation))[:8]
+    report = lp.check_law(law, lambda law: identifier(model, observation, law), samples)
+    assert report.ok, str(report)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_energy_falls_with_exact_data(name: str) -> None:
+    """The terms with A cancel in the coupled step, as in (align:neplusnr)."""
+    model = excited(10)
+    exact, gain = twin(model, lp.Full()), 100.0
+    run = identifier(model, lp.Full(), law(name, gain, 1.0))
+    energy = [exact.energy(run.step(s.t, s.z), gain) for s in exact]
+    assert np.all(np.diff(energy) <= 1e-9 * energy[0])
+    assert energy[-1] < 0.75 * energy[0]
+
+
+def test_baumeister_refuses_partial_data() -> None:
+    with pytest.raises(lp.LawError, match=r"all of the state; .* Use GradientLaw"):
+        identifier(excited(10), PART, lp.BaumeisterLaw())
+
+
+def test_baumeister_is_the_papers_law_with_a_linear_pull() -> None:
+    """With R = I, (est_exact_q) and (est_exact_u) with theta = mu."""
+    model = excited(10)
+    paper = identifier(model, lp.Full(), lp.GradientLaw(100.0, _Linear(2.0)))
+    other = identifier(model, lp.Full(), lp.BaumeisterLaw(100.0, 2.0))
+    for sample in twin(model, lp.Full()):
+        one, two = paper.step(sample.t, sample.z), other.step(sample.t, sample.z)
+    assert np.array_equal(one.q, two.q)
+    assert np.array_equal(one.u, two.u)
+
+
+def squared(u: Any, v: Any, x: Any) -> Any:
+    return laplace(u, v, x) + u**3 * v
+
+
+@pytest.mark.parametrize("B", [laplace, squared], ids=["affine", "monotone, nonlinear"])
+def test_kueglers_stage_solves_its_equations(B: Any) -> None:
+    """C is evaluated at u^; once by the products of a bilinear model, once in general."""
+    model = reaction(lp.interval(0.0, 1.0, 10), ElementLineP1(), B=B)
+    observed = PART.bind(model.state_space, model.X, model.parameter_space)
+    split, gain, mu, h = observed.split(), 50.0, 3.0, 0.2
+    M_op = model.bilinear(mass_form)
+    gains = Gains(gain, _Linear(mu), 0.0, 0.0, M_op, M_op, at_estimate=True)
+    stage = CoupledStage(model, split, gains, Newton(tolerance=1e-12))
+    rng, n = np.random.default_rng(0), model.X.dim
+    c = 0.3 * rng.standard_normal(n + model.Q.dim)
+    c[:n] *= model.X.free
+    u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
+    y = stage.solve(c, h, lp.Moment(0.2), u_alpha, np.zeros_like(c))
+    u, q = y[:n], y[n:]
+    r, A = split.R @ u - u_alpha, model.A(u)
+    state = model.mass @ (u - c[:n]) / h + model.B(u) + A.matrix @ q
+    state += mu * (split.R.T @ (model.mass @ r)) - model.F(lp.Moment(0.2))
+    learned = model.Q.gram @ (q - c[n:]) / (gain * h) - A.matrix.T @ r
+    assert np.abs(state * model.X.free).max() < 1e-9
+    assert np.abs(learned * model.Q.free).max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", [lp.BaumeisterLaw, lp.KueglerLaw])
+@pytest.mark.parametrize("options", [{"gain": 0.0}, {"gain": np.inf}, {"mu": -1.0}, {"mu": np.nan}])
+def test_bad_weights(kind: Any, options: dict[str, float]) -> None:
+    with pytest.raises(lp.LawError, match="must be a number"):
+        kind(**options)
+
+
+@pytest.mark.parametrize("kind", [lp.BaumeisterLaw, lp.KueglerLaw])
+def test_no_sensor_of_the_parameter(kind: Any) -> None:
+    model = lp.Model(
+        lp.Field(lp.interval(0.0, 1.0, 2), ElementLineP1()),
+        lp.Scalar(1.0),
+        A=lambda q, u, v, x: q * u * v,
+    )
+    sensors = lp.Points([0.0, 0.5, 1.0], direct={"z0": lambda q, x: q})
+    with pytest.raises(lp.LawError, match="sees a parameter directly"):
+        lp.Identifier(model, sensors, kind())
+
+
+def test_reproduction() -> None:
+    from livepde.reproduce import EXPERIMENTS
+
+    outcome = EXPERIMENTS["relatives"].run()
+    assert outcome.ok, [check.name for check in outcome.checks if not check.ok]
+    assert len(outcome.checks) == len(EXPECTED) + 1
+    assert sum("refused" in row for row in outcome.tables[0].rows) == 2
+    assert outcome.figures["error"]() is not None
