@@ -60,9 +60,23 @@ from livepde.laws import (
     ResidualDamping,
     SensitivityLaw,
     Status,
+    observed_operator,
+    unobserved_operator,
 )
 from livepde.model import Model
-from livepde.observation import Averages, Full, Matrix, Observation, Points, Subdomain, Transformed
+from livepde.observation import (
+    Apriori,
+    Averages,
+    Discrepancy,
+    Full,
+    Matrix,
+    Observation,
+    Points,
+    Pseudoinverse,
+    Subdomain,
+    Tikhonov,
+    Transformed,
+)
 from livepde.operators import DualOperator
 from livepde.result import Estimate, Result
 from livepde.spaces import HilbertSpace
@@ -73,6 +87,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Advance",
     "Alexander2",
+    "Apriori",
     "Averages",
     "BaumeisterLaw",
     "Belief",
@@ -84,6 +99,7 @@ __all__ = [
     "ConstantDamping",
     "Damping",
     "DataError",
+    "Discrepancy",
     "DualOperator",
     "Estimate",
     "Field",
@@ -111,6 +127,7 @@ __all__ = [
     "Place",
     "Points",
     "Problem",
+    "Pseudoinverse",
     "Replay",
     "Report",
     "Residual",
@@ -126,6 +143,7 @@ __all__ = [
     "SpaceError",
     "Status",
     "Subdomain",
+    "Tikhonov",
     "TimeOrderError",
     "Transformed",
     "check_law",
@@ -138,8 +156,10 @@ __all__ = [
     "grad",
     "hess",
     "interval",
+    "observed_operator",
     "rectangle",
     "simulate",
     "trace",
     "transpose",
+    "unobserved_operator",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
 from livepde.laws.gradient import GradientLaw
+from livepde.laws.operators import observed_operator, unobserved_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
 from livepde.laws.sensitivity import Replay, SensitivityLaw
 
@@ -24,4 +25,6 @@ __all__ = [
     "ResidualDamping",
     "SensitivityLaw",
     "Status",
+    "observed_operator",
+    "unobserved_operator",
 ]

@@ -79,6 +79,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         Stabilising term of (noisy_q), >= 0.
     M_op, N_op
         Integrands (u, v, x) of M and N of (MN1), (MN2); default u v + grad u . grad v.
+        `observed_operator(omega, D)` and `unobserved_operator(omega, D)` are the paper's, with |D|.
     newton
         The nonlinear iteration.
     """
