@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,3 +94,19 @@ def test_the_manufactured_state_solves_the_discrete_process():
     run = lp.simulate(model, q, model.exact(0.0), times, lp.Advance(lp.ImplicitEuler()))
     for t, u in run:
         np.testing.assert_allclose(u, model.exact(t), atol=1e-11)
+
+
+@pytest.mark.parametrize(("D", "nu", "holds"), [(0.05, 0.0, True), (-0.05, 0.9, False)])
+def test_it_is_the_sign_of_D_that_needs_nu_above_one(D, nu, holds):
+    """With D > 0 the same gains hold p without nu; with D < 0 nu = 0.9 is too little, as |D| says.
+
+    nu = 1.1 and 5 hold it as nu = 2 does, with |p| <= 1.5.
+    """
+    process = replace(
+        degenerate.PROCESSES["antidiffusion"],
+        D=lambda x: np.where(x[0] < degenerate.OMEGA, D, 1.0),
+        steps=400,
+    )
+    course = degenerate.identify(process, nu)
+    assert course.failed != holds
+    assert (course.hidden.max() < degenerate.BOUNDED) == holds
