@@ -134,7 +134,7 @@ class TwinTracker:
         twin, spaces = self.twin, self.spaces
         exact, split = twin.u(estimate.t), spaces.split
         boundary = twin.model.impose(np.zeros(len(exact)), Moment(estimate.t))
-        z = np.asarray(z, dtype=float)
+        z = spaces.observed.linearised(np.asarray(z, dtype=float), estimate.u)
         if self.reconstruct is not None:
             u_alpha = self.reconstruct(z)
         else:
@@ -142,7 +142,7 @@ class TwinTracker:
         error = estimate.u - exact
         # Dirichlet values agree, so the error lies in the tangent space.
         r = split.R @ error
-        d = u_alpha - split.reconstruct(spaces.observed.G @ exact, boundary)
+        d = u_alpha - split.R @ (exact - boundary)
         residual = r - d
         seen, hidden = spaces.observed_part, spaces.hidden_part
         norms = seen.norms(residual)
@@ -269,7 +269,7 @@ def conditions(
                 "(cond_d)",
                 _values(errors, lambda item: item.margin) >= need,
                 "the data error d outweighs the residual r, so T* has passed: smooth the data "
-                "(in V~, not only in L2), or stop learning at `stopping_time_online`.",
+                "(in V~, not only in L2), or stop learning at T* (`OnlineStopping`).",
             )
         )
     return CheckReport(f"conditions, {data} data", tuple(lines))

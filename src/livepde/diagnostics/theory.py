@@ -167,6 +167,7 @@ class OnlineTracker:
         direct = observed.sensitivity(moment)
         if direct is not None:
             z = z - direct @ estimate.q
+        z = observed.linearised(z, estimate.u)
         u_alpha, alpha = self._reconstruct(z, boundary)
         r = observed.split(np.isfinite(z)).R @ (estimate.u - boundary) - u_alpha
         norms = self.spaces.observed_part.norms(r)

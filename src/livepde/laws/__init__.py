@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws.bounds import (
+    Constants,
+    ExactBound,
+    NoisyBound,
+    Norms,
+    SmoothedBound,
+    unobserved_damping,
+)
 from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
 from livepde.laws.gradient import GradientLaw
 from livepde.laws.operators import observed_operator, unobserved_operator
@@ -14,17 +22,23 @@ __all__ = [
     "BaumeisterLaw",
     "Belief",
     "ConstantDamping",
+    "Constants",
     "Damping",
+    "ExactBound",
     "GradientLaw",
     "KueglerLaw",
     "Law",
+    "NoisyBound",
+    "Norms",
     "Problem",
     "Replay",
     "Report",
     "Residual",
     "ResidualDamping",
     "SensitivityLaw",
+    "SmoothedBound",
     "Status",
     "observed_operator",
+    "unobserved_damping",
     "unobserved_operator",
 ]
