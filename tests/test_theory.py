@@ -535,6 +535,8 @@ def test_report_theory_of_a_run_directory(tmp_path):
     titles = [table["title"] for table in json.loads(found.stdout)["tables"]]
     assert "Constants of the discretised model" in titles
     assert (copy / "theory.md").read_text().startswith("# Theory: ")
+    without = runner.invoke(app, ["report", str(copy), "--theory"])
+    assert "add --data FILE" in str(without.exception)
 
 
 # --- experiments ----------------------------------------------------------------------------------

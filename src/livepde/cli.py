@@ -487,10 +487,17 @@ def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: boo
     """Take a run's samples again, and print and write what the theory says."""
     from livepde import cases
     from livepde.diagnostics import theory_report
+    from livepde.errors import CaseError, RunError
     from livepde.runs import Table
 
     case = opened.case_file()
-    prepared = cases.load(case, allow_code=allow_code).prepare(data or opened.data_file)
+    try:
+        prepared = cases.load(case, allow_code=allow_code).prepare(data or opened.data_file)
+    except CaseError as error:
+        if case.parent != opened.path:
+            raise
+        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
+        raise RunError(f"{error} {moved}") from error
     found = theory_report(prepared.identifier, prepared.stream)
     target = opened.path / "theory.md"
     target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")

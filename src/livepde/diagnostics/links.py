@@ -127,7 +127,7 @@ class Interpolation:
 def interpolation(norms: Sequence[Norms]) -> Interpolation:
     """Return the extreme quotients along a run; C_int is at most 1 for the norms of M itself."""
     least = 1e-10 * max((n.X for n in norms), default=0.0)  # the rest is rounding
-    quotients = [n.VX**2 / (n.V * n.X) for n in norms if n.V > 0 and n.X > least]
+    quotients = [n.VX**2 / (n.V * n.X) for n in norms if n.V > 0 and least < n.X]
     if not quotients:
         raise ConfigurationError("interpolation: every residual is zero.")
     return Interpolation(min(quotients), max(quotients))
