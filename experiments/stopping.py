@@ -101,10 +101,11 @@ def main() -> None:
         f"{'noise':>6} {'c1':>6} {'alpha':>11} {'h':>5} {'T*':>8} {'surrogate':>9} {'quotient':>8}"
     )
     for setting, exact, surrogate, ratio, within in table():
+        verdict = "" if within else "   not within a factor of 2"
         alpha = "discrepancy" if setting.alpha is None else f"{setting.alpha:g}"
         print(
             f"{setting.level:6.3f} {setting.c1:6g} {alpha:>11} {setting.h:5g} "
-            f"{exact:8.3f} {surrogate:9.3f} {ratio:8.2f}{'' if within else '   not within a factor of 2'}"
+            f"{exact:8.3f} {surrogate:9.3f} {ratio:8.2f}{verdict}"
         )
 
 
