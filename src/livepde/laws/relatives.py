@@ -1,8 +1,8 @@
 """Two older laws that the paper's method grew out of, through the same coupled stage.
 
 Boiger and Kaltenbacher call their method "strongly motivated" by both. Neither article could be
-read in full for this module (their bibliographic data were checked); what is implemented is stated
-as equations below, after what Boiger and Kaltenbacher say of them: Baumeister et al. observe all of
+read for this module; what is implemented is stated as equations below, after what Boiger and
+Kaltenbacher say of them: Baumeister et al. observe all of
 the state, Kügler demands a monotone C and evaluates it at the estimate.
 
                   C evaluated at          pull                      q^' = gain A(.)* r, r
