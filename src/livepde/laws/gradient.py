@@ -119,8 +119,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         self, work: GradientWork, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         model, observed = work.problem.model, work.problem.observed
-        seen = [observed.linearised(z, state.u) for z in (interval.z0, interval.z1)]
-        interval = replace(interval, z0=seen[0], z1=seen[1])
+        z0, z1 = (observed.linearised(z, state.u) for z in (interval.z0, interval.z1))
+        if z1 is not interval.z1:  # a nonlinear sensor
+            interval = replace(interval, z0=z0, z1=z1)
         coupled = work.stage(interval.present)
         zero = np.zeros(model.X.dim)
         regularises = observed.observation.reconstruction.regularises
@@ -156,10 +157,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         lower, upper = model.parameter_space.bounds
         u, q = end[: model.X.dim], np.clip(end[model.X.dim :], lower, upper)
         observed_u = coupled.split.R @ u
-        rate = (end - y) / (interval.t1 - interval.t0)
-        rate[: model.X.dim] -= (observed_u - coupled.split.R @ state.u) / (
-            interval.t1 - interval.t0
-        )
+        rate = end - y
+        rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
+        rate /= interval.t1 - interval.t0
         notes = {"residual": model.X.norm(observed_u - found.u)}
         if regularises:
             notes |= {"alpha": found.alpha, "misfit": found.misfit}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -85,7 +86,7 @@ class BandedSolver:
         storage.ravel()[position] = data
         lower, upper = self.band
         lu, pivots, info = lapack.dgbtrf(storage.T, lower, upper, overwrite_ab=1)
-        if info != 0 or not np.isfinite(lu[lower + upper]).all():
+        if info != 0 or not math.isfinite(lu[lower + upper].sum()):
             raise LinearAlgebraError(
                 f"The {shape[0]} by {shape[0]} matrix is singular or not finite: check the "
                 "model's forms, or take a smaller time step."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -103,7 +104,7 @@ class Newton:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
             size = _relative(update, new, blocks)
-            if not np.isfinite(size):
+            if not math.isfinite(size):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
             if affine:
                 return new
@@ -137,8 +138,8 @@ def _relative(update: Array, y: Array, blocks: tuple[slice, ...]) -> float:
     for block in blocks:
         change, size = update[block], y[block]
         square = float(change @ change)
-        if not np.isfinite(square):  # max() would pass over a value that is not a number
+        if not math.isfinite(square):  # max() would pass over a value that is not a number
             return np.inf
         if square != 0.0:
             worst = max(worst, square / max(float(size @ size), 1e-300))
-    return float(np.sqrt(worst))
+    return math.sqrt(worst)
