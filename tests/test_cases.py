@@ -174,6 +174,32 @@ def test_gradient_law_on_averages(rod):
     assert (data.status == 0).all()
 
 
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ("true", lp.Tikhonov("V", lp.Discrepancy(1.1))),
+        ('{ norm = "X", tau = 1.5 }', lp.Tikhonov("X", lp.Discrepancy(1.5))),
+        ("{ alpha = 1e-3 }", lp.Tikhonov("V", 1e-3)),
+        ("false", lp.Pseudoinverse()),
+    ],
+)
+def test_tikhonov_from_a_case(rod, keys, expected):
+    kind = ('kind = "sensitivity" ', f'kind = "gradient"\ngain = 1e-12\ntikhonov = {keys}\n#')
+    prepared = cases.load(rod(kind, NO_REPLAY)).prepare()
+    assert prepared.identifier.observed.observation.reconstruction == expected
+    assert prepared.identifier.withheld.observation.reconstruction == lp.Pseudoinverse()
+    for sample in list(prepared.stream)[:4]:
+        estimate = prepared.identifier.step(sample.t, sample.z, sample.inputs)
+    assert estimate.status.ok
+    assert ("alpha" in estimate.notes) == (keys != "false")
+
+
+def test_tikhonov_by_discrepancy_needs_the_noise(rod):
+    kind = ('kind = "sensitivity" ', 'kind = "gradient"\ntikhonov = true\n#')
+    with pytest.raises(lp.CaseError, match="noise of every sensor"):
+        cases.load(rod(kind, NO_REPLAY, (', noise = "0.05 K"', ""))).prepare()
+
+
 def test_gradient_law_on_points_gets_a_note(rod):
     case = cases.load(rod(GRADIENT, NO_REPLAY))
     assert "point sensors mislead" in case.notes[0]

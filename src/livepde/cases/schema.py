@@ -6,7 +6,15 @@ import re
 from datetime import date, datetime
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PositiveInt, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    model_validator,
+)
 
 from livepde.runs.outcome import Bound, Sense
 
@@ -18,6 +26,7 @@ __all__ = [
     "MeshSpec",
     "SensitivitySpec",
     "StepsSpec",
+    "TikhonovSpec",
     "UnknownSpec",
 ]
 
@@ -167,6 +176,14 @@ class SensitivitySpec(Spec):
     replay: bool | ReplaySpec = False
 
 
+class TikhonovSpec(Spec):
+    """Regularised reconstruction of the observed part from noisy samples."""
+
+    norm: Literal["X", "V"] = "V"
+    alpha: PositiveFloat | Literal["discrepancy"] = "discrepancy"
+    tau: PositiveFloat = 1.1
+
+
 class GradientSpec(Spec):
     """The paper's law, for observed subdomains and averages."""
 
@@ -176,6 +193,7 @@ class GradientSpec(Spec):
     mu: float | None = None
     nu: float = 0.0
     sigma: float = 0.0
+    tikhonov: bool | TikhonovSpec = False
 
     @model_validator(mode="after")
     def _one_damping(self) -> GradientSpec:

@@ -9,10 +9,18 @@ import numpy as np
 
 from livepde.cases.frame import Frame
 from livepde.cases.read import did_you_mean
-from livepde.cases.schema import ChannelSpec
+from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.identifier import Sample
-from livepde.observation import Averages, Observation, Points
+from livepde.observation import (
+    Averages,
+    Discrepancy,
+    Observation,
+    Points,
+    Pseudoinverse,
+    Reconstruction,
+    Tikhonov,
+)
 from livepde.streams import Column
 
 __all__ = ["columns_of", "initial_of", "noise_of", "observation_of"]
@@ -36,6 +44,7 @@ def observation_of(
     if not channels:
         return None
     unit, noise = frame.equation.state.unit, noise_of(frame, role)
+    how = _reconstruction(frame) if role == "sensor" else Pseudoinverse()
     spans = {
         name: frame.pair(item.over, frame.equation.length_unit, f"channels.{name}.over")
         for name, item in channels.items()
@@ -49,13 +58,27 @@ def observation_of(
         )
     if spans:
         regions = {name: _inside(*span) for name, span in spans.items()}
-        return Averages(regions, noise=noise, unit=unit)
+        return Averages(regions, noise=noise, unit=unit, reconstruction=how)
     points, direct = {}, {}
     for name, channel in channels.items():
         points[name] = _position(frame, mesh, name, channel)
         if channel.quantity is not None:
             direct[name] = frame.equation.quantities[channel.quantity].direct(options)
-    return Points(points, direct, noise=noise, unit=unit)
+    return Points(points, direct, noise=noise, unit=unit, reconstruction=how)
+
+
+def _reconstruction(frame: Frame) -> Reconstruction:
+    """Return how the observed part is reconstructed: what law.tikhonov says."""
+    law = frame.spec.law
+    given = law.tikhonov if isinstance(law, GradientSpec) else False
+    if given is False:
+        return Pseudoinverse()
+    spec = TikhonovSpec() if given is True else given
+    alpha = Discrepancy(spec.tau) if spec.alpha == "discrepancy" else spec.alpha
+    if spec.alpha == "discrepancy" and noise_of(frame, "sensor") is None:
+        text = "the discrepancy principle needs the noise of every sensor; or give alpha a number."
+        raise frame.error("law.tikhonov.alpha", text)
+    return Tikhonov(spec.norm, alpha)
 
 
 def _inside(low: float, high: float) -> Any:
