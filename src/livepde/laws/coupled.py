@@ -226,12 +226,16 @@ class _Equation:
         return self.theta * self.Mr
 
     def changing(self, y: Array, sweep: bool) -> Array:
-        """Return the data of the Jacobian that depend on y; in a sweep, with A(w) held."""
+        """Return the data of the Jacobian that depend on y.
+
+        A sweep holds the coupling A(w)^T r and theta. It does not hold A(w) q: with an unknown in
+        the principal part that would be an explicit iteration, which diverges or goes astray.
+        """
         stage, form = self.stage, self.stage.model.form_A
         maps, q, r, w = stage.maps, y[stage.n :], self.r, self.w
         data: Array = maps["A"] @ form.data("v", "q", self.moment, u=w)
+        data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
         if not sweep:
-            data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
             data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r)
         if not stage.constant_B:
             data += maps["B"] @ stage.model.form_B.data("v", "u", self.moment, u=w)
@@ -240,7 +244,7 @@ class _Equation:
     def factor(self, y: Array, sweep: bool) -> Factor:
         """Return the factorised Jacobian at the y of the last `residual`.
 
-        In a sweep, A(w) and theta are held.
+        In a sweep, the coupling to r and theta are held.
         """
         stage = self.stage
         data = self.changing(y, sweep)
@@ -289,8 +293,8 @@ class _Bilinear:
         block, block_maps = whole.build()
         self.coupling = sp.csr_array(block_maps["A"] @ vq)
         self.block = block.operator()
-        self.lagged = sp.csr_array(maps["A"] @ vq)
-        self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Au"] @ vu, maps["Aq"] @ qu]))
+        self.lagged = sp.csr_array(sp.hstack([maps["A"] @ vq, maps["Au"] @ vu]))
+        self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Aq"] @ qu]))
         zero = np.zeros(n)
         B = model.form_B.matrix("v", "u", u=zero)
         self.offset = model.B(zero) * model.X.free
@@ -348,7 +352,8 @@ class _BilinearEquation(_Equation):
 
     def changing(self, y: Array, sweep: bool) -> Array:
         if sweep:
-            lagged: Array = self.products.lagged @ self.w
+            known = np.concatenate([self.w, y[self.stage.n :]])
+            lagged: Array = self.products.lagged @ known
             return lagged
         data: Array = self.products.jacobian @ np.concatenate([self.w, y[self.stage.n :], self.r])
         return data
