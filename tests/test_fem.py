@@ -317,8 +317,8 @@ def test_piecewise_by_predicate_and_by_subdomain():
 
     with pytest.raises(lp.SpaceError, match="Region 'a': the mesh has no subdomain 'bottom'"):
         lp.Model(state, lp.Piecewise({"a": "bottom"}), diffusion)
-    with pytest.raises(lp.SpaceError, match="needed on boundaries"):
-        lp.Model(state, named, lp.On("left", lambda q, u, v, x: q * u * v))
+    edge = lp.Model(state, named, lp.On("left", lambda q, u, v, x: q * u * v))
+    assert edge.A(np.ones(edge.X.dim)).matrix.nnz
 
 
 def test_product_of_unknowns():

@@ -37,6 +37,9 @@ def rebuild(template: Any, leaves: Mapping[str, Array], prefix: str = "state") -
         }
         return type(template)(**parts)
     array = leaves[prefix]
+    # The first axis may grow (stored samples); the others are the problem's.
+    if isinstance(template, np.ndarray) and array.shape[1:] != template.shape[1:]:
+        raise ValueError(f"{prefix} has shape {array.shape}, needs {template.shape}")
     return array if isinstance(template, np.ndarray) else type(template)(array.item())
 
 

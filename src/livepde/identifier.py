@@ -343,13 +343,23 @@ class Identifier:
                     f"{path} was saved with {key} = {header.get(key)!r}; this identifier has "
                     f"{value!r}. Build it as it was when it was saved."
                 )
-        self._t, self._samples = float(leaves["t"]), int(leaves["samples"])
-        self._z = leaves["z"]
-        names = self.model.channels if len(leaves["inputs"]) else ()
-        self._inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
-        if header["begun"]:
-            template = self.law.init(self._work, self._q0, self._u0)
-            self._state = checkpoint.rebuild(template, leaves)
+        state = None
+        try:
+            t, samples, z = float(leaves["t"]), int(leaves["samples"]), leaves["z"]
+            names = self.model.channels if len(leaves["inputs"]) else ()
+            inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
+            if header["begun"]:
+                template = self.law.init(self._work, self._q0, self._u0)
+                state = checkpoint.rebuild(template, leaves)
+        except (KeyError, ValueError) as error:
+            raise RunError(
+                f"{path} does not fit this identifier ({error}): build it with the law's options "
+                "as they were when it was saved."
+            ) from error
+        self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
+        self._state = state
+        if state is None and not self.model.channels:
+            self._begin(inputs)
 
 
 def _number(value: Any, what: str) -> float:
@@ -368,12 +378,16 @@ def _number(value: Any, what: str) -> float:
 
 
 def _array(z: Any, observed: Observed) -> Array:
+    if (
+        np.asarray(z).dtype.kind in "USb"
+        if not isinstance(z, list | tuple)
+        else any(isinstance(value, str | bytes | bool) for value in z)
+    ):
+        raise SampleError(f"z = {z!r} is not an array of numbers.")
     try:
         array = np.asarray(z, dtype=float)
     except (TypeError, ValueError):
         raise SampleError(f"z = {z!r} holds something that is not a number.") from None
-    if isinstance(z, str) or (array.dtype.kind != "f"):
-        raise SampleError(f"z = {z!r} is not an array of numbers.")
     if array.ndim == 0 and observed.size == 1:
         array = array.reshape(1)
     if array.shape != (observed.size,):

@@ -262,6 +262,8 @@ class Model:
         q = q.copy()
         q[self.parameter_space.fixed] = 0.0
         lower, upper = self.parameter_space.bounds
+        if not np.isfinite(q).all():
+            raise ModelError("q0 holds values that are not finite.")
         if np.any(q < lower) or np.any(q > upper):
             raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
         return q

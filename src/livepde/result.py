@@ -190,7 +190,8 @@ class Result:
         data["status"] = ("time", np.array(rows[5], dtype=np.int32), flags)
         data["steps"] = ("time", np.array(rows[7], dtype=np.int32), {"long_name": "substeps taken"})
         for name in dict.fromkeys(key for notes in rows[6] for key in notes):
-            data[name] = ("time", np.array([notes.get(name, np.nan) for notes in rows[6]]))
+            key = f"note_{name}" if name in data else name  # an unknown may have the same name
+            data[key] = ("time", np.array([notes.get(name, np.nan) for notes in rows[6]]))
         data.attrs["fields"] = " ".join(self.model.parameter_space.fields)
         data.attrs["scalars"] = "\n".join(self.model.parameter_space.labels)
         data.attrs["state"] = next(iter(self.model.state_space.blocks))

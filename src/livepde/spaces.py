@@ -99,11 +99,16 @@ class HilbertSpace:
             factor = analyse(pattern, symmetric=True).factorise(_data(self.tangent_gram, pattern))
         except LinearAlgebraError as error:
             raise SpaceError(singular) from error
-        # Two steps of inverse iteration find a nearly zero eigenvalue that no pivot shows.
+        # Two steps of inverse iteration find a nearly zero eigenvalue that no pivot shows; on the
+        # matrix scaled to a unit diagonal, since unknowns of a product have different units.
+        scale = np.sqrt(np.abs(self.tangent_gram.diagonal()))
+        if not scale.all():
+            raise SpaceError(singular)
         x = np.random.default_rng(0).standard_normal(self.dim)
         for _ in range(2):
-            x = factor.solve(x / np.linalg.norm(x))
-        largest = abs(self.tangent_gram).sum(axis=1).max()
+            x = scale * factor.solve(scale * x / np.linalg.norm(x))
+        unit = sp.diags_array(1.0 / scale)
+        largest = abs(unit @ self.tangent_gram @ unit).sum(axis=1).max()
         if not np.isfinite(x).all() or np.linalg.norm(x) * largest > LARGEST_CONDITION:
             raise SpaceError(singular)
         if not positive_definite(self.tangent_gram):

@@ -130,15 +130,14 @@ class ScalarBlock(Block):
         for mask, (name, region) in zip(masks, self.unknown.regions.items(), strict=True):
             if callable(region):
                 mask[:] = region(measure.points)
-            elif region in (measure.mesh.subdomains or {}) and not measure.on_boundary:
+            elif region in (measure.mesh.subdomains or {}):
                 members = measure.basis(measure.mesh.elem()).tind
                 if members is None:
                     members = np.arange(measure.mesh.nelements)
                 mask[np.isin(members, measure.mesh.subdomains[region])] = 1.0
             else:
                 raise SpaceError(
-                    f"Region '{name}': the mesh has no subdomain '{region}' here; give a "
-                    "predicate on x (needed on boundaries)."
+                    f"Region '{name}': the mesh has no subdomain '{region}'; give a predicate on x."
                 )
         return masks
 

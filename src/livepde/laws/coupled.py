@@ -16,6 +16,8 @@ from livepde.model import Model
 from livepde.observation import Split
 from livepde.stepping import Newton
 
+RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
+
 __all__ = ["CoupledStage", "Gains"]
 
 
@@ -66,6 +68,7 @@ class CoupledStage:
         self.newton = newton
         self.n = model.X.dim
         self.blocks = (slice(0, self.n), slice(self.n, self.n + model.Q.dim))
+        self.floors = (0.0, RESOLVED * float(np.linalg.norm(model.parameter_space.deviations)))
         self.RT = sp.csr_array(split.R.T)
         self.RM = sp.csr_array(self.RT @ gains.M_op)
         self.RMR = sp.csr_array(self.RM @ split.R)
@@ -183,7 +186,7 @@ class CoupledStage:
             equation: _Equation = _BilinearEquation(self._bilinear, self, c, h, moment, u_alpha)
         else:
             equation = _Equation(self, c, h, moment, u_alpha)
-        return self.newton.solve(equation, start, self.blocks, lagged=True)
+        return self.newton.solve(equation, start, self.blocks, floors=self.floors, lagged=True)
 
 
 class _Equation:

@@ -101,7 +101,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 raise LawError(f"GradientLaw: {name} must be a number >= 0; got {value}.")
 
     def prepare(self, problem: Problem) -> GradientWork:
-        if problem.observed.sensitivity() is not None:
+        if problem.observed.observation.directs:
             raise LawError(
                 "GradientLaw cannot use a sensor that sees a parameter directly: use "
                 "SensitivityLaw, or leave out direct=."

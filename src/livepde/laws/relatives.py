@@ -64,7 +64,7 @@ class _Relative(Law[GradientWork, GradientState]):
         return GradientLaw(self.gain, _Linear(self.mu), newton=self.newton)
 
     def _work(self, problem: Problem, pull: Any, *, at_estimate: bool) -> GradientWork:
-        if problem.observed.sensitivity() is not None:
+        if problem.observed.observation.directs:
             raise LawError(
                 f"{type(self).__name__} cannot use a sensor that sees a parameter directly: use "
                 "SensitivityLaw, or leave out direct=."

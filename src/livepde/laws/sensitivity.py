@@ -320,6 +320,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         here = observed.predict(point.u + point.du, point.q + work.Phi @ point.da, interval.end)
         if failure is not None:
             return point, Report(Status.of(failure), here)
+        if not np.isfinite(y).all():
+            return point, Report(Status("not_finite", "the prediction is not finite"), here)
         h = interval.t1 - interval.t0
         fade = np.exp(-h / self.memory)
         u, L = y[:, 0], fade * y[:, 1 : 1 + k]

@@ -140,7 +140,7 @@ class Observed:
         self.X = X
         self.parameter = parameter
         block = next(iter(state.fields.values()))
-        self.G = sp.csr_array(observation.matrix(block))
+        self.G = sp.csr_array(observation.matrix(block), copy=True).astype(float)
         if self.G.shape[1] != X.dim:
             raise ObservationError(
                 f"The observation matrix has {self.G.shape[1]} columns; the state has {X.dim}."

@@ -17,6 +17,9 @@ __all__ = ["Newton", "StepFailed"]
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
 
+STALLED = 3  # sweeps in a row without a smaller update than before: let Newton try
+
+
 class StepFailed(Exception):
     """A stage that did not converge; caught by the step control, never seen by users."""
 
@@ -73,7 +76,7 @@ class Newton:
         y: Array,
         blocks: tuple[slice, ...] = (slice(None),),
         *,
-        affine: bool = False,
+        floors: tuple[float, ...] = (),
         lagged: bool = False,
     ) -> Array:
         """Return the solution, starting from y.
@@ -82,8 +85,9 @@ class Newton:
         ----------
         blocks
             Parts of y measured separately (state and parameter have different units).
-        affine
-            The equation is affine: one update solves it.
+        floors
+            Norm of each block below which it counts as this large: a block of nothing but rounding
+            errors has no relative accuracy.
         lagged
             Begin with lagged sweeps.
 
@@ -93,8 +97,10 @@ class Newton:
             "not_converged", "not_finite" or "singular".
         """
         factor: Factor | None = None
-        begin = y
+        begin = start = y
+        floors = floors or (0.0,) * len(blocks)
         last, basin, sweeps = np.inf, self.basin, lagged
+        least, first, stalled = np.inf, np.inf, 0
         for _ in range(self.iterations):
             residual = equation.residual(y)
             try:
@@ -103,25 +109,30 @@ class Newton:
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
-            size = _relative(update, new, blocks)
+            size = _relative(update, new, blocks, floors)
             if not math.isfinite(size):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
-            if affine:
-                return new
             ratio = size / last
             if ratio >= 0.5 and size <= ROUNDING:
                 return new  # updates that no longer shrink down there are rounding errors
-            if ratio >= 1.0 and lagged and not sweeps:
+            if lagged and not sweeps and size >= first:
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
                 y, factor, sweeps, last, basin = begin, None, True, np.inf, 0.3 * basin
+                first, stalled = np.inf, 0
                 continue
+            if not sweeps and math.isinf(first):
+                first = size
             y = new
             # The error left behind is about ratio/(1 - ratio) times the update.
             left = size * ratio / (1.0 - ratio) if 0.0 < ratio < 1.0 else np.inf
             if size == 0.0 or left <= self.tolerance:
                 return y
             last = size
-            if sweeps and size <= basin:
+            stalled = stalled + 1 if sweeps and size > 0.9 * least else 0
+            least = min(least, size)
+            if sweeps and stalled == STALLED:
+                y = start  # sweeps that jump about lead nowhere: Newton from where they began
+            if sweeps and (size <= basin or stalled == STALLED):
                 # Newton's first update may be larger: sweeps creep, Newton goes all the way.
                 begin, factor, sweeps, last = y, None, False, np.inf
             elif sweeps or ratio > self.refresh:
@@ -132,14 +143,16 @@ class Newton:
         )
 
 
-def _relative(update: Array, y: Array, blocks: tuple[slice, ...]) -> float:
+def _relative(
+    update: Array, y: Array, blocks: tuple[slice, ...], floors: tuple[float, ...]
+) -> float:
     """Return the largest update of a block relative to the block, in Euclidean norms."""
     worst = 0.0
-    for block in blocks:
+    for block, floor in zip(blocks, floors, strict=True):
         change, size = update[block], y[block]
         square = float(change @ change)
         if not math.isfinite(square):  # max() would pass over a value that is not a number
             return np.inf
         if square != 0.0:
-            worst = max(worst, square / max(float(size @ size), 1e-300))
+            worst = max(worst, square / max(float(size @ size), floor**2, 1e-300))
     return math.sqrt(worst)

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from livepde.errors import LinearAlgebraError
 from livepde.fem import START, Moment
 from livepde.linalg import Array, Assembler, Factor, Pattern, Solver, analyse
 from livepde.model import Model
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.newton import Newton
+from livepde.stepping.newton import Newton, StepFailed
 
 __all__ = ["ForwardStage", "simulate"]
 
@@ -66,7 +67,10 @@ class ForwardStage:
 
     def _factorise(self, data: Array) -> Factor:
         solver, rows, fixed = self._free
-        return solver.factorise(rows @ data + fixed)
+        try:
+            return solver.factorise(rows @ data + fixed)
+        except LinearAlgebraError as error:
+            raise StepFailed("singular", str(error)) from error
 
     @cached_property
     def _offset(self) -> tuple[Array, sp.csr_array]:
@@ -94,7 +98,7 @@ class ForwardStage:
             residual = system.matrix @ u - model.mass @ (c / h) + system.offset - model.F(moment)
             return u - system.factor.solve(residual * model.X.free)
         equation = _Equation(self, c, q, h, moment)
-        return self.newton.solve(equation, u, affine=model.affine)
+        return self.newton.solve(equation, u)
 
     def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised Jacobian at a solved stage, for sensitivities."""
