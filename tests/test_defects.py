@@ -1,0 +1,177 @@
+"""Defects that a review found once, each by its smallest example."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from problems import diffusion, laplace, line, observe, product, truth
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde.diagnostics import check_model
+
+ZERO = {"boundary": 0.0}
+
+
+def conduction(prior=1.0, **options):
+    return lp.Model(
+        lp.Field(line(20), ElementLineP1(), dirichlet=ZERO),
+        lp.Scalar(prior),
+        A=diffusion,
+        f=lambda x, t: 10 * (1 + np.sin(3 * t)) + 0 * x[0],
+        **options,
+    )
+
+
+@pytest.mark.parametrize("start", [0.3, 1.0, 1.3])
+def test_an_unknown_in_the_principal_part_is_found_from_partial_data(start):
+    """Lagged sweeps held A(w) q whole: the iteration went to q = 0 and called it ok."""
+    model = conduction()
+    times = 0.1 * np.arange(60)
+    states = truth(model, np.array([1.3]), 0.0, times)
+    omega = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87))
+    ident = lp.Identifier(model, omega, lp.GradientLaw(gain=10.0), q0=start)
+    for t, u in zip(times[1:], states[1:], strict=True):
+        estimate = ident.step(t, ident.observed.G @ u)
+        assert estimate.status.ok
+        assert estimate.steps == 1
+    assert estimate.q[0] == pytest.approx(1.3, abs=1e-3)
+
+
+@pytest.mark.parametrize("sensors", [lp.Full(), lp.Points([0.2, 0.6])])
+def test_a_sample_without_any_value_is_a_step_of_the_model(sensors):
+    ident = lp.Identifier(conduction(), sensors, lp.GradientLaw())
+    estimate = ident.step(0.1, np.full(ident.observed.size, np.nan))
+    assert estimate.status.ok
+    np.testing.assert_allclose(
+        estimate.u, truth(conduction(), np.array([1.0]), 0.0, [0.0, 0.1])[-1]
+    )
+
+
+@pytest.mark.parametrize("start", [0.0, 0.5])
+def test_a_parameter_of_zero_is_no_failure(start):
+    """q is nothing but rounding errors then, and has no relative accuracy."""
+    model = lp.Model(
+        lp.Field(line(10), ElementLineP1(), dirichlet=ZERO),
+        lp.Scalar(0.0),
+        A=product,
+        B=laplace,
+        f=1.0,
+    )
+    states = truth(model, np.array([0.0]), 0.0, 0.5 * np.arange(40))
+    G = observe(model, lp.Full()).G
+    ident = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=1e3), q0=start, u0=states[-1])
+    for k in range(1, 200):
+        assert ident.step(0.1 * k, G @ states[-1]).status.ok
+    assert abs(ident.estimate().q[0]) < 1e-6
+
+
+def test_unknowns_of_very_different_units():
+    model = lp.Model(
+        lp.Field(line(8), ElementLineP1(), dirichlet=ZERO),
+        {"D": lp.Scalar(5e-7, 1e-7), "T": lp.Scalar(10.0, 10.0)},
+        A=lambda q, u, v, x: 1e7 * q.D * lp.dot(lp.grad(u), lp.grad(v)) - q.T * v,
+    )
+    check_model(model, u=1.0).raise_if_failed()
+
+
+def test_a_form_that_is_affine_at_times_is_not_affine():
+    def solve(bend):
+        model = lp.Model(
+            lp.Field(line(4), ElementLineP1()),
+            lp.Scalar(0.0),
+            A=product,
+            B=lambda u, v, x: (np.maximum(x.t - 1, 0) * u**3 + bend * u**2) * v,
+        )
+        return truth(model, np.array([0.0]), 10.0, [0.0, 1.0, 2.0, 3.0])[-1]
+
+    np.testing.assert_allclose(solve(0.0), solve(1e-12), rtol=1e-6)
+
+
+def test_a_singular_stage_is_a_status():
+    model = lp.Model(lp.Field(line(4), ElementLineP1()), lp.Scalar(-1.0), A=product)
+    law = lp.SensitivityLaw(noise=0.1)
+    ident = lp.Identifier(model, lp.Points([0.5]), law, u0=1.0)
+    assert ident.step(1.0, [2.0]).status.code in ("ok", "singular")
+
+
+def test_a_prediction_that_is_not_a_number_is_not_accepted():
+    model = lp.Model(
+        lp.Field(line(4), ElementLineP1()),
+        lp.Scalar(0.0),
+        A=product,
+        f=lambda x, t: np.nan if abs(t - 0.2) < 1e-9 else 1.0,
+    )
+    ident = lp.Identifier(model, lp.Points([0.5]), lp.SensitivityLaw(noise=0.1))
+    assert ident.step(0.1, [0.1]).status.ok
+    assert ident.step(0.2, [np.nan]).status.code == "not_finite"
+    assert ident.step(0.3, [0.3]).status.ok
+
+
+def test_a_checkpoint_of_other_options_is_refused_and_changes_nothing(tmp_path):
+    mesh = line(8)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet=ZERO),
+        lp.Field(mesh, ElementLineP1(), inner="H1"),
+        A=product,
+        B=laplace,
+        f=1.0,
+    )
+    few, many = (
+        lp.Identifier(model, lp.Points([0.5]), lp.SensitivityLaw(modes=k, noise=0.1))
+        for k in (3, 5)
+    )
+    few.step(0.1, [0.1])
+    few.save(tmp_path / "few.npz")
+    many.step(0.05, [0.1])
+    before = many.t, many._state
+    with pytest.raises(lp.RunError, match="does not fit"):
+        many.load(tmp_path / "few.npz")
+    assert (many.t, many._state) == before
+
+
+def test_a_checkpoint_from_before_the_start_starts_again(tmp_path):
+    one, two = (lp.Identifier(conduction(), lp.Full(), lp.GradientLaw()) for _ in range(2))
+    z = np.full(one.observed.size, 0.1)
+    one.save(tmp_path / "fresh.npz")
+    two.step(0.1, z)
+    two.load(tmp_path / "fresh.npz")
+    np.testing.assert_array_equal(two.step(0.1, z).u, one.step(0.1, z).u)
+
+
+def test_notes_of_a_law_never_hide_an_unknown():
+    model = lp.Model(
+        lp.Field(line(10), ElementLineP1(), dirichlet=ZERO),
+        {"residual": lp.Scalar(2.0)},
+        A=lambda q, u, v, x: q.residual * u * v,
+        B=laplace,
+    )
+    ident = lp.Identifier(model, lp.Full(), lp.GradientLaw())
+    result = ident.run([(0.1, np.zeros(ident.observed.size))])
+    assert float(result.to_xarray()["residual"][-1]) == result.last.parameters["residual"][0]
+
+
+def test_the_users_matrix_is_his_own():
+    model = conduction()
+    G = sp.csr_array(np.eye(3, model.X.dim) + 1e-18)
+    before = G.nnz
+    observed = observe(model, lp.Matrix(G))
+    assert G.nnz == before
+    G.data[:] = 7.0
+    assert abs(observed.G).max() == 1.0
+
+
+def test_text_and_nothing_are_no_numbers():
+    ident = lp.Identifier(conduction(), lp.Points([0.5]), lp.GradientLaw())
+    with pytest.raises(lp.SampleError, match="not an array of numbers"):
+        ident.step(0.1, ["1.5"])
+    with pytest.raises(lp.ModelError, match="not finite"):
+        lp.Identifier(conduction(), lp.Points([0.5]), lp.GradientLaw(), q0=np.nan)
+
+
+def test_a_direct_sensor_that_reads_an_input_is_refused_by_its_law():
+    model = conduction(inputs=("Q",))
+    sensors = lp.Points({"a": 0.5}, direct={"a": lambda q, x: q * x.inputs["Q"]})
+    with pytest.raises(lp.LawError, match="SensitivityLaw"):
+        lp.Identifier(model, sensors, lp.GradientLaw())
