@@ -17,7 +17,7 @@ __all__ = ["Newton", "StepFailed"]
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
 
-STALLED = 3  # sweeps in a row without a smaller update than before: let Newton try
+STALLED = 10  # sweeps in a row without a smaller update than before: let Newton try
 
 
 class StepFailed(Exception):
