@@ -17,7 +17,7 @@ __all__ = ["Newton", "StepFailed"]
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
 
-STALLED = 10  # sweeps in a row without a smaller update than before: let Newton try
+STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
 
 
 class StepFailed(Exception):
@@ -100,7 +100,7 @@ class Newton:
         begin = start = y
         floors = floors or (0.0,) * len(blocks)
         last, basin, sweeps = np.inf, self.basin, lagged
-        least, first, stalled = np.inf, np.inf, 0
+        first, stalled = np.inf, 0
         for _ in range(self.iterations):
             residual = equation.residual(y)
             try:
@@ -128,8 +128,7 @@ class Newton:
             if size == 0.0 or left <= self.tolerance:
                 return y
             last = size
-            stalled = stalled + 1 if sweeps and size > 0.9 * least else 0
-            least = min(least, size)
+            stalled = stalled + 1 if sweeps and size > 0.9 else 0
             if sweeps and stalled == STALLED:
                 y = start  # sweeps that jump about lead nowhere: Newton from where they began
             if sweeps and (size <= basin or stalled == STALLED):
