@@ -565,3 +565,17 @@ def test_thermal_response_does_not_depend_on_the_prior(tmp_path):
         early = data.innovation.values[data.time.values < prepared.assimilate_from]
         assert np.sqrt(np.nanmean(early**2)) > 5 * found["rmse"]  # the model is wrong there
     assert max(ends) - min(ends) <= 0.05
+
+
+def test_a_misspelt_expectation(rod):
+    (note,) = cases.load(rod(("alpha = [9e-5", "alpah = [9e-5"))).notes
+    assert note.startswith("expect.alpah: a run of this case has no such number; did you mean")
+
+
+def test_decimal_commas_are_not_cut(rod):
+    path = rod()
+    data = path.with_name("rod.csv")
+    header, *rows = data.read_text().splitlines()
+    data.write_text("\n".join([header, *(row.replace(".", ",") for row in rows)]) + "\n")
+    with pytest.raises(lp.DataError, match=r"row 2: .* fields, but the header has 6"):
+        cases.load(path).prepare()

@@ -17,7 +17,7 @@ from livepde.cases.data import assimilation_start, clock_of, read_data
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
-from livepde.cases.read import read_spec, read_text
+from livepde.cases.read import did_you_mean, read_spec, read_text
 from livepde.cases.schema import GradientSpec, SensitivitySpec
 from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
 from livepde.errors import DataError, LawError
@@ -247,7 +247,24 @@ class Case:
                 "The gradient law is made for observed subdomains and averages; a few noisy point "
                 "sensors mislead it. Use law.kind = 'sensitivity' for points."
             )
-        return found
+        return found + self._expected_notes()
+
+    def _expected_notes(self) -> list[str]:
+        """Name expected numbers that no run of this case can have; see `runs.measures`."""
+        labels = list(self.model.parameter_space.labels)
+        scored = list(self.frame.roles("sensor", "withheld"))
+        known = [
+            *labels,
+            *(f"{label}.std" for label in labels),
+            "rmse",
+            *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
+            "failed_steps",
+        ]
+        return [
+            f"expect.{name}: a run of this case has no such number; {did_you_mean(name, known)}"
+            for name in self.expected
+            if name not in known
+        ]
 
     def prepare(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return an identifier and its stream.

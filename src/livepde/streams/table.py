@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import difflib
 import json
 import math
@@ -143,6 +144,7 @@ def read_csv(
         for name in needed:
             if name not in header:
                 raise SampleError(f"{path}: there is no column '{name}'{_hint(name, header)}")
+        _check_widths(path, len(header))
         frame = pd.read_csv(
             path,
             usecols=sorted(set(needed)),
@@ -256,6 +258,17 @@ class JsonLines:
             value = _number(row.get(name), f"{where}, '{name}'")
             numbers.append(math.nan if value in self._missing else value)
         return column.factor * sum(numbers) / len(numbers) + column.offset
+
+
+def _check_widths(path: Path, width: int) -> None:
+    """Refuse a row with more fields than the header: pandas would cut it without a word."""
+    with path.open(newline="", encoding="utf-8") as file:
+        for number, row in enumerate(csv.reader(file), start=1):
+            if any(field.strip() for field in row[width:]):
+                raise SampleError(
+                    f"{path}, row {number}: {len(row)} fields, but the header has {width}; "
+                    "decimals need a point, and fields with a comma in them quotes."
+                )
 
 
 def read_json_lines(
