@@ -17,6 +17,7 @@ from livepde.stepping import ForwardStage, Interval, advance
 __all__ = ["Replay", "SensitivityLaw", "SensitivityState"]
 
 CONVERGED = 0.5  # standard deviations between reference and estimate at which replays stop
+STRIDE = 1.0  # prior deviations that a replay moves its reference at most: a trust region
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,9 @@ class Replay:
     forgets. With a replay the filter stays linear about one reference, and whenever the number of
     assimilated samples has doubled, the reference is moved to the estimate and the stored samples
     are run through again, until reference and estimate agree within half a standard deviation: a
-    Gauss-Newton iteration. One replay for each doubling makes less than four times the steps in
-    all; more than one is needed mostly while the store is short.
+    Gauss-Newton iteration, whose steps are at most one prior deviation long. One replay for each
+    doubling makes less than four times the steps in all; more than one is needed mostly while the
+    store is short.
 
     Parameters
     ----------
@@ -369,9 +371,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return replace(state, now=now, samples=samples, assimilated=used)
 
     def _replayed(self, work: SensitivityWork, state: SensitivityState) -> tuple[Point, Status]:
-        """Run the stored samples again about the reference q_ref = the estimate now."""
+        """Run the stored samples again about a reference at the estimate, or on the way to it."""
         start, samples = state.start, state.samples
-        q = work.bounded(work.latent(state.now))
+        reference = state.now.q
+        step = work.reduced(work.bounded(work.latent(state.now)) - reference)
+        step = step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
+        q = reference + work.Phi @ step
         shift = work.reduced(q - start.q)
         along = _along(start, shift)
         point = replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
