@@ -416,17 +416,20 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
         control = work.problem.control
         y, steps, failure = advance(control, stage, np.column_stack(columns), interval)
-        here = work.predict(before, interval.end)
+
+        def failed(status: Status) -> tuple[Point, Report]:
+            return before, Report(status, work.predict(before, interval.end))
+
         if failure is not None:
-            return before, Report(Status.of(failure), here)
+            return failed(Status.of(failure))
         if not np.isfinite(y).all():
-            return before, Report(Status("not_finite", "the prediction is not finite"), here)
+            return failed(Status("not_finite", "the prediction is not finite"))
         fade = np.exp(-(interval.t1 - interval.t0) / self.memory)
         moved = replace(point, u=y[:, 0], U=fade * y[:, 1:-1], du=y[:, -1])
         predicted = work.predict(moved, interval.end)
         new, refused = self._update(work, moved, interval, predicted)
         if not np.isfinite(new.da).all():
-            return before, Report(Status("not_finite", "the update is not finite"), here)
+            return failed(Status("not_finite", "the update is not finite"))
         notes = {
             "innovation_ratio": new.consistency.ratio,
             "innovation_correlation": new.consistency.correlation,
@@ -469,22 +472,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if not used.any():
             return point, count
         Y = Y[used]
-        # (I + Y^T Y)^-1 = R^-1 R^-T from a QR factorisation of [I; Y].
-        rank = Y.shape[1]
-        root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(rank), Y]), mode="r"))
+        # (I + Y^T Y)^-1 = W W^T with W = R^-1 from a QR factorisation of [I; Y].
+        root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(Y.shape[1]), Y]), mode="r"))
         # SciPy's triangular solve would start threads for this small matrix; this one does not.
-        joint = np.vstack([point.C, point.U])
-        factor: Array = np.asarray(np.linalg.solve(root.T, joint.T).T, dtype=float)
-        half = np.linalg.solve(root.T, Y.T @ (d / work.noise)[used])
-        step = factor @ half
-        k = len(point.da)
-        new = replace(
-            point,
-            da=point.da + step[:k],
-            du=point.du + step[k:],
-            C=factor[:k],
-            U=factor[k:],
-        )
+        W: Array = np.asarray(np.linalg.inv(root), dtype=float)
+        half = W.T @ (Y.T @ (d / work.noise)[used])
+        U, C = point.U @ W, point.C @ W
+        new = replace(point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U)
         return new, count
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
