@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from livepde.fem.blocks import FieldBlock
+from livepde.fem.branches import absolute, maximum, minimum, positive
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.fields import (
     Channel,
@@ -49,6 +50,7 @@ __all__ = [
     "Scalars",
     "Sobolev",
     "Unknown",
+    "absolute",
     "box",
     "compose",
     "ddot",
@@ -59,6 +61,9 @@ __all__ = [
     "hess",
     "interval",
     "linear",
+    "maximum",
+    "minimum",
+    "positive",
     "quadratic",
     "rectangle",
     "smooth",
