@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from livepde.models.base import Equation, Option, Quantity, Variable
 from livepde.models.diffusion import HEAT, heat
+from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
 from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
 
@@ -14,11 +15,14 @@ __all__ = [
     "Quantity",
     "Variable",
     "borehole",
+    "fisher_kpp",
     "fluid",
     "heat",
+    "porous_fisher",
     "reaction_diffusion",
 ]
 
 EQUATIONS: dict[str, Equation] = {
-    equation.name: equation for equation in (HEAT, BOREHOLE, REACTION_DIFFUSION)
+    equation.name: equation
+    for equation in (HEAT, BOREHOLE, REACTION_DIFFUSION, FISHER_KPP, POROUS_FISHER)
 }
