@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -117,6 +117,9 @@ class Field:
         prior covariance is the inverse Gram matrix.
     unit, name
         For tables and plots.
+    periodic
+        Pairs of boundaries of equal shape, as in (("left", "right"),): the function goes on behind
+        the second as behind the first.
     """
 
     mesh: Mesh
@@ -128,6 +131,7 @@ class Field:
     unit: str = ""
     name: str = ""
     quadrature: int | None = None
+    periodic: Sequence[tuple[str, str]] = ()
 
     def __post_init__(self) -> None:
         if isinstance(self.inner, str) and self.inner not in ("L2", "H1", "H2"):
@@ -140,6 +144,16 @@ class Field:
             if name not in known:
                 raise SpaceError(
                     f"dirichlet: the mesh has no boundary '{name}'; it has {sorted(known)}."
+                )
+        for name in [name for pair in self.periodic for name in pair]:
+            if name not in known - {"boundary"}:
+                raise SpaceError(
+                    f"periodic: the mesh has no boundary '{name}'; it has {sorted(known)}."
+                )
+            if {name, "boundary"} & set(self.dirichlet):
+                raise SpaceError(
+                    f"'{name}' is periodic and has a Dirichlet value: leave one of both out, and "
+                    'name the other boundaries instead of "boundary".'
                 )
         _check_prior("Field", self.std, (-np.inf, np.inf), self.prior)
 

@@ -48,7 +48,7 @@ class _Term:
     spaces: Mapping[str, LocalSpace]
 
     def evaluate(self, values: Mapping[str, Array], moment: Moment) -> tuple[Any, Place]:
-        place = Place(self.measure.points, self.measure.normal, moment)
+        place = self.measure.place(moment)
         jets = [self.spaces[name].jets(array) for name, array in values.items()]
         return self.integrand(*jets, place), place
 
@@ -202,7 +202,7 @@ class Form:
     def _vector(self, slot: str, moment: Moment, coefficients: Mapping[str, Array]) -> Array:
         result = np.zeros(self.spaces[slot].dim)
         for term in self.terms:
-            place = Place(term.measure.points, term.measure.normal, moment)
+            place = term.measure.place(moment)
             jets = [
                 local.unit_jets(0, 1)
                 if key == slot
@@ -308,7 +308,7 @@ class Form:
             else:
                 step = 1j * STEP * local.units(axis[key], 2)
                 jets.append(local.jets(here[:, None, None] + step))
-        place = Place(term.measure.points, term.measure.normal, moment)
+        place = term.measure.place(moment)
         if self.nonlinear not in axis:
             return np.asarray(term.integrand(*jets, place))
         if given is not None:
