@@ -14,6 +14,11 @@ from skfem import (
 import livepde as lp
 from livepde.fem import START, Inputs, Moment
 from livepde.stepping import Advance, Alexander2, simulate
+from livepde.streams import Twin
+
+
+def twin_of(model, sensors, q, times, **options):
+    return Twin(model=model, observation=sensors, q_true=q, times=times, **options)
 
 
 def diffusion(u, v):
@@ -117,8 +122,8 @@ def test_both_laws_learn_an_exchange_rate(mesh, sparse):
         sensors, law = lp.Points([0.3, 0.7], of="c", noise=1e-3), lp.SensitivityLaw()
     else:
         sensors = lp.Full(of="c")
-        law = lp.GradientLaw(gain=30.0, damping=lp.ResidualDamping(c1=1.0))
-    twin = lp.Twin(model, sensors, {"k": 2.5}, times, u0=0.0, inputs=inflow)
+        law = lp.GradientLaw(gain=1e3, damping=lp.ResidualDamping(c1=1.0))
+    twin = twin_of(model, sensors, {"k": 2.5}, times, u0=0.0, inputs=inflow)
     ident = lp.Identifier(model, sensors, law)
     result = ident.run(twin)
     assert twin.error(result.last.q) < (0.01 if sparse else 0.05)
@@ -135,7 +140,7 @@ def test_plots_draw_every_component(mesh):
     pytest.importorskip("matplotlib")
     model = exchange(mesh)
     sensors = lp.Points([0.3], of="c", noise=0.1)
-    twin = lp.Twin(
+    twin = twin_of(
         model, sensors, {"k": 2.0}, [0.0, 0.1, 0.2], u0=0.0, inputs=lambda t: {"inflow": 1.0}
     )
     result = lp.Identifier(model, sensors, lp.SensitivityLaw()).run(twin)
@@ -149,13 +154,13 @@ def test_truth_on_another_mesh_and_by_formula(mesh):
     sensors = lp.Points([0.3], of="s")
     options = {"inputs": lambda t: {"inflow": 1.0}}
     fine = exchange(lp.interval(0.0, 1.0, 40))
-    twin = lp.Twin(
+    twin = twin_of(
         exchange(mesh), sensors, {"k": 2.0}, [0.0, 0.2], u0=0.0, truth="fine", fine=fine, **options
     )
-    coarse = lp.Twin(exchange(mesh), sensors, {"k": 2.0}, [0.0, 0.2], u0=0.0, **options)
+    coarse = twin_of(exchange(mesh), sensors, {"k": 2.0}, [0.0, 0.2], u0=0.0, **options)
     assert np.abs(twin.u(0.2) - coarse.u(0.2)).max() < 0.2
     formula = {"c": lambda x, t: 1.0 + 0 * x[0], "s": lambda x, t: x[0] * t}
-    twin = lp.Twin(
+    twin = twin_of(
         exchange(mesh), sensors, {"k": 2.0}, [0.0, 0.2], u_true=formula, truth="analytic", **options
     )
     assert twin.exact_data[1] == pytest.approx(0.06)

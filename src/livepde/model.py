@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -35,8 +36,8 @@ Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
 
 
 def mass_form(u: Any, v: Any, x: Any) -> Any:
-    """The L2 inner product, u v."""
-    return u * v
+    """The L2 inner product, u v; of several components their sum."""
+    return _summed(lambda u, v: u * v, u, v)
 
 
 def _product(space: FunctionSpace) -> Integrand:
@@ -56,8 +57,14 @@ def _pointwise(block: FieldBlock) -> Callable[[Any, Any], Any]:
 
 
 def h1_form(u: Any, v: Any, x: Any) -> Any:
-    """The H1 inner product, u v + grad u . grad v."""
-    return u * v + dot(grad(u), grad(v))
+    """The H1 inner product, u v + grad u . grad v; of several components their sum."""
+    return _summed(lambda u, v: u * v + dot(grad(u), grad(v)), u, v)
+
+
+def _summed(form: Callable[[Any, Any], Any], u: Any, v: Any) -> Any:
+    if not isinstance(u, SimpleNamespace):
+        return form(u, v)
+    return sum(form(part, getattr(v, name)) for name, part in vars(u).items())
 
 
 def _no_term(u: Any, v: Any, x: Any) -> Any:

@@ -15,7 +15,7 @@ from livepde.fem.fields import (
     interval,
 )
 from livepde.fem.forms import Form
-from livepde.fem.meshes import box, hermite, linear, quadratic, rectangle, smooth
+from livepde.fem.meshes import box, hermite, linear, quadratic, read_mesh, rectangle, smooth
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
 from livepde.fem.sobolev import Sobolev
@@ -48,6 +48,7 @@ __all__ = [
     "interval",
     "linear",
     "quadratic",
+    "read_mesh",
     "rectangle",
     "smooth",
     "trace",
