@@ -17,9 +17,10 @@ from livepde.fem.fields import (
 from livepde.fem.forms import Form
 from livepde.fem.meshes import box, hermite, linear, quadratic, read_mesh, rectangle, smooth
 from livepde.fem.place import START, Inputs, Moment, Place
-from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
+from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace
+from livepde.fem.upwind import upwind
 
 __all__ = [
     "START",
@@ -47,10 +48,12 @@ __all__ = [
     "hess",
     "interval",
     "linear",
+    "mul",
     "quadratic",
     "read_mesh",
     "rectangle",
     "smooth",
     "trace",
     "transpose",
+    "upwind",
 ]

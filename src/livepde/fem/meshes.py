@@ -185,8 +185,10 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
         ) from error
     with _quiet():
         mesh = _loaded(path, meshio, from_meshio)
+    if type(mesh) in LINEAR:  # centres of arcs and the like belong to no cell
+        mesh = mesh.remove_unused_nodes()
     if scale != 1.0:
-        mesh = mesh.scaled(scale)
+        mesh = mesh.scaled(float(scale))
     boundaries = {k: v for k, v in (mesh.boundaries or {}).items() if _is_name(k) and len(v)}
     subdomains = {k: v for k, v in (mesh.subdomains or {}).items() if _is_name(k) and len(v)}
     return replace(mesh, _boundaries=boundaries or None, _subdomains=subdomains or None)
@@ -216,8 +218,8 @@ def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
         read = meshio.read(path)
     except (Exception, SystemExit) as error:
         raise SpaceError(
-            f"read_mesh: '{path}' cannot be read ({str(error) or type(error).__name__}): check that "
-            "its ending tells its format, or save it again as Gmsh 4.1 (.msh)."
+            f"read_mesh: '{path}' cannot be read ({str(error) or type(error).__name__}): "
+            "check that its ending tells its format, or save it again as Gmsh 4.1 (.msh)."
         ) from error
     try:
         mesh: Mesh = from_meshio(read, ignore_orientation=True)

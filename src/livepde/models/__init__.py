@@ -6,6 +6,7 @@ from livepde.models.base import Equation, Option, Quantity, Variable
 from livepde.models.diffusion import HEAT, heat
 from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
+from livepde.models.wave import WAVE, wave
 
 __all__ = [
     "EQUATIONS",
@@ -17,8 +18,9 @@ __all__ = [
     "fluid",
     "heat",
     "reaction_diffusion",
+    "wave",
 ]
 
 EQUATIONS: dict[str, Equation] = {
-    equation.name: equation for equation in (HEAT, BOREHOLE, REACTION_DIFFUSION)
+    equation.name: equation for equation in (HEAT, BOREHOLE, REACTION_DIFFUSION, WAVE)
 }
