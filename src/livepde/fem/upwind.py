@@ -18,7 +18,7 @@ def upwind(b: Any, kappa: Any, h: Any) -> Any:
 
     Added to kappa, it makes elements of first order on a uniform line exact at the vertices for
     the steady -kappa u'' + b u' = 0, however large the cell Peclet number Pe (Brooks and Hughes
-    1982, equation 3.3.2); it vanishes like h^2 on fine meshes. In more dimensions it acts along
+    1982, section 2); it vanishes like h^2 on fine meshes. In more dimensions it acts along
     the streamlines only. Smooth also at b = 0, so that derivatives by complex steps hold.
 
     Parameters
