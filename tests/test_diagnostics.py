@@ -60,13 +60,24 @@ def test_a_form_that_is_not_analytic_is_found():
     assert any("B'(u)" in name for name in failed(report))
 
 
-def test_a_form_that_is_not_linear_in_q_is_found():
+def test_a_form_that_is_not_linear_in_q_has_its_derivatives_checked():
     model = lp.Model(
         lp.Field(line(6), ElementLineP1()),
         lp.Scalar(1.0),
         A=lambda q, u, v, x: q**2 * u * v,
     )
-    assert any("linear in q" in name for name in failed(check_model(model, u=1.0)))
+    report = check_model(model, u=1.0)
+    report.raise_if_failed()
+    assert any("/dq" in line.name for line in report.lines)
+
+
+def test_a_form_that_is_not_analytic_in_q_is_found():
+    model = lp.Model(
+        lp.Field(line(6), ElementLineP1()),
+        lp.Scalar(1.0),
+        A=lambda q, u, v, x: abs(q) ** 1.5 * u * v,
+    )
+    assert any("/dq" in name for name in failed(check_model(model, u=1.0)))
 
 
 def test_an_unsymmetric_mass_is_refused():

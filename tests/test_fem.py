@@ -342,7 +342,7 @@ def test_product_of_unknowns():
     np.testing.assert_array_equal(model.initial_parameter({"R": 5.0})[20:], 5.0)
     np.testing.assert_array_equal(model.initial_parameter(q), q)
     assert model.Q.gram.toarray()[0, 0] == pytest.approx(1 / 0.5**2)
-    lower, upper = space.bounds
+    lower, upper = model.latent.bounds
     assert (lower[0], upper[0], lower[5], upper[21]) == (0.0, 9.0, -np.inf, np.inf)
     u = model.initial(lambda x: x[0])
     regions = model.A(u)(q * (np.arange(22) > 19))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -65,7 +65,7 @@ class Identifier:
         How estimates are updated.
     q0, u0
         Where to start: numbers, functions of x, coefficients, or for several unknowns a mapping.
-        q0 defaults to the prior mean.
+        q0 defaults to the prior mean, u0 to what the model says (`initial`), else zero.
     t0
         Initial time. A first sample at exactly t0 describes the start and takes no step.
     withheld
@@ -88,7 +88,7 @@ class Identifier:
         law: AnyLaw,
         *,
         q0: Any = None,
-        u0: Any = 0.0,
+        u0: Any = None,
         t0: float = 0.0,
         withheld: Observation | None = None,
         scheme: Scheme | None = None,
@@ -109,7 +109,11 @@ class Identifier:
         self._check_names()
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
-        self._u0 = model.state_space.interpolate(u0)
+        if u0 is not None and model.form_initial is not None:
+            raise ConfigurationError(
+                "the model has an initial state of its own (initial=): leave out u0."
+            )
+        self._u0 = model.state_space.interpolate(0.0 if u0 is None else u0)
         self._state: Any = None
         self._t = float(t0)
         self._z = np.full(self.observed.size, np.nan)
@@ -128,7 +132,11 @@ class Identifier:
             )
 
     def _begin(self, inputs: Inputs) -> None:
-        u0 = self.model.impose(self._u0, Moment(self._t, inputs))
+        moment = Moment(self._t, inputs)
+        if self.model.form_initial is not None:
+            u0 = self.model.initial_state(self._q0, moment)
+        else:
+            u0 = self.model.impose(self._u0, moment)
         self._state = self.law.init(self._work, self._q0, u0)
         self._inputs = inputs
 
@@ -179,7 +187,7 @@ class Identifier:
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         if t == self._t:
             moment = Moment(t, values)
-            belief = self.law.belief(self._work, self._state)
+            belief = self._belief()
             report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
         else:
             interval = Interval(self._t, t, self._inputs, values, self._z, used)
@@ -188,6 +196,17 @@ class Identifier:
         if report.status.ok:
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held)
+
+    def _belief(self) -> Belief:
+        """Return what the law believes, of the physical parameter."""
+        belief: Belief = self.law.belief(self._work, self._state)
+        latent = self.model.latent
+        if latent.plain:
+            return belief
+        factor = belief.q_factor
+        if factor is not None:
+            factor = latent.tangent(belief.q, factor)
+        return replace(belief, q=latent.value(belief.q), q_factor=factor)
 
     def _estimate(
         self,
@@ -198,7 +217,7 @@ class Identifier:
         report: Report,
         held: tuple[str, ...],
     ) -> Estimate:
-        belief: Belief = self.law.belief(self._work, self._state)
+        belief = self._belief()
         error = withheld
         if self.withheld is not None:
             error = withheld - self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
@@ -230,7 +249,7 @@ class Identifier:
             )
         nothing = np.full(self.observed.size, np.nan)
         hidden = np.full(self.withheld.size if self.withheld else 0, np.nan)
-        belief = self.law.belief(self._work, self._state)
+        belief = self._belief()
         moment = Moment(self._t, self._inputs)
         report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())

@@ -14,15 +14,18 @@ from livepde.errors import ModelError
 from livepde.fem import (
     START,
     Channel,
+    Composed,
     Field,
     FieldBlock,
     Form,
     FunctionSpace,
     Integrand,
+    Latent,
     Moment,
     On,
     Sobolev,
     Unknown,
+    compose,
     dot,
     grad,
 )
@@ -75,7 +78,9 @@ class Model:
     """A time-dependent PDE with unknown parameters, M u' + B(t, u) + A(t, u) q = F(t) in X*.
 
     The paper's abstract equation (main) with C(q, u) = A(u) q + B(u) (Assumption ass:equation),
-    tested with the basis of X. Frozen: it is built once and never changes.
+    tested with the basis of X. A may be nonlinear in q, too: then the laws take its derivative at
+    the estimate in the place of A(u) (Kaltenbacher and Nguyen 2021). Frozen: it is built once and
+    never changes.
 
     Parameters
     ----------
@@ -85,7 +90,8 @@ class Model:
     parameter
         What is unknown: a `Field`, `Scalar` or `Piecewise`, or a mapping of names to those.
     A
-        Integrand (q, u, v, x), linear in q and v; for a mapping of unknowns `q.name`.
+        Integrand (q, u, v, x), linear in v; for a mapping of unknowns `q.name`. Whether it is
+        linear in q is found out; all of the residual may stand here.
     B
         Integrand (u, v, x), linear in v.
     f
@@ -98,6 +104,9 @@ class Model:
         them a complex step is taken (exact for analytic integrands).
     inputs
         Names of the channels that forms read as x.inputs["name"].
+    initial
+        Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
+        projection is where u begins. Unknowns in it belong to the initial state.
 
     `A`, `B`, `f` and `M` may each be a list of terms; `On("left", form)` restricts a term to a
     named boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time.
@@ -121,6 +130,7 @@ class Model:
         dB: Integrand | Sequence[Integrand] | None = None,
         inputs: Sequence[str] = (),
         time_unit: str = "",
+        initial: Integrand | On | Sequence[Integrand | On] | None = None,
     ) -> None:
         self.state = state
         self.time_unit = time_unit
@@ -133,10 +143,17 @@ class Model:
         pair, triple = {"u": x, "v": x}, {"q": q, "u": x, "v": x}
         self.form_M = self._form("M", _product(x) if M is None else M, pair)
         self.form_B = self._form("B", B, pair, "u", dB)
-        self.form_A = self._form("A", A, triple, "u", dA)
+        self.latent = Latent(q)
+        self.form_A = compose(self._form("A", A, triple, "u", dA, "q"), self.latent)
         sources = f if isinstance(f, Sequence) else [f]
         integrands = [_as_integrand(item, x) for item in sources]
         self.form_F = self._form("f", integrands, {"v": x})
+        self.form_initial: Form | Composed | None = None
+        if initial is not None:
+            pair = {"q": q, "v": x}
+            self.form_initial = compose(
+                self._form("initial", initial, pair, parameter="q"), self.latent
+            )
         if not self.form_M.constant:
             raise ModelError("M may not depend on time or inputs: move the change into B or f.")
 
@@ -147,9 +164,10 @@ class Model:
         spaces: Mapping[str, FunctionSpace],
         nonlinear: str | None = None,
         derivative: Any = None,
+        parameter: str | None = None,
     ) -> Form:
-        mesh, order = self.mesh, self.order
-        return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, self.inputs)
+        mesh, order, inputs = self.mesh, self.order, self.inputs
+        return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
 
     def _check_parameter(self) -> None:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
@@ -198,32 +216,29 @@ class Model:
 
     @cached_property
     def Q(self) -> HilbertSpace:
-        """Parameter space; its Gram matrix is the inverse of the prior covariance."""
-        pairs = zip(
-            self.parameter_space.unknowns.values(),
-            self.parameter_space.blocks.values(),
-            strict=True,
-        )
-        parts = [
-            self._field_space(unknown, block)
-            if isinstance(unknown, Field)
-            else HilbertSpace(sp.csr_array(sp.eye_array(block.size) / unknown.std**2), "Q")
-            for unknown, block in pairs
-        ]
-        return product(parts, "Q", self.parameter_space.fixed)
+        """Space of the latent parameter; its Gram matrix is the inverse of the prior covariance."""
+        parts = []
+        for part in self.latent.parts.values():
+            unknown, size, variance = part.unknown, part.size, part.unknown.latent_std**2
+            if isinstance(unknown, Field):
+                space = self._field_space(unknown, part.block, variance)
+            else:
+                space = HilbertSpace(sp.csr_array(sp.eye_array(size) / variance), "Q")
+            parts += [space] * part.evolution.copies
+        return product(parts, "Q", self.latent.fixed)
 
-    def _field_space(self, field: Field, block: Any) -> HilbertSpace:
+    def _field_space(self, field: Field, block: Any, variance: float) -> HilbertSpace:
         inner: Any = Sobolev(2.0) if field.inner == "H2" else field.inner
         if isinstance(inner, str):
             inner = {"L2": mass_form, "H1": h1_form}[inner]
         form = inner.form(field.element) if isinstance(inner, Sobolev) else inner
         if form is not None:
-            gram = self._on_parameter(field, form) / field.std**2
+            gram = self._on_parameter(field, form) / variance
             return HilbertSpace(sp.csr_array(gram), "Q", block.fixed)
         free = np.ones(block.size)
         free[block.fixed] = 0.0
         mass, K = (self._on_parameter(field, form) for form in (mass_form, inner.operator))
-        border = inner.border(mass, K, free) / field.std**2
+        border = inner.border(mass, K, free) / variance
         return BorderedSpace(sp.csr_array(border), block.size, "Q", block.fixed)
 
     @cached_property
@@ -264,9 +279,14 @@ class Model:
         """True if A and B do not depend on time or inputs."""
         return self.form_A.constant and self.form_B.constant
 
-    def A(self, u: Array, moment: Moment = START) -> DualOperator:
-        """Return A(u): Q -> X*, for coefficients u of shape (n,)."""
-        return DualOperator(self.form_A.matrix("v", "q", moment, u=u), self.Q, self.X)
+    def A(self, u: Array, moment: Moment = START, q: Array | None = None) -> DualOperator:
+        """Return A(u): Q -> X*, for coefficients u of shape (n,).
+
+        For an A that is not linear in the latent parameter its derivative at q, by default the
+        prior mean.
+        """
+        q = self.latent.prior if q is None else q
+        return DualOperator(self.form_A.matrix("v", "q", moment, u=u, q=q), self.Q, self.X)
 
     def B(self, u: Array, moment: Moment = START) -> Array:
         """Return B(u) in X*, shape (n,)."""
@@ -290,14 +310,36 @@ class Model:
         """Return coefficients of u0: a number, a function of x, coefficients, or a mapping."""
         return self.impose(self.state_space.interpolate(u0), moment)
 
+    def initial_state(self, q: Array, moment: Moment = START) -> Array:
+        """Return coefficients of the initial state that belongs to a latent parameter."""
+        if self.form_initial is None:
+            return self.impose(np.zeros(self.X.dim), moment)
+        boundary = self.impose(np.zeros(self.X.dim), moment)
+        functional = self.form_initial.vector("v", moment, q=q) - self._projection.dual(boundary)
+        return boundary + self._projection.riesz(functional)
+
+    @cached_property
+    def _projection(self) -> HilbertSpace:
+        """The state with the L2 inner product."""
+        return HilbertSpace(self.bilinear(_product(self.state_space)), "L2", self.state_space.fixed)
+
+    def initial_directions(self, q: Array, directions: Array, moment: Moment = START) -> Array:
+        """Return du_0/dq applied to columns of shape (m, k): shape (n, k); zero without initial."""
+        if self.form_initial is None:
+            return np.zeros((self.X.dim, directions.shape[1]))
+        return self._projection.riesz(self.form_initial.product("v", "q", directions, moment, q=q))
+
     def initial_parameter(self, q0: Any = None) -> Array:
-        """Return coefficients of q0; None is the prior mean. Fixed coefficients are zero."""
-        q = self.parameter_space.prior if q0 is None else self.parameter_space.interpolate(q0)
-        q = q.copy()
-        q[self.parameter_space.fixed] = 0.0
-        lower, upper = self.parameter_space.bounds
-        if not np.isfinite(q).all():
-            raise ModelError("q0 holds values that are not finite.")
+        """Return latent coefficients of q0; None is the prior mean. Fixed coefficients are zero."""
+        if q0 is None:
+            q = self.latent.prior.copy()
+        else:
+            physical = self.parameter_space.interpolate(q0)
+            if not np.isfinite(physical).all():
+                raise ModelError("q0 holds values that are not finite.")
+            q = self.latent.inverse(physical).copy()
+        q[self.latent.fixed] = 0.0
+        lower, upper = self.latent.bounds
         if np.any(q < lower) or np.any(q > upper):
             raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
         return q

@@ -100,7 +100,7 @@ def check_law(
         _count(
             "bounds kept (violations)",
             lambda: _outside(build(law), run(items)),
-            "clip q to problem.model.parameter_space.bounds.",
+            "clip q to problem.model.latent.bounds.",
         ),
         _count(
             "all sensors missing (failures)",
@@ -154,7 +154,7 @@ def _unusable(estimate: Estimate) -> int:
 
 
 def _outside(identifier: Identifier, estimates: list[Estimate]) -> int:
-    lower, upper = identifier.model.parameter_space.bounds
+    lower, upper = identifier.model.latent.bounds
     return sum(int(((e.q < lower) | (e.q > upper)).sum()) for e in estimates)
 
 

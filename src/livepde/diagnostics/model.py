@@ -11,7 +11,7 @@ import numpy as np
 from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.diagnostics.space import definite, largest, relative
 from livepde.errors import ModelError
-from livepde.fem import Form, Inputs, Moment
+from livepde.fem import Composed, Form, Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 
@@ -117,16 +117,8 @@ class _Point:
         n, m = model.X.dim, model.Q.dim
         centre = model.initial(u, moment)
         width = spread or 0.1 * float(np.abs(centre).max()) or 1.0
-        space = model.parameter_space
-        std = np.concatenate(
-            [
-                np.full(block.size, unknown.std)
-                for block, unknown in zip(
-                    space.blocks.values(), space.unknowns.values(), strict=True
-                )
-            ]
-        )
-        lower, upper = space.bounds
+        std = model.latent.deviations
+        lower, upper = model.latent.bounds
         prior = model.initial_parameter(q)
         varied = np.clip(prior + std * rng.standard_normal(m), lower, upper) * model.Q.free
         return cls(
@@ -150,11 +142,16 @@ def _densities(form: Form, moment: Moment, **coefficients: Array) -> Array:
     return np.concatenate(found)
 
 
+def _plain(form: Form | Composed) -> Form:
+    """Return the form in the physical parameter."""
+    return form.form if isinstance(form, Composed) else form
+
+
 def _finite(model: Model, at: _Point) -> list[CheckLine]:
     values = {
         "F": model.F(at.moment),
         "B(u)": model.B(at.u, at.moment),
-        "A(u)": model.A(at.u, at.moment).matrix.data,
+        "A(u)": model.A(at.u, at.moment, at.q).matrix.data,
     }
     return [
         CheckLine.at_most(
@@ -171,15 +168,14 @@ def _finite(model: Model, at: _Point) -> list[CheckLine]:
 def _linear(model: Model, at: _Point) -> list[CheckLine]:
     lines = []
     in_v = "write each term as a factor times v or grad(v); a term without v belongs nowhere."
-    in_q = (
-        "move the part without q into B; for a law such as 1/q or exp(q) take that expression as "
-        "the unknown."
-    )
-    arguments = {"q": at.q, "u": at.u, "v": at.r}
-    others = {"q": at.dq, "u": at.du, "v": at.du}
+    in_q = "it seemed linear at moderate values; rescale q, or write its law without thresholds."
+    latent, form_A = model.latent, _plain(model.form_A)
+    other = latent.value(at.q + 0.1 * at.dq)
+    arguments = {"q": latent.value(at.q), "u": at.u, "v": at.r}
+    others = {"q": other, "u": at.du, "v": at.du}
     cases = (
-        (model.form_A, "A", "q", in_q),
-        (model.form_A, "A", "v", in_v),
+        *([(form_A, "A", "q", in_q)] if form_A.linear_in_parameter else []),
+        (form_A, "A", "v", in_v),
         (model.form_B, "B", "v", in_v),
         (model.form_M, "M", "u", "M(u, v, x) must be bilinear: move what is not into B."),
         (model.form_M, "M", "v", in_v),
@@ -211,8 +207,9 @@ def _agreement(model: Model, at: _Point) -> list[CheckLine]:
     )
     lines = []
     for name, form in (("B(u)", model.form_B), ("A(u) q", model.form_A)):
-        given = {key: value for key, value in (("q", at.q), ("u", at.u)) if key in form.spaces}
-        density = _densities(form, at.moment, **given, v=at.r)
+        given = {"u": at.u} if name == "B(u)" else {"u": at.u, "q": at.q}
+        plain = {**given, **({"q": model.latent.value(at.q)} if "q" in given else {})}
+        density = _densities(_plain(form), at.moment, **plain, v=at.r)
         value = form.vector("v", at.moment, **given) @ at.r
         size = float(np.abs(density).sum())
         error = abs(float(value - density.sum()))
@@ -228,8 +225,8 @@ def _agreement(model: Model, at: _Point) -> list[CheckLine]:
 
 
 def _adjoint(model: Model, at: _Point) -> list[CheckLine]:
-    A = model.A(at.u, at.moment)
-    transpose = model.form_A.matrix("q", "v", at.moment, u=at.u)
+    A = model.A(at.u, at.moment, at.q)
+    transpose = model.form_A.matrix("q", "v", at.moment, u=at.u, q=at.q)
     star = A.adjoint(at.r)
     size = model.Q.norm(star) * model.Q.norm(at.dq)
     error = abs(model.Q.inner(star, at.dq) - A(at.dq) @ at.r)
@@ -238,7 +235,7 @@ def _adjoint(model: Model, at: _Point) -> list[CheckLine]:
             "A(u)^T = transpose of A(u)",
             relative(transpose - A.matrix.T, A.matrix),
             ROUNDING,
-            "A must be linear in q and in v.",
+            "A must be linear in v.",
         ),
         CheckLine.at_most(
             "(A(u)* r, xi)_Q = <A(u) xi, r>",
@@ -252,52 +249,85 @@ def _adjoint(model: Model, at: _Point) -> list[CheckLine]:
 
 def _derivatives(model: Model, at: _Point) -> list[CheckLine]:
     A, B, moment = model.form_A, model.form_B, at.moment
+    given = "dA" if any(_plain(A).derivatives) else ""
 
     def residual(u: Array) -> Array:
-        return A.matrix("v", "q", moment, u=u).T @ at.r
+        return A.matrix("v", "q", moment, u=u, q=at.q).T @ at.r
 
-    return [
+    def pulled(q: Array) -> Array:
+        return A.matrix("v", "q", moment, u=at.u, q=q).T @ at.r
+
+    found = [
         _taylor(
             "B'(u)",
             "dB" if any(B.derivatives) else "",
             lambda u: B.vector("v", moment, u=u),
             B.matrix("v", "u", moment, u=at.u) @ at.du,
-            at,
+            at.u,
+            at.du,
         ),
         _taylor(
             "d(A(u) q)/du",
-            "dA" if any(A.derivatives) else "",
+            given,
             lambda u: A.vector("v", moment, q=at.q, u=u),
             A.matrix("v", "u", moment, u=at.u, q=at.q) @ at.du,
-            at,
+            at.u,
+            at.du,
         ),
         _taylor(
             "d(A(u)^T r)/du",
-            "dA" if any(A.derivatives) else "",
+            given,
             residual,
-            A.matrix("q", "u", moment, u=at.u, v=at.r) @ at.du,
-            at,
+            A.matrix("q", "u", moment, u=at.u, v=at.r, q=at.q) @ at.du,
+            at.u,
+            at.du,
         ),
     ]
+    if not A.linear_in_parameter:
+        dq = 0.1 * at.dq
+        found += [
+            _taylor(
+                "d(A(u) q)/dq",
+                "",
+                lambda q: A.vector("v", moment, q=q, u=at.u),
+                A.matrix("v", "q", moment, u=at.u, q=at.q) @ dq,
+                at.q,
+                dq,
+            ),
+            _taylor(
+                "d(A(u)^T r)/dq",
+                "",
+                pulled,
+                A.matrix("q", "q", moment, u=at.u, v=at.r, q=at.q) @ dq,
+                at.q,
+                dq,
+            ),
+        ]
+    return found
 
 
 def _taylor(
-    name: str, given: str, function: Callable[[Array], Array], slope: Array, at: _Point
+    name: str,
+    given: str,
+    function: Callable[[Array], Array],
+    slope: Array,
+    at: Array,
+    along: Array,
 ) -> CheckLine:
     """Return the rate of the Taylor remainder, or its size if it is all rounding."""
     remedy = (
         f"{given}= does not belong to {given[1]}: correct it, or leave it out and let a complex "
         "step take the derivative."
         if given
-        else f"a complex step cannot see abs, max, min or a comparison of u: give d{name[0]}= with "
-        "the derivative, or write the form without them."
+        else "a complex step cannot see abs, max, min or a comparison: give "
+        f"d{name[0]}= with the derivative in u, or write the form without them."
     )
     if name.startswith("d("):
         remedy = remedy.replace("dd=", "dA=")
-    start = function(at.u)
+    start = function(at)
     remainders = []
     for step in (1.0, *STEPS):
-        remainder = function(at.u + step * at.du) - start - step * slope
+        remainder = function(at + step * along) - start - step * slope
         remainders.append(largest(remainder))
     size = largest(start) + largest(slope)
     if remainders[0] <= FLOOR * size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from livepde.fem.blocks import FieldBlock
+from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.fields import (
     Channel,
     Field,
@@ -11,10 +12,12 @@ from livepde.fem.fields import (
     Piecewise,
     Predicate,
     Scalar,
+    Scalars,
     Unknown,
     interval,
 )
 from livepde.fem.forms import Form
+from livepde.fem.latent import Composed, Latent, LatentPart, compose
 from livepde.fem.meshes import box, hermite, linear, quadratic, read_mesh, rectangle, smooth
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
@@ -25,21 +28,30 @@ from livepde.fem.upwind import upwind
 __all__ = [
     "START",
     "Channel",
+    "Composed",
+    "Evolution",
     "Field",
     "FieldBlock",
     "Form",
     "FunctionSpace",
     "Inputs",
     "Integrand",
+    "Latent",
+    "LatentPart",
+    "MeanReverting",
     "Moment",
     "On",
+    "Periodic",
     "Piecewise",
     "Place",
     "Predicate",
+    "RandomWalk",
     "Scalar",
+    "Scalars",
     "Sobolev",
     "Unknown",
     "box",
+    "compose",
     "ddot",
     "div",
     "dot",

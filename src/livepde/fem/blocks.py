@@ -17,7 +17,7 @@ from skfem.helpers import inner
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elements import own
-from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Unknown
+from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Scalars, Unknown
 from livepde.fem.periodic import tied
 from livepde.fem.place import Moment, Place
 from livepde.linalg import Array, IntArray
@@ -126,11 +126,6 @@ class Block(ABC):
     def labels(self, name: str) -> tuple[str, ...]:
         """Return a label for each coefficient that stands for itself (none for fields)."""
 
-    @property
-    @abstractmethod
-    def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the coefficients, each of shape (size,)."""
-
 
 class ScalarBlock(Block):
     """Numbers: constant on the domain (`Scalar`) or on each region (`Piecewise`)."""
@@ -174,10 +169,29 @@ class ScalarBlock(Block):
             return (name,)
         return tuple(f"{name}[{region}]" for region in self.unknown.regions)
 
-    @property
-    def bounds(self) -> tuple[Array, Array]:
-        lower, upper = self.unknown.bounds
-        return np.full(self.size, lower), np.full(self.size, upper)
+
+class NamesBlock(Block):
+    """Numbers by name (`Scalars`), the same everywhere."""
+
+    def __init__(self, unknown: Scalars) -> None:
+        self.unknown = unknown
+        self.names = tuple(unknown.names)
+        self.size = len(self.names)
+
+    def local(self, measure: Measure) -> Local:
+        phi = np.zeros((self.size, self.size, *measure.weights.shape))
+        phi[np.arange(self.size), np.arange(self.size)] = 1.0
+        dofs = np.repeat(np.arange(self.size)[:, None], phi.shape[2], axis=1)
+        return Local(dofs, tuple((name, ()) for name in self.names), phi)
+
+    def jet(self, parts: Local, values: Array) -> dict[str, Array]:
+        return dict(zip(self.names, values, strict=True))
+
+    def prior(self) -> Array:
+        return np.full(self.size, float(self.unknown.prior))
+
+    def labels(self, name: str) -> tuple[str, ...]:
+        return tuple(f"{name}[{item}]" for item in self.names)
 
 
 class FieldBlock(Block):
@@ -262,16 +276,20 @@ class FieldBlock(Block):
         return ()
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
-        return np.full(self.size, -np.inf), np.full(self.size, np.inf)
+    def nodal(self) -> bool:
+        """True if coefficients are values at nodes: elements of first order."""
+        return int(self.field.element.maxdeg) <= 1
 
     def interpolate(self, value: Any) -> Array:
         """Return coefficients of a number, or the L2 projection of a function of x."""
         if not callable(value):
             level = float(value)
-            if level == 0.0:
-                return np.zeros(self.size)
+            if level == 0.0 or self.nodal:
+                return np.full(self.size, level)
             value = lambda x: np.full(np.shape(x[0]), level)  # noqa: E731
+        if self.field.transform is not None:  # a projection need not stay within the bounds
+            nodes = self.doflocs
+            return np.asarray(value(nodes) + 0.0 * nodes[0])
         if not self.field.periodic:
             coefficients: Array = self.basis.project(lambda x: value(x) + 0.0 * x[0])
             return coefficients
@@ -389,4 +407,6 @@ def _slope(g: Any, axis: int, width: float) -> Any:
 
 def block_of(unknown: Unknown) -> Block:
     """Return the block of an unknown."""
-    return FieldBlock(unknown) if isinstance(unknown, Field) else ScalarBlock(unknown)
+    if isinstance(unknown, Field):
+        return FieldBlock(unknown)
+    return NamesBlock(unknown) if isinstance(unknown, Scalars) else ScalarBlock(unknown)

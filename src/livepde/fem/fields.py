@@ -11,7 +11,9 @@ from skfem import Mesh, MeshLine
 from skfem.element import Element
 
 from livepde.errors import SpaceError
+from livepde.fem.evolution import CONSTANT, Evolution
 from livepde.fem.sobolev import Sobolev
+from livepde.fem.transforms import Transform, transform_of
 from livepde.linalg import Array
 
 __all__ = [
@@ -22,6 +24,7 @@ __all__ = [
     "Piecewise",
     "Predicate",
     "Scalar",
+    "Scalars",
     "Unknown",
     "interval",
 ]
@@ -87,7 +90,9 @@ def interval(
     return mesh.with_subdomains(dict(regions)) if regions else mesh
 
 
-def _check_prior(what: str, std: float, bounds: tuple[float, float], prior: float) -> None:
+def _check_prior(
+    what: str, std: float, bounds: tuple[float, float], prior: float, transform: str | None
+) -> None:
     if not (np.isfinite(std) and std > 0):
         raise SpaceError(f"{what}: std must be a positive number; got {std}.")
     lower, upper = bounds
@@ -95,10 +100,53 @@ def _check_prior(what: str, std: float, bounds: tuple[float, float], prior: floa
         raise SpaceError(f"{what}: bounds must be (lower, upper) with lower < upper; got {bounds}.")
     if not lower <= prior <= upper:
         raise SpaceError(f"{what}: prior {prior} lies outside of its bounds {bounds}.")
+    if not np.isfinite(transform_of(what, transform, bounds).inverse(np.array(prior))):
+        raise SpaceError(
+            f"{what}: prior {prior} is not inside of what transform='{transform}' allows; move it "
+            "inside of the bounds."
+        )
+
+
+class _Prior:
+    """What all unknowns have in common: a prior, bounds, a transform, an evolution."""
+
+    prior: float
+    std: float
+    bounds: tuple[float, float]
+    transform: str | None
+    evolution: Evolution
+
+    @property
+    def map(self) -> Transform:
+        """The transform q = T(latent)."""
+        return transform_of(type(self).__name__, self.transform, self.bounds)
+
+    @property
+    def latent_prior(self) -> float:
+        """Prior mean of the latent coefficients."""
+        return float(self.map.inverse(np.array(float(self.prior))))
+
+    @property
+    def latent_std(self) -> float:
+        """Prior deviation of the latent coefficients: that of q, to first order."""
+        return float(self.std / self.map.slope(np.array(self.latent_prior)))
+
+    @property
+    def latent_bounds(self) -> tuple[float, float]:
+        """Bounds of the latent coefficients: none where a transform keeps them."""
+        return self.bounds if self.transform is None else (-np.inf, np.inf)
+
+    def _check(self) -> None:
+        what = type(self).__name__
+        _check_prior(what, self.std, self.bounds, self.prior, self.transform)
+        if self.evolution.copies > 1 and self.transform is not None:
+            raise SpaceError(
+                f"{what}: a transform together with Periodic is not possible; choose one."
+            )
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class Field(_Prior):
     """A function on a mesh: the state u, or a parameter q(x).
 
     Parameters
@@ -115,6 +163,8 @@ class Field:
     std
         Prior deviation of a parameter: the inner product is divided by std**2, so that the
         prior covariance is the inverse Gram matrix.
+    bounds, transform, evolution
+        As for `Scalar`; bounds need a transform, and a transform an element of first order.
     unit, name
         For tables and plots.
     periodic
@@ -131,6 +181,9 @@ class Field:
     unit: str = ""
     name: str = ""
     quadrature: int | None = None
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    transform: str | None = None
+    evolution: Evolution = CONSTANT
     periodic: Sequence[tuple[str, str]] = ()
 
     def __post_init__(self) -> None:
@@ -155,24 +208,46 @@ class Field:
                     f"'{name}' is periodic and has a Dirichlet value: leave one of both out, and "
                     'name the other boundaries instead of "boundary".'
                 )
-        _check_prior("Field", self.std, (-np.inf, np.inf), self.prior)
+        self._check()
+        if self.transform is None and np.isfinite(self.bounds).any():
+            raise SpaceError("Field: bounds need transform='log' or 'logit', which keeps them.")
+        if self.transform is not None and (self.element.maxdeg > 1 or self.dirichlet):
+            raise SpaceError(
+                "Field: a transform acts on values at nodes: take an element of first order and "
+                "no boundary values."
+            )
 
 
 @dataclass(frozen=True, eq=False)
-class Scalar:
-    """One unknown number with a Gaussian prior; bounds are never left by an estimate."""
+class Scalar(_Prior):
+    """One unknown number with a Gaussian prior; bounds are never left by an estimate.
+
+    Parameters
+    ----------
+    prior, std
+        Mean and standard deviation, in `unit`.
+    bounds
+        (lower, upper). Without a transform estimates are clipped to them.
+    transform
+        "log": positive (above a finite lower bound); the prior is the median and the deviation of
+        the logarithm is std / prior. "logit": strictly between two finite bounds.
+    evolution
+        How the unknown moves by itself: `RandomWalk`, `MeanReverting`, `Periodic`; default not.
+    """
 
     prior: float = 0.0
     std: float = 1.0
     bounds: tuple[float, float] = (-np.inf, np.inf)
     unit: str = ""
+    transform: str | None = None
+    evolution: Evolution = CONSTANT
 
     def __post_init__(self) -> None:
-        _check_prior("Scalar", self.std, self.bounds, self.prior)
+        self._check()
 
 
 @dataclass(frozen=True, eq=False)
-class Piecewise:
+class Piecewise(_Prior):
     """One unknown number for each named region, with a common prior.
 
     Parameters
@@ -180,6 +255,8 @@ class Piecewise:
     regions
         Name -> predicate on x, or the name of a subdomain of the mesh. A point in no region sees
         the value zero; in two regions, the sum.
+    prior, std, bounds, unit, transform, evolution
+        As for `Scalar`.
     """
 
     regions: Mapping[str, Predicate | str]
@@ -187,11 +264,41 @@ class Piecewise:
     std: float = 1.0
     bounds: tuple[float, float] = (-np.inf, np.inf)
     unit: str = ""
+    transform: str | None = None
+    evolution: Evolution = CONSTANT
 
     def __post_init__(self) -> None:
         if not self.regions:
             raise SpaceError("Piecewise: needs at least one region.")
-        _check_prior("Piecewise", self.std, self.bounds, self.prior)
+        self._check()
 
 
-Unknown: TypeAlias = Field | Scalar | Piecewise
+@dataclass(frozen=True, eq=False)
+class Scalars(_Prior):
+    """One unknown number for each name, with a common prior: an offset of each sensor, say.
+
+    Forms and sensors see a mapping, q.offset["T_10"].
+
+    Parameters
+    ----------
+    names
+        Their names.
+    prior, std, bounds, unit, transform, evolution
+        As for `Scalar`.
+    """
+
+    names: Sequence[str]
+    prior: float = 0.0
+    std: float = 1.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+    unit: str = ""
+    transform: str | None = None
+    evolution: Evolution = CONSTANT
+
+    def __post_init__(self) -> None:
+        if not self.names or len(set(self.names)) != len(self.names):
+            raise SpaceError(f"Scalars: names must be given and differ; got {list(self.names)}.")
+        self._check()
+
+
+Unknown: TypeAlias = Field | Scalar | Piecewise | Scalars

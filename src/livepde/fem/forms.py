@@ -18,6 +18,7 @@ the derivative from the user, and `check_model` tells when one is missing.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,9 +34,10 @@ from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern, PatternOperator
 
-__all__ = ["Form"]
+__all__ = ["Form", "FormMatrices"]
 
 STEP = 1e-30  # of the complex step: far below rounding, far above underflow
+SHIFT = 1e-3  # of a central difference of fourth order, relative: its errors are about 1e-13
 LARGEST_TENSOR = 20_000_000  # entries of a precomputed trilinear form; beyond it, quadrature
 
 
@@ -58,7 +60,38 @@ class _Term:
         return np.broadcast_to(array, (*axes, *self.measure.weights.shape))
 
 
-class Form:
+class FormMatrices(ABC):
+    """Matrices of mixed derivatives with fixed sparsity, from `pattern` and `data`."""
+
+    def __init__(self) -> None:
+        self._operators: dict[tuple[str, str], PatternOperator] = {}
+
+    @abstractmethod
+    def pattern(self, rows: str, cols: str) -> Pattern:
+        """Return the sparsity of the matrices `data(rows, cols)`."""
+
+    @abstractmethod
+    def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
+        """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`."""
+
+    def matrix(
+        self, rows: str, cols: str, moment: Moment = START, **coefficients: Array
+    ) -> sp.csr_array:
+        """Return `data(...)` as a CSR matrix."""
+        return self.pattern(rows, cols).matrix(self.data(rows, cols, moment, **coefficients))
+
+    def product(
+        self, rows: str, cols: str, x: Array, moment: Moment = START, **coefficients: Array
+    ) -> Array:
+        """Return `matrix(...) @ x` without building the matrix again; x of shape (m,) or (m, k)."""
+        if (rows, cols) not in self._operators:
+            self._operators[rows, cols] = self.pattern(rows, cols).operator()
+        operator = self._operators[rows, cols]
+        operator.set(self.data(rows, cols, moment, **coefficients))
+        return operator.apply(x)
+
+
+class Form(FormMatrices):
     """A sum of integrals, linear in every argument not named in `nonlinear`.
 
     Parameters
@@ -73,7 +106,9 @@ class Form:
     order
         Quadrature order.
     nonlinear
-        Arguments in which the form need not be linear (found out by probing).
+        The argument in which the form need not be linear, u.
+    parameter
+        An argument in which it may be nonlinear, q: found out by probing.
     derivative
         Optional integrand of the derivative in the nonlinear argument: the same arguments, with
         the direction behind that argument, as in dB(u, du, v, x).
@@ -91,7 +126,9 @@ class Form:
         nonlinear: str | None = None,
         derivative: Integrand | Sequence[Integrand] | None = None,
         inputs: Sequence[str] = (),
+        parameter: str | None = None,
     ) -> None:
+        super().__init__()
         items = integrands if isinstance(integrands, Sequence) else [integrands]
         self.name = name
         self.spaces = dict(spaces)
@@ -112,11 +149,14 @@ class Form:
         self._constants: dict[tuple[str, str], Array] = {}
         self._offsets: dict[str, Array] = {}
         self._slopes: dict[str, sp.csr_array] = {}
-        self._operators: dict[tuple[str, str], PatternOperator] = {}
         self._tensors: dict[tuple[str, str], sp.csr_array | None] = {}
         self._patterns: dict[tuple[str, str], Pattern] = {}
         self._gathers: dict[tuple[str, str], list[sp.csr_array]] = {}
         self.uses: frozenset[str] = self._probe()
+        self.parameter = parameter
+        self.linear_in_parameter = parameter is None or self._linear(parameter)
+        curved = {nonlinear} if self.linear_in_parameter else {nonlinear, parameter}
+        self._curved = frozenset(key for key in curved if key is not None)
 
     def _probe(self) -> frozenset[str]:
         """Evaluate once: find errors early, and what of time and inputs the form reads."""
@@ -155,8 +195,13 @@ class Form:
     @cached_property
     def affine(self) -> bool:
         """True if the form is affine in its nonlinear argument (probed at several magnitudes)."""
-        if self.nonlinear is None:
-            return True
+        return self.nonlinear is None or self._affine(self.nonlinear, homogeneous=False)
+
+    def _linear(self, slot: str) -> bool:
+        return self._affine(slot, homogeneous=True)
+
+    def _affine(self, slot: str, homogeneous: bool) -> bool:
+        """Return true if the form is affine (linear, if homogeneous) in an argument."""
         rng = np.random.default_rng(1)
         probe = Moment(0.3, self._inputs)
         for term in self.terms:
@@ -166,23 +211,31 @@ class Form:
             }
 
             def at(x: Array, term: _Term = term, values: dict[str, Array] = values) -> Array:
-                density, _ = term.evaluate({**values, str(self.nonlinear): x}, probe)
+                density, _ = term.evaluate({**values, slot: x}, probe)
                 return np.asarray(density)
 
             for scale in (1e-3, 1.0, 1e3, 1e6, 1e9):
-                a, b = scale * rng.standard_normal((2, *values[self.nonlinear].shape))
+                a, b = scale * rng.standard_normal((2, *values[slot].shape))
                 with np.errstate(all="ignore"):
-                    change = at(a + b) - at(a) - at(b) + at(0 * a)
-                    size = max(np.abs(at(a)).max(), np.abs(at(b)).max(), 1e-300)
-                # Not a number (a root, a logarithm) counts as not affine.
-                if not np.abs(change).max() <= 1e-11 * size:
+                    zero = at(0 * a)
+                    change = at(a + b) - at(a) - at(b) + (0 * zero if homogeneous else zero)
+                    sizes = np.abs(np.concatenate([at(a).ravel(), at(b).ravel()]))
+                    size = max(sizes[np.isfinite(sizes)].max(initial=0.0), 1e-300)
+                # Points where the form is not a number (a root of a negative one) say nothing.
+                finite = np.isfinite(change)
+                if not finite.any() or np.abs(change[finite]).max() > 1e-11 * size:
                     return False
         return True
+
+    @property
+    def _trilinear(self) -> bool:
+        """True if the form is constant, affine in u and linear in all other arguments."""
+        return self.constant and self.linear_in_parameter and self.affine
 
     def vector(self, slot: str, moment: Moment = START, **coefficients: Array) -> Array:
         """Return the derivative in the linear argument `slot`, shape (dim of its space,)."""
         others = [key for key in self.spaces if key != slot]
-        if self.affine and self.constant and others:
+        if self._trilinear and others:
             linear = [key for key in others if key != self.nonlinear]
             if not linear:  # B(u) = B(0) + B' u
                 if slot not in self._slopes:
@@ -236,11 +289,13 @@ class Form:
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
         """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`.
 
-        Constant bilinear forms are assembled once; constant trilinear ones become one sparse
-        product with the coefficients of the third argument.
+        The second derivative in one argument for rows = cols. Constant bilinear forms are assembled
+        once; constant trilinear ones become one sparse product with the third coefficients.
         """
+        if rows == cols and rows not in self._curved:
+            return np.zeros(self.pattern(rows, cols).nnz)
         others = [key for key in self.spaces if key not in (rows, cols)]
-        if self.affine and self.constant:
+        if self._trilinear:
             if not others:
                 return self._constant(rows, cols)
             if len(others) == 1:
@@ -251,22 +306,6 @@ class Form:
                         product += self._constant(rows, cols)
                     return product
         return self._quadrature(rows, cols, moment, coefficients)
-
-    def matrix(
-        self, rows: str, cols: str, moment: Moment = START, **coefficients: Array
-    ) -> sp.csr_array:
-        """Return `data(...)` as a CSR matrix."""
-        return self.pattern(rows, cols).matrix(self.data(rows, cols, moment, **coefficients))
-
-    def product(
-        self, rows: str, cols: str, x: Array, moment: Moment = START, **coefficients: Array
-    ) -> Array:
-        """Return `matrix(...) @ x` without building the matrix again; x of shape (m,) or (m, k)."""
-        if (rows, cols) not in self._operators:
-            self._operators[rows, cols] = self.pattern(rows, cols).operator()
-        operator = self._operators[rows, cols]
-        operator.set(self.data(rows, cols, moment, **coefficients))
-        return operator.apply(x)
 
     def _quadrature(
         self, rows: str, cols: str, moment: Moment, coefficients: Mapping[str, Array]
@@ -293,28 +332,52 @@ class Form:
         coefficients: Mapping[str, Array],
         given: Integrand | None,
     ) -> Array:
-        """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P)."""
-        axis = {rows: 0, cols: 1}
-        jets: list[Any] = []
-        for key, local in term.spaces.items():
-            if key in axis and key != self.nonlinear:
-                jets.append(local.unit_jets(axis[key], 2))
-                continue
-            here = local.values(coefficients[key]) if key in coefficients else local.zeros()
-            if key not in axis:
-                jets.append(local.jets(here))
-            elif given is not None:
-                jets += [local.jets(here[:, None, None]), local.unit_jets(axis[key], 2)]
-            else:
-                step = 1j * STEP * local.units(axis[key], 2)
-                jets.append(local.jets(here[:, None, None] + step))
+        """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P).
+
+        Unit jets in arguments in which the form is linear; a complex step in one that is not; a
+        central difference of complex steps if both are not (only Jacobians of iterations use it).
+        """
         place = term.measure.place(moment)
-        if self.nonlinear not in axis:
-            return np.asarray(term.integrand(*jets, place))
-        if given is not None:
-            return np.asarray(given(*jets, place))
-        slope: Array = np.imag(term.integrand(*jets, place)) / STEP
-        return slope
+        if self.nonlinear not in (rows, cols):
+            given = None
+        curved = [axis for axis, key in enumerate((rows, cols)) if key in self._curved]
+        if given is not None:  # the user's derivative takes the place of one complex step
+            curved = [axis for axis in curved if (rows, cols)[axis] != self.nonlinear]
+        stepped = curved[-1] if curved else None
+        shifted = curved[0] if len(curved) == 2 else None
+
+        def evaluate(shift: float) -> Array:
+            jets: list[Any] = []
+            for key, local in term.spaces.items():
+                axes = [axis for axis, name in enumerate((rows, cols)) if name == key]
+                if axes and key not in self._curved:
+                    jets.append(local.unit_jets(axes[0], 2))
+                    continue
+                here = local.values(coefficients[key]) if key in coefficients else local.zeros()
+                if not axes:
+                    jets.append(local.jets(here))
+                    continue
+                value: Any = here[:, None, None]
+                if shifted in axes:
+                    value = value + shift * _scale(here) * local.units(0, 2)
+                if stepped in axes:
+                    value = value + 1j * STEP * local.units(axes[-1], 2)
+                jets.append(local.jets(value))
+                if given is not None and key == self.nonlinear:
+                    jets.append(local.unit_jets(axes[0], 2))
+            density = (term.integrand if given is None else given)(*jets, place)
+            slope: Array = np.asarray(density) if stepped is None else np.imag(density) / STEP
+            return slope
+
+        if shifted is None:
+            return evaluate(0.0)
+        local = term.spaces[rows]
+        here = local.values(coefficients[rows]) if rows in coefficients else local.zeros()
+        near = evaluate(SHIFT) - evaluate(-SHIFT)
+        far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
+        difference = (8.0 * near - far) / (12.0 * SHIFT)
+        scaled: Array = difference / _scale(here)[:, 0]
+        return scaled
 
     def _constant(self, rows: str, cols: str) -> Array:
         """Return data(rows, cols) of an affine form at zero, computed once."""
@@ -328,7 +391,7 @@ class Form:
         None unless the form is trilinear and constant, and T is of reasonable size.
         """
         (third,) = [key for key in self.spaces if key not in (rows, cols)]
-        if not (self.affine and self.constant):
+        if not self._trilinear:
             return None
         if third == self.nonlinear and np.any(self._constant(rows, cols)):
             return None
@@ -368,3 +431,9 @@ class Form:
         total.eliminate_zeros()
         self._tensors[rows, cols] = total
         return total
+
+
+def _scale(values: Array) -> Array:
+    """Return a size for each component, shape (components, 1, 1, 1, 1)."""
+    size = np.abs(values).max(axis=(1, 2))
+    return np.where(size > 0.0, size, 1.0)[:, None, None, None, None]

@@ -149,22 +149,6 @@ class FunctionSpace:
         return np.concatenate([block.prior() for block in self.blocks.values()])
 
     @cached_property
-    def deviations(self) -> Array:
-        """Prior deviation that belongs to each coefficient, shape (dim,)."""
-        return np.concatenate(
-            [
-                np.full(block.size, unknown.std)
-                for unknown, block in zip(self.unknowns.values(), self.blocks.values(), strict=True)
-            ]
-        )
-
-    @cached_property
-    def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the coefficients."""
-        pairs = [block.bounds for block in self.blocks.values()]
-        return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
-
-    @cached_property
     def labels(self) -> dict[str, int]:
         """Label of each scalar unknown -> its coefficient."""
         found: dict[str, int] = {}

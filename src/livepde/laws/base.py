@@ -8,6 +8,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
@@ -64,6 +65,15 @@ class Problem:
     model: Model
     observed: Observed
     control: Advance
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Input channels that model or sensors read."""
+        return self.model.channels
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        """Return what the sensors are expected to show, for state u and latent parameter q."""
+        return self.observed.predict(u, self.model.latent.value(q), moment)
 
 
 @dataclass(frozen=True, eq=False)

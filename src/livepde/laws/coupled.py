@@ -58,7 +58,8 @@ class CoupledStage:
 
     together (with w = u if `Gains.at_estimate`), so that the two terms with A cancel in the energy
     as in the paper (align:neplusnr). theta depends on all of r; its derivative is a rank-one
-    term of the Jacobian.
+    term of the Jacobian. Where A is nonlinear in q, A(w) in the second line is its derivative; an
+    unknown that moves by itself adds -G_Q K (q - prior)/gain there.
     """
 
     def __init__(self, model: Model, split: Split, gains: Gains, newton: Newton) -> None:
@@ -68,7 +69,7 @@ class CoupledStage:
         self.newton = newton
         self.n = model.X.dim
         self.blocks = (slice(0, self.n), slice(self.n, self.n + model.Q.dim))
-        self.floors = (0.0, RESOLVED * float(np.linalg.norm(model.parameter_space.deviations)))
+        self.floors = (0.0, RESOLVED * float(np.linalg.norm(model.latent.deviations)))
         self.RT = sp.csr_array(split.R.T)
         self.RM = sp.csr_array(self.RT @ gains.M_op)
         self.RMR = sp.csr_array(self.RM @ split.R)
@@ -82,6 +83,7 @@ class CoupledStage:
         self.gram = model.Q.augmented
         self.auxiliary = self.gram.shape[0] - model.Q.dim
         self.size = self.n + model.Q.dim
+        self.linear = model.form_A.linear_in_parameter
 
     @cached_property
     def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:
@@ -101,8 +103,13 @@ class CoupledStage:
         whole.add("A", A.pattern("v", "q"), minus, R_free, at=(n, 0), transposed=True)
         whole.add("Aq", A.pattern("q", "u"), minus, W_free, at=(n, 0))
         rest = np.zeros(self.auxiliary)
+        if not self.linear:
+            whole.add("Aqq", A.pattern("q", "q"), minus, free_q, at=(n, n))
         free_g = sp.diags_array(np.concatenate([self.free_q, 1.0 - rest]))
         whole.add("G", Pattern.of(self.gram), free_g, free_g, at=(n, n))
+        if model.latent.generator.nnz:
+            K = sp.block_diag([model.latent.generator, sp.csr_array((len(rest), len(rest)))])
+            whole.add("K", Pattern.of(self.gram), -free_g, sp.csr_array(K @ free_g), at=(n, n))
         fixed = np.concatenate([1.0 - model.X.free, 1.0 - self.free_q, rest])
         whole.add("fixed", Pattern.of(sp.eye_array(len(fixed))), sp.diags_array(fixed))
         pattern, maps = whole.build()
@@ -125,6 +132,8 @@ class CoupledStage:
         gram = maps["G"] @ _stored(self.gram) / g.gain
         rest = maps["PNP"] @ (g.nu * _stored(self.PNP)) + g.sigma * gram
         rest += maps["fixed"] @ np.ones(self.size + self.auxiliary)
+        if "K" in maps:
+            rest += maps["K"] @ _stored(self.gram) / g.gain
         if self.constant_B:
             rest += maps["B"] @ model.form_B.data("v", "u", u=np.zeros(self.n))
         return {
@@ -148,6 +157,8 @@ class CoupledStage:
     @cached_property
     def _bilinear(self) -> _Bilinear | None:
         form = self.model.form_A
+        if self.model.latent.generator.nnz:
+            return None
         vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
         if self.auxiliary or not self.constant_B or vq is None or vu is None or qu is None:
             return None
@@ -213,10 +224,13 @@ class _Equation:
         self.r = r = stage.split.R @ u - self.u_alpha
         self.w = w = u if g.at_estimate else u - r  # u_alpha + P u, since P = I - R
         self.Mr, self.mass_r = stage.RM @ r, stage.RT @ (model.mass @ r)
-        A = model.form_A.matrix("v", "q", self.moment, u=w)
-        flux = model.B(w, self.moment) + A @ q + g.nu * (stage.PNP @ u) - self.source
+        A = model.form_A.matrix("v", "q", self.moment, u=w, q=q)
+        C = A @ q if stage.linear else model.form_A.vector("v", self.moment, u=w, q=q)
+        flux = model.B(w, self.moment) + C + g.nu * (stage.PNP @ u) - self.source
         rate = (u - self.c[:n]) / self.h
         drive = (q - self.c[n:]) / (g.gain * self.h) + (g.sigma / g.gain) * q
+        if model.latent.generator.nnz:
+            drive -= model.latent.generator @ (q - model.latent.prior) / g.gain
         out = np.empty_like(y)
         out[:n] = (model.mass @ rate + flux) * model.X.free + self.pull()
         out[n:] = (model.Q.dual(drive) - A.T @ r) * stage.free_q
@@ -236,10 +250,12 @@ class _Equation:
         """
         stage, form = self.stage, self.stage.model.form_A
         maps, q, r, w = stage.maps, y[stage.n :], self.r, self.w
-        data: Array = maps["A"] @ form.data("v", "q", self.moment, u=w)
+        data: Array = maps["A"] @ form.data("v", "q", self.moment, u=w, q=q)
         data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
         if not sweep:
-            data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r)
+            data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r, q=q)
+            if not stage.linear:
+                data += maps["Aqq"] @ form.data("q", "q", self.moment, u=w, v=r, q=q)
         if not stage.constant_B:
             data += maps["B"] @ stage.model.form_B.data("v", "u", self.moment, u=w)
         return data

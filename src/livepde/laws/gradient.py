@@ -152,9 +152,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         end, steps, failure = advance(work.problem.control, stage, y, interval)
         if failure is not None:
             return state, Report(
-                Status.of(failure), observed.predict(state.u, state.q, interval.end)
+                Status.of(failure), work.problem.predict(state.u, state.q, interval.end)
             )
-        lower, upper = model.parameter_space.bounds
+        lower, upper = model.latent.bounds
         u, q = end[: model.X.dim], np.clip(end[model.X.dim :], lower, upper)
         observed_u = coupled.split.R @ u
         rate = end - y
@@ -163,7 +163,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         notes = {"residual": model.X.norm(observed_u - found.u)}
         if regularises:
             notes |= {"alpha": found.alpha, "misfit": found.misfit}
-        predicted = observed.predict(u, q, interval.end)
+        predicted = work.problem.predict(u, q, interval.end)
         return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from livepde.errors import LawError
-from livepde.fem import FieldBlock, Inputs, Moment
+from livepde.fem import Evolution, FieldBlock, Inputs, Moment, RandomWalk
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
 from livepde.linalg import Array
@@ -17,6 +17,7 @@ from livepde.stepping import ForwardStage, Interval, advance
 __all__ = ["Replay", "SensitivityLaw", "SensitivityState"]
 
 CONVERGED = 0.5  # standard deviations between reference and estimate at which replays stop
+STRIDE = 1.0  # prior deviations that a replay moves its reference at most: a trust region
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,9 @@ class Replay:
     forgets. With a replay the filter stays linear about one reference, and whenever the number of
     assimilated samples has doubled, the reference is moved to the estimate and the stored samples
     are run through again, until reference and estimate agree within half a standard deviation: a
-    Gauss-Newton iteration. One replay for each doubling makes less than four times the steps in
-    all; more than one is needed mostly while the store is short.
+    Gauss-Newton iteration, whose steps are at most one prior deviation long. One replay for each
+    doubling makes less than four times the steps in all; more than one is needed mostly while the
+    store is short.
 
     Parameters
     ----------
@@ -60,23 +62,25 @@ class Point:
     ----------
     u, q
         Reference state and parameter, shapes (n,) and (m,).
-    L
-        Sensitivity du/da, shape (n, k).
     du, da
         Estimated deviations of u and of the reduced parameter a, shapes (n,) and (k,).
-    C
-        Square root of the covariance of a, C C^T, shape (k, k).
+    U, C
+        Square root of the joint covariance of u and a, [U; C] [U; C]^T, shapes (n, r) and (k, r).
+        As long as nothing moves, r = k and U = L C with the sensitivity L = du/da.
     consistency
         Statistics of the innovations.
+    refused
+        How many values in a row of each sensor the gate has refused, shape (sensors,).
     """
 
     u: Array
     q: Array
-    L: Array
     du: Array
     da: Array
+    U: Array
     C: Array
     consistency: Consistency
+    refused: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,13 +126,74 @@ class SensitivityState:
 
 
 @dataclass(frozen=True, eq=False)
+class Motion:
+    """How one unknown moves by itself, in reduced coordinates.
+
+    Attributes
+    ----------
+    part
+        Where its reduced coordinates stand: copies times modes.
+    evolution, std
+        Its model, and the prior deviation of its latent coefficients.
+    """
+
+    part: slice
+    evolution: Evolution
+    std: float
+
+    def transition(self, h: float) -> Array:
+        """Return the transition of its coordinates in a time h."""
+        F = self.evolution.transition(h)
+        return np.asarray(np.kron(F, np.eye((self.part.stop - self.part.start) // len(F))))
+
+    def growth(self, h: float) -> Array:
+        """Return the variance its coordinates gain in a time h."""
+        gained = self.evolution.growth(h, self.std)
+        return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
+
+
+@dataclass(frozen=True, eq=False)
 class SensitivityWork:
-    """The problem, its forward stage and the reduction q = q_prior + Phi a."""
+    """The problem, its forward stage and the reduction a_latent = prior + Phi a.
+
+    `scale` makes columns of U comparable with those of C when a factor is compressed: the square
+    root of the mass of each coefficient, in units of the noise.
+    """
 
     problem: Problem
     forward: ForwardStage
     Phi: Array
+    motions: tuple[Motion, ...]
     noise: Array
+    scale: Array
+    rank: int
+
+    def latent(self, point: Point) -> Array:
+        """Return the estimated latent parameter, not yet bounded."""
+        q: Array = point.q + self.Phi @ point.da
+        return q
+
+    def predict(self, point: Point, moment: Moment) -> Array:
+        """Return what the sensors are expected to show."""
+        return self.problem.predict(point.u + point.du, self.latent(point), moment)
+
+    def output(self, point: Point, moment: Moment) -> Array:
+        """Return the derivative of the prediction along the columns of the factor, H [U; C]."""
+        problem, latent = self.problem, self.problem.model.latent
+        a = self.latent(point)
+        H_u, H_q = problem.observed.jacobian(point.u + point.du, latent.value(a), moment)
+        HC: Array = H_u @ point.U
+        return HC if H_q is None else HC + H_q @ latent.tangent(a, self.Phi @ point.C)
+
+    def reduced(self, dq: Array) -> Array:
+        """Return a with Phi a = dq: the columns of Phi are orthonormal in Q."""
+        a: Array = self.Phi.T @ self.problem.model.Q.dual(dq)
+        return a
+
+    def bounded(self, q: Array) -> Array:
+        """Return the latent parameter within its bounds."""
+        lower, upper = self.problem.model.latent.bounds
+        return np.clip(q, lower, upper)
 
 
 @dataclass(frozen=True)
@@ -137,12 +202,17 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     Reduced-order filter of Moireau, Chapelle and Le Tallec (2008); Zhang's adaptive observer;
     recursive prediction error. q = q_prior + Phi a with a ~ N(0, I): Phi is the prior deviation for
-    numbers and the leading modes of the prior for fields. With S the Jacobian of a step,
+    numbers and the leading modes of the prior for fields. The joint covariance of u and a has the
+    square root [U; C]. With S the Jacobian of a step and A the derivative of A(u) q in q,
 
-        predict   one implicit step for u;   S L+ = M L/h - A(u+) Phi;   C grows by drift h
-        update    d = z - G u+ - D q,  H = G L+ + D Phi:   a += K d,  u += L+ K d
+        predict   one implicit step for u;   S U+ = M U/h - A(u+) Phi C
+        update    d = z - G u+ - D q,  Y = G U+ + D Phi C:   a += C K d,  u += U+ K d,
+                  K = (I + Y^T N^-1 Y)^-1 Y^T N^-1,  [U; C] times the square root of (I + ...)^-1
 
-    in square-root form. It costs one step and one block of back-substitutions.
+    It costs one step and one block of back-substitutions. For unknowns that stay as they are U is
+    L C with the sensitivity L = du/da. One that moves (`evolution`, or `drift` for all) adds new
+    columns at each sample, independent of what the state remembers of older values; the factor is
+    then compressed to `rank` columns, so that nothing has to be forgotten by hand.
 
     Bounds of numbers hold for the reference about which the filter is linear, and for what is
     reported; the filter itself stays linear.
@@ -154,14 +224,20 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     noise
         Standard deviation of the measurement noise; default what the observation says.
     drift
-        Variance of a gained per unit of time, relative to the prior: > 0 follows parameters that
-        change.
+        Variance of a gained per unit of time, relative to the prior, by every unknown without an
+        evolution of its own: > 0 follows parameters that change.
     memory
-        Time after which old sensitivities have faded to 1/e. Needed with drift: the state forgets
-        what old parameters did to it.
+        Time after which what the state knows of the parameters has faded to 1/e.
     replay
-        Iterate about one reference trajectory; for constant parameters and states with a long
-        memory. Not together with `memory`.
+        Iterate about one reference trajectory; for states with a long memory. Not together with
+        `memory`.
+    rank
+        Columns of the factor while unknowns move; default the number of coordinates and five times
+        that of those that move.
+    gate
+        Innovations of more than this many expected deviations are not used; default all are.
+    gate_patience
+        After so many refusals in a row a sensor is believed again: something has really changed.
     """
 
     modes: int | dict[str, int] = 12
@@ -169,6 +245,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     drift: float = 0.0
     memory: float = np.inf
     replay: Replay | None = None
+    rank: int | None = None
+    gate: float = np.inf
+    gate_patience: int = 10
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.drift) and self.drift >= 0):
@@ -181,9 +260,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             )
         if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
             raise LawError(f"SensitivityLaw: noise must be a positive number; got {self.noise}.")
+        if not self.gate > 0:
+            raise LawError(f"SensitivityLaw: gate must be positive; got {self.gate}.")
+        if self.gate_patience < 1:
+            raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
 
     def prepare(self, problem: Problem) -> SensitivityWork:
-        observed = problem.observed
+        observed, model = problem.observed, problem.model
         noise = observed.noise
         if self.noise is not None:
             noise = np.full(observed.size, self.noise)
@@ -192,44 +275,60 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 "SensitivityLaw needs the noise level of the sensors: give noise= to the "
                 "observation (one number, or one for each sensor) or to the law."
             )
-        return SensitivityWork(problem, ForwardStage(problem.model), self._modes(problem), noise)
-
-    def _modes(self, problem: Problem) -> Array:
-        model = problem.model
-        space = model.parameter_space
-        counts = (
-            self.modes if isinstance(self.modes, dict) else dict.fromkeys(space.fields, self.modes)
-        )
-        if set(counts) != set(space.fields):
+        Phi, motions = self._modes(problem)
+        moving = sum(m.part.stop - m.part.start for m in motions if m.growth(1.0).any())
+        rank = self.rank if self.rank is not None else Phi.shape[1] + 5 * moving
+        if rank < Phi.shape[1]:
             raise LawError(
-                f"SensitivityLaw: modes names {sorted(counts)}; the fields are "
-                f"{sorted(space.fields)}."
+                f"SensitivityLaw: rank must be at least the {Phi.shape[1]} reduced coordinates; "
+                f"got {rank}."
             )
-        columns = []
-        for name, block in space.blocks.items():
-            part = space.part(name)
-            if isinstance(block, FieldBlock):
-                mass = model.parameter_mass[part, part]
-                inner = model.Q.restricted(part, block.fixed)
-                phi, _ = inner.modes(min(counts[name], int(inner.free.sum())), mass)
+        mass = np.maximum(model.mass.diagonal(), 0.0)
+        scale = np.sqrt(mass / mass.sum()) / float(np.median(noise))
+        forward = ForwardStage(model)
+        return SensitivityWork(problem, forward, Phi, motions, noise, scale, rank)
+
+    def _modes(self, problem: Problem) -> tuple[Array, tuple[Motion, ...]]:
+        """Return Phi, shape (m, k), and how its coordinates move."""
+        model = problem.model
+        fields = model.parameter_space.fields
+        counts = self.modes if isinstance(self.modes, dict) else dict.fromkeys(fields, self.modes)
+        if set(counts) != set(fields):
+            raise LawError(
+                f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
+            )
+        blocks, motions, start = [], [], 0
+        for name, item in model.latent.parts.items():
+            first = slice(item.part.start, item.part.start + item.size)
+            if isinstance(item.block, FieldBlock):
+                part = model.parameter_space.part(name)
+                inner = model.Q.restricted(first, item.block.fixed)
+                count = min(counts[name], int(inner.free.sum()))
+                phi, _ = inner.modes(count, model.parameter_mass[part, part])
             else:
-                phi = np.diag(1.0 / np.sqrt(model.Q.augmented[part, part].diagonal()))
-            whole = np.zeros((space.dim, phi.shape[1]))
-            whole[part] = phi
-            columns.append(whole)
-        return np.hstack(columns)
+                phi = np.eye(item.size) * item.unknown.latent_std
+            evolution = item.evolution
+            if self.drift and not evolution.moves:
+                evolution = RandomWalk(np.sqrt(self.drift) * item.unknown.latent_std)
+            blocks.append(np.kron(np.eye(evolution.copies), phi))
+            stop = start + blocks[-1].shape[1]
+            motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std))
+            start = stop
+        Phi: Array = np.asarray(block_diag(*blocks))
+        return Phi, tuple(motions)
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
-        n, k = len(u0), work.Phi.shape[1]
-        sensors, channels = work.problem.observed.size, work.problem.model.channels
+        k, model = work.Phi.shape[1], work.problem.model
+        sensors, channels = work.problem.observed.size, work.problem.channels
         start = Point(
             u0,
             q0,
-            np.zeros((n, k)),
-            np.zeros(n),
+            np.zeros(len(u0)),
             np.zeros(k),
+            model.initial_directions(q0, work.Phi),
             np.eye(k),
             Consistency.start(sensors),
+            np.zeros(sensors, dtype=np.int64),
         )
         empty = Samples(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, len(channels))))
         due = self.replay.first if self.replay else 0
@@ -261,7 +360,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def _store(
         self, work: SensitivityWork, state: SensitivityState, now: Point, interval: Interval
     ) -> SensitivityState:
-        channels = work.problem.model.channels
+        channels = work.problem.channels
         samples = state.samples
         if not len(samples.t):
             first = np.array([interval.inputs0[c] for c in channels])
@@ -272,18 +371,16 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return replace(state, now=now, samples=samples, assimilated=used)
 
     def _replayed(self, work: SensitivityWork, state: SensitivityState) -> tuple[Point, Status]:
-        """Run the stored samples again about the reference q_ref = the estimate now."""
+        """Run the stored samples again about a reference at the estimate, or on the way to it."""
         start, samples = state.start, state.samples
-        q = _bounded(work, state.now.q + work.Phi @ state.now.da)
-        shift = _reduced(work, q - start.q)
-        point = replace(
-            start,
-            q=q,
-            u=start.u + start.L @ shift,
-            du=start.du - start.L @ shift,
-            da=start.da - shift,
-        )
-        channels = work.problem.model.channels
+        reference = state.now.q
+        step = work.reduced(work.bounded(work.latent(state.now)) - reference)
+        step = step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
+        q = reference + work.Phi @ step
+        shift = work.reduced(q - start.q)
+        along = _along(start, shift)
+        point = replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
+        channels = work.problem.channels
         named = [dict(zip(channels, row, strict=True)) for row in samples.inputs]
         for k in range(1, len(samples.t)):
             interval = Interval(
@@ -303,106 +400,111 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         self, work: SensitivityWork, point: Point, interval: Interval
     ) -> tuple[Point, Report]:
         """Predict over an interval and update at its end, linear about the reference."""
-        model, observed = work.problem.model, work.problem.observed
-        k = work.Phi.shape[1]
-        direction = np.column_stack([work.Phi, work.Phi @ point.da])
-        columns = [point.u, point.L, point.du]
+        model = work.problem.model
+        before = point
+        point = self._moved(work, point, interval.t1 - interval.t0)
+        direction = work.Phi @ np.column_stack([point.C, point.da])
+        columns = [point.u, point.U, point.du]
 
         def stage(c: Array, t: float, h: float) -> Array:
             moment = interval.at(t)
             u = work.forward.solve(c[:, 0], point.q, h, moment)
             factor = work.forward.tangent(u, point.q, h, moment)
-            forcing = model.form_A.product("v", "q", direction, moment, u=u)
+            forcing = model.form_A.product("v", "q", direction, moment, u=u, q=point.q)
             rhs = (model.mass @ c[:, 1:]) / h - forcing
             return np.column_stack([u, factor.solve(rhs * model.X.free[:, None])])
 
-        y, steps, failure = advance(work.problem.control, stage, np.column_stack(columns), interval)
-        here = observed.predict(point.u + point.du, point.q + work.Phi @ point.da, interval.end)
+        control = work.problem.control
+        y, steps, failure = advance(control, stage, np.column_stack(columns), interval)
+
+        def failed(status: Status) -> tuple[Point, Report]:
+            return before, Report(status, work.predict(before, interval.end))
+
         if failure is not None:
-            return point, Report(Status.of(failure), here)
+            return failed(Status.of(failure))
         if not np.isfinite(y).all():
-            return point, Report(Status("not_finite", "the prediction is not finite"), here)
-        h = interval.t1 - interval.t0
-        fade = np.exp(-h / self.memory)
-        u, L = y[:, 0], fade * y[:, 1 : 1 + k]
-        du = y[:, 1 + k]
-        C = point.C
-        if self.drift:
-            C = _square_root(np.vstack([C.T, np.sqrt(self.drift * h) * np.eye(k)]))
-        predicted = observed.predict(u + du, point.q + work.Phi @ point.da, interval.end)
-        moved = replace(point, u=u, L=L, du=du, C=C)
-        new = self._update(work, moved, interval, predicted)
+            return failed(Status("not_finite", "the prediction is not finite"))
+        fade = np.exp(-(interval.t1 - interval.t0) / self.memory)
+        moved = replace(point, u=y[:, 0], U=fade * y[:, 1:-1], du=y[:, -1])
+        predicted = work.predict(moved, interval.end)
+        new, refused = self._update(work, moved, interval, predicted)
         if not np.isfinite(new.da).all():
-            return point, Report(Status("not_finite", "the update is not finite"), here)
+            return failed(Status("not_finite", "the update is not finite"))
         notes = {
             "innovation_ratio": new.consistency.ratio,
             "innovation_correlation": new.consistency.correlation,
         }
+        if np.isfinite(self.gate):
+            notes["refused"] = float(refused)
         return new, Report(Status(), predicted, steps, notes)
+
+    def _moved(self, work: SensitivityWork, point: Point, h: float) -> Point:
+        """Let the unknowns move by themselves for a time h; the state follows in the prediction."""
+        latent = work.problem.model.latent
+        if not any(motion.evolution.moves for motion in work.motions):
+            return point
+        F = block_diag(*(motion.transition(h) for motion in work.motions))
+        gained = np.sqrt(np.concatenate([motion.growth(h) for motion in work.motions]))
+        new = np.diag(gained)[:, gained > 0.0]
+        C = np.hstack([F @ point.C, new])
+        U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
+        if C.shape[1] > work.rank:
+            U, C = _compressed(U, C, work.scale, work.rank)
+        return replace(point, q=latent.moved(point.q, h), da=F @ point.da, U=U, C=C)
 
     def _update(
         self, work: SensitivityWork, point: Point, interval: Interval, predicted: Array
-    ) -> Point:
-        present = interval.present
-        if not present.any():
-            return point
-        noise = work.noise[present]
-        H = _output(work, point, interval.end)[present]
-        d = (interval.z1 - predicted)[present]
-        HC = (H @ point.C) / noise[:, None]
-        expected = noise * np.sqrt(1.0 + (HC**2).sum(axis=1))
-        e = np.full(len(present), np.nan)
-        e[present] = d / expected
-        # C+ C+^T = C (I + HC^T HC)^-1 C^T from a QR factorisation of [I; HC].
-        root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(len(point.da)), HC]), mode="r"))
-        # SciPy's triangular solve would start threads for this small matrix; this one does not.
-        C: Array = np.asarray(np.linalg.solve(root.T, point.C.T).T, dtype=float)
-        step = C @ (C.T @ (H.T @ (d / noise**2)))
-        return replace(
-            point,
-            da=point.da + step,
-            du=point.du + point.L @ step,
-            C=C,
-            consistency=point.consistency.add(e),
+    ) -> tuple[Point, int]:
+        """Return the filter after the sample, and how many values the gate refused."""
+        d = interval.z1 - predicted
+        used = np.isfinite(d)
+        if not used.any():
+            return point, 0
+        Y = work.output(point, interval.end) / work.noise[:, None]
+        e = d / (work.noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
+        far = used & (np.abs(e, where=used, out=np.zeros(len(e))) > self.gate)
+        refused = np.where(far, point.refused + 1, np.where(used, 0, point.refused))
+        used &= ~far | (refused > self.gate_patience)
+        point = replace(
+            point, refused=refused, consistency=point.consistency.add(np.where(used, e, np.nan))
         )
+        count = int((far & ~used).sum())
+        if not used.any():
+            return point, count
+        Y = Y[used]
+        # (I + Y^T Y)^-1 = W W^T with W = R^-1 from a QR factorisation of [I; Y].
+        root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(Y.shape[1]), Y]), mode="r"))
+        # SciPy's triangular solve would start threads for this small matrix; this one does not.
+        W: Array = np.asarray(np.linalg.inv(root), dtype=float)
+        half = W.T @ (Y.T @ (d / work.noise)[used])
+        U, C = point.U @ W, point.C @ W
+        new = replace(point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U)
+        return new, count
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         now = state.now
         return Belief(
-            _bounded(work, now.q + work.Phi @ now.da),
+            work.bounded(work.latent(now)),
             now.u + now.du,
             work.Phi @ now.C,
-            now.L @ now.C,
+            now.U,
             now.consistency.inflation,
         )
 
 
-def _output(work: SensitivityWork, point: Point, moment: Moment) -> Array:
-    """Return H = G'(u) L + D Phi, the derivative of the prediction in a."""
-    observed = work.problem.observed
-    H: Array = observed.G @ point.L
-    direct = observed.sensitivity(moment)
-    if direct is not None:
-        H = H + direct @ work.Phi
-    slope = observed.slope(point.u + point.du, point.q + work.Phi @ point.da, moment)
-    return H if slope is None else slope[:, None] * H
-
-
-def _reduced(work: SensitivityWork, dq: Array) -> Array:
-    """Return a with Phi a = dq: the columns of Phi are orthonormal in Q."""
-    a: Array = work.Phi.T @ work.problem.model.Q.dual(dq)
-    return a
-
-
-def _bounded(work: SensitivityWork, q: Array) -> Array:
-    lower, upper = work.problem.model.parameter_space.bounds
-    return np.clip(q, lower, upper)
+def _along(point: Point, shift: Array) -> Array:
+    """Return by how much the state is expected to move with a shift of a, shape (n,)."""
+    if not shift.any():
+        return np.zeros(len(point.u))
+    weights = np.linalg.lstsq(point.C, shift, rcond=None)[0]
+    along: Array = point.U @ weights
+    return along
 
 
 def _converged(work: SensitivityWork, point: Point) -> bool:
     """Return true if the estimate is within half a standard deviation of the reference."""
-    shift = _bounded(work, point.q + work.Phi @ point.da) - point.q
-    deviations = np.linalg.solve(point.C, _reduced(work, shift))
+    shift = work.reduced(work.bounded(work.latent(point)) - point.q)
+    deviations = np.linalg.lstsq(point.C, shift, rcond=None)[0]
     return bool(np.linalg.norm(deviations) <= CONVERGED * point.consistency.inflation)
 
 
@@ -412,8 +514,8 @@ def _recentre(work: SensitivityWork, point: Point) -> Point:
     Bounds hold for references and for what is reported, not for the linear filter: what lies
     beyond them stays in da and du, so that nothing the data said is lost.
     """
-    shift = _reduced(work, _bounded(work, point.q + work.Phi @ point.da) - point.q)
-    beyond = point.L @ (point.da - shift)
+    shift = work.reduced(work.bounded(work.latent(point)) - point.q)
+    beyond = _along(point, point.da - shift)
     return replace(
         point,
         u=point.u + point.du - beyond,
@@ -423,8 +525,9 @@ def _recentre(work: SensitivityWork, point: Point) -> Point:
     )
 
 
-def _square_root(rows: Array) -> Array:
-    """Return C with C C^T = rows^T rows."""
-    root: Any = np.linalg.qr(rows, mode="r")
-    lower: Array = root.T
-    return lower
+def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:
+    """Return the factor with its `rank` leading directions, states measured by `scale`."""
+    weighted = np.vstack([scale[:, None] * U, C])
+    _, vectors = np.linalg.eigh(weighted.T @ weighted)
+    kept = vectors[:, ::-1][:, :rank]
+    return U @ kept, C @ kept

@@ -220,6 +220,14 @@ class Observed:
         """Return the derivative of the readings in G u + D q, shape (sensors,); None if it is 1."""
         return None
 
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        """Return the derivative of `predict` in u, (sensors, n), and in q, (sensors, m) or None."""
+        slope, direct = self.slope(u, q, moment), self.sensitivity(moment)
+        if slope is None:
+            return self.G, direct
+        scaled = sp.csr_array(sp.diags_array(slope) @ self.G)
+        return scaled, None if direct is None else slope[:, None] * direct
+
     def linearised(self, z: Array, u: Array) -> Array:
         """Return z as linear sensors would have shown it, by one Newton step from the state u."""
         return z

@@ -73,10 +73,11 @@ class ForwardStage:
             raise StepFailed("singular", str(error)) from error
 
     @cached_property
-    def _offset(self) -> tuple[Array, sp.csr_array]:
-        """B(0) and A(0) of an affine model."""
+    def _offset(self) -> tuple[Array, sp.csr_array | None]:
+        """B(0) of an affine model, and A(0) if it is linear in q."""
         zero = np.zeros(self.model.X.dim)
-        return self.model.B(zero), self.model.A(zero).matrix
+        linear = self.model.form_A.linear_in_parameter
+        return self.model.B(zero), self.model.A(zero).matrix if linear else None
 
     def system(self, q: Array, h: float) -> _System:
         """Return matrix and factor of an affine, constant model, kept for the last (q, h)."""
@@ -84,7 +85,10 @@ class ForwardStage:
         if self._kept is None or self._kept[0] != key:
             data = self._data(np.zeros(self.model.X.dim), q, h, START)
             offset, constant = self._offset
-            if constant.data.any():
+            if constant is None:
+                zero = np.zeros(self.model.X.dim)
+                offset = offset + self.model.form_A.vector("v", q=q, u=zero)
+            elif constant.data.any():
                 offset = offset + constant @ q
             self._kept = (key, _System(self._rows[0].matrix(data), offset, self._factorise(data)))
         return self._kept[1]

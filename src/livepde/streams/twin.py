@@ -235,7 +235,7 @@ class Twin:
         return partial(_at, self.u_true, t)
 
     def _simulated(self, model: Model, control: Advance) -> list[Array]:
-        q = model.parameter_space.interpolate(self.q_true)
+        q = model.latent.inverse(model.parameter_space.interpolate(self.q_true))
         times = [float(t) for t in self.times]
         try:
             run = simulate(model, q, self._start(), times, control, self._inputs)
@@ -290,7 +290,7 @@ class Twin:
         if self.truth == "fine" and self.fine is not None and self._sees_any_mesh:
             model, states = self.fine, tuple(self._fine_states)
             observed = _bound(self.observation, model)
-        q = model.parameter_space.interpolate(self.q_true)
+        q = self.q
         rows = [
             observed.predict(u, q, self._moment(float(t)))
             for t, u in zip(self.times, states, strict=True)
@@ -330,7 +330,7 @@ class Twin:
 
     def baseline(self, q0: Any = None, unknown: str | None = None) -> float:
         """Return the error of knowing nothing: of q0, by default the prior mean."""
-        return self.error(self.model.initial_parameter(q0), unknown)
+        return self.error(self.model.latent.value(self.model.initial_parameter(q0)), unknown)
 
     def u_error(self, estimate: Estimate) -> float:
         """Return the relative error of the state in X, ||u - u_true|| / ||u_true||."""

@@ -1,0 +1,143 @@
+"""How an unknown moves by itself between two samples: the model of q(t) that laws assume.
+
+Each is a linear stochastic equation for the latent coefficients about their prior mean,
+
+    d(q - prior) = K (q - prior) dt + noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.errors import SpaceError
+from livepde.linalg import Array
+
+__all__ = ["CONSTANT", "Constant", "Evolution", "MeanReverting", "Periodic", "RandomWalk"]
+
+
+def _positive(what: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise SpaceError(f"{what} must be a positive number; got {value}.")
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Does not move."""
+
+    @property
+    def copies(self) -> int:
+        """Number of parts that an unknown is made of; q is the sum of the `visible` ones."""
+        return 1
+
+    @property
+    def visible(self) -> Array:
+        """Weight of each part in q, shape (copies,)."""
+        return np.ones(1)
+
+    @property
+    def generator(self) -> Array:
+        """K on the parts, shape (copies, copies)."""
+        return np.zeros((1, 1))
+
+    @property
+    def moves(self) -> bool:
+        """True unless it stays as it is."""
+        return type(self) is not Constant
+
+    def transition(self, h: float) -> Array:
+        """Return exp(K h), shape (copies, copies)."""
+        return np.eye(1)
+
+    def growth(self, h: float, std: float) -> Array:
+        """Return the variance that each part gains in h, as a share of the prior's, (copies,)."""
+        return np.zeros(1)
+
+
+@dataclass(frozen=True)
+class RandomWalk(Constant):
+    """Drifts: a deviation of rate * sqrt(h) is gained in a time h.
+
+    Parameters
+    ----------
+    rate
+        In the unit of the unknown (of its logarithm for transform="log") per square root of the
+        model's unit of time.
+    """
+
+    rate: float
+
+    def __post_init__(self) -> None:
+        _positive("RandomWalk: rate", self.rate)
+
+    def growth(self, h: float, std: float) -> Array:
+        return np.array([self.rate**2 * h / std**2])
+
+
+@dataclass(frozen=True)
+class MeanReverting(Constant):
+    """Returns to the prior mean within `time`, with the prior deviation (Ornstein-Uhlenbeck)."""
+
+    time: float
+
+    def __post_init__(self) -> None:
+        _positive("MeanReverting: time", self.time)
+
+    @property
+    def generator(self) -> Array:
+        return np.array([[-1.0 / self.time]])
+
+    def transition(self, h: float) -> Array:
+        return np.array([[np.exp(-h / self.time)]])
+
+    def growth(self, h: float, std: float) -> Array:
+        return np.array([-np.expm1(-2.0 * h / self.time)])
+
+
+@dataclass(frozen=True)
+class Periodic(Constant):
+    """A constant and harmonics: q(t) = q_0 + sum over k of a_k cos(2 pi k t/period + phase_k).
+
+    The prior mean belongs to the constant; each harmonic has the prior deviation. The parts rotate
+    with the time, so that a law needs no clock.
+    """
+
+    period: float
+    harmonics: int = 1
+
+    def __post_init__(self) -> None:
+        _positive("Periodic: period", self.period)
+        if self.harmonics < 1:
+            raise SpaceError(f"Periodic: harmonics must be at least 1; got {self.harmonics}.")
+
+    @property
+    def copies(self) -> int:
+        return 1 + 2 * self.harmonics
+
+    @property
+    def visible(self) -> Array:
+        return np.array([1.0] + self.harmonics * [1.0, 0.0])
+
+    @property
+    def generator(self) -> Array:
+        K = np.zeros((self.copies, self.copies))
+        for k in range(1, self.harmonics + 1):
+            omega, at = 2.0 * np.pi * k / self.period, 2 * k - 1
+            K[at, at + 1], K[at + 1, at] = -omega, omega
+        return K
+
+    def transition(self, h: float) -> Array:
+        F = np.eye(self.copies)
+        for k in range(1, self.harmonics + 1):
+            angle, at = 2.0 * np.pi * k * h / self.period, 2 * k - 1
+            c, s = np.cos(angle), np.sin(angle)
+            F[at : at + 2, at : at + 2] = [[c, -s], [s, c]]
+        return F
+
+    def growth(self, h: float, std: float) -> Array:
+        return np.zeros(self.copies)
+
+
+Evolution = Constant
+CONSTANT = Constant()

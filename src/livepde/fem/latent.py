@@ -1,0 +1,279 @@
+"""What laws estimate: latent coefficients a with a Gaussian prior, from which q = V T(a) follows.
+
+Without transforms and evolutions latent coefficients are those of q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import SpaceError
+from livepde.fem.evolution import Evolution
+from livepde.fem.forms import Form, FormMatrices
+from livepde.fem.place import START, Moment
+from livepde.fem.space import FunctionSpace
+from livepde.fem.transforms import Identity, Transform
+from livepde.linalg import Array, IntArray, Pattern, sandwich
+
+__all__ = ["Composed", "Latent", "LatentPart", "compose"]
+
+
+@dataclass(frozen=True, eq=False)
+class LatentPart:
+    """The latent coefficients of one unknown: `copies` times `size`, copy by copy.
+
+    Attributes
+    ----------
+    name, unknown, block
+        Of the function space.
+    part
+        Where they stand among all latent coefficients.
+    """
+
+    name: str
+    unknown: Any
+    block: Any
+    part: slice
+
+    @property
+    def transform(self) -> Transform:
+        """T of this unknown."""
+        transform: Transform = self.unknown.map
+        return transform
+
+    @property
+    def evolution(self) -> Evolution:
+        """How the unknown moves by itself."""
+        evolution: Evolution = self.unknown.evolution
+        return evolution
+
+    @property
+    def size(self) -> int:
+        """Coefficients of q."""
+        return int(self.block.size)
+
+
+class Latent:
+    """The map q = V T(a) from latent to physical coefficients of a function space, and its prior.
+
+    T acts on each coefficient (`transform` of the unknown); V adds up the parts of an unknown with
+    harmonics (`Periodic`).
+    """
+
+    def __init__(self, space: FunctionSpace) -> None:
+        self.space = space
+        self.parts: dict[str, LatentPart] = {}
+        start = 0
+        for name, block in space.blocks.items():
+            unknown = space.unknowns[name]
+            stop = start + block.size * unknown.evolution.copies
+            self.parts[name] = LatentPart(name, unknown, block, slice(start, stop))
+            start = stop
+        self.dim = start
+
+    @cached_property
+    def plain(self) -> bool:
+        """True if latent coefficients are those of q."""
+        return self.dim == self.space.dim and self.linear
+
+    @cached_property
+    def linear(self) -> bool:
+        """True if q is linear in the latent coefficients."""
+        return all(isinstance(p.transform, Identity) for p in self.parts.values())
+
+    @cached_property
+    def moves(self) -> bool:
+        """True if an unknown moves by itself."""
+        return any(p.evolution.moves for p in self.parts.values())
+
+    @cached_property
+    def V(self) -> sp.csr_array:
+        """Sum of the visible parts, shape (m, dim)."""
+        blocks = [
+            sp.kron(p.evolution.visible[None], sp.eye_array(p.size)) for p in self.parts.values()
+        ]
+        return sp.csr_array(sp.block_diag(blocks, format="csr"))
+
+    def _each(self, a: Array, function: str) -> Array:
+        pieces = [getattr(p.transform, function)(a[p.part]) for p in self.parts.values()]
+        return np.concatenate(pieces)
+
+    def value(self, a: Array) -> Array:
+        """Return the coefficients of q, shape (m,), for latent ones of shape (dim,)."""
+        if self.plain:
+            return a
+        with np.errstate(over="ignore"):
+            value: Array = self.V @ self._each(a, "value")
+        return value
+
+    def slopes(self, a: Array) -> Array:
+        """Return T' of each latent coefficient, shape (dim,)."""
+        with np.errstate(over="ignore"):
+            return self._each(a, "slope")
+
+    def curvatures(self, a: Array) -> Array:
+        """Return T'' of each latent coefficient, shape (dim,)."""
+        with np.errstate(over="ignore"):
+            return self._each(a, "curvature")
+
+    def tangent(self, a: Array, directions: Array) -> Array:
+        """Return dq/da applied to columns of shape (dim, k): shape (m, k)."""
+        if self.plain:
+            return directions
+        product: Array = self.V @ (self.slopes(a)[:, None] * directions)
+        return product
+
+    def inverse(self, q: Array) -> Array:
+        """Return latent coefficients of q; harmonics are zero.
+
+        Raises
+        ------
+        SpaceError
+            q lies outside of what a transform allows.
+        """
+        if self.plain:
+            return q
+        a = np.zeros(self.dim)
+        for p in self.parts.values():
+            inside = p.transform.inverse(q[self.space.part(p.name)])
+            if not np.isfinite(inside).all():
+                raise SpaceError(
+                    f"'{p.name}': a value lies outside of what transform="
+                    f"'{p.unknown.transform}' with bounds {p.unknown.bounds} allows."
+                )
+            a[p.part.start : p.part.start + p.size] = inside
+        return a
+
+    def _filled(self, values: Iterator[float]) -> Array:
+        lengths = [p.part.stop - p.part.start for p in self.parts.values()]
+        return np.repeat(np.array(list(values), dtype=float), lengths)
+
+    @cached_property
+    def prior(self) -> Array:
+        """Prior mean of the latent coefficients, shape (dim,)."""
+        return self.inverse(self.space.prior)
+
+    @cached_property
+    def deviations(self) -> Array:
+        """Prior deviation that belongs to each latent coefficient, shape (dim,)."""
+        return self._filled(p.unknown.latent_std for p in self.parts.values())
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the latent coefficients, as laws have to respect them."""
+        pairs = [p.unknown.latent_bounds for p in self.parts.values()]
+        return self._filled(iter([p[0] for p in pairs])), self._filled(iter([p[1] for p in pairs]))
+
+    @cached_property
+    def fixed(self) -> IntArray:
+        """Latent coefficients that boundary conditions fix at zero."""
+        found = []
+        for p in self.parts.values():
+            if p.name in self.space.fields:
+                fixed = self.space.fields[p.name].fixed
+                found += [fixed + p.part.start + c * p.size for c in range(p.evolution.copies)]
+        return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
+
+    @cached_property
+    def generator(self) -> sp.csr_array:
+        """K of the evolutions, d(a - prior)/dt = K (a - prior) + noise, shape (dim, dim)."""
+        blocks = [sp.kron(p.evolution.generator, sp.eye_array(p.size)) for p in self.parts.values()]
+        return sp.csr_array(sp.block_diag(blocks, format="csr"))
+
+    def moved(self, a: Array, h: float) -> Array:
+        """Return the expected latent coefficients a time h later."""
+        if not self.generator.nnz:
+            return a
+        change = a - self.prior
+        for p in self.parts.values():
+            parts = change[p.part].reshape(p.evolution.copies, p.size)
+            change[p.part] = (p.evolution.transition(h) @ parts).ravel()
+        return self.prior + change
+
+
+class Composed(FormMatrices):
+    """A form in which q = V T(a): the same interface, with latent coefficients in the slot q."""
+
+    def __init__(self, form: Form, latent: Latent) -> None:
+        super().__init__()
+        self.form = form
+        self.latent = latent
+        self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array]] = {}
+
+    @property
+    def affine(self) -> bool:
+        """True if the form is affine in u."""
+        return self.form.affine
+
+    @property
+    def constant(self) -> bool:
+        """True if the form reads neither time nor inputs."""
+        return self.form.constant
+
+    @property
+    def linear_in_parameter(self) -> bool:
+        """True if the form is linear in the latent coefficients."""
+        return self.latent.linear and self.form.linear_in_parameter
+
+    def _physical(self, coefficients: dict[str, Array]) -> dict[str, Array]:
+        if "q" not in coefficients:
+            return coefficients
+        return {**coefficients, "q": self.latent.value(coefficients["q"])}
+
+    def vector(self, slot: str, moment: Moment = START, **coefficients: Array) -> Array:
+        """Return the derivative in the linear argument `slot`."""
+        return self.form.vector(slot, moment, **self._physical(coefficients))
+
+    def pattern(self, rows: str, cols: str) -> Pattern:
+        """Return the sparsity of the matrices `data(rows, cols)`."""
+        return self._mapped(rows, cols)[0]
+
+    def _mapped(self, rows: str, cols: str) -> tuple[Pattern, sp.csr_array]:
+        """Return the pattern, and the map of the data of the form in q."""
+        if (rows, cols) not in self._maps:
+            inner, V, dim = self.form.pattern(rows, cols), self.latent.V, self.latent.dim
+            left = sp.csr_array(V.T) if rows == "q" else sp.eye_array(inner.shape[0])
+            right = V if cols == "q" else sp.eye_array(inner.shape[1])
+            i, j, weights = sandwich(left, inner, right)
+            shape = (left.shape[0], right.shape[1])
+            more = np.arange(dim if rows == cols == "q" else 0)
+            pattern = Pattern.from_entries(np.append(i, more), np.append(j, more), shape)
+            self._maps[rows, cols] = (pattern, sp.csr_array(pattern.gather(i, j) @ weights))
+        return self._maps[rows, cols]
+
+    def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
+        """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`."""
+        pattern, mapped = self._mapped(rows, cols)
+        physical = self._physical(coefficients)
+        data: Array = mapped @ self.form.data(rows, cols, moment, **physical)
+        if "q" not in (rows, cols):
+            return data
+        a = coefficients.get("q", np.zeros(self.latent.dim))
+        if not self.latent.linear:
+            slopes = self.latent.slopes(a)
+            if rows == "q":
+                data *= slopes[pattern.rows]
+            if cols == "q":
+                data *= slopes[pattern.indices]
+        if rows == cols == "q":
+            test = {key: value for key, value in physical.items() if key != "v"}
+            force = self.form.matrix("v", "q", moment, **test).T @ physical["v"]
+            at = np.arange(self.latent.dim)
+            curvature = self.latent.curvatures(a) * (self.latent.V.T @ force)
+            data[pattern.positions(at, at)] += curvature
+        return data
+
+    def tensor(self, rows: str, cols: str) -> sp.csr_array | None:
+        """Return None: the data are no linear function of the third argument."""
+        return None
+
+
+def compose(form: Form, latent: Latent) -> Form | Composed:
+    """Return the form in latent coefficients; the form itself where they are those of q."""
+    return form if latent.plain else Composed(form, latent)

@@ -1,0 +1,115 @@
+"""Unknowns that stay positive or within bounds: q = T(latent), coefficient by coefficient.
+
+Laws work with the latent coefficients, whose prior is Gaussian; weak forms and sensors see q.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.errors import SpaceError
+from livepde.linalg import Array
+
+__all__ = ["Identity", "Log", "Logit", "Transform", "transform_of"]
+
+
+class Transform(ABC):
+    """A smooth increasing function of one variable with its derivatives and its inverse."""
+
+    @abstractmethod
+    def value(self, latent: Array) -> Array:
+        """Return q = T(latent)."""
+
+    @abstractmethod
+    def slope(self, latent: Array) -> Array:
+        """Return T'(latent)."""
+
+    @abstractmethod
+    def curvature(self, latent: Array) -> Array:
+        """Return T''(latent)."""
+
+    @abstractmethod
+    def inverse(self, q: Array) -> Array:
+        """Return the latent value of q; not finite where q lies outside of the range of T."""
+
+
+@dataclass(frozen=True)
+class Identity(Transform):
+    """q itself."""
+
+    def value(self, latent: Array) -> Array:
+        return latent
+
+    def slope(self, latent: Array) -> Array:
+        return np.ones_like(latent)
+
+    def curvature(self, latent: Array) -> Array:
+        return np.zeros_like(latent)
+
+    def inverse(self, q: Array) -> Array:
+        return q
+
+
+@dataclass(frozen=True)
+class Log(Transform):
+    """q = lower + exp(latent): above a bound."""
+
+    lower: float = 0.0
+
+    def value(self, latent: Array) -> Array:
+        return np.asarray(self.lower + np.exp(latent))
+
+    def slope(self, latent: Array) -> Array:
+        return np.asarray(np.exp(latent))
+
+    def curvature(self, latent: Array) -> Array:
+        return np.asarray(np.exp(latent))
+
+    def inverse(self, q: Array) -> Array:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.log(q - self.lower))
+
+
+@dataclass(frozen=True)
+class Logit(Transform):
+    """q = lower + (upper - lower) / (1 + exp(-latent)): between two bounds."""
+
+    lower: float
+    upper: float
+
+    def _share(self, latent: Array) -> Array:
+        return np.asarray(0.5 * (1.0 + np.tanh(0.5 * latent)))
+
+    def value(self, latent: Array) -> Array:
+        return self.lower + (self.upper - self.lower) * self._share(latent)
+
+    def slope(self, latent: Array) -> Array:
+        share = self._share(latent)
+        return (self.upper - self.lower) * share * (1.0 - share)
+
+    def curvature(self, latent: Array) -> Array:
+        share = self._share(latent)
+        return (self.upper - self.lower) * share * (1.0 - share) * (1.0 - 2.0 * share)
+
+    def inverse(self, q: Array) -> Array:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.log(q - self.lower) - np.log(self.upper - q))
+
+
+def transform_of(what: str, name: str | None, bounds: tuple[float, float]) -> Transform:
+    """Return the transform that an unknown names: None, "log" or "logit"."""
+    lower, upper = bounds
+    if name is None:
+        return Identity()
+    if name == "log":
+        if np.isfinite(upper):
+            raise SpaceError(f"{what}: transform='log' knows no upper bound; take 'logit'.")
+        return Log(lower if np.isfinite(lower) else 0.0)
+    if name == "logit":
+        if not (np.isfinite(lower) and np.isfinite(upper)):
+            raise SpaceError(f"{what}: transform='logit' needs two finite bounds; got {bounds}.")
+        return Logit(lower, upper)
+    raise SpaceError(f"{what}: transform='{name}' is not known; expected 'log' or 'logit'.")

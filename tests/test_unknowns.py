@@ -1,0 +1,324 @@
+"""Unknowns that are positive, bounded, named, moving, nonlinear, or make the initial state."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from skfem import ElementLineHermite, ElementLineP1
+
+import livepde as lp
+from livepde.diagnostics import check_model
+from livepde.errors import ConfigurationError, LawError, SpaceError
+from livepde.fem import FunctionSpace, Latent
+from livepde.fem.evolution import Constant
+from livepde.fem.transforms import Log, Logit
+from livepde.stepping import ForwardStage
+
+NOISE = 0.01
+SENSORS = [0.25, 0.5, 0.75]
+mesh = lp.interval(0.0, 1.0, 20)
+
+
+def swinging(x: Any, t: float) -> Any:
+    return np.sin(3.0 * t) + 0.0 * x[0]
+
+
+def rod(parameter: Any, A: Any = None, **options: Any) -> lp.Model:
+    """Return a rod heated and cooled at its left end; the diffusivity is `a` unless A is given."""
+    state = lp.Field(mesh, ElementLineP1(), dirichlet={"left": swinging, "right": 0.0})
+    A = A or (lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
+    return lp.Model(state, parameter, A, **options)
+
+
+def data(a: Any, times: Any, noise: float = NOISE, seed: int = 0) -> list[tuple[float, Any]]:
+    """Return noisy samples of the sensors for a diffusivity a(t)."""
+    model, rng = rod({"a": lp.Scalar(1.0)}), np.random.default_rng(seed)
+    observed = lp.Points(SENSORS).bind(model.state_space, model.X, model.parameter_space)
+    forward, u = ForwardStage(model), model.initial(0.0)
+    samples = [(float(times[0]), observed.G @ u)]
+    for t0, t1 in itertools.pairwise(times):
+        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
+        samples.append((float(t1), observed.G @ u + noise * rng.standard_normal(len(SENSORS))))
+    return samples
+
+
+def estimates(model: lp.Model, law: Any, samples: Any, **options: Any) -> list[lp.Estimate]:
+    sensors = lp.Points(SENSORS, noise=NOISE)
+    identifier = lp.Identifier(model, sensors, law, **options)
+    found = [identifier.step(t, z) for t, z in samples]
+    assert all(estimate.status.ok for estimate in found)
+    return found
+
+
+@given(st.floats(-8, 8), st.floats(-5, 5), st.floats(0.1, 10))
+def test_transforms_have_their_inverse_and_derivatives(latent: float, lower: float, width: float):
+    a, h = np.array([latent]), 1e-6
+    for transform in (Log(lower), Logit(lower, lower + width)):
+        q = transform.value(a)
+        assert q > lower
+        np.testing.assert_allclose(transform.inverse(q), a, rtol=1e-6, atol=1e-6)
+        slope = (transform.value(a + h) - transform.value(a - h)) / (2 * h)
+        curvature = (transform.slope(a + h) - transform.slope(a - h)) / (2 * h)
+        size = float(transform.slope(a)[0])
+        np.testing.assert_allclose(transform.slope(a), slope, rtol=1e-4, atol=1e-8)
+        np.testing.assert_allclose(transform.curvature(a), curvature, rtol=1e-4, atol=1e-4 * size)
+
+
+@pytest.mark.parametrize(
+    "evolution", [Constant(), lp.RandomWalk(0.3), lp.MeanReverting(2.0), lp.Periodic(5.0, 3)]
+)
+def test_transitions_are_exponentials_and_compose(evolution: Any):
+    K = evolution.generator
+    np.testing.assert_allclose(evolution.transition(0.7), expm(0.7 * K), atol=1e-12)
+    both = evolution.transition(0.3) @ evolution.transition(0.4)
+    np.testing.assert_allclose(both, evolution.transition(0.7), atol=1e-12)
+    F, once = evolution.transition(0.4), evolution.growth(0.3, 2.0)
+    twice = np.diag(F @ np.diag(once) @ F.T) + evolution.growth(0.4, 2.0)
+    np.testing.assert_allclose(twice, evolution.growth(0.7, 2.0), atol=1e-12)
+
+
+def test_a_mean_reverting_unknown_keeps_its_prior_variance():
+    evolution = lp.MeanReverting(2.0)
+    kept = evolution.transition(0.5)[0, 0] ** 2 + evolution.growth(0.5, 1.0)[0]
+    assert kept == pytest.approx(1.0)
+
+
+UNKNOWNS = {
+    "log": lp.Scalar(0.4, 0.2, transform="log"),
+    "logit": lp.Scalar(0.4, 0.2, bounds=(0.1, 0.9), transform="logit"),
+    "layers": lp.Piecewise(
+        {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}, 0.4, 0.2, transform="log"
+    ),
+    "field": lp.Field(mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.2, transform="log"),
+    "periodic": lp.Scalar(0.4, 0.1, evolution=lp.Periodic(5.0, 2)),
+    "periodic field": lp.Field(
+        mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.1, evolution=lp.Periodic(5.0)
+    ),
+    "walk": lp.Scalar(0.4, 0.2, evolution=lp.RandomWalk(0.1)),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWNS)
+def test_models_in_latent_coefficients_pass_the_checks(name: str):
+    check_model(rod({"a": UNKNOWNS[name]}), u=1.0).raise_if_failed()
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.2, 3.0), st.floats(0.2, 3.0), st.integers(0, 100))
+def test_residuals_nonlinear_in_q_pass_the_checks(k: float, s: float, seed: int):
+    unknowns = {
+        "k": lp.Scalar(k, 0.3 * k, transform="log"),
+        "S": lp.Scalar(s, 0.3 * s, transform="log"),
+    }
+
+    def A(q: Any, u: Any, v: Any, x: Any) -> Any:
+        return q.k / q.S * (1 + u**2) * lp.dot(lp.grad(u), lp.grad(v)) - x.t / q.S * v
+
+    model = rod(unknowns, A)
+    assert not model.form_A.linear_in_parameter
+    check_model(model, u=1.0, seed=seed, t=1.0).raise_if_failed()
+
+
+def test_latent_coefficients_round_trip_and_report_what_is_outside():
+    names = {name.replace(" ", "_"): item for name, item in UNKNOWNS.items()}
+    space = FunctionSpace.of({**names, "n": lp.Scalars(("x", "y"), 0.1)}, "q")
+    latent = Latent(space)
+    q = space.prior
+    np.testing.assert_allclose(latent.value(latent.inverse(q)), q, atol=1e-14)
+    assert latent.dim == space.dim + 4 + 2 * 21
+    assert list(space.labels)[-2:] == ["n[x]", "n[y]"]
+    q = q.copy()
+    q[0] = -1.0
+    with pytest.raises(SpaceError, match="'log': a value lies outside"):
+        latent.inverse(q)
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: lp.Scalar(0.0, 1.0, transform="log"), "not inside of what"),
+        (lambda: lp.Scalar(1.0, 1.0, transform="sqrt"), "expected 'log' or 'logit'"),
+        (lambda: lp.Scalar(1.0, 1.0, transform="logit"), "two finite bounds"),
+        (lambda: lp.Scalar(1.0, 1.0, (0, 2), transform="log"), "no upper bound"),
+        (lambda: lp.Scalars(("a", "a")), "names must be given and differ"),
+        (lambda: lp.Scalars(()), "names must be given and differ"),
+        (lambda: lp.RandomWalk(0.0), "rate must be a positive number"),
+        (lambda: lp.MeanReverting(-1.0), "time must be a positive number"),
+        (lambda: lp.Periodic(1.0, 0), "harmonics must be at least 1"),
+        (lambda: lp.Field(mesh, ElementLineP1(), bounds=(0, 1)), "bounds need transform"),
+        (
+            lambda: lp.Field(mesh, ElementLineHermite(), prior=1.0, transform="log"),
+            "element of first order",
+        ),
+        (
+            lambda: lp.Scalar(1.0, 1.0, transform="log", evolution=lp.Periodic(1.0)),
+            "together with Periodic",
+        ),
+    ],
+)
+def test_priors_that_cannot_be_meant_are_one_sentence(build: Any, words: str):
+    with pytest.raises(SpaceError, match=words):
+        build()
+
+
+def test_positive_unknowns_are_found_and_stay_positive():
+    times = np.arange(0.0, 6.0, 0.05)
+    samples = data(lambda t: 0.05, times)
+    model = rod({"a": lp.Scalar(1.0, 1.0, transform="log")})
+    found = estimates(model, lp.SensitivityLaw(replay=lp.Replay(first=8)), samples)
+    values = [estimate.parameters["a"][0] for estimate in found]
+    assert min(values) > 0.0
+    value, std = found[-1].parameters["a"]
+    assert abs(value - 0.05) < 4 * std < 0.01
+    assert found[-1].q_std is not None
+
+
+def test_the_gradient_law_learns_a_positive_field_and_a_nonlinear_unknown():
+    model = rod({"a": UNKNOWNS["field"], "c": lp.Scalar(2.0, 1.0)}, A=None)
+    assert model.latent.dim == 22
+
+    def A(q: Any, u: Any, v: Any, x: Any) -> Any:
+        return (q.a + 0.1 * q.c**2) * lp.dot(lp.grad(u), lp.grad(v))
+
+    model = rod({"a": UNKNOWNS["field"], "c": lp.Scalar(1.0, 0.01)}, A)
+    full = lp.Full()
+    law = lp.GradientLaw(gain=100.0, damping=lp.ResidualDamping(10.0))
+    identifier = lp.Identifier(model, full, law)
+    truth = model.initial_parameter({"a": lambda x: 0.5 + 0.2 * np.sin(3 * x[0]), "c": 1.0})
+    forward, u = ForwardStage(model), model.initial(0.0)
+    times = np.arange(0.0, 20.0, 0.05)
+    identifier.step(0.0, identifier.observed.G @ u)
+    for t0, t1 in itertools.pairwise(times):
+        u = forward.solve(u, truth, t1 - t0, lp.Moment(t1))
+        estimate = identifier.step(t1, identifier.observed.G @ u)
+        assert estimate.status.ok
+    exact = model.latent.value(truth)
+    inside = slice(4, 17)
+    start = model.latent.value(model.initial_parameter())
+    error, before = (np.abs(q - exact)[inside].max() for q in (estimate.q, start))
+    assert error < 0.2 * before
+    assert estimate.q[:21].min() > 0.0
+
+
+def rms(found: list[lp.Estimate], a: Any, after: float) -> tuple[float, float]:
+    """Return the error of the estimates, absolute and in deviations."""
+    late = [estimate for estimate in found if estimate.t > after]
+    values = np.array([estimate.parameters["a"] for estimate in late])
+    errors = values[:, 0] - np.array([a(estimate.t) for estimate in late])
+    return float(np.sqrt((errors**2).mean())), float(np.sqrt(((errors / values[:, 1]) ** 2).mean()))
+
+
+def test_a_periodic_unknown_is_followed_without_delay():
+    def a(t: float) -> float:
+        return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
+
+    samples = data(a, np.arange(0.0, 30.0, 0.05))
+    periodic = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.Periodic(10.0))})
+    walking = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.RandomWalk(0.1))})
+    error, deviations = rms(estimates(periodic, lp.SensitivityLaw(), samples), a, 10.0)
+    slower, _ = rms(estimates(walking, lp.SensitivityLaw(), samples), a, 10.0)
+    assert error < 0.004
+    assert 0.3 < deviations < 2.0
+    assert 3 * error < slower < 0.03
+
+
+def test_a_random_walk_is_followed_with_an_honest_deviation():
+    times, rate = np.arange(0.0, 60.0, 0.05), 0.02
+    rng = np.random.default_rng(3)
+    walk = 0.4 + rate * np.sqrt(0.05) * np.cumsum(rng.standard_normal(len(times)))
+    samples = data(lambda t: float(np.interp(t, times, walk)), times)
+    model = rod({"a": lp.Scalar(0.4, 0.2, evolution=lp.RandomWalk(rate))})
+    found = estimates(model, lp.SensitivityLaw(), samples)
+    error, deviations = rms(found, lambda t: float(np.interp(t, times, walk)), 5.0)
+    assert 0.7 < deviations < 1.3
+    assert error < 0.5 * np.sqrt(((walk - 0.4) ** 2).mean())
+
+
+def test_the_gradient_law_rotates_a_periodic_unknown():
+    def a(t: float) -> float:
+        return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
+
+    errors = {}
+    for name, evolution in (("periodic", lp.Periodic(10.0)), ("constant", Constant())):
+        model = rod({"a": lp.Scalar(0.2, 0.2, evolution=evolution)})
+        law = lp.GradientLaw(gain=10.0, damping=lp.ResidualDamping(10.0))
+        identifier = lp.Identifier(model, lp.Full(), law)
+        forward, u = ForwardStage(rod({"a": lp.Scalar(0.3)})), model.initial(0.0)
+        times, found = np.arange(0.0, 40.0, 0.05), []
+        for t0, t1 in itertools.pairwise(times):
+            u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
+            found.append(identifier.step(t1, identifier.observed.G @ u))
+        errors[name] = np.sqrt(np.mean([(e.parameters["a"][0] - a(e.t)) ** 2 for e in found[400:]]))
+    assert 3 * errors["periodic"] < errors["constant"]
+
+
+def test_an_unknown_initial_state_is_found_with_the_diffusivity():
+    start = lp.Field(
+        mesh,
+        ElementLineP1(),
+        inner=lambda u, v, x: 2.5 * u * v + 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
+        std=0.7,
+    )
+    model = rod({"a": lp.Scalar(0.2, 0.1), "u0": start}, initial=lambda q, v, x: q.u0 * v)
+    truth = model.initial_parameter({"a": 0.1, "u0": lambda x: np.sin(np.pi * x[0])})
+    forward, rng = ForwardStage(model), np.random.default_rng(0)
+    u = model.initial_state(truth)
+    assert np.abs(u - np.sin(np.pi * mesh.p[0])).max() < 0.01
+    law = lp.SensitivityLaw(modes=8, replay=lp.Replay(first=8))
+    identifier = lp.Identifier(model, lp.Points(SENSORS, noise=NOISE), law)
+    G, times = identifier.observed.G, np.arange(0.0, 4.0, 0.02)
+    identifier.step(0.0, G @ u + NOISE * rng.standard_normal(3))
+    for t0, t1 in itertools.pairwise(times):
+        u = forward.solve(u, truth, t1 - t0, lp.Moment(t1))
+        estimate = identifier.step(t1, G @ u + NOISE * rng.standard_normal(3))
+    value, std = estimate.parameters["a"]
+    assert abs(value - 0.1) < 4 * std < 0.01
+    profile = estimate.q[model.parameter_space.part("u0")]
+    assert np.abs(profile - np.sin(np.pi * mesh.p[0]))[2:-2].max() < 0.1
+
+
+def test_an_initial_state_is_given_once():
+    model = rod({"a": lp.Scalar(0.2)}, initial=lambda q, v, x: q.a * v)
+    with pytest.raises(ConfigurationError, match="leave out u0"):
+        lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(), u0=1.0)
+
+
+def test_the_gate_refuses_outliers_and_believes_what_lasts():
+    times = np.arange(0.0, 8.0, 0.05)
+    samples = data(lambda t: 0.3, times)
+    for k in (50, 80, 81, 110):
+        samples[k][1][1] += 1.0
+    model = rod({"a": lp.Scalar(0.2, 0.2)})
+    plain = estimates(model, lp.SensitivityLaw(), samples)[-1].parameters["a"][0]
+    found = estimates(model, lp.SensitivityLaw(gate=5.0), samples)
+    assert abs(found[-1].parameters["a"][0] - 0.3) < 0.002 < abs(plain - 0.3)
+    assert [e.t for e in found if e.notes.get("refused")] == [
+        pytest.approx(times[k]) for k in (50, 80, 81, 110)
+    ]
+    for t, z in samples[60:]:
+        z[1] += 0.5 if t else 0.0
+    lasting = estimates(model, lp.SensitivityLaw(gate=5.0, gate_patience=7), samples)
+    refused = [bool(e.notes.get("refused")) for e in lasting]
+    assert sum(refused[60:67]) == 7
+    assert not refused[67]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"gate": 0.0}, "gate must be positive"), ({"gate_patience": 0}, "gate_patience")],
+)
+def test_gates_that_cannot_be_meant_are_one_sentence(options: Any, words: str):
+    with pytest.raises(LawError, match=words):
+        lp.SensitivityLaw(**options)
+
+
+def test_a_factor_too_narrow_for_its_unknowns_is_refused():
+    model = rod({"a": lp.Scalar(0.2), "b": lp.Scalar(0.2)})
+    with pytest.raises(LawError, match="rank must be at least the 2"):
+        lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(rank=1))
