@@ -322,3 +322,33 @@ def test_a_factor_too_narrow_for_its_unknowns_is_refused():
     model = rod({"a": lp.Scalar(0.2), "b": lp.Scalar(0.2)})
     with pytest.raises(LawError, match="rank must be at least the 2"):
         lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(rank=1))
+
+
+def test_a_model_takes_more_unknowns_for_its_sensors():
+    model = rod({"a": lp.Scalar(0.2)}, inputs=["Q"], initial=lambda q, v, x: q.a * v)
+    more = model.with_unknowns({"offset": lp.Scalars(("A", "B"), 0.0, 0.3)})
+    assert list(more.parameter_space.labels) == ["a", "offset[A]", "offset[B]"]
+    assert more.channels == ("Q",)
+    np.testing.assert_array_equal(
+        more.initial_state(more.initial_parameter()), model.initial_state(np.array([0.2]))
+    )
+    with pytest.raises(lp.ModelError, match="'a' is taken"):
+        model.with_unknowns({"a": lp.Scalar()})
+    with pytest.raises(lp.ModelError, match="has no name"):
+        rod(lp.Scalar(), lambda q, u, v, x: q * u * v).with_unknowns({"b": lp.Scalar()})
+
+
+@pytest.mark.parametrize(
+    "kink",
+    [
+        lambda u: lp.absolute(u - 0.5),
+        lambda u: lp.maximum(u, 0.5 * u**2),
+        lambda u: lp.minimum(u, 0.3),
+        lambda u: lp.positive(u - 0.2) ** 2,
+    ],
+)
+def test_functions_with_kinks_have_their_derivatives(kink: Any):
+    def A(q: Any, u: Any, v: Any, x: Any) -> Any:
+        return (q.a**2 + lp.absolute(q.a - 3.0)) * kink(u) * v
+
+    check_model(rod({"a": lp.Scalar(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()

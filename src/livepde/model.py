@@ -132,6 +132,10 @@ class Model:
         time_unit: str = "",
         initial: Integrand | On | Sequence[Integrand | On] | None = None,
     ) -> None:
+        self._parts: dict[str, Any] = {
+            **{"A": A, "B": B, "f": f, "M": M, "dA": dA, "dB": dB},
+            **{"inputs": inputs, "initial": initial},
+        }
         self.state = state
         self.time_unit = time_unit
         self.state_space = FunctionSpace.of(state, "u")
@@ -168,6 +172,22 @@ class Model:
     ) -> Form:
         mesh, order, inputs = self.mesh, self.order, self.inputs
         return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
+
+    def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
+        """Return the same process with more unknowns, which its forms do not see: of sensors, say.
+
+        Raises
+        ------
+        ModelError
+            This model has one unknown without a name, or a name is taken.
+        """
+        space = self.parameter_space
+        taken = sorted(set(space.unknowns) & set(more))
+        if space.single or taken:
+            what = f"the name '{taken[0]}' is taken" if taken else "its one unknown has no name"
+            raise ModelError(f"with_unknowns: {what}; write parameter={{name: unknown, ...}}.")
+        unknowns = {**space.unknowns, **more}
+        return Model(self.state, unknowns, **self._parts, time_unit=self.time_unit)
 
     def _check_parameter(self) -> None:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)

@@ -319,8 +319,8 @@ def _taylor(
         f"{given}= does not belong to {given[1]}: correct it, or leave it out and let a complex "
         "step take the derivative."
         if given
-        else "a complex step cannot see abs, max, min or a comparison: give "
-        f"d{name[0]}= with the derivative in u, or write the form without them."
+        else "a complex step cannot see abs, max, min or a comparison: write them as "
+        f"livepde.absolute, maximum, minimum, or give d{name[0]}= with the derivative in u."
     )
     if name.startswith("d("):
         remedy = remedy.replace("dd=", "dA=")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from livepde.fem.blocks import FieldBlock
+from livepde.fem.branches import absolute, maximum, minimum, positive
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.fields import (
     Channel,
@@ -50,6 +51,7 @@ __all__ = [
     "Scalars",
     "Sobolev",
     "Unknown",
+    "absolute",
     "box",
     "compose",
     "ddot",
@@ -60,7 +62,10 @@ __all__ = [
     "hess",
     "interval",
     "linear",
+    "maximum",
+    "minimum",
     "mul",
+    "positive",
     "quadratic",
     "read_mesh",
     "rectangle",

@@ -28,7 +28,7 @@ class Consistency:
     slow_count, slow_square
         Sums of 1 and of the squared `slow`.
     last
-        e of the last sample, shape (sensors,), NaN where missing.
+        Last e of each sensor, shape (sensors,), NaN before its first.
     slow
         Exponential average of e over `SLOW` samples, shape (sensors,).
     """
@@ -61,7 +61,7 @@ class Consistency:
             fade * self.product + float(products[both].sum()),
             fade * self.slow_count + float(seen.sum()),
             fade * self.slow_square + float((slow[seen] ** 2).sum()),
-            e,
+            np.where(seen, e, self.last),
             slow,
         )
 

@@ -457,18 +457,20 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> tuple[Point, int]:
         """Return the filter after the sample, and how many values the gate refused."""
         d = interval.z1 - predicted
-        used = np.isfinite(d)
-        if not used.any():
+        present = np.isfinite(d)
+        if not present.any():
             return point, 0
         Y = work.output(point, interval.end) / work.noise[:, None]
         e = d / (work.noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
-        far = used & (np.abs(e, where=used, out=np.zeros(len(e))) > self.gate)
-        refused = np.where(far, point.refused + 1, np.where(used, 0, point.refused))
-        used &= ~far | (refused > self.gate_patience)
-        point = replace(
-            point, refused=refused, consistency=point.consistency.add(np.where(used, e, np.nan))
-        )
-        count = int((far & ~used).sum())
+        used, count = present, 0
+        if np.isfinite(self.gate):
+            far = present & ~(np.abs(e) <= self.gate)
+            refused = np.where(far, point.refused + 1, np.where(present, 0, point.refused))
+            used = present & ~(far & (refused <= self.gate_patience))
+            count = int(present.sum() - used.sum())
+            point = replace(point, refused=refused)
+            e = np.where(used, e, np.nan)
+        point = replace(point, consistency=point.consistency.add(e))
         if not used.any():
             return point, count
         Y = Y[used]
@@ -514,7 +516,12 @@ def _recentre(work: SensitivityWork, point: Point) -> Point:
     Bounds hold for references and for what is reported, not for the linear filter: what lies
     beyond them stays in da and du, so that nothing the data said is lost.
     """
-    shift = work.reduced(work.bounded(work.latent(point)) - point.q)
+    estimate = work.latent(point)
+    within = work.bounded(estimate)
+    if np.array_equal(within, estimate):
+        zero = np.zeros(len(point.da))
+        return replace(point, u=point.u + point.du, q=estimate, du=0.0 * point.du, da=zero)
+    shift = work.reduced(within - point.q)
     beyond = _along(point, point.da - shift)
     return replace(
         point,
