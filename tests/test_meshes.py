@@ -40,6 +40,41 @@ $Elements
 $EndElements
 """
 
+SQUARE_4 = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+2
+1 1 "inlet"
+2 2 "sand"
+$EndPhysicalNames
+$Entities
+0 1 1 0
+1 0 0 0 0 1 0 1 1 0
+1 0 0 0 1 1 0 1 2 0
+$EndEntities
+$Nodes
+1 4 1 4
+2 1 0 4
+1
+2
+3
+4
+0 0 0
+1 0 0
+1 1 0
+0 1 0
+$EndNodes
+$Elements
+2 3 1 3
+1 1 1 1
+1 1 4
+2 1 2 2
+2 1 2 3
+3 1 3 4
+$EndElements
+"""
+
 
 def named(tmp_path, suffix, **options):
     """Write two squares with groups in another format than Gmsh's."""
@@ -78,6 +113,15 @@ def test_groups_of_a_gmsh_file_are_kept(gmsh, capsys):
     assert np.allclose(mesh.p[0, mesh.facets[:, mesh.boundaries["inlet"]]], 0.0)
     assert np.allclose(mesh.p[0, mesh.facets[:, mesh.boundaries["wall"]]], 2.0)
     assert capsys.readouterr().out == capsys.readouterr().err == ""
+
+
+def test_groups_of_the_newer_gmsh_format(tmp_path):
+    path = tmp_path / "square.msh"
+    path.write_text(SQUARE_4)
+    mesh = lp.read_mesh(path)
+    assert set(mesh.boundaries) == {"inlet"}
+    assert set(mesh.subdomains) == {"sand"}
+    assert [area(mesh, name) for name in ("sand", "inlet")] == pytest.approx([1.0, 1.0])
 
 
 def test_a_model_on_a_file(gmsh):

@@ -384,6 +384,10 @@ class _Inside:
 
     def __init__(self, observed: Observed, basis: Array) -> None:
         self.space: FunctionSpace = observed.state
+        if len(self.space.fields) > 1:
+            raise ObservationError(
+                "Tikhonov: norm 'V' and forms know states of one component; take norm='X'."
+            )
         self.block: FieldBlock = self.space.component()[0]
         self.mask = np.ones(self.block.element_dofs.shape[1])
         if observed.observation.nodal:
