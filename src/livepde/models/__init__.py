@@ -7,6 +7,7 @@ from livepde.models.diffusion import HEAT, heat
 from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
 from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
+from livepde.models.wave import WAVE, wave
 
 __all__ = [
     "EQUATIONS",
@@ -20,9 +21,17 @@ __all__ = [
     "heat",
     "porous_fisher",
     "reaction_diffusion",
+    "wave",
 ]
 
 EQUATIONS: dict[str, Equation] = {
     equation.name: equation
-    for equation in (HEAT, BOREHOLE, REACTION_DIFFUSION, FISHER_KPP, POROUS_FISHER)
+    for equation in (
+        HEAT,
+        BOREHOLE,
+        REACTION_DIFFUSION,
+        FISHER_KPP,
+        POROUS_FISHER,
+        WAVE,
+    )
 }
