@@ -5,6 +5,7 @@ from __future__ import annotations
 from livepde.models.base import Equation, Option, Quantity, Variable
 from livepde.models.diffusion import HEAT, heat
 from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
+from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
 from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
 from livepde.models.wave import WAVE, wave
@@ -18,8 +19,10 @@ __all__ = [
     "borehole",
     "fisher_kpp",
     "fluid",
+    "groundwater",
     "heat",
     "porous_fisher",
+    "pumping_test",
     "reaction_diffusion",
     "wave",
 ]
@@ -33,5 +36,7 @@ EQUATIONS: dict[str, Equation] = {
         FISHER_KPP,
         POROUS_FISHER,
         WAVE,
+        GROUNDWATER,
+        PUMPING_TEST,
     )
 }
