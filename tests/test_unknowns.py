@@ -352,3 +352,24 @@ def test_functions_with_kinks_have_their_derivatives(kink: Any):
         return (q.a**2 + lp.absolute(q.a - 3.0)) * kink(u) * v
 
     check_model(rod({"a": lp.Scalar(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()
+
+
+def test_a_first_sample_at_the_start_says_what_is_unknown_there():
+    model = rod(
+        {"u0": lp.Scalar(1.0, 1.0)},
+        lambda q, u, v, x: 0.1 * u * v + 0.0 * q.u0 * v,
+        initial=lambda q, v, x: q.u0 * v,
+    )
+    for replay in (None, lp.Replay(first=2)):
+        sensors = lp.Points(SENSORS, noise=NOISE)
+        identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=replay))
+        start = model.initial_state(np.array([2.0]))
+        first = identifier.step(0.0, identifier.observed.G @ start)
+        np.testing.assert_allclose(first.innovation, 1.0, atol=0.1)
+        assert first.parameters["u0"][0] == pytest.approx(2.0, abs=0.01)
+        forward, u = ForwardStage(model), start
+        for t in (0.1, 0.2, 0.3):
+            u = forward.solve(u, np.array([2.0]), 0.1, lp.Moment(t))
+            estimate = identifier.step(t, identifier.observed.G @ u)
+        value, std = estimate.parameters["u0"]
+        assert abs(value - 2.0) < 3 * std < 0.03

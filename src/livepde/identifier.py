@@ -67,7 +67,8 @@ class Identifier:
         Where to start: numbers, functions of x, coefficients, or for several unknowns a mapping.
         q0 defaults to the prior mean, u0 to what the model says (`initial`), else zero.
     t0
-        Initial time. A first sample at exactly t0 describes the start and takes no step.
+        Initial time. A first sample at exactly t0 describes the start and takes no step; a law
+        may learn from it what is unknown there.
     withheld
         Sensors that are never assimilated, only scored.
     scheme, dt_max
@@ -189,6 +190,8 @@ class Identifier:
             moment = Moment(t, values)
             belief = self._belief()
             report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
+            interval = Interval(t, t, values, values, used, used)
+            self._state = self.law.begin(self._work, self._state, interval)
         else:
             interval = Interval(self._t, t, self._inputs, values, self._z, used)
             self._state, report = self.law.step(self._work, self._state, interval)

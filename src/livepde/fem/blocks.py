@@ -17,7 +17,7 @@ from skfem.helpers import inner
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elements import own
-from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Scalars, Unknown
+from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Scalars, Unknown, is_nodal
 from livepde.fem.periodic import tied
 from livepde.fem.place import Moment, Place
 from livepde.linalg import Array, IntArray
@@ -278,7 +278,7 @@ class FieldBlock(Block):
     @property
     def nodal(self) -> bool:
         """True if coefficients are values at nodes: elements of first order."""
-        return int(self.field.element.maxdeg) <= 1
+        return is_nodal(self.field.element)
 
     def interpolate(self, value: Any) -> Array:
         """Return coefficients of a number, or the L2 projection of a function of x."""

@@ -90,6 +90,12 @@ def interval(
     return mesh.with_subdomains(dict(regions)) if regions else mesh
 
 
+def is_nodal(element: Element) -> bool:
+    """Return true if coefficients are values at nodes or in cells: elements of first order."""
+    inner = element.facet_dofs + element.edge_dofs
+    return not inner and element.nodal_dofs + element.interior_dofs == 1
+
+
 def _check_prior(
     what: str, std: float, bounds: tuple[float, float], prior: float, transform: str | None
 ) -> None:
@@ -211,7 +217,7 @@ class Field(_Prior):
         self._check()
         if self.transform is None and np.isfinite(self.bounds).any():
             raise SpaceError("Field: bounds need transform='log' or 'logit', which keeps them.")
-        if self.transform is not None and (self.element.maxdeg > 1 or self.dirichlet):
+        if self.transform is not None and (not is_nodal(self.element) or self.dirichlet):
             raise SpaceError(
                 "Field: a transform acts on values at nodes: take an element of first order and "
                 "no boundary values."

@@ -37,6 +37,7 @@ from livepde.linalg import Array, IntArray, Pattern, PatternOperator
 __all__ = ["Form", "FormMatrices"]
 
 STEP = 1e-30  # of the complex step: far below rounding, far above underflow
+SMALL = 1e-3  # share of the largest value of a component below which that is its scale
 SHIFT = 1e-3  # of a central difference of fourth order, relative: its errors are about 1e-13
 LARGEST_TENSOR = 20_000_000  # entries of a precomputed trilinear form; beyond it, quadrature
 
@@ -434,6 +435,8 @@ class Form(FormMatrices):
 
 
 def _scale(values: Array) -> Array:
-    """Return a size for each component, shape (components, 1, 1, 1, 1)."""
-    size = np.abs(values).max(axis=(1, 2))
-    return np.where(size > 0.0, size, 1.0)[:, None, None, None, None]
+    """Return the size of each component at each point, not too small: (components, 1, 1, E, P)."""
+    size = np.abs(values)
+    whole = size.max(axis=(1, 2), keepdims=True)
+    whole = np.where(whole > 0.0, whole, 1.0)
+    return np.where(size > SMALL * whole, size, whole)[:, None, None]

@@ -157,6 +157,13 @@ class Law(ABC, Generic[Work, State]):
     def init(self, work: Work, q0: Array, u0: Array) -> State:
         """Return the state at the start, from coefficients q0 (m,) and u0 (n,)."""
 
+    def begin(self, work: Work, state: State, interval: Interval) -> State:
+        """Return the state after a sample at the initial time; here the same.
+
+        `interval` has no length: it holds the sample and the inputs.
+        """
+        return state
+
     @abstractmethod
     def step(self, work: Work, state: State, interval: Interval) -> tuple[State, Report]:
         """Return the state at the end of the interval; the old one if the step failed."""

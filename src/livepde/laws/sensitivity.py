@@ -90,7 +90,8 @@ class Samples:
     Attributes
     ----------
     t, z, inputs
-        Shapes (count + 1,), (count + 1, sensors), (count + 1, channels); first row: the start.
+        Shapes (count + 1,), (count + 1, sensors), (count + 1, channels); first row: the start,
+        with what was assimilated there.
     """
 
     t: Array
@@ -334,6 +335,20 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         due = self.replay.first if self.replay else 0
         return SensitivityState(start, start, empty, 0, due)
 
+    def begin(
+        self, work: SensitivityWork, state: SensitivityState, interval: Interval
+    ) -> SensitivityState:
+        point = state.now
+        # A state that is known, seen by sensors that see no unknown, has nothing to learn.
+        if not work.output(point, interval.end).any():
+            return state
+        new, _ = self._update(work, point, interval, work.predict(point, interval.end))
+        if not np.isfinite(new.da).all():
+            return state
+        if self.replay is None:
+            return replace(state, now=_recentre(work, new))
+        return self._store(work, state, new, interval)
+
     def step(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
     ) -> tuple[SensitivityState, Report]:
@@ -362,9 +377,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> SensitivityState:
         channels = work.problem.channels
         samples = state.samples
-        if not len(samples.t):
+        if not len(samples.t) and interval.t1 > interval.t0:
             first = np.array([interval.inputs0[c] for c in channels])
-            samples = samples.append(interval.t0, interval.z0, first)
+            samples = samples.append(interval.t0, np.full_like(interval.z1, np.nan), first)
         values = np.array([interval.inputs1[c] for c in channels])
         samples = samples.append(interval.t1, interval.z1, values)
         used = state.assimilated + bool(interval.present.any())
@@ -382,6 +397,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         point = replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
         channels = work.problem.channels
         named = [dict(zip(channels, row, strict=True)) for row in samples.inputs]
+        if np.isfinite(samples.z[0]).any():
+            end, z = Moment(samples.t[0], Inputs(named[0])), samples.z[0]
+            at = Interval(end.t, end.t, end.inputs, end.inputs, z, z)
+            point, _ = self._update(work, point, at, work.predict(point, end))
         for k in range(1, len(samples.t)):
             interval = Interval(
                 samples.t[k - 1],
