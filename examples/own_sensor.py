@@ -7,7 +7,8 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.diagnostics import CheckReport, check_observation
-from livepde.fem import FieldBlock
+from livepde.fem import FunctionSpace
+from livepde.observation import component, widened
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,11 +17,12 @@ class Differences(lp.Observation):
 
     pairs: tuple[tuple[float, float], ...]
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
-        """Return G, one row for each pair; `state.probe` evaluates the state at points."""
-        first = state.probe([[a for a, _ in self.pairs]])
-        second = state.probe([[b for _, b in self.pairs]])
-        return sp.csr_array(first - second)
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
+        """Return G, one row for each pair; `block.probe` evaluates the state at points."""
+        block, part = component(state, self.of)
+        first = block.probe([[a for a, _ in self.pairs]])
+        second = block.probe([[b for _, b in self.pairs]])
+        return widened(first - second, part, state.dim)
 
 
 def main() -> CheckReport:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -64,6 +65,11 @@ class Problem:
     model: Model
     observed: Observed
     control: Advance
+
+    @cached_property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all input channels: those of the model, then those the sensors read."""
+        return tuple(dict.fromkeys([*self.model.channels, *self.observed.observation.inputs]))
 
 
 @dataclass(frozen=True, eq=False)

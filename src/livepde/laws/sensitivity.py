@@ -221,7 +221,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
         n, k = len(u0), work.Phi.shape[1]
-        sensors, channels = work.problem.observed.size, work.problem.model.channels
+        sensors, channels = work.problem.observed.size, work.problem.channels
         start = Point(
             u0,
             q0,
@@ -261,7 +261,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def _store(
         self, work: SensitivityWork, state: SensitivityState, now: Point, interval: Interval
     ) -> SensitivityState:
-        channels = work.problem.model.channels
+        channels = work.problem.channels
         samples = state.samples
         if not len(samples.t):
             first = np.array([interval.inputs0[c] for c in channels])
@@ -283,7 +283,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             du=start.du - start.L @ shift,
             da=start.da - shift,
         )
-        channels = work.problem.model.channels
+        channels = work.problem.channels
         named = [dict(zip(channels, row, strict=True)) for row in samples.inputs]
         for k in range(1, len(samples.t)):
             interval = Interval(
@@ -343,7 +343,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def _update(
         self, work: SensitivityWork, point: Point, interval: Interval, predicted: Array
     ) -> Point:
-        present = interval.present
+        seen = work.problem.observed.available(interval.end)
+        present = np.logical_and(interval.present, seen)
         if not present.any():
             return point
         noise = work.noise[present]
@@ -379,13 +380,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
 def _output(work: SensitivityWork, point: Point, moment: Moment) -> Array:
     """Return H = G'(u) L + D Phi, the derivative of the prediction in a."""
-    observed = work.problem.observed
-    H: Array = observed.G @ point.L
-    direct = observed.sensitivity(moment)
-    if direct is not None:
-        H = H + direct @ work.Phi
-    slope = observed.slope(point.u + point.du, point.q + work.Phi @ point.da, moment)
-    return H if slope is None else slope[:, None] * H
+    u, q = point.u + point.du, point.q + work.Phi @ point.da
+    H_u, H_q = work.problem.observed.jacobian(u, q, moment)
+    H: Array = H_u @ point.L
+    return H if H_q is None else H + H_q @ work.Phi
 
 
 def _reduced(work: SensitivityWork, dq: Array) -> Array:

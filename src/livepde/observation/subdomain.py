@@ -8,9 +8,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, Predicate
+from livepde.fem import FieldBlock, FunctionSpace, Predicate
 from livepde.linalg import IntArray
-from livepde.observation.base import Observation
+from livepde.observation.base import Observation, component, widened
 
 __all__ = ["Full", "Subdomain"]
 
@@ -43,10 +43,11 @@ class Subdomain(Observation):
             )
         return found
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
-        found = self.selected(state)
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
+        block, part = component(state, self.of)
+        found = self.selected(block)
         entries = (np.ones(len(found)), (np.arange(len(found)), found))
-        return sp.csr_array(entries, shape=(len(found), state.size))
+        return widened(sp.csr_array(entries, shape=(len(found), block.size)), part, state.dim)
 
     @property
     def nodal(self) -> bool:
