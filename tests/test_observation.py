@@ -163,14 +163,17 @@ def test_sensors_that_see_the_parameter():
     direct = {"fluid": lambda q, x: q.k * x.inputs["Q"] - q.R[1]}
     observed = observe(model, lp.Points({"wall": 0.3, "fluid": 0.0}, direct=direct))
     moment = Moment(0.0, Inputs({"Q": 4.0}))
-    np.testing.assert_array_equal(observed.sensitivity(moment), [[0, 0, 0], [4, 0, -1]])
     u, q = np.arange(11.0), np.array([2.0, 7.0, 1.0])
+    G, direct = observed.jacobian(u, q, moment)
+    np.testing.assert_array_equal(direct, [[0, 0, 0], [4, 0, -1]])
+    assert G is observed.G
+    assert not observed.linear
     np.testing.assert_allclose(observed.predict(u, q, moment), [3.0, 0.0 + 8.0 - 1.0], atol=1e-12)
-    assert observe(model, lp.Points([0.3])).sensitivity(moment) is None
+    assert observe(model, lp.Points([0.3])).jacobian(u, q, moment)[1] is None
 
     single = lp.Model(lp.Field(line(10), ElementLineP1()), lp.Scalar(), product)
     seen = observe(single, lp.Points({"s": 0.5}, direct={"s": lambda q, x: 3 * q}))
-    np.testing.assert_array_equal(seen.sensitivity(), [[3.0]])
+    np.testing.assert_array_equal(seen.jacobian(u, q[:1], moment)[1], [[3.0]])
 
 
 def test_direct_parts_are_checked():
@@ -179,7 +182,7 @@ def test_direct_parts_are_checked():
         observe(model, lp.Points({"a": 0.5}, direct={"x": lambda q, x: q.k}))
     affine = observe(model, lp.Points({"a": 0.5}, direct={"a": lambda q, x: q.k + 1}))
     with pytest.raises(lp.ObservationError, match=r"must be linear in q; at q = 0 it gives 1\.0"):
-        affine.sensitivity()
+        affine.predict(np.zeros(11), np.zeros(3), Moment())
 
 
 def test_names_and_noise():

@@ -120,7 +120,7 @@ def test_no_sensor_of_the_parameter(kind: Any) -> None:
         A=lambda q, u, v, x: q * u * v,
     )
     sensors = lp.Points([0.0, 0.5, 1.0], direct={"z0": lambda q, x: q})
-    with pytest.raises(lp.LawError, match="sees a parameter directly"):
+    with pytest.raises(lp.LawError, match="sees a parameter directly: use SensitivityLaw"):
         lp.Identifier(model, sensors, kind())
 
 

@@ -120,7 +120,7 @@ class Identifier:
         self._z = np.full(self.observed.size, np.nan)
         self._inputs: Inputs = Inputs({})
         self._samples = 0
-        if not model.channels:
+        if not self.inputs:
             self._begin(self._inputs)
 
     def _check_names(self) -> None:
@@ -150,7 +150,21 @@ class Identifier:
     def channels(self) -> tuple[str, ...]:
         """Every channel a sample may name."""
         withheld = self.withheld.names if self.withheld else ()
-        return tuple(dict.fromkeys([*self.observed.names, *withheld, *self.model.channels]))
+        return tuple(dict.fromkeys([*self.observed.names, *withheld, *self.inputs]))
+
+    @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """Channels that the model and the sensors read."""
+        withheld = self.withheld.observation.inputs if self.withheld else ()
+        return tuple(dict.fromkeys([*self.problem.channels, *withheld]))
+
+    @cached_property
+    def _optional(self) -> frozenset[str]:
+        """Inputs that may be missing: positions of moving sensors."""
+        sensors = [item.observation for item in (self.observed, self.withheld) if item is not None]
+        needed = {name for item in sensors for name in set(item.inputs) - item.optional}
+        found = frozenset().union(*(item.optional for item in sensors))
+        return found - needed - set(self.model.channels)
 
     def step(
         self,
@@ -170,7 +184,8 @@ class Identifier:
         TimeOrderError
             t is not later than the sample before.
         MissingInputError
-            An input has no value yet; a later gap holds the last value and is noted.
+            An input has no value yet; a later gap holds the last value and is noted. The position
+            of a moving sensor may be missing, and is not held.
         """
         t = _number(t, "time t")
         if np.isnan(t):
@@ -244,11 +259,11 @@ class Identifier:
         Raises
         ------
         MissingInputError
-            The model needs channels and no sample has come yet.
+            Model or sensors need channels and no sample has come yet.
         """
         if self._state is None:
             raise MissingInputError(
-                f"No estimate before the first sample: the model needs {self.model.channels}."
+                f"No estimate before the first sample: it brings the inputs {list(self.inputs)}."
             )
         nothing = np.full(self.observed.size, np.nan)
         hidden = np.full(self.withheld.size if self.withheld else 0, np.nan)
@@ -298,30 +313,30 @@ class Identifier:
             values = {name: _number(value, f"channel '{name}'") for name, value in z.items()}
             measured = np.array([values.get(name, np.nan) for name in self.observed.names])
             withheld = np.array([values.get(name, np.nan) for name in hidden])
-            named = {name: values[name] for name in self.model.channels if name in values}
+            named = {name: values[name] for name in self.inputs if name in values}
         else:
             measured = _array(z, self.observed)
             withheld, named = np.full(len(hidden), np.nan), {}
         for name, value in inputs.items():
-            if name not in self.model.channels:
+            if name not in self.inputs:
                 raise SampleError(
-                    f"unknown input '{name}'; the model has {list(self.model.channels)}."
+                    f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
             named[name] = _number(value, f"input '{name}'")
         return measured, withheld, named
 
     def _filled(self, named: dict[str, float]) -> tuple[Inputs, tuple[str, ...]]:
         """Return all inputs; a missing one holds its last value."""
-        values, held = {}, []
-        for name in self.model.channels:
+        values, held, last = {}, [], dict(self._inputs)
+        for name in self.inputs:
             value = named.get(name, np.nan)
-            if np.isnan(value):
-                if name not in self._inputs:
+            if np.isnan(value) and name not in self._optional:
+                if name not in last:
                     raise MissingInputError(
                         f"input '{name}' has no value in the first sample; start the stream where "
-                        f"all of {list(self.model.channels)} have one."
+                        f"all of {[c for c in self.inputs if c not in self._optional]} have one."
                     )
-                value = self._inputs[name]
+                value = last[name]
                 held.append(name)
             values[name] = value
         return Inputs(values), tuple(held)
@@ -333,7 +348,7 @@ class Identifier:
             "n": self.model.X.dim,
             "m": self.model.Q.dim,
             "sensors": list(self.observed.names),
-            "channels": list(self.model.channels),
+            "channels": list(self.inputs),
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -368,7 +383,7 @@ class Identifier:
         state = None
         try:
             t, samples, z = float(leaves["t"]), int(leaves["samples"]), leaves["z"]
-            names = self.model.channels if len(leaves["inputs"]) else ()
+            names = self.inputs if len(leaves["inputs"]) else ()
             inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
             if header["begun"]:
                 template = self.law.init(self._work, self._q0, self._u0)
@@ -380,7 +395,7 @@ class Identifier:
             ) from error
         self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
         self._state = state
-        if state is None and not self.model.channels:
+        if state is None and not self.inputs:
             self._begin(inputs)
 
 

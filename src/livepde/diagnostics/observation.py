@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.diagnostics.space import largest, relative
 from livepde.errors import ObservationError
-from livepde.fem import START
+from livepde.fem import Inputs, Latent, Moment
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.observation import Observation, Observed, Split, TransformedObserved
+from livepde.observation import Observation, Observed, Split
 
 __all__ = ["check_observation"]
 
 ROUNDING = 1e-12
-TAYLOR = 1e-6  # of central differences with steps of 1e-5
+STEP = 1e-5  # of central differences, relative
+TAYLOR = 1e-6
 INVERSE = 1e-9  # G^+ of sensors that nearly repeat each other amplifies rounding
 
 
@@ -26,22 +29,28 @@ def check_observation(
     *,
     seed: int = 0,
     at: float = 1.0,
+    inputs: Mapping[str, float] | None = None,
 ) -> CheckReport:
-    """Check the observation operator G and its projections R = G^+ G and P = I - R.
+    """Check the derivatives of the readings, and for linear sensors the projections R and P.
 
-    R and P are idempotent, R P = 0, P maps into the null space of G, G G^+ G = G, R is self-adjoint
-    in the inner product in which G^+ is taken, `reconstruct` returns R u from z = G u, and missing
-    sensors shrink G and nothing else. For nonlinear sensors all this holds for their linear part
-    G_0, and G'(u) is compared with differences of the readings.
+    For every sensor: `jacobian` is compared with differences of `predict` in u and in q.
+
+    For linear sensors, with R = G^+ G and P = I - R: R and P are idempotent, R P = 0, P maps into
+    the null space of G, G G^+ G = G, R is self-adjoint in the inner product in which G^+ is taken,
+    `reconstruct` returns R u from z = G u, and missing sensors shrink G and nothing else. For
+    `Transformed` sensors all this holds for their linear part G_0.
 
     Parameters
     ----------
     observed
         A bound observation (`identifier.observed`), or an observation and its model.
     seed
-        Of the random vectors.
+        Of the random vectors and times.
     at
-        Size of the state at which the derivative of nonlinear sensors is compared with differences.
+        Size of the state at which the derivatives are compared with differences.
+    inputs
+        Channel -> value, for sensors that read channels (default 1); positions of moving sensors
+        must lie in the mesh.
 
     Returns
     -------
@@ -64,6 +73,13 @@ def check_observation(
             )
         observed = observed.bind(model.state_space, model.X, model.parameter_space)
     rng = np.random.default_rng(seed)
+    lines = _projections(observed, rng) if observed.linear else []
+    channels = {**dict.fromkeys(observed.observation.inputs, 1.0), **(inputs or {})}
+    lines += _taylor(observed, at, Moment(rng.uniform(), Inputs(channels)), rng)
+    return CheckReport("observation", tuple(lines), ObservationError)
+
+
+def _projections(observed: Observed, rng: np.random.Generator) -> list[CheckLine]:
     everything = np.ones(observed.size, dtype=bool)
     lines = _lines(observed, observed.split(), everything, rng, "")
     if observed.size > 1:
@@ -89,26 +105,53 @@ def check_observation(
             "split(present) must give R = 0 when nothing is present.",
         )
     )
-    if isinstance(observed, TransformedObserved):
-        lines.append(_taylor(observed, at, rng))
-    return CheckReport("observation", tuple(lines), ObservationError)
+    return lines
 
 
-def _taylor(observed: TransformedObserved, at: float, rng: np.random.Generator) -> CheckLine:
-    """Compare the derivative of nonlinear sensors with a central difference of their readings."""
-    u = at * (1.0 + 0.1 * rng.uniform(-1.0, 1.0, observed.X.dim))
-    direction = rng.standard_normal(observed.X.dim)
-    q, step = np.zeros(observed.parameter.dim), 1e-5 * max(abs(at), 1e-300)
-    more, less = (observed.predict(u + s * direction, q, START) for s in (step, -step))
-    slope = observed.slope(u, q, START)
-    exact = observed.G @ direction if slope is None else slope * (observed.G @ direction)
-    return CheckLine.at_most(
-        "G'(u) by differences",
-        relative((more - less) / (2.0 * step) - exact, exact),
-        TAYLOR,
+def _taylor(
+    observed: Observed, at: float, moment: Moment, rng: np.random.Generator
+) -> list[CheckLine]:
+    """Compare the derivatives with central differences of the readings.
+
+    Only sensors with a reading take part, and at least one must have one.
+    """
+    n, latent = observed.X.dim, Latent(observed.parameter)
+    size = max(abs(at), 1e-300)
+    u = at * (1.0 + 0.1 * rng.uniform(-1.0, 1.0, n))
+    spread = latent.deviations * rng.uniform(-1.0, 1.0, latent.dim)
+    a = np.clip(latent.prior + 0.1 * spread, *latent.bounds)
+    q = latent.value(a)
+    seen = observed.available(moment)
+    H_u, H_q = observed.jacobian(u, q, moment)
+    du = size * rng.standard_normal(n)
+    along = latent.deviations * rng.standard_normal(latent.dim)
+    dq = latent.tangent(a, along[:, None])[:, 0]
+    nothing = np.zeros(observed.size)
+    z = observed.predict(u, q, moment)[seen]
+    text = (
         "derivative= must be that of function=; without it, function must be analytic, and "
-        "defined near the state at= of the check.",
+        "defined near the state at= of the check."
     )
+
+    def line(name: str, step: tuple[Array, Array], exact: Array) -> CheckLine:
+        more, less = (
+            observed.predict(u + s * step[0], q + s * step[1], moment) for s in (STEP, -STEP)
+        )
+        error = ((more - less) / (2.0 * STEP) - exact)[seen]
+        # Differences cannot see what is far below the readings themselves.
+        size = max(largest(exact[seen]), 1e-4 * largest(z), 1e-300)
+        return CheckLine.at_most(name, largest(error) / size, TAYLOR, text)
+
+    return [
+        CheckLine.at_most(
+            "sensors without a reading",
+            1.0 - float(seen.any()),
+            0.0,
+            "give inputs= at which at least one sensor has a reading (a position in the mesh).",
+        ),
+        line("G'(u) by differences", (du, 0.0 * dq), H_u @ du),
+        line("G'(q) by differences", (0.0 * du, dq), nothing if H_q is None else H_q @ dq),
+    ]
 
 
 def _lines(

@@ -164,7 +164,7 @@ class OnlineTracker:
             return
         moment = Moment(estimate.t, Inputs(self.inputs))
         boundary = model.impose(np.zeros(model.X.dim), moment)
-        direct = observed.sensitivity(moment)
+        _, direct = observed.jacobian(estimate.u, estimate.q, moment)
         if direct is not None:
             z = z - direct @ estimate.q
         z = observed.linearised(z, estimate.u)

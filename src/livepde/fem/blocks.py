@@ -361,24 +361,34 @@ class FieldBlock(Block):
                 u[dofs] = value
         return u
 
+    @cached_property
+    def box(self) -> tuple[Array, Array]:
+        """Lowest and highest coordinates of the mesh, each of shape (d,)."""
+        p: Array = self.field.mesh.p
+        return p.min(axis=1), p.max(axis=1)
+
+    def contains(self, point: Array) -> bool:
+        """Return true if a point, shape (d,), lies in the mesh."""
+        low, high = self.box
+        slack = 1e-12 * (high - low)
+        inside = bool(np.all(point >= low - slack) and np.all(point <= high + slack))
+        if inside and len(low) > 1:
+            try:
+                self.basis.mesh.element_finder()(*point[:, None])
+            except ValueError:
+                return False
+        return inside
+
     def probe(self, points: Array, what: str = "point") -> sp.csr_array:
         """Return the matrix that evaluates the function at points of shape (d, k)."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
-        mesh = self.field.mesh
-        low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+        low, high = self.box
         if points.shape[0] != len(low):
             raise ObservationError(
                 f"{what}: coordinates of dimension {points.shape[0]}; the mesh has {len(low)}."
             )
         for k, point in enumerate(points.T):
-            slack = 1e-12 * (high - low)
-            inside = bool(np.all(point >= low - slack) and np.all(point <= high + slack))
-            if inside and len(low) > 1:
-                try:
-                    self.basis.mesh.element_finder()(*point[:, None])
-                except ValueError:
-                    inside = False
-            if not inside:
+            if not self.contains(point):
                 raise ObservationError(
                     f"{what} {k} at {point.tolist()} lies outside of the mesh, which spans "
                     f"{low.tolist()} to {high.tolist()}: check its coordinates and their unit."

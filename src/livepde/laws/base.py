@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -66,10 +67,10 @@ class Problem:
     observed: Observed
     control: Advance
 
-    @property
+    @cached_property
     def channels(self) -> tuple[str, ...]:
-        """Input channels that model or sensors read."""
-        return self.model.channels
+        """Names of all input channels: those of the model, then those the sensors read."""
+        return tuple(dict.fromkeys([*self.model.channels, *self.observed.observation.inputs]))
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         """Return what the sensors are expected to show, for state u and latent parameter q."""

@@ -101,10 +101,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 raise LawError(f"GradientLaw: {name} must be a number >= 0; got {value}.")
 
     def prepare(self, problem: Problem) -> GradientWork:
-        if problem.observed.observation.directs:
+        if not problem.observed.linear:
             raise LawError(
-                "GradientLaw cannot use a sensor that sees a parameter directly: use "
-                "SensitivityLaw, or leave out direct=."
+                "GradientLaw needs readings z = G u; this observation is not linear or sees a "
+                "parameter directly: use SensitivityLaw."
             )
         model = problem.model
         M_op = model.bilinear(self.M_op)

@@ -64,10 +64,10 @@ class _Relative(Law[GradientWork, GradientState]):
         return GradientLaw(self.gain, _Linear(self.mu), newton=self.newton)
 
     def _work(self, problem: Problem, pull: Any, *, at_estimate: bool) -> GradientWork:
-        if problem.observed.observation.directs:
+        if not problem.observed.linear:
             raise LawError(
-                f"{type(self).__name__} cannot use a sensor that sees a parameter directly: use "
-                "SensitivityLaw, or leave out direct=."
+                f"{type(self).__name__} needs readings z = G u; this observation is not linear "
+                "or sees a parameter directly: use SensitivityLaw."
             )
         M_op = problem.model.bilinear(pull)
         gains = Gains(self.gain, _Linear(self.mu), 0.0, 0.0, M_op, M_op, at_estimate)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from livepde.observation.base import Observation, Observed, Split
+from livepde.observation.combined import Calibrated, Combined
+from livepde.observation.functionals import Functionals
+from livepde.observation.moving import Moving
 from livepde.observation.nonlinear import Transformed, TransformedObserved
 from livepde.observation.reconstruction import (
     Alpha,
@@ -14,16 +17,21 @@ from livepde.observation.reconstruction import (
     Reconstructor,
     Tikhonov,
 )
-from livepde.observation.sensors import Averages, Matrix, Points
+from livepde.observation.sensors import Averages, LineIntegrals, Matrix, Points
 from livepde.observation.subdomain import Full, Subdomain
 
 __all__ = [
     "Alpha",
     "Apriori",
     "Averages",
+    "Calibrated",
+    "Combined",
     "Discrepancy",
     "Full",
+    "Functionals",
+    "LineIntegrals",
     "Matrix",
+    "Moving",
     "Observation",
     "Observed",
     "Points",

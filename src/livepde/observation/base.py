@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +13,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
-from livepde.fem import START, FunctionSpace, Moment, Place
+from livepde.fem import FunctionSpace, Moment, Place
 from livepde.linalg import Array
 from livepde.observation.reconstruction import (
     Pseudoinverse,
@@ -24,7 +23,7 @@ from livepde.observation.reconstruction import (
 )
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Observation", "Observed", "Split"]
+__all__ = ["Observation", "Observed", "Split", "numbers"]
 
 Direct = Callable[[Any, Place], Any]
 DEPENDENT = 1e-12  # eigenvalues of G G* below this share of the largest count as zero
@@ -33,13 +32,18 @@ LARGEST_MEMO = 64  # splits kept for different patterns of missing samples
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Observation(ABC):
+class Observation:
     """What the sensors see of the state: z = G u (+ a part that depends on q directly).
 
-    Subclasses say what G is; `bind` ties it to a state space.
+    Subclasses say what G is (`matrix`); sensors that are not linear in the state return a bound
+    object of their own (`bind`).
 
     Parameters
     ----------
+    of
+        The component that the sensors see of a state that has several.
+    inputs
+        Channels of the stream that the sensors themselves read, beside those of the model.
     noise
         Standard deviation of the measurement noise, in the unit of z: one number, or one for each
         sensor. None: not known.
@@ -50,17 +54,18 @@ class Observation(ABC):
         `Tikhonov`, G_alpha (section 3.2).
     """
 
+    of: str = ""
+    inputs: Sequence[str] = ()
     noise: float | Sequence[float] | None = None
     unit: str = ""
     reconstruction: Reconstruction = field(default_factory=Pseudoinverse)
 
-    @abstractmethod
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
-        """Return G on the coefficients of the state, shape (sensors, n).
-
-        `state.component(of)` is a component's block and where its coefficients stand;
-        `state.widen(matrix, of)` makes a matrix on that component one on the whole state.
-        """
+        """Return G on the coefficients of the state, shape (sensors, n)."""
+        raise ObservationError(
+            f"{type(self).__name__} is not linear in the state alone, so it has no matrix G and no "
+            "projections R and P: use SensitivityLaw."
+        )
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return a name for each sensor."""
@@ -72,8 +77,18 @@ class Observation(ABC):
         return {}
 
     @property
+    def optional(self) -> frozenset[str]:
+        """Those of `inputs` that may be missing: then the sensors that need them read nothing."""
+        return frozenset()
+
+    @property
     def nodal(self) -> bool:
         """True if G^+ is taken in coefficients, false if in the inner product of X."""
+        return False
+
+    @property
+    def portable(self) -> bool:
+        """True if the readings mean the same on every mesh, false if they are coefficients."""
         return False
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
@@ -130,7 +145,11 @@ class Split:
 
 
 class Observed:
-    """An observation bound to a state space: the operator G with its names and its noise."""
+    """An observation bound to a state space: what the sensors read, with its derivative.
+
+    Sensors of other kinds than z = G u + D q override `predict`, `jacobian` and `linear`, and
+    `available` if they have no reading at times.
+    """
 
     def __init__(
         self,
@@ -143,24 +162,13 @@ class Observed:
         self.state = state
         self.X = X
         self.parameter = parameter
-        self.G = sp.csr_array(observation.matrix(state), copy=True).astype(float)
-        if self.G.shape[1] != X.dim:
-            raise ObservationError(
-                f"The observation matrix has {self.G.shape[1]} columns; the state has {X.dim}."
-            )
-        if not np.isfinite(self.G.data).all():
-            raise ObservationError("The observation matrix holds values that are not finite.")
-        # Shape functions evaluated at a node leave entries of 1e-17: a sensor on the Dirichlet
-        # boundary would seem to see something.
-        largest = abs(self.G).max(axis=1).toarray().ravel()
-        self.G.data[
-            np.abs(self.G.data) <= ROUNDING * np.repeat(largest, np.diff(self.G.indptr))
-        ] = 0.0
-        self.G.eliminate_zeros()
-        self.size = int(self.G.shape[0])
-        self.names = observation.names(self.size)
+        self.names = self._names()
+        self.size = len(self.names)
         if len(set(self.names)) != self.size:
-            raise ObservationError(f"Sensor names must differ; got {list(self.names)}.")
+            raise ObservationError(
+                f"Sensor names must differ; got {list(self.names)}. A mapping gives them names, as "
+                'in Points({"T_30": 0.3}).'
+            )
         for name in observation.directs:
             if name not in self.names:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
@@ -182,7 +190,63 @@ class Observed:
             raise ObservationError("noise: standard deviations must be positive numbers.")
         return np.broadcast_to(noise, (self.size,)).copy()
 
-    def sensitivity(self, moment: Moment = START) -> Array | None:
+    def _names(self) -> tuple[str, ...]:
+        return self.observation.names(int(self.G.shape[0]))
+
+    @cached_property
+    def G(self) -> sp.csr_array:
+        """The constant matrix of the linear part, shape (sensors, n).
+
+        Raises `ObservationError` if the sensors have none.
+        """
+        G = sp.csr_array(self.observation.matrix(self.state), copy=True).astype(float)
+        if G.shape[1] != self.X.dim:
+            raise ObservationError(
+                f"The observation matrix has {G.shape[1]} columns; the state has {self.X.dim}."
+            )
+        if not np.isfinite(G.data).all():
+            raise ObservationError("The observation matrix holds values that are not finite.")
+        # Shape functions evaluated at a node leave entries of 1e-17: a sensor on the Dirichlet
+        # boundary would seem to see something.
+        largest = abs(G).max(axis=1).toarray().ravel()
+        G.data[np.abs(G.data) <= ROUNDING * np.repeat(largest, np.diff(G.indptr))] = 0.0
+        G.eliminate_zeros()
+        return G
+
+    @property
+    def linear(self) -> bool:
+        """True if z = G u, or `linearised` makes it so: what projections and the gradient law need.
+
+        False for sensors that see the parameter.
+        """
+        return not self.observation.directs
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        """Return what the sensors read, G u + D q, shape (sensors,); NaN: no reading.
+
+        Parameters
+        ----------
+        u, q
+            Coefficients of the state and of the parameter, shapes (n,) and (m,).
+        moment
+            Time and input channels.
+        """
+        z: Array = self.G @ u
+        direct = self._direct(moment)
+        return z if direct is None else z + direct @ q
+
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        """Return the derivatives of `predict` in u and q, shapes (sensors, n) and (sensors, m).
+
+        The second is None if the sensors see no parameter. Rows without a reading are zero.
+        """
+        return self.G, self._direct(moment)
+
+    def available(self, moment: Moment) -> Array:
+        """Return which sensors have a reading, shape (sensors,); samples of others are not used."""
+        return np.ones(self.size, dtype=bool)
+
+    def _direct(self, moment: Moment) -> Array | None:
         """Return the direct part D of z = G u + D q, shape (sensors, m); None if there is none."""
         if not self.observation.directs:
             return None
@@ -191,7 +255,7 @@ class Observed:
         place = Place(np.zeros((0,)), None, moment)
         for name, direct in self.observation.directs.items():
             row = self.names.index(name)
-            offset = float(direct(self._numbers(zero), place))
+            offset = float(direct(numbers(self.parameter, zero), place))
             if offset != 0.0:
                 raise ObservationError(
                     f"direct of sensor '{name}' must be linear in q; at q = 0 it gives {offset}."
@@ -199,34 +263,8 @@ class Observed:
             for column in self.parameter.labels.values():
                 unit = zero.copy()
                 unit[column] = 1.0
-                matrix[row, column] = float(direct(self._numbers(unit), place))
+                matrix[row, column] = float(direct(numbers(self.parameter, unit), place))
         return matrix
-
-    def _numbers(self, q: Array) -> Any:
-        """Return the scalar unknowns as a `direct` function sees them."""
-        parts = {name: q[self.parameter.part(name)] for name in self.parameter.blocks}
-        numbers = {name: part[0] if len(part) == 1 else part for name, part in parts.items()}
-        if self.parameter.single:
-            return next(iter(numbers.values()))
-        return SimpleNamespace(**numbers)
-
-    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        """Return G u + D q, shape (sensors,)."""
-        z: Array = self.G @ u
-        direct = self.sensitivity(moment)
-        return z if direct is None else z + direct @ q
-
-    def slope(self, u: Array, q: Array, moment: Moment) -> Array | None:
-        """Return the derivative of the readings in G u + D q, shape (sensors,); None if it is 1."""
-        return None
-
-    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
-        """Return the derivative of `predict` in u, (sensors, n), and in q, (sensors, m) or None."""
-        slope, direct = self.slope(u, q, moment), self.sensitivity(moment)
-        if slope is None:
-            return self.G, direct
-        scaled = sp.csr_array(sp.diags_array(slope) @ self.G)
-        return scaled, None if direct is None else slope[:, None] * direct
 
     def linearised(self, z: Array, u: Array) -> Array:
         """Return z as linear sensors would have shown it, by one Newton step from the state u."""
@@ -323,3 +361,18 @@ def _is_selection(G: sp.csr_array) -> bool:
     """Return true if every row picks one coefficient, and no two the same."""
     one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
     return one_each and len(np.unique(G.indices)) == len(G.indices)
+
+
+def numbers(parameter: FunctionSpace, q: Array) -> Any:
+    """Return the parameter as functions of sensors see it: numbers, arrays, mappings by name."""
+    seen: dict[str, Any] = {}
+    for name, block in parameter.blocks.items():
+        part = q[parameter.part(name)]
+        keys = getattr(getattr(block, "unknown", None), "names", None)  # Scalars
+        if keys is not None:
+            seen[name] = dict(zip(keys, part, strict=True))
+        else:
+            seen[name] = part[0] if len(part) == 1 else part
+    if parameter.single:
+        return next(iter(seen.values()))
+    return SimpleNamespace(**seen)

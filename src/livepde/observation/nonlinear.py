@@ -84,6 +84,7 @@ class Transformed(Observation):
             )
         if not self.reach > 0:
             raise ObservationError(f"Transformed: reach must be positive; got {self.reach}.")
+        object.__setattr__(self, "inputs", tuple(self.base.inputs))
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         return self.base.matrix(state)
@@ -98,6 +99,10 @@ class Transformed(Observation):
     @property
     def nodal(self) -> bool:
         return self.base.nodal
+
+    @property
+    def portable(self) -> bool:
+        return self.base.portable
 
     def bind(
         self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
@@ -124,15 +129,18 @@ class Transformed(Observation):
 
 
 class TransformedObserved(Observed):
-    """The bound observation: G is the linear part G_0, `predict` and `slope` know g."""
+    """The bound observation: G is the linear part G_0; the readings and their slope know g."""
 
     observation: Transformed
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         return self.observation.read(super().predict(u, q, moment))
 
-    def slope(self, u: Array, q: Array, moment: Moment) -> Array | None:
-        return self.observation.slope(super().predict(u, q, moment))
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        slope = self.observation.slope(super().predict(u, q, moment))
+        direct = self._direct(moment)
+        H_u = sp.csr_array(sp.diags_array(slope) @ self.G)
+        return H_u, None if direct is None else slope[:, None] * direct
 
     def linearised(self, z: Array, u: Array) -> Array:
         sensors, y = self.observation, np.asarray(self.G @ u)

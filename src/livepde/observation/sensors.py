@@ -1,4 +1,4 @@
-"""Sensors: values at points, averages over regions, and any matrix."""
+"""Linear sensors: values at points, averages over regions, line integrals, and any matrix."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Predicate
+from livepde.fem.blocks import Measure
+from livepde.linalg import Array
 from livepde.observation.base import Direct, Observation
 
-__all__ = ["Averages", "Matrix", "Points"]
+__all__ = ["Averages", "LineIntegrals", "Matrix", "Points"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +30,6 @@ class Points(Observation):
     direct
         Sensor name -> (q, x) for sensors that see a parameter directly, linear in q:
         z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b * x.inputs["Q"] / H}.
-    of
-        Component of the state; may be left out if it has only one.
 
     >>> Points({"TS_10": 0.10, "TS_20": 0.20}, noise=0.1, unit="degC").names(2)
     ('TS_10', 'TS_20')
@@ -37,7 +37,6 @@ class Points(Observation):
 
     points: Mapping[str, Any] | Sequence[Any]
     direct: Mapping[str, Direct] = field(default_factory=dict)
-    of: str = ""
 
     def __post_init__(self) -> None:
         if len(self.points) == 0:
@@ -52,28 +51,33 @@ class Points(Observation):
     def directs(self) -> Mapping[str, Direct]:
         return self.direct
 
+    @property
+    def portable(self) -> bool:
+        return True
+
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
+        block, _ = state.component(self.of)
         mapping = isinstance(self.points, Mapping)
         positions = list(self.points.values()) if isinstance(self.points, Mapping) else self.points
         array = np.array([np.atleast_1d(p) for p in positions], dtype=float).T
         what = f"sensors {list(self.points)}: number" if mapping else "sensor"
-        return state.probe(array, what, self.of)
+        return state.widen(sp.csr_array(block.probe(array, what)), self.of)
 
 
 @dataclass(frozen=True, eq=False)
 class Averages(Observation):
-    """Mean values over regions, z_k = (integral of u over omega_k) / |omega_k|.
+    """Mean values over regions or boundaries, z_k = (integral of u over omega_k) / |omega_k|.
 
     Parameters
     ----------
     regions
-        Sensor name -> predicate on x, evaluated at the quadrature points of the mesh.
-    of
-        Component of the state; may be left out if it has only one.
+        Sensor name -> name of a subdomain or boundary of the mesh, or a predicate on x, evaluated
+        at the quadrature points of the mesh.
+
+    >>> sensors = Averages({"core": lambda x: x[0] < 0.1, "wall": "right"}, noise=0.1)
     """
 
-    regions: Mapping[str, Predicate]
-    of: str = ""
+    regions: Mapping[str, Predicate | str]
 
     def __post_init__(self) -> None:
         if not self.regions:
@@ -82,23 +86,117 @@ class Averages(Observation):
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.regions)
 
+    @property
+    def portable(self) -> bool:
+        return True
+
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block, _ = state.component(self.of)
         rows = [self._row(block, name, region) for name, region in self.regions.items()]
         return state.widen(sp.csr_array(np.array(rows)), self.of)
 
     @staticmethod
-    def _row(state: FieldBlock, name: str, region: Predicate) -> Any:
-        basis = state.basis
-        weights = region(np.asarray(basis.global_coordinates())) * basis.dx
+    def _row(block: FieldBlock, name: str, region: Predicate | str) -> Array:
+        mesh, element = block.field.mesh, block.field.element
+        where = region if isinstance(region, str) else None
+        known = [*(mesh.boundaries or {}), *(mesh.subdomains or {})]
+        if where is not None and where not in known:
+            raise ObservationError(
+                f"Averages: region '{name}' is '{where}'; the mesh names {known or 'nothing'}."
+            )
+        measure = Measure(mesh, 2 * int(element.maxdeg), where)
+        weights = measure.weights
+        if not isinstance(region, str):
+            weights = region(measure.points) * weights
         size = float(weights.sum())
         if size <= 0:
             raise ObservationError(f"Averages: region '{name}' holds no part of the mesh.")
-        row = np.zeros(state.size)
-        for i in range(basis.Nbfun):
-            phi = np.asarray(basis.basis[i][0])
-            np.add.at(row, state.element_dofs[i], (phi * weights).sum(axis=-1))
+        local = block.local(measure)
+        row = np.zeros(block.size)
+        np.add.at(row, local.dofs, (local.phi[0] * weights).sum(axis=-1))
         return row / size
+
+
+@dataclass(frozen=True, eq=False)
+class LineIntegrals(Observation):
+    """Integrals along straight lines, z_k = integral of u from a_k to b_k: a beam, a fibre.
+
+    Exact up to rounding for functions of the elements: the line is cut where it crosses from cell
+    to cell, and Gauss points are taken in between.
+
+    Parameters
+    ----------
+    lines
+        Sensor name -> (start, end); in 1D numbers, else sequences of d coordinates.
+    mean
+        Divide by the length.
+
+    >>> beams = LineIntegrals({"beam": ([0.0, 0.2], [1.0, 0.7])}, mean=True, noise=0.01)
+    """
+
+    lines: Mapping[str, tuple[Any, Any]]
+    mean: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.lines:
+            raise ObservationError("LineIntegrals: give at least one line.")
+
+    def names(self, count: int) -> tuple[str, ...]:
+        return tuple(self.lines)
+
+    @property
+    def portable(self) -> bool:
+        return True
+
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
+        block, _ = state.component(self.of)
+        rows = sp.vstack([self._row(block, name, *ends) for name, ends in self.lines.items()])
+        return state.widen(sp.csr_array(rows), self.of)
+
+    def _row(self, block: FieldBlock, name: str, start: Any, end: Any) -> sp.csr_array:
+        a, b = (np.atleast_1d(np.asarray(point, dtype=float)) for point in (start, end))
+        mesh = block.field.mesh
+        if a.shape != b.shape or len(a) != mesh.dim():
+            raise ObservationError(
+                f"LineIntegrals: line '{name}' goes from {a.tolist()} to {b.tolist()}; the mesh "
+                f"has {mesh.dim()} coordinates."
+            )
+        length = float(np.linalg.norm(b - a))
+        if not length > 0:
+            raise ObservationError(f"LineIntegrals: line '{name}' has no length.")
+        nodes, weights = np.polynomial.legendre.leggauss(int(block.field.element.maxdeg) // 2 + 1)
+        cuts = _cuts(mesh, a, b)
+        width = np.diff(cuts)[:, None]
+        s = (cuts[:-1, None] + 0.5 * width * (1.0 + nodes)).ravel()
+        w = (0.5 * width * weights).ravel() * (1.0 if self.mean else length)
+        values = block.probe(a[:, None] + (b - a)[:, None] * s, f"line '{name}': point")
+        return sp.csr_array(sp.csr_array(w[None, :]) @ values)
+
+
+def _cuts(mesh: Any, a: Array, b: Array) -> Array:
+    """Return where a line crosses facets, as increasing shares of its length from 0 to 1.
+
+    A crossing of the bounding box of a facet counts, too: one cut more does no harm.
+    """
+    corners = mesh.p[:, mesh.facets].transpose(2, 0, 1)  # (facets, d, vertices)
+    d = len(a)
+    if d == 1:
+        normals = np.ones((len(corners), 1))
+    elif d == 2:
+        side = corners[:, :, 1] - corners[:, :, 0]
+        normals = np.column_stack([-side[:, 1], side[:, 0]])
+    else:
+        first = corners[:, :, 1] - corners[:, :, 0]
+        normals = np.cross(first, corners[:, :, 2] - corners[:, :, 0])
+    across = normals @ (b - a)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = np.einsum("fd,fd->f", normals, corners[:, :, 0] - a) / across
+    s, corners = s[np.isfinite(s)], corners[np.isfinite(s)]
+    points = a + s[:, None] * (b - a)
+    slack = 1e-9 * (mesh.p.max() - mesh.p.min())
+    low, high = corners.min(axis=2) - slack, corners.max(axis=2) + slack
+    hit = s[np.all((points >= low) & (points <= high), axis=1) & (s > 0) & (s < 1)]
+    return np.unique(np.concatenate([[0.0], hit, [1.0]]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,12 +27,9 @@ class Subdomain(Observation):
     ----------
     omega
         Predicate on x of shape (d, points).
-    of
-        Component of the state; may be left out if it has only one.
     """
 
     omega: Predicate
-    of: str = ""
 
     def selected(self, state: FieldBlock) -> IntArray:
         """Return the free coefficients located in omega."""

@@ -19,7 +19,7 @@ from livepde.fem import Moment
 from livepde.identifier import Sample
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.observation import Averages, Observation, Observed, Points
+from livepde.observation import Observation, Observed
 from livepde.result import Estimate
 from livepde.stepping import Advance, ImplicitEuler, Scheme, StepFailed, simulate
 
@@ -121,9 +121,9 @@ class Twin:
             estimator's scheme gets wrong.
         "fine"
             The model `fine` (a finer mesh, other elements) with steps of at most `fine_dt`.
-            `Points` and `Averages` see the fine state itself; for a `Subdomain`, `Full` or
-            `Matrix`, whose channels belong to the coefficients of the estimator, it is projected
-            onto them.
+            Sensors that are `portable` (`Points`, `Averages`, ...) see the fine state itself; for a
+            `Subdomain`, `Full` or `Matrix`, whose channels belong to the coefficients of the
+            estimator, it is projected onto them.
     scheme, dt_max
         Time scheme of the truth, and for "discrete" its longest substep.
     fine, fine_dt
@@ -287,7 +287,7 @@ class Twin:
     def exact_data(self) -> Array:
         """Data without noise, shape (times, sensors)."""
         model, observed, states = self.model, self.observed, self.states
-        if self.truth == "fine" and self.fine is not None and self._sees_any_mesh:
+        if self.truth == "fine" and self.fine is not None and self.observation.portable:
             model, states = self.fine, tuple(self._fine_states)
             observed = _bound(self.observation, model)
         q = self.q
@@ -296,11 +296,6 @@ class Twin:
             for t, u in zip(self.times, states, strict=True)
         ]
         return np.array(rows)
-
-    @property
-    def _sees_any_mesh(self) -> bool:
-        """True if the channels mean the same on every mesh."""
-        return isinstance(self.observation, Points | Averages)
 
     def u(self, t: float) -> Array:
         """Return the exact state at a sample time as coefficients of the estimator, shape (n,)."""

@@ -1,0 +1,241 @@
+"""Observations made of others: sensors of several kinds, and what instruments make of readings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import ObservationError
+from livepde.fem import FunctionSpace, Moment, Place
+from livepde.linalg import Array
+from livepde.observation.base import Observation, Observed, numbers
+from livepde.spaces import HilbertSpace
+
+__all__ = ["Calibrated", "CalibratedObserved", "Combined", "CombinedObserved"]
+
+STEP = 1e-30  # of the complex step
+
+
+@dataclass(frozen=True, eq=False)
+class Combined(Observation):
+    """Sensors of several kinds, one after the other.
+
+    Parameters
+    ----------
+    parts
+        Observations; the names of all their sensors differ. Each has its own `noise`, unless
+        `noise` is given here for all sensors.
+
+    >>> import livepde as lp
+    >>> sensors = Combined(
+    ...     [lp.Points({"T_1": 0.3}, noise=0.1), lp.Averages({"wall": "right"}, noise=0.5)]
+    ... )
+    """
+
+    parts: Sequence[Observation]
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise ObservationError("Combined: give at least one observation.")
+        if self.noise is not None and any(part.noise is not None for part in self.parts):
+            raise ObservationError("Combined: give noise= to it or to its parts, not to both.")
+        channels = [name for part in self.parts for name in part.inputs]
+        object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
+
+    @property
+    def optional(self) -> frozenset[str]:
+        required = {name for part in self.parts for name in set(part.inputs) - part.optional}
+        return frozenset().union(*(part.optional for part in self.parts)) - required
+
+    @property
+    def nodal(self) -> bool:
+        return all(part.nodal for part in self.parts)
+
+    @property
+    def portable(self) -> bool:
+        return all(part.portable for part in self.parts)
+
+    def bind(
+        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
+    ) -> CombinedObserved:
+        return CombinedObserved(self, state, X, parameter)
+
+
+class CombinedObserved(Observed):
+    """The bound observation: everything of the parts, stacked."""
+
+    observation: Combined
+
+    def __init__(
+        self,
+        observation: Combined,
+        state: FunctionSpace,
+        X: HilbertSpace,
+        parameter: FunctionSpace,
+    ) -> None:
+        self.parts = [part.bind(state, X, parameter) for part in observation.parts]
+        ends = np.cumsum([0] + [part.size for part in self.parts])
+        self.slices = [slice(a, b) for a, b in pairwise(ends)]
+        super().__init__(observation, state, X, parameter)
+
+    def _names(self) -> tuple[str, ...]:
+        return tuple(name for part in self.parts for name in part.names)
+
+    @cached_property
+    def noise(self) -> Array | None:
+        own = super().noise
+        if own is not None:
+            return own
+        levels = [part.noise for part in self.parts]
+        known = [level for level in levels if level is not None]
+        return np.concatenate(known) if len(known) == len(levels) else None
+
+    @cached_property
+    def G(self) -> sp.csr_array:
+        return sp.csr_array(sp.vstack([part.G for part in self.parts]))
+
+    @property
+    def linear(self) -> bool:
+        return all(part.linear for part in self.parts)
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        return np.concatenate([part.predict(u, q, moment) for part in self.parts])
+
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        pairs = [part.jacobian(u, q, moment) for part in self.parts]
+        H_u = sp.csr_array(sp.vstack([pair[0] for pair in pairs]))
+        if all(pair[1] is None for pair in pairs):
+            return H_u, None
+        H_q = np.zeros((self.size, self.parameter.dim))
+        for rows, (_, direct) in zip(self.slices, pairs, strict=True):
+            if direct is not None:
+                H_q[rows] = direct
+        return H_u, H_q
+
+    def available(self, moment: Moment) -> Array:
+        return np.concatenate([part.available(moment) for part in self.parts])
+
+    def linearised(self, z: Array, u: Array) -> Array:
+        parts = zip(self.parts, self.slices, strict=True)
+        return np.concatenate([part.linearised(z[rows], u) for part, rows in parts])
+
+
+Calibration = Callable[[Array, Any, Place], Any]
+"""(y, q, x) -> readings, all of shape (sensors,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated(Observation):
+    """What instruments with unknown gain, offset or contact resistance show of what they see.
+
+        z = function(y, q, x),      y = readings of `base`
+
+    The derivatives in y and q are taken by a complex step: exact for analytic functions.
+
+    Parameters
+    ----------
+    base
+        The sensors: any observation, also one of several kinds. Its own `noise` is not used.
+    function
+        (y, q, x) with y of shape (sensors,), the numbers among the unknowns q (q.gain; one for each
+        region or name: q.k[1], q.offset["T_10"]), and x for x.t and x.inputs["Q"]; returns readings
+        of shape (sensors,).
+
+    >>> import livepde as lp
+    >>> sensors = Calibrated(lp.Points([0.3, 0.7]), lambda y, q, x: q.gain * y, noise=0.01)
+    """
+
+    base: Observation
+    function: Calibration
+
+    def __post_init__(self) -> None:
+        if self.base.noise is not None:
+            raise ObservationError(
+                "Calibrated: give noise= to it and not to its base: it is that of the readings."
+            )
+        channels = dict.fromkeys([*self.base.inputs, *self.inputs])
+        object.__setattr__(self, "inputs", tuple(channels))
+
+    @property
+    def optional(self) -> frozenset[str]:
+        return self.base.optional
+
+    @property
+    def portable(self) -> bool:
+        return self.base.portable
+
+    def bind(
+        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
+    ) -> CalibratedObserved:
+        return CalibratedObserved(self, state, X, parameter)
+
+
+class CalibratedObserved(Observed):
+    """The bound observation: the chain rule."""
+
+    observation: Calibrated
+
+    def __init__(
+        self,
+        observation: Calibrated,
+        state: FunctionSpace,
+        X: HilbertSpace,
+        parameter: FunctionSpace,
+    ) -> None:
+        self.base = observation.base.bind(state, X, parameter)
+        super().__init__(observation, state, X, parameter)
+
+    def _names(self) -> tuple[str, ...]:
+        return self.base.names
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    def _read(self, y: Any, q: Any, moment: Moment) -> Any:
+        place = Place(np.zeros((0,)), None, moment)
+        z = np.asarray(self.observation.function(y, numbers(self.parameter, q), place))
+        if z.shape != (self.size,):
+            raise ObservationError(
+                f"Calibrated: function gave shape {z.shape} for {self.size} sensors; it must "
+                f"return one reading for each of {list(self.names)}."
+            )
+        return z
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        z: Array = self._read(self.base.predict(u, q, moment), q, moment).astype(float)
+        z[np.logical_not(self.available(moment))] = np.nan
+        return z
+
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        y = self.base.predict(u, q, moment)
+        seen = self.available(moment)
+        inner_u, inner_q = self.base.jacobian(u, q, moment)
+        slope = np.zeros((self.size, self.size))
+        for k in np.flatnonzero(seen):
+            slope[seen, k] = self._slope(_nudged(y, int(k)), q, moment)[seen]
+        H_q = np.zeros((self.size, self.parameter.dim))
+        for j in self.parameter.labels.values():
+            H_q[seen, j] = self._slope(y, _nudged(q, j), moment)[seen]
+        if inner_q is not None:
+            H_q += slope @ inner_q
+        return sp.csr_array(sp.csr_array(slope) @ inner_u), H_q
+
+    def _slope(self, y: Any, q: Any, moment: Moment) -> Array:
+        return np.asarray(np.imag(self._read(y, q, moment)) / STEP)
+
+    def available(self, moment: Moment) -> Array:
+        return self.base.available(moment)
+
+
+def _nudged(values: Array, k: int) -> Any:
+    """Return values with a complex step in one of them."""
+    nudged: Any = values.astype(complex)
+    nudged[k] += 1j * STEP
+    return nudged

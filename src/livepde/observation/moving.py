@@ -1,0 +1,128 @@
+"""Sensors that move: a probe that is lowered, a float, a scanner."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import ObservationError
+from livepde.fem import FunctionSpace, Moment
+from livepde.linalg import Array
+from livepde.observation.base import Observation, Observed
+from livepde.spaces import HilbertSpace
+
+__all__ = ["Moving", "MovingObserved"]
+
+
+@dataclass(frozen=True, eq=False)
+class Moving(Observation):
+    """Point sensors whose positions arrive with the stream, z_k(t) = u(x_k(t), t).
+
+    While its position is missing or outside of the mesh, a sensor has no reading: its prediction is
+    NaN and its sample is not used. Positions are not held from one sample to the next.
+
+    Parameters
+    ----------
+    positions
+        Sensor name -> channel of its position; in more than one dimension one channel for each
+        coordinate.
+
+    >>> Moving({"probe": ("probe_x", "probe_y")}, noise=0.1).inputs
+    ('probe_x', 'probe_y')
+    """
+
+    positions: Mapping[str, str | Sequence[str]]
+
+    def __post_init__(self) -> None:
+        if not self.positions:
+            raise ObservationError("Moving: give at least one sensor.")
+        channels = [name for names in self.channels for name in names]
+        object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
+
+    @property
+    def channels(self) -> list[tuple[str, ...]]:
+        """Channels of the coordinates of each sensor."""
+        given = self.positions.values()
+        return [(names,) if isinstance(names, str) else tuple(names) for names in given]
+
+    def names(self, count: int) -> tuple[str, ...]:
+        return tuple(self.positions)
+
+    @property
+    def optional(self) -> frozenset[str]:
+        return frozenset(name for names in self.channels for name in names)
+
+    @property
+    def portable(self) -> bool:
+        return True
+
+    def bind(
+        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
+    ) -> MovingObserved:
+        return MovingObserved(self, state, X, parameter)
+
+
+class MovingObserved(Observed):
+    """The bound observation: G moves with the moment."""
+
+    observation: Moving
+
+    def __init__(
+        self,
+        observation: Moving,
+        state: FunctionSpace,
+        X: HilbertSpace,
+        parameter: FunctionSpace,
+    ) -> None:
+        super().__init__(observation, state, X, parameter)
+        self.block, _ = state.component(observation.of)
+        dimension = self.block.field.mesh.dim()
+        for name, channels in zip(self.names, observation.channels, strict=True):
+            if len(channels) != dimension:
+                raise ObservationError(
+                    f"Moving: sensor '{name}' has position channels {list(channels)}; the mesh "
+                    f"has {dimension} coordinates."
+                )
+        self._last: tuple[bytes, sp.csr_array, Array] | None = None
+
+    def _names(self) -> tuple[str, ...]:
+        return self.observation.names(len(self.observation.positions))
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        G, seen = self._at(moment)
+        z: Array = G @ u
+        z[np.logical_not(seen)] = np.nan
+        return z
+
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        return self._at(moment)[0], None
+
+    def available(self, moment: Moment) -> Array:
+        return self._at(moment)[1]
+
+    def _at(self, moment: Moment) -> tuple[sp.csr_array, Array]:
+        """Return G at a moment, and which sensors are in the mesh."""
+        given = dict(moment.inputs)
+        points = np.array(
+            [[given.get(name, np.nan) for name in names] for names in self.observation.channels]
+        )
+        key = points.tobytes()
+        if self._last is None or self._last[0] != key:
+            seen = np.array([self.block.contains(point) for point in points])
+            rows = np.flatnonzero(seen)
+            G = sp.csr_array((len(points), self.state.dim))
+            if len(rows):
+                values = self.state.widen(self.block.probe(points[rows].T), self.observation.of)
+                place = sp.csr_array(
+                    (np.ones(len(rows)), (rows, np.arange(len(rows)))), (len(points), len(rows))
+                )
+                G = sp.csr_array(place @ values)
+            self._last = (key, G, seen)
+        return self._last[1], self._last[2]
