@@ -13,6 +13,7 @@ import pytest
 import livepde as lp
 from livepde import cases
 from livepde.cases.preview import preview
+from livepde.cases.settings import parse, to_toml
 from livepde.cases.template import write_template
 from livepde.cases.units import convert
 from livepde.runs import checks_of, measures
@@ -499,6 +500,187 @@ def test_borehole_needs_its_options_and_input(tmp_path):
         with pytest.raises(lp.CaseError) as error:
             cases.load(other)
         assert named in str(error.value)
+
+
+# --- data that a function reads --------------------------------------------------------------
+
+READER = """
+import numpy as np
+import pandas as pd
+
+def read(folder, name="rod.csv", noise=0.0, seed=0):
+    frame = pd.read_csv(folder / name)
+    rng = np.random.default_rng(seed)
+    columns = {key: frame[key] + noise * rng.standard_normal(len(frame)) for key in frame}
+    return frame["time_s"], columns
+"""
+FROM_READER = ('file = "rod.csv"', 'reader = "own.py:read"\noptions = { noise = 0.0 } #')
+
+
+def with_reader(rod, body: str, *changes: tuple[str, str]) -> Path:
+    path = rod(FROM_READER, *changes)
+    (path.parent / "own.py").write_text(body)
+    return path
+
+
+def test_reader_gives_what_the_file_gives(rod, monkeypatch):
+    _, first = result_of(rod())
+    path = with_reader(rod, READER)
+    monkeypatch.setenv("LIVEPDE_DATA", str(path.parent))
+    with pytest.raises(lp.CaseError, match=r"data\.reader: .* add --allow-code"):
+        cases.load(path)
+    _, second = result_of(path, allow_code=True)
+    assert float(second.alpha[-1]) == float(first.alpha[-1])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("noise=0.0", "noize=0.0", "has no option 'noise'; did you mean 'noize'?"),
+        ("def read(", "def raed(", "has no function 'read'"),
+        ("return ", "return 3 #", "returned int; expected times and a mapping"),
+        ("return ", "raise ValueError('bad') #", "failed with ValueError: bad"),
+        ("rod.csv", "none.csv", "there is no file"),
+        ('frame["time_s"]', "[]", "holds no samples"),
+        ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is not later"),
+        ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (181,); there are 180 times"),
+        ("{key:", "{key + '_': ", "there is no column 'T_left'; did you mean 'T_left_'?"),
+        ("+ noise", "+ np.inf + noise", "is infinite in sample 0"),
+        ("frame[key] + noise * rng", "['a'] * 181 or rng", "does not hold numbers only"),
+    ],
+)
+def test_readers_that_fail(rod, monkeypatch, old, new, named):
+    assert old in READER
+    path = with_reader(rod, READER.replace(old, new))
+    monkeypatch.setenv("LIVEPDE_DATA", str(path.parent))
+    with pytest.raises(lp.LivepdeError) as error:
+        cases.load(path, allow_code=True).prepare()
+    message = str(error.value)
+    assert named in message
+    assert str(path) in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ('time = "time_s"', "", "time is missing"),
+        ("time_unit", "options = { a = 1 }\ntime_unit", "options belong to a reader"),
+        ("time_unit", 'reader = "a.py:b"\ntime_unit', "are two sources"),
+        ("time_unit", 'separator = "::"\ntime_unit', "data.separator"),
+    ],
+)
+def test_one_source_of_data(rod, old, new, named):
+    with pytest.raises(lp.CaseError, match=named):
+        cases.load(rod((old, new)))
+
+
+def test_semicolons(rod):
+    path = rod()
+    data = path.with_name("rod.csv")
+    data.write_text(data.read_text().replace(",", ";"))
+    with pytest.raises(lp.DataError, match="say separator = ';'"):
+        cases.load(path).prepare()
+    prepared = cases.load(rod(("time_unit", 'separator = ";"\ntime_unit'))).prepare()
+    assert len(prepared.stream) == 181
+
+
+def test_options_that_are_text_or_booleans(rod):
+    body = """
+from dataclasses import replace
+from livepde.models import EQUATIONS, Option
+
+def make(mesh, unknowns, dirichlet, *, shape, closed):
+    assert shape == "radial" and closed is True
+    return EQUATIONS["heat"].build(mesh, unknowns, dirichlet)
+
+options = {"shape": Option("", "coordinates", choices=("plane", "radial")),
+           "closed": Option("", "closed at the left", False)}
+build = replace(EQUATIONS["heat"], build=make, options=options)
+"""
+    path = own_code(rod, body)
+    text = path.read_text()
+    for given, named in (
+        ("", "options.shape is missing: the coordinates: one of plane, radial"),
+        ('shape = "radail"', "did you mean 'radial'?"),
+        ("shape = 3", "options.shape: got 3.0; expected text"),
+        ('shape = "radial"\nclosed = "yes"', "options.closed: got 'yes'; expected true or false"),
+        ('shape = "radial"\nclosed = true', ""),
+    ):
+        path.write_text(text.replace("[law]", f"[options]\n{given}\n[law]"))
+        if named:
+            with pytest.raises(lp.CaseError, match=named.replace("?", r"\?")):
+                cases.load(path, allow_code=True)
+        else:
+            cases.load(path, allow_code=True)
+
+
+def test_text_for_a_bare_function(rod):
+    body = "from livepde.models import heat\n\ndef build(mesh, unknowns, dirichlet, *, a, b, c):\n"
+    body += "    assert (a, b, c) == (2.0, 'x', True)\n"
+    body += "    return heat(mesh, unknowns['alpha'], dirichlet)\n"
+    path = own_code(rod, body)
+    text = path.read_text().replace(" m^2/s", "").replace(' K"', '"')
+    for number in ("5e-5", "3e-5", "1e-6", "1e-3", "0.05"):
+        text = text.replace(f'"{number}"', number)
+    path.write_text(text.replace("[law]", '[options]\na = 2\nb = "x"\nc = true\n[law]'))
+    cases.load(path, allow_code=True)
+
+
+# --- values set from outside -----------------------------------------------------------------
+
+
+def test_settings(rod):
+    path = rod()
+    given = parse(["law.noise=0.2 K", "law.replay=false", "law.memory='1 h'",
+                   "unknowns.alpha.prior=6e-5", "title=A rod", "channels.T_20.role=sensor",
+                   "channels.T_20.noise='1 K'"])  # fmt: skip
+    case = cases.load(path, settings=given)
+    assert (case.title, case.law.noise, case.law.memory) == ("A rod", 0.2, 3600.0)
+    assert case.model.parameter_space.prior[0] == 6e-5
+    assert case.withheld is None
+    assert case.original == path.read_text()
+    other = path.with_name("resolved.toml")
+    other.write_text(case.text)
+    again = cases.load(other, settings=given)
+    assert (again.title, again.law.noise, again.text) == ("A rod", 0.2, case.text)
+
+
+def test_tables_are_set_key_by_key(rod):
+    case = cases.load(rod(), settings={"steps": {"dt_max": "5 s"}, 'law."replay".first': 16})
+    assert (case.dt_max, case.frame.spec.steps.scheme) == (5.0, "alexander2")
+    assert case.law.replay == lp.Replay(first=16)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "named"),
+    [
+        ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
+        ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
+        ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),
+        ("channels.T_21.noise", 1, "did you mean 'T_20'?"),
+        ("law..noise", 1, "'law..noise' is no key"),
+        ("law.noise", "2 m", "law.noise: 'm' cannot be converted"),
+    ],
+)
+def test_settings_that_are_refused(rod, key, value, named):
+    path = rod()
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(path, settings={key: value})
+    assert named in str(error.value)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_settings_need_an_equals_sign():
+    with pytest.raises(lp.CaseError, match=r"--set law: expected key=value"):
+        parse(["law"])
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda path: path.stem)
+def test_documents_survive_being_written(path):
+    document = tomllib.loads(path.read_text())
+    document["odd"] = {"a b": 'x"\\\n\x07', "": [True, 1e300, {"y": {}}], "inf": float("inf")}
+    assert tomllib.loads(to_toml(document)) == document
 
 
 # --- shipped cases ---------------------------------------------------------------------------

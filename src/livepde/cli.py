@@ -47,7 +47,18 @@ OutOption = Annotated[
 ]
 CodeOption = Annotated[
     bool,
-    typer.Option("--allow-code", help="Load an equation of your own that the case names."),
+    typer.Option(
+        "--allow-code", help="Load the equation or reader of your own that the case names."
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Another value than the case has, as law.noise='2 K'. Repeat it for more.",
+        show_default=False,
+    ),
 ]
 CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show_default=False)]
 
@@ -221,16 +232,16 @@ def check(
         typer.Option(help="Other data than the case names (.csv, .jsonl).", show_default=False),
     ] = None,
     allow_code: CodeOption = False,
+    settings: SetOption = None,
 ) -> None:
     """Check a case and its data, and tell what its sensors can identify.
 
     Nothing is written. Example:  livepde check mycase/case.toml
     """
-    from livepde import cases
     from livepde.runs import Table
 
     console = _console()
-    loaded = cases.load(case, allow_code=allow_code)
+    loaded = _load(case, allow_code, settings)
     prepared = loaded.prepare(data)
     _show_model(console, prepared)
     samples: Samples = prepared.stream  # type: ignore[assignment]
@@ -248,6 +259,13 @@ def check(
     if failed:
         raise typer.Exit(CHECK_FAILED)
     console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
+
+
+def _load(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
+    from livepde import cases
+    from livepde.cases.settings import parse
+
+    return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 
 
 def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
@@ -352,6 +370,7 @@ def run(
     out: OutOption = None,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
+    settings: SetOption = None,
 ) -> None:
     """Identify: take every sample of a case, and write a run directory.
 
@@ -360,22 +379,23 @@ def run(
     Example:  livepde run mycase/case.toml
     Live:     logger | livepde run mycase/case.toml --data -
     """
-    from livepde import cases
     from livepde.runs import RunWriter, checks_of, drive, free_path, tables
     from livepde.streams import Table as Samples
 
-    loaded = cases.load(case, allow_code=allow_code)
+    loaded = _load(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
     if out is not None and out.exists():
         _must_be_empty(out)
     prepared = loaded.prepare(source)
-    folder = out or free_path(Path("runs") / case.stem)
+    folder = out or free_path(Path("runs") / loaded.name)
     writer = RunWriter.create(
         folder,
         version=__version__,
         command=["livepde", *sys.argv[1:]],
         title=loaded.title,
         case=loaded.text,
+        settings=settings or (),
+        original=loaded.original,
     )
     total = len(prepared.stream) if isinstance(prepared.stream, Samples) else None
     driven = drive(
@@ -448,8 +468,8 @@ def report(
 ) -> None:
     """Show what a run found: tables, and figures into the run directory.
 
-    Example:  livepde report runs/case
-    Theory:   livepde report runs/case --theory
+    Example:  livepde report runs/mycase
+    Theory:   livepde report runs/mycase --theory
     """
     from livepde import runs
 
@@ -485,14 +505,13 @@ def report(
 
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
     """Take a run's samples again, and print and write what the theory says."""
-    from livepde import cases
     from livepde.diagnostics import theory_report
     from livepde.errors import CaseError, RunError
     from livepde.runs import Table
 
     case = opened.case_file()
     try:
-        prepared = cases.load(case, allow_code=allow_code).prepare(data or opened.data_file)
+        prepared = _load(case, allow_code, opened.settings).prepare(data or opened.data_file)
     except CaseError as error:
         if case.parent != opened.path:
             raise

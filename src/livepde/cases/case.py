@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.data import assimilation_start, clock_of, read_data
+from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
-from livepde.cases.read import did_you_mean, read_spec, read_text
+from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import GradientSpec, SensitivitySpec
 from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
+from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError, LawError
 from livepde.identifier import Identifier, Sample
 from livepde.laws import (
@@ -99,7 +100,12 @@ class Prepared:
         return found
 
 
-def load(path: str | os.PathLike[str], *, allow_code: bool = False) -> Case:
+def load(
+    path: str | os.PathLike[str],
+    *,
+    allow_code: bool = False,
+    settings: Mapping[str, Any] | None = None,
+) -> Case:
     """Read and check a case file.
 
     Parameters
@@ -107,7 +113,9 @@ def load(path: str | os.PathLike[str], *, allow_code: bool = False) -> Case:
     path
         A TOML file.
     allow_code
-        Load an equation of the user's own ('module:function' or 'file.py:function').
+        Load an equation or a reader of the user's own ('module:function', 'file.py:function').
+    settings
+        Key -> value instead of what the file says, as {"law.noise": "2 K"}.
 
     Raises
     ------
@@ -115,9 +123,14 @@ def load(path: str | os.PathLike[str], *, allow_code: bool = False) -> Case:
         One sentence: which key, what it got, what was expected, and the remedy.
     """
     file = Path(path)
-    text = read_text(file)
-    spec = read_spec(text, str(file))
-    case = Case(Frame(file, spec, resolve(spec, file.parent, str(file), allow_code)), text)
+    text = original = read_text(file)
+    document = read_toml(text, str(file))
+    if settings:
+        document = apply(document, settings, str(file))
+        text = to_toml(document)
+    spec = read_spec(document, str(file))
+    place = (spec, file.parent, str(file), allow_code)
+    case = Case(Frame(file, spec, resolve(*place), reader_of(*place)), text, original)
     case.check()
     return case
 
@@ -131,16 +144,25 @@ class Case:
     frame
         File, specification and equation.
     text
+        The case as it is run: the file's content, or with settings what it amounts to.
+    original
         The file's content.
     """
 
     frame: Frame
     text: str
+    original: str
 
     def check(self) -> None:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
         _ = self.scheme, self.dt_max
+
+    @property
+    def name(self) -> str:
+        """A name for its runs: that of the file, of its folder if the file is just 'case.toml'."""
+        path = self.frame.path.absolute()
+        return path.stem if path.stem != "case" else path.parent.name or "case"
 
     @property
     def title(self) -> str:
@@ -163,7 +185,7 @@ class Case:
         return mesh_of(self.frame)
 
     @cached_property
-    def options(self) -> dict[str, float]:
+    def options(self) -> dict[str, Any]:
         """Known numbers of the equation."""
         return options_of(self.frame)
 

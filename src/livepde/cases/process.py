@@ -13,6 +13,7 @@ from livepde.cases.schema import UnknownSpec
 from livepde.cases.units import conversion
 from livepde.fem import Channel, Field, Piecewise, Scalar, dot, grad, interval, rectangle
 from livepde.model import Model
+from livepde.models import Option
 
 __all__ = ["mesh_of", "model_of", "options_of", "process_notes"]
 
@@ -34,23 +35,36 @@ def mesh_of(frame: Frame) -> Any:
     return interval(start, stop, cells, geometric=geometric)
 
 
-def options_of(frame: Frame) -> dict[str, float]:
-    """Return the known numbers of the equation."""
+def options_of(frame: Frame) -> dict[str, Any]:
+    """Return the options of the equation: numbers in its units, text and booleans."""
     known, given = frame.equation.options, frame.spec.options
     frame.only(given, known, "options")
-    values = {}
+    values: dict[str, Any] = {}
     for name, option in known.items():
         key = f"options.{name}"
         if name in given:
-            values[name] = frame.convert(given[name], option.unit, key)
+            values[name] = _option(frame, option, given[name], key)
         elif option.default is not None:
             values[name] = option.default
         else:
-            raise frame.missing(key, f"the {option.text}, in {option.unit}.")
+            unit = f", in {option.unit}" if option.unit else ""
+            choices = f": one of {', '.join(option.choices)}" if option.choices else ""
+            raise frame.missing(key, f"the {option.text}{unit}{choices}.")
     return values
 
 
-def model_of(frame: Frame, mesh: Any, options: Mapping[str, float]) -> Model:
+def _option(frame: Frame, option: Option, value: Any, key: str) -> Any:
+    if option.kind is float and not isinstance(value, bool):
+        return frame.convert(value, option.unit, key)
+    if not isinstance(value, option.kind):
+        kind = {float: "a number", str: "text", bool: "true or false"}[option.kind]
+        raise frame.error(key, f"got {value!r}; expected {kind}.")
+    if option.choices and value not in option.choices:
+        raise frame.error(key, f"got '{value}'; {did_you_mean(str(value), option.choices)}")
+    return value
+
+
+def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     """Return the model."""
     inputs = frame.roles("input")
     frame.only(inputs, frame.equation.inputs, "channels (role input)")

@@ -24,7 +24,7 @@ from livepde.cases.schema import (
 )
 from livepde.errors import CaseError
 
-__all__ = ["did_you_mean", "read_spec", "read_text"]
+__all__ = ["did_you_mean", "read_spec", "read_text", "read_toml"]
 
 EXPECTED = {
     "int_type": "a whole number",
@@ -71,12 +71,16 @@ def _cases_in(folder: Path) -> list[str]:
     return [file.name for file in folder.glob("*.toml")] if folder.is_dir() else []
 
 
-def read_spec(text: str, where: str) -> CaseSpec:
-    """Return the checked content of a case file; raises `CaseError`."""
+def read_toml(text: str, where: str) -> dict[str, Any]:
+    """Return the document of a case file; raises `CaseError`."""
     try:
-        raw = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise CaseError(f"{where}: is not valid TOML: {error}.") from None
+
+
+def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
+    """Return the checked content of a case's document; raises `CaseError`."""
     try:
         return CaseSpec.model_validate(raw)
     except ValidationError as error:

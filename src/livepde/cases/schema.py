@@ -13,6 +13,7 @@ from pydantic import (
     Field,
     PositiveFloat,
     PositiveInt,
+    StrictBool,
     model_validator,
 )
 
@@ -92,16 +93,29 @@ class MeshSpec(Spec):
 
 
 class DataSpec(Spec):
-    """The data file and its time column."""
+    """The data file and its time column, or a function that reads them."""
 
     file: Name | None = None
-    time: Name
+    separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
+    reader: Name | None = None
+    options: dict[Identifier, Any] = Field(default_factory=dict)
+    time: Name = "time"
     time_unit: str | None = None
     start: Instant | None = None
     stop: Instant | None = None
     assimilate_from: Instant | None = None
     every: PositiveInt = 1
     missing: tuple[float, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> DataSpec:
+        if self.reader is None and "time" not in self.model_fields_set:
+            raise ValueError("time is missing: the name of the column of times")
+        if self.reader is None and self.options:
+            raise ValueError("options belong to a reader")
+        if self.reader is not None and self.file is not None:
+            raise ValueError("file and reader are two sources: keep one")
+        return self
 
 
 class UnknownSpec(Spec):
@@ -225,7 +239,7 @@ class CaseSpec(Spec):
     equation: Name
     initial: Quantity
     mesh: MeshSpec
-    options: dict[Identifier, Quantity] = Field(default_factory=dict)
+    options: dict[Identifier, StrictBool | Quantity] = Field(default_factory=dict)
     boundary: dict[Name, Quantity] = Field(default_factory=dict)
     data: DataSpec
     unknowns: dict[Identifier, UnknownSpec] = Field(min_length=1)

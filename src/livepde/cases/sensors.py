@@ -37,7 +37,7 @@ def columns_of(frame: Frame) -> dict[str, Column]:
 
 
 def observation_of(
-    frame: Frame, mesh: Any, options: Mapping[str, float], role: str
+    frame: Frame, mesh: Any, options: Mapping[str, Any], role: str
 ) -> Observation | None:
     """Return what the channels of a role see; None if there are none."""
     channels = frame.roles(role)
