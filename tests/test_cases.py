@@ -16,7 +16,7 @@ from livepde.cases.preview import preview
 from livepde.cases.settings import parse, to_toml
 from livepde.cases.template import write_template
 from livepde.cases.units import convert
-from livepde.runs import checks_of, measures
+from livepde.runs import checks_of, measures, tables
 
 SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 
@@ -681,6 +681,77 @@ def test_documents_survive_being_written(path):
     document = tomllib.loads(path.read_text())
     document["odd"] = {"a b": 'x"\\\n\x07', "": [True, 1e300, {"y": {}}], "inf": float("inf")}
     assert tomllib.loads(to_toml(document)) == document
+
+
+# --- references and variants -----------------------------------------------------------------
+
+REFERENCE = ("[expect]", '[reference]\nalpha = "0.97 cm^2/s"\nsource = "made up"\n[expect]')
+
+
+def described(path):
+    prepared, data = result_of(path)
+    prepared.describe(data)
+    return prepared.case, data
+
+
+def test_references(rod):
+    path = rod(REFERENCE, ("alpha = [9e-5, 1.05e-4]", 'alpha.error = "<= 0.03"'))
+    case, data = described(path)
+    assert case.references == {"alpha": pytest.approx(9.7e-5)}
+    assert case.source == "made up"
+    assert not case.notes
+    found = measures(data)
+    assert found["alpha.error"] == pytest.approx(abs(found["alpha"] / 9.7e-5 - 1))
+    assert all(check.ok for check in checks_of(case.expected, data))
+    table = tables(data)[0]
+    assert table.title.endswith("made up")
+    assert table.columns[-2:] == ("reference", "error")
+    assert table.rows[0][-2] == "9.7e-05"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ('alpha = "0.97', 'alhpa = "0.97', "reference: there is no unknown number 'alhpa'; did"),
+        ("cm^2/s", "cm/s", "reference.alpha: 'cm/s' cannot be converted"),
+    ],
+)
+def test_references_that_are_refused(rod, old, new, named):
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(rod((REFERENCE[0], REFERENCE[1].replace(old, new))))
+    assert named in str(error.value)
+
+
+VARIANTS = """
+[[variants]]
+name = "noisier"
+set = { law.noise = "1 K", "data.every" = 2 }
+seeds = 3
+expect = { rmse = "<= 1", alpha.error = "<= 0.1" }
+
+[expect]"""
+
+
+def test_variants(rod):
+    (variant,) = cases.load(rod(("[expect]", VARIANTS))).variants
+    assert variant.name == "noisier"
+    assert variant.seeds == 3
+    assert variant.expect == {"rmse": ("<=", 1.0), "alpha.error": ("<=", 0.1)}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("seeds", "sedes", "there is no key 'variants[0].sedes'; did you mean 'seeds'?"),
+        ("seeds = 3", 'seeds = 3\n[[variants]]\nname = "noisier"', "two have the name 'noisier'"),
+        ('name = "noisier"', "", "the key 'variants[0].name' is missing"),
+        ('rmse = "<= 1"', "rmse = 1", "variants[0].expect.rmse: got 1"),
+    ],
+)
+def test_variants_that_are_refused(rod, old, new, named):
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(rod(("[expect]", VARIANTS.replace(old, new))))
+    assert named in str(error.value)
 
 
 # --- shipped cases ---------------------------------------------------------------------------

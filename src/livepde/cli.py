@@ -190,19 +190,55 @@ def reproduce(
 def bench(
     name: Annotated[str, typer.Argument(help="Name of the benchmark; 'list' shows them.")] = "list",
     as_json: JsonOption = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="With 'cases': only the case of this name. Repeat it for more."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="With 'cases': where they are. Default: the next folder 'cases'."),
+    ] = None,
+    gallery: Annotated[
+        Path | None,
+        typer.Option(help="With 'cases': folder for a page with tables and figures."),
+    ] = None,
 ) -> None:
-    """Measure what things cost, as ratios that hold on any machine.
+    """Measure what things cost, as ratios that hold on any machine, and what cases find.
+
+    'cases' runs every case of the project with its variants, and the code that they name.
 
     Example:  livepde bench step
+    Cases:    livepde bench cases --only soil_layers --json
     """
     from livepde.bench import BENCHMARKS
 
     if name == "list":
-        for key in BENCHMARKS:
+        for key in (*BENCHMARKS, "cases"):
             _console().print(key)
         return
-    outcome = _named(name, BENCHMARKS, "benchmark")()
+    if name == "cases":
+        _bench_cases(folder, only or [], gallery, as_json)
+        return
+    outcome = _named(name, {**BENCHMARKS, "cases": None}, "benchmark")()
     _report_outcome(outcome, ["livepde", "bench", name], as_json)
+
+
+def _bench_cases(
+    folder: Path | None, only: Sequence[str], gallery: Path | None, as_json: bool
+) -> None:
+    from livepde.bench import cases
+
+    known = {path.stem: path for path in cases.find_cases(folder)}
+    paths = [_named(name, known, "case") for name in only] or list(known.values())
+    pictures = None
+    if gallery is not None:
+        gallery.mkdir(parents=True, exist_ok=True)
+        pictures = gallery if _can_draw(_console(err=True)) else None
+    outcome, runs = cases.bench_cases(paths, progress=True, pictures=pictures)
+    if gallery is not None:
+        page = cases.gallery(runs, gallery)
+        _console(err=True).print(f"Gallery: {page}", soft_wrap=True)
+    _report_outcome(outcome, ["livepde", "bench", "cases"], as_json)
 
 
 # --- cases ---------------------------------------------------------------------------------------
@@ -406,9 +442,7 @@ def run(
         fields_every=loaded.fields_every,
     )
     dataset = driven.result.to_xarray()
-    dataset.attrs |= prepared.attributes
-    for axis in set("xyz") & set(dataset.coords):
-        dataset[axis].attrs["units"] = loaded.frame.equation.length_unit
+    prepared.describe(dataset)
     checks = checks_of(loaded.expected, dataset)
     notes = list(loaded.notes)
     if driven.status == "interrupted":

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
-from livepde.cases.schema import GradientSpec, SensitivitySpec
+from livepde.cases.schema import GradientSpec, SensitivitySpec, VariantSpec
 from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
 from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError, LawError
@@ -88,6 +89,17 @@ class Prepared:
         """The initial state: a number, or a function of x."""
         return initial_of(self.case.frame, self.case.mesh, self.first)
 
+    def describe(self, data: xr.Dataset) -> None:
+        """Add to a run's dataset what its case knows: title, start, units of axes, references."""
+        data.attrs |= self.attributes
+        for axis in set("xyz") & set(data.coords):
+            data[axis].attrs["units"] = self.case.frame.equation.length_unit
+        for label, value in self.case.references.items():
+            if label in data:
+                data[label].attrs["reference"] = value
+        if self.case.source:
+            data.attrs["reference_source"] = self.case.source
+
     @property
     def attributes(self) -> dict[str, Any]:
         """What a dataset of this case should say about itself."""
@@ -156,7 +168,7 @@ class Case:
     def check(self) -> None:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
-        _ = self.scheme, self.dt_max
+        _ = self.scheme, self.dt_max, self.references
 
     @property
     def name(self) -> str:
@@ -168,6 +180,32 @@ class Case:
     def title(self) -> str:
         """The title, or the name of the file."""
         return self.frame.spec.title or self.frame.path.stem
+
+    @cached_property
+    def references(self) -> dict[str, float]:
+        """Label of an unknown -> what others found, in the model's unit."""
+        frame, space = self.frame, self.model.parameter_space
+        found = {}
+        for label, value in frame.spec.reference.items():
+            if label == "source" and label not in space.labels:
+                continue
+            if label not in space.labels:
+                text = f"there is no unknown number '{label}'; "
+                raise frame.error("reference", text + did_you_mean(label, space.labels))
+            unit = space.unknowns[label.split("[")[0]].unit
+            found[label] = frame.convert(value, unit, f"reference.{label}")
+        return found
+
+    @property
+    def source(self) -> str:
+        """Where the references come from."""
+        given = self.frame.spec.reference.get("source", "")
+        return given if isinstance(given, str) and "source" not in self.references else ""
+
+    @property
+    def variants(self) -> tuple[VariantSpec, ...]:
+        """The case with other values, by name."""
+        return self.frame.spec.variants
 
     @property
     def expected(self) -> dict[str, tuple[Sense, Bound]]:
@@ -278,6 +316,7 @@ class Case:
         known = [
             *labels,
             *(f"{label}.std" for label in labels),
+            *(f"{label}.error" for label in self.references),
             "rmse",
             *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
             "failed_steps",

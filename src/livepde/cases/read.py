@@ -21,6 +21,7 @@ from livepde.cases.schema import (
     SensitivitySpec,
     StepsSpec,
     UnknownSpec,
+    VariantSpec,
 )
 from livepde.errors import CaseError
 
@@ -50,6 +51,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "unknowns.*": UnknownSpec,
     "channels.*": ChannelSpec,
     "law.replay": ReplaySpec,
+    "variants.*": VariantSpec,
 }
 
 
@@ -151,7 +153,8 @@ def _keys(path: list[str], raw: Mapping[str, Any]) -> list[str]:
         kind = raw["law"].get("kind") if isinstance(raw.get("law"), dict) else ""
         model = GradientSpec if kind == "gradient" else SensitivitySpec
     elif path:
-        model = TABLES.get(".".join(path)) or TABLES.get(f"{path[0]}.*")
+        first = path[0].partition("[")[0]  # variants[0] is one of the variants
+        model = TABLES.get(".".join(path)) or TABLES.get(f"{first}.*")
     if model is None:
         return []
     return [item.alias or name for name, item in model.model_fields.items()]

@@ -29,6 +29,7 @@ __all__ = [
     "StepsSpec",
     "TikhonovSpec",
     "UnknownSpec",
+    "VariantSpec",
 ]
 
 
@@ -53,6 +54,20 @@ def _bound(value: Any) -> Any:
             except ValueError:
                 pass
     raise ValueError('expected [low, high], "<= number" or ">= number"')
+
+
+def _flat(value: Any) -> Any:
+    """{"k": {"error": x}} -> {"k.error": x}: TOML reads k.error = x as a table."""
+    if not isinstance(value, dict):
+        return value
+    found: dict[str, Any] = {}
+    for name, item in value.items():
+        inner = _flat(item)
+        if isinstance(inner, dict):
+            found |= {f"{name}.{key}": one for key, one in inner.items()}
+        else:
+            found[name] = item
+    return found
 
 
 Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
@@ -229,6 +244,21 @@ class OutputSpec(Spec):
     fields_every: PositiveInt = 24
 
 
+Expected: TypeAlias = Annotated[
+    dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_bound)]], BeforeValidator(_flat)
+]
+
+
+class VariantSpec(Spec):
+    """The case with other values: what 'livepde bench cases' runs beside it."""
+
+    name: Name
+    set: dict[str, Any] = Field(default_factory=dict)
+    seeds: PositiveInt = 1
+    reference: dict[Name, Quantity] = Field(default_factory=dict)
+    expect: Expected = Field(default_factory=dict)
+
+
 Law: TypeAlias = Annotated[SensitivitySpec | GradientSpec, Field(discriminator="kind")]
 
 
@@ -247,6 +277,14 @@ class CaseSpec(Spec):
     law: Law
     steps: StepsSpec = Field(default_factory=StepsSpec)
     output: OutputSpec = Field(default_factory=OutputSpec)
-    expect: dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_bound)]] = Field(
-        default_factory=dict
-    )
+    reference: dict[Name, Quantity] = Field(default_factory=dict)
+    expect: Expected = Field(default_factory=dict)
+    variants: tuple[VariantSpec, ...] = ()
+
+    @model_validator(mode="after")
+    def _names_once(self) -> CaseSpec:
+        names = [variant.name for variant in self.variants]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"variants: two have the name '{name}'")
+        return self

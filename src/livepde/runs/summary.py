@@ -59,10 +59,17 @@ def _scalars(data: xr.Dataset) -> list[str]:
     return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
 
 
+def _error(data: xr.Dataset, label: str) -> float:
+    """Return the relative error of the last estimate to the reference, NaN without one."""
+    reference = float(data[label].attrs.get("reference", math.nan))
+    return abs(float(data[label][-1]) - reference) / abs(reference) if reference else math.nan
+
+
 def measures(data: xr.Dataset) -> dict[str, float]:
     """Return every number of a run that a case may expect something of, by name.
 
-    Each scalar unknown by its label, with `.std` behind it its deviation; `rmse` one-step, of all
+    Each scalar unknown by its label, with `.std` behind it its deviation and with `.error` the
+    relative error to a reference; `rmse` one-step, of all
     sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`, `rmse.CHANNEL`;
     `failed_steps`.
     """
@@ -71,6 +78,8 @@ def measures(data: xr.Dataset) -> dict[str, float]:
         for label in _scalars(data):
             found[label] = float(data[label][-1])
             found[f"{label}.std"] = float(data[f"{label}_std"][-1])
+            if "reference" in data[label].attrs:
+                found[f"{label}.error"] = _error(data, label)
     scored = _scored(data)
     parts = [errors for _, errors in scored.values()]
     found["rmse"] = _rmse(np.concatenate(parts)) if parts else math.nan
@@ -94,15 +103,27 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 
 
 def tables(data: xr.Dataset) -> list[Table]:
-    """Return the tables of a run: estimates, and errors of each channel."""
+    """Return the tables of a run: estimates with references, and errors of each channel."""
     result: list[Table] = []
     labels = _scalars(data) if data.sizes["time"] else []
     rows: list[tuple[Any, ...]] = []
     if labels:
+        compared = any("reference" in data[label].attrs for label in labels)
         for label in labels:
             value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
-            rows.append((label, *digits(value, std), data[label].attrs.get("units", "")))
-        result.append(Table("Estimates", ("unknown", "value", "± deviation", "unit"), rows))
+            cells = [*digits(value, std), data[label].attrs.get("units", "")]
+            if compared:
+                error, attrs = _error(data, label), data[label].attrs
+                cells.append(f"{attrs['reference']:.5g}" if "reference" in attrs else "–")
+                cells.append(f"{100 * error:.2g} %" if math.isfinite(error) else "–")
+            rows.append((label, *cells))
+        columns: tuple[str, ...] = ("unknown", "value", "± deviation", "unit")
+        title = "Estimates"
+        if compared:
+            columns += ("reference", "error")
+            source = str(data.attrs.get("reference_source", ""))
+            title += f"; reference: {source}" if source else ""
+        result.append(Table(title, columns, rows))
     fields = [name for name in str(data.attrs.get("fields", "")).split() if name in data]
     if fields:
         rows = []
