@@ -502,6 +502,117 @@ def test_borehole_needs_its_options_and_input(tmp_path):
         assert named in str(error.value)
 
 
+# --- meshes, regions, and unknowns that move or stay positive ---------------------------------
+
+
+def test_nodes(rod):
+    path = rod(('from = 0\nto = "40 cm"\ncells = 40', 'nodes = [0, "10 cm", 0.2, 0.3, "400 mm"] #'))
+    mesh = cases.load(path).mesh
+    np.testing.assert_allclose(mesh.p[0], [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert set(mesh.boundaries) == {"left", "right"}
+
+
+@pytest.mark.parametrize(
+    ("mesh", "named"),
+    [
+        ("nodes = [0, 0.4, 0.3]", "mesh.nodes: line: needs at least two increasing nodes"),
+        ("nodes = [0]", "mesh.nodes"),
+        ("nodes = [0, 0.4]\ncells = 3", "mesh: expected from and to"),
+        ('nodes = [0, 0.4]\nspacing = "geometric"', "spacing belongs to an interval with cells"),
+        ('nodes = [0, 0.4]\nunit = "mm"', "unit belongs to a file"),
+        ("from = 0\nto = 1", "mesh: expected from and to"),
+    ],
+)
+def test_meshes_that_are_refused(rod, mesh, named):
+    path = rod(('from = 0\nto = "40 cm"\ncells = 40', f"{mesh} #"))
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(path)
+    assert named in str(error.value)
+
+
+PLANE = """
+equation = "reaction_diffusion"
+initial = 1.0
+mesh = { x = [0, 2], y = [0, 1], cells = [4, 2] }
+data = { file = "data.csv", time = "t" }
+unknowns.q = { prior = 1.0, std = 1.0, regions = REGIONS }
+law = { kind = "sensitivity", noise = 0.1 }
+channels.a = { role = "sensor", column = "a", at = [0.5, 0.5] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("regions", "named"),
+    [
+        ("{ a = [0, 1, 0, 1], b = [1, 2, 0, 1] }", ""),
+        ("{ a = [0, 1, 0, 1] }", "lies in 0 regions"),
+        ("{ a = [0, 1, 0, 1], b = [0, 2, 0, 1] }", "lies in 2 regions"),
+        ("{ a = [0, 1] }", "expected [x0, x1, y0, y1]"),
+        ("{ a = [5, 6, 0, 1] }", "holds no cell of the mesh, which spans 0 to 2 x 0 to 1"),
+        ('{ a = "steel" }', "the mesh has no subdomain 'steel'"),
+    ],
+)
+def test_regions_of_a_rectangle(tmp_path, regions, named):
+    path = tmp_path / "case.toml"
+    path.write_text(PLANE.replace("REGIONS", regions))
+    if not named:
+        assert set(cases.load(path).model.parameter_space.labels) == {"q[a]", "q[b]"}
+        return
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(path)
+    assert named in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("evolution", "expected"),
+    [
+        ('kind = "random-walk", rate = "6e-6 m^2/s/min^0.5"', lp.RandomWalk(6e-6 / 60**0.5)),
+        ('kind = "mean-reverting", time = "2 h"', lp.MeanReverting(7200.0)),
+        ('kind = "periodic", period = "1 day", harmonics = 2', lp.Periodic(86400.0, 2)),
+    ],
+)
+def test_unknowns_that_move(rod, evolution, expected):
+    path = rod((NO_REPLAY[0], "#"), ("bounds = [", f"evolution = {{ {evolution} }}\nbounds = ["))
+    unknown = cases.load(path).model.parameter_space.unknowns["alpha"]
+    assert type(unknown.evolution) is type(expected)
+    assert vars(unknown.evolution) == pytest.approx(vars(expected))
+
+
+def test_positive_unknowns(rod):
+    path = rod(('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "log"'))
+    _, data = result_of(path)
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+    case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))
+    assert case.model.parameter_space.unknowns["alpha"].transform == "log"
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('evolution = { kind = "random-walk" }', "'random-walk' takes rate"),
+        ('evolution = { kind = "periodic", rate = 1 }', "takes harmonics and period"),
+        ('evolution = { kind = "perodic" }', "did you mean 'periodic'?"),
+        ('evolution = { kind = "periodic", perod = 1 }', "did you mean 'period'?"),
+        ('evolution = { kind = "mean-reverting", time = "2 m" }', "evolution.time: 'm' cannot"),
+        ('transform = "lg"', "did you mean 'log'?"),
+        ('transform = "logit"\n#', "unknowns.alpha: "),
+    ],
+)
+def test_evolutions_that_are_refused(rod, text, named):
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(rod(("bounds = [", f"{text}\nbounds = [" if "#" not in text else f"{text}[")))
+    assert named in str(error.value)
+
+
+def test_gate(rod):
+    assert cases.load(rod(("replay = true ", "gate = 5 #"))).law.gate == 5.0
+
+
+def test_the_initial_state_is_said_once(rod):
+    with pytest.raises(lp.CaseError, match="initial is missing"):
+        cases.load(rod(('initial = "interpolate"', ""))).prepare()
+
+
 # --- data that a function reads --------------------------------------------------------------
 
 READER = """

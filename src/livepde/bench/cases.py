@@ -120,7 +120,7 @@ def bench_cases(
     Returns
     -------
     outcome
-        One table, and a check for every number that a case expects.
+        Two tables, and a check for every number that a case expects.
     runs
         Means over the seeds: of each case, and of each variant.
     """
@@ -135,7 +135,7 @@ def bench_cases(
         "Time is that of a sample over that of a forward step of the same model, taken in turns; "
         "'prior' is the RMSE of the model with its unknowns at their prior."
     )
-    return Outcome([_table(runs)], checks, notes), runs
+    return Outcome(_tables(runs), checks, notes), runs
 
 
 def _collect(
@@ -236,7 +236,7 @@ class _Frozen(Law[tuple[Problem, ForwardStage], tuple[Array, Array]]):
         self.seconds += perf_counter() - start
         status = Status() if failure is None else Status.of(failure)
         end = u if failure is not None else end
-        return (end, q), Report(status, problem.observed.predict(end, q, interval.end), steps)
+        return (end, q), Report(status, problem.predict(end, q, interval.end), steps)
 
     def belief(self, work: tuple[Problem, ForwardStage], state: tuple[Array, Array]) -> Belief:
         u, q = state
@@ -303,36 +303,28 @@ def _checks(job: Job, run: Run) -> list[Check]:
     ]
 
 
-COLUMNS = (
-    "case", "unknown", "estimate", "± deviation", "unit", "reference", "error",
-    "RMSE", "withheld", "prior", "samples", "time", "failed steps",
-)  # fmt: skip
-
-
-def _table(runs: Sequence[tuple[Job, Run]]) -> Table:
+def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
+    """Return what was found, and how good and how dear it was."""
     rows: list[tuple[Any, ...]] = []
+    quality: list[tuple[Any, ...]] = []
     for job, run in runs:
         if run.error:
-            rows.append((job.label, "failed", *["–"] * (len(COLUMNS) - 2)))
+            quality.append((job.label, *["–"] * 5, "failed"))
             continue
         numbers = run.numbers
-        common = (
-            _shown(numbers["rmse"]),
-            _shown(numbers.get("rmse.withheld", math.nan)),
-            _shown(run.prior),
-            run.samples,
-            _shown(run.ratio, ".1f"),
-            int(numbers["failed_steps"]),
-        )
+        rmse, withheld = numbers["rmse"], numbers.get("rmse.withheld", math.nan)
+        shown = [_shown(value) for value in (rmse, withheld, run.prior)]
+        steps = int(numbers["failed_steps"])
+        quality.append((job.label, *shown, run.samples, _shown(run.ratio, ".1f"), steps))
         for label, (unit, reference) in run.unknowns.items():
             estimate = digits(numbers[label], numbers[f"{label}.std"])
             error = 100 * numbers.get(f"{label}.error", math.nan)
             ending = " %" if math.isfinite(error) else ""
             compared = (_shown(reference, ".5g"), _shown(error, ".2g") + ending)
-            rows.append((job.label, label, *estimate, unit, *compared, *common))
-        if not run.unknowns:
-            rows.append((job.label, "field", *["–"] * 5, *common))
-    return Table("Cases", COLUMNS, rows)
+            rows.append((job.label, label, *estimate, unit, *compared))
+    columns = ("case", "unknown", "estimate", "± deviation", "unit", "reference", "error")
+    more = ("case", "RMSE", "withheld", "prior", "samples", "time", "failed steps")
+    return [Table("Estimates", columns, rows), Table("Runs", more, quality)]
 
 
 def _shown(value: float, form: str = ".3g") -> str:
@@ -348,7 +340,7 @@ def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
         checks = [check for pair in some for check in _checks(*pair)]
         source = [f"Reference: {run.source}"] if run.source else []
         figures = [job.figure.name] if job.figure and job.figure.exists() else []
-        text = markdown(run.title or path.stem, [_table(some)], checks, source, figures)
+        text = markdown(run.title or path.stem, _tables(some), checks, source, figures)
         parts.append(text.replace("\n## ", "\n### ").replace("# ", "## ", 1))
     target = folder / "gallery.md"
     target.write_text("# Gallery\n\n" + "\n".join(parts), encoding="utf-8")

@@ -86,8 +86,13 @@ class Prepared:
 
     @cached_property
     def u0(self) -> Any:
-        """The initial state: a number, or a function of x."""
-        return initial_of(self.case.frame, self.case.mesh, self.first)
+        """The initial state: a number, or a function of x; None if the model says it itself."""
+        frame = self.case.frame
+        if self.case.model.form_initial is None:
+            return initial_of(frame, self.case.mesh, self.first)
+        if frame.spec.initial is not None:
+            raise frame.error("initial", "the equation has its own initial state; leave it out.")
+        return None
 
     def describe(self, data: xr.Dataset) -> None:
         """Add to a run's dataset what its case knows: title, start, units of axes, references."""
@@ -277,7 +282,8 @@ class Case:
         replay = Replay() if spec.replay is True else None
         if not isinstance(spec.replay, bool):
             replay = Replay(**spec.replay.model_dump())
-        return SensitivityLaw(spec.modes, noise, drift, memory, replay)
+        gate = float(np.inf) if spec.gate is None else spec.gate
+        return SensitivityLaw(spec.modes, noise, drift, memory, replay, gate=gate)
 
     @cached_property
     def scheme(self) -> Scheme:

@@ -14,6 +14,7 @@ from livepde.cases.schema import (
     CaseSpec,
     ChannelSpec,
     DataSpec,
+    EvolutionSpec,
     GradientSpec,
     MeshSpec,
     OutputSpec,
@@ -52,6 +53,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "channels.*": ChannelSpec,
     "law.replay": ReplaySpec,
     "variants.*": VariantSpec,
+    "*.evolution": EvolutionSpec,
 }
 
 
@@ -154,7 +156,8 @@ def _keys(path: list[str], raw: Mapping[str, Any]) -> list[str]:
         model = GradientSpec if kind == "gradient" else SensitivitySpec
     elif path:
         first = path[0].partition("[")[0]  # variants[0] is one of the variants
-        model = TABLES.get(".".join(path)) or TABLES.get(f"{first}.*")
+        names = (".".join(path), f"*.{path[-1]}", f"{first}.*")
+        model = next((TABLES[name] for name in names if name in TABLES), None)
     if model is None:
         return []
     return [item.alias or name for name, item in model.model_fields.items()]

@@ -23,6 +23,7 @@ __all__ = [
     "CaseSpec",
     "ChannelSpec",
     "DataSpec",
+    "EvolutionSpec",
     "GradientSpec",
     "MeshSpec",
     "SensitivitySpec",
@@ -72,6 +73,7 @@ def _flat(value: Any) -> Any:
 
 Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
 Pair: TypeAlias = tuple[Quantity, Quantity]
+Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
 Instant: TypeAlias = date | datetime | float | str
 Name: TypeAlias = Annotated[str, Field(min_length=1)]
 Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
@@ -84,26 +86,37 @@ class Spec(BaseModel):
 
 
 class MeshSpec(Spec):
-    """An interval (from, to, cells) or a rectangle (x, y, cells)."""
+    """An interval (from, to, cells; or nodes), a rectangle (x, y, cells), or a file."""
 
     start: Quantity | None = Field(None, alias="from")
     stop: Quantity | None = Field(None, alias="to")
+    nodes: tuple[Quantity, ...] | None = Field(None, min_length=2)
     x: Pair | None = None
     y: Pair | None = None
-    cells: PositiveInt | tuple[PositiveInt, PositiveInt]
+    file: Name | None = None
+    unit: str | None = None
+    cells: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
     spacing: Literal["uniform", "geometric"] = "uniform"
 
     @model_validator(mode="after")
     def _one_kind(self) -> MeshSpec:
-        given = {"from": self.start, "to": self.stop, "x": self.x, "y": self.y}
-        names = {name for name, value in given.items() if value is not None}
-        line, plane = names == {"from", "to"}, names == {"x", "y"}
-        if not (line or plane):
-            raise ValueError("expected from and to (an interval), or x and y (a rectangle)")
-        if line and not isinstance(self.cells, int):
-            raise ValueError("cells: expected one number for an interval")
-        if plane and (isinstance(self.cells, int) or self.spacing != "uniform"):
-            raise ValueError("expected cells = [nx, ny] and uniform spacing for a rectangle")
+        given = self.model_fields_set - {"spacing", "unit"}
+        if given in ({"nodes"}, {"file"}):
+            if "spacing" in self.model_fields_set:
+                raise ValueError("spacing belongs to an interval with cells")
+        elif given == {"start", "stop", "cells"}:
+            if not isinstance(self.cells, int):
+                raise ValueError("cells: expected one number for an interval")
+        elif given == {"x", "y", "cells"}:
+            if isinstance(self.cells, int) or self.spacing != "uniform":
+                raise ValueError("expected cells = [nx, ny] and uniform spacing for a rectangle")
+        else:
+            raise ValueError(
+                "expected from and to (an interval) or x and y (a rectangle), with cells; or nodes "
+                "(an interval); or file"
+            )
+        if self.unit is not None and self.file is None:
+            raise ValueError("unit belongs to a file")
         return self
 
 
@@ -133,6 +146,24 @@ class DataSpec(Spec):
         return self
 
 
+class EvolutionSpec(Spec):
+    """How an unknown moves by itself."""
+
+    kind: Literal["random-walk", "mean-reverting", "periodic"]
+    rate: Quantity | None = None
+    time: Quantity | None = None
+    period: Quantity | None = None
+    harmonics: PositiveInt = 1
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> EvolutionSpec:
+        needed = {"random-walk": "rate", "mean-reverting": "time", "periodic": "period"}[self.kind]
+        known = {"kind", needed, *(["harmonics"] if self.kind == "periodic" else [])}
+        if getattr(self, needed) is None or self.model_fields_set - known:
+            raise ValueError(f"'{self.kind}' takes {' and '.join(sorted(known - {'kind'}))}")
+        return self
+
+
 class UnknownSpec(Spec):
     """One unknown: a number, one number for each layer, or a field."""
 
@@ -140,14 +171,16 @@ class UnknownSpec(Spec):
     std: Quantity
     bounds: Pair | None = None
     unit: str | None = None
-    regions: dict[Name, Pair] | None = None
+    regions: dict[Name, Pair | Box | Name] | None = None
     field: bool = False
     length: Quantity | None = None
+    transform: Literal["log", "logit"] | None = None
+    evolution: EvolutionSpec | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> UnknownSpec:
-        if self.field and (self.regions or self.bounds):
-            raise ValueError("a field takes no regions and no bounds")
+        if self.field and (self.regions or (self.bounds and not self.transform)):
+            raise ValueError("a field takes no regions, and bounds with a transform only")
         if self.length is not None and not self.field:
             raise ValueError("length belongs to a field: add field = true")
         return self
@@ -203,6 +236,7 @@ class SensitivitySpec(Spec):
     drift: Quantity = 0.0
     memory: Quantity | None = None
     replay: bool | ReplaySpec = False
+    gate: PositiveFloat | None = None
 
 
 class TikhonovSpec(Spec):
@@ -267,7 +301,7 @@ class CaseSpec(Spec):
 
     title: str = ""
     equation: Name
-    initial: Quantity
+    initial: Quantity | dict[Name, Quantity] | None = None
     mesh: MeshSpec
     options: dict[Identifier, StrictBool | Quantity] = Field(default_factory=dict)
     boundary: dict[Name, Quantity] = Field(default_factory=dict)

@@ -128,11 +128,16 @@ def noise_of(frame: Frame, role: str) -> list[float] | None:
 
 
 def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
-    """Return the initial state: a number, or the first sample interpolated.
+    """Return the initial state: a number (of each component), or the first sample interpolated.
 
     Withheld channels take no part.
     """
     initial = frame.spec.initial
+    if initial is None:
+        raise frame.missing("initial", "a number, or 'interpolate' from the first sample.")
+    if isinstance(initial, dict):
+        unit = frame.equation.state.unit
+        return {name: frame.convert(v, unit, f"initial.{name}") for name, v in initial.items()}
     if initial != "interpolate":
         if isinstance(initial, str) and not any(letter.isdigit() for letter in initial):
             text = f"got '{initial}'; {did_you_mean(initial, ['interpolate', 'a number'])}"

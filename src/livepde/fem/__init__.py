@@ -19,7 +19,7 @@ from livepde.fem.fields import (
 )
 from livepde.fem.forms import Form
 from livepde.fem.latent import Composed, Latent, LatentPart, compose
-from livepde.fem.meshes import box, hermite, linear, quadratic, rectangle, smooth
+from livepde.fem.meshes import box, hermite, line, linear, quadratic, rectangle, smooth
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
 from livepde.fem.sobolev import Sobolev
@@ -60,6 +60,7 @@ __all__ = [
     "hermite",
     "hess",
     "interval",
+    "line",
     "linear",
     "maximum",
     "minimum",

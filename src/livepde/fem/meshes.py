@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from skfem.element import (
 
 from livepde.errors import SpaceError
 
-__all__ = ["box", "hermite", "linear", "quadratic", "rectangle", "smooth"]
+__all__ = ["box", "hermite", "line", "linear", "quadratic", "rectangle", "smooth"]
 
 LINEAR: dict[Any, Any] = {
     MeshLine: ElementLineP1,
@@ -82,6 +83,16 @@ def smooth(mesh: Mesh) -> Element:
 def hermite(mesh: Mesh) -> Element:
     """Return cubic Hermite on a line, the element of first order elsewhere."""
     return ElementLineHermite() if isinstance(mesh, MeshLine) else linear(mesh)
+
+
+def line(nodes: Sequence[float]) -> MeshLine:
+    """Return a mesh of an interval with the given nodes and boundaries "left" and "right"."""
+    x = np.asarray(nodes, dtype=float)
+    if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
+        raise SpaceError(f"line: needs at least two increasing nodes; got {x.tolist()}.")
+    return MeshLine(x).with_boundaries(
+        {"left": lambda p: np.isclose(p[0], x[0]), "right": lambda p: np.isclose(p[0], x[-1])}
+    )
 
 
 def rectangle(x: tuple[float, float], y: tuple[float, float], cells: tuple[int, int]) -> MeshQuad:
