@@ -387,7 +387,11 @@ REFUSED = [
     (', noise = "0.05 K"', "", "law.noise is missing"),
     ('noise = "0.05 K"', 'noise = "0.05 m"', "T_10.noise: 'm' cannot"),
     ('noise = "0.05 K"', 'noise = "0 K"', "T_10.noise: got '0 K'"),
-    ('at = "10 cm", noise', 'over = [0.1, 0.2], noise', "all points (at) or all averages"),
+    ('at = "10 cm"', 'over = "lft"', "the mesh has no part 'lft'; did you mean 'left'?"),
+    ('at = "20 cm"', 'at = 0.2, offset = 1', "offset belongs to sensors that are assimilated"),
+    ('at = "left"', 'at = "left", of = "u"', "of belongs to sensors"),
+    ('at = "20 cm"', "each = [0, 0.4, 5]", "each needs column = a name with {}"),
+    ('noise = "0.05 K" }', 'noise = "0.05 K", correlated = { tim = 3 } }', "did you mean 'time'?"),
     ('role = "sensor"', 'role = "withheld"', "no sensor to learn from"),
     ("[law]", "[boundary]\nlft = 3\n[law]", "boundary: no boundary 'lft'"),
     ('rmse = "<= 0.15"', 'rmse = "lots"', "expect.rmse: got 'lots'; expected [low, high]"),
@@ -611,6 +615,61 @@ def test_gate(rod):
 def test_the_initial_state_is_said_once(rod):
     with pytest.raises(lp.CaseError, match="initial is missing"):
         cases.load(rod(('initial = "interpolate"', ""))).prepare()
+
+
+# --- sensors ---------------------------------------------------------------------------------
+
+
+def test_families(rod):
+    old = 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }'
+    path = rod((old, 'T = { role = "withheld", column = "T_{}0", each = ["0 cm", "40 cm", 5] }'),
+               ("T_10 =", "first ="), ("T_30 =", "third ="))  # fmt: skip
+    case = cases.load(path)
+    assert case.withheld.names(5) == ("T_0", "T_1", "T_2", "T_3", "T_4")
+    np.testing.assert_allclose(list(case.withheld.points.values()), [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert case.columns["T_3"].names == ("T_30",)
+    with pytest.raises(lp.CaseError, match="there is a channel 'T_1' already"):
+        cases.load(rod(("first =", "T_1 =")))
+
+
+OFFSET = ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm", noise = "0.05 K", offset = "0.5 K"')
+
+
+def test_unknowns_of_sensors_share_a_prior(rod):
+    more = ', offset = "0.5 K", gain = 0.05, correlated = { time = "1 h", std = "0.1 K" }'
+    path = rod((OFFSET[0], f'at = "10 cm", noise = "0.05 K"{more}'))
+    with pytest.raises(lp.CaseError, match=r"T_30.offset: differs from that of 'T_10'"):
+        cases.load(rod(('at = "30 cm", noise', 'at = "30 cm", offset = "0.4 K", noise')))
+    model = cases.load(rod(('offset = "0.4 K", noise', "noise"))).model
+    assert set(model.parameter_space.labels) == {
+        "alpha", "offset[T_10]", "gain[T_10]", "correlated[T_10]"
+    }  # fmt: skip
+    unknowns = model.parameter_space.unknowns
+    assert (unknowns["offset"].std, unknowns["offset"].unit) == (0.5, "K")
+    assert (unknowns["gain"].prior, unknowns["gain"].std) == (1.0, 0.05)
+    assert unknowns["correlated"].evolution == lp.MeanReverting(3600.0)
+    assert path.exists()
+
+
+def test_an_unknown_offset_is_found(rod):
+    import pandas as pd
+
+    path = rod(OFFSET, NO_REPLAY)
+    frame = pd.read_csv(path.parent / "rod.csv")
+    frame["T_10"] += 0.4
+    frame.to_csv(path.parent / "rod.csv", index=False)
+    _, data = result_of(path)
+    found = measures(data)
+    assert found["offset[T_10]"] == pytest.approx(0.4, abs=0.05)
+    assert found["alpha"] == pytest.approx(9.7e-5, rel=0.05)
+
+
+def test_points_and_averages_together(rod):
+    path = rod(('at = "30 cm", noise = "0.05 K"', 'over = ["28 cm", "32 cm"], noise = "0.07 K"'))
+    prepared, data = result_of(path)
+    assert prepared.identifier.observed.names == ("T_10", "T_30")
+    np.testing.assert_allclose(prepared.identifier.observed.noise, [0.05, 0.07])
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
 
 
 # --- data that a function reads --------------------------------------------------------------

@@ -17,6 +17,7 @@ import xarray as xr
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
+from livepde.cases.instruments import expanded
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import GradientSpec, SensitivitySpec, VariantSpec
@@ -147,7 +148,8 @@ def load(
         text = to_toml(document)
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
-    case = Case(Frame(file, spec, resolve(*place), reader_of(*place)), text, original)
+    frame = expanded(Frame(file, spec, resolve(*place), reader_of(*place)))
+    case = Case(frame, text, original)
     case.check()
     return case
 

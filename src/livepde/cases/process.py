@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.frame import Frame
+from livepde.cases.instruments import unknowns_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
-from livepde.errors import SpaceError
+from livepde.errors import ModelError, SpaceError
 from livepde.fem import (
     Channel,
     Evolution,
@@ -31,7 +32,7 @@ from livepde.fem import (
 from livepde.model import Model
 from livepde.models import Option
 
-__all__ = ["mesh_of", "model_of", "options_of", "process_notes"]
+__all__ = ["mesh_of", "model_of", "options_of", "process_notes", "sides_of"]
 
 
 def mesh_of(frame: Frame) -> Any:
@@ -105,7 +106,14 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
         if name not in inputs:
             raise frame.missing(f"channels.{name}", f"the {variable.text}, with role = 'input'.")
     unknowns = _unknowns(frame, mesh)
-    return frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
+    model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
+    own = unknowns_of(frame)
+    if not own:
+        return model
+    try:
+        return model.extended(own)
+    except ModelError as error:
+        raise frame.error("channels", str(error)) from None
 
 
 def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
@@ -217,7 +225,7 @@ def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> d
             found[name] = given
             count[known[given]] += 1
             continue
-        sides = _sides(frame, given, len(mesh.p), f"{key}.{name}")
+        sides = sides_of(frame, given, len(mesh.p), f"{key}.{name}")
 
         def inside(x: Any, sides: list[tuple[float, float]] = sides) -> Any:
             return np.logical_and.reduce(
@@ -247,7 +255,7 @@ def _ends(mesh: Any) -> tuple[Any, Any]:
     return mesh.p.min(axis=1), mesh.p.max(axis=1)
 
 
-def _sides(frame: Frame, given: Any, dimension: int, key: str) -> list[tuple[float, float]]:
+def sides_of(frame: Frame, given: Any, dimension: int, key: str) -> list[tuple[float, float]]:
     """Return (low, high) for each coordinate."""
     if len(given) != 2 * dimension:
         expected = {1: "[from, to]", 2: "[x0, x1, y0, y1]"}.get(

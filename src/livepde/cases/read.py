@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 from livepde.cases.schema import (
     CaseSpec,
     ChannelSpec,
+    CorrelatedSpec,
     DataSpec,
     EvolutionSpec,
     GradientSpec,
@@ -54,6 +55,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "law.replay": ReplaySpec,
     "variants.*": VariantSpec,
     "*.evolution": EvolutionSpec,
+    "*.correlated": CorrelatedSpec,
 }
 
 

@@ -22,6 +22,7 @@ from livepde.runs.outcome import Bound, Sense
 __all__ = [
     "CaseSpec",
     "ChannelSpec",
+    "CorrelatedSpec",
     "DataSpec",
     "EvolutionSpec",
     "GradientSpec",
@@ -186,6 +187,13 @@ class UnknownSpec(Spec):
         return self
 
 
+class CorrelatedSpec(Spec):
+    """An error of a sensor that fades within `time`, with the deviation `std`."""
+
+    time: Quantity
+    std: Quantity
+
+
 class ChannelSpec(Spec):
     """One channel of the stream and its role."""
 
@@ -193,22 +201,38 @@ class ChannelSpec(Spec):
     column: Name | None = None
     columns: tuple[Name, ...] | None = None
     at: Quantity | tuple[Quantity, ...] | None = None
-    over: Pair | None = None
+    over: Pair | Box | Name | None = None
+    each: tuple[Quantity, Quantity, PositiveInt] | None = None
     quantity: str | None = None
+    of: Name | None = None
     noise: Quantity | None = None
     unit: str | None = None
+    offset: Quantity | None = None
+    gain: PositiveFloat | None = None
+    correlated: CorrelatedSpec | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> ChannelSpec:
         if (self.column is None) == (not self.columns):
             raise ValueError("expected column = name, or columns = [names] that are averaged")
-        placed = (self.at is not None) + (self.over is not None) + (self.quantity is not None)
+        places = (self.at, self.over, self.quantity, self.each)
+        placed = sum(place is not None for place in places)
         if self.role == "input" and placed:
-            raise ValueError("an input has no place: leave out at, over and quantity")
+            raise ValueError("an input has no place: leave out at, over, each and quantity")
         if self.role == "boundary" and not isinstance(self.at, str):
             raise ValueError('a boundary channel needs at = the name of a boundary, as "left"')
         if self.role in ("sensor", "withheld") and placed != 1:
-            raise ValueError("expected one of: at = position, over = [from, to], quantity = name")
+            raise ValueError(
+                "expected one of: at = position, over = [from, to], each = [from, to, count], "
+                "quantity = name"
+            )
+        if self.each is not None and "{}" not in (self.column or ""):
+            raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
+        own = {"offset", "gain", "correlated"} & self.model_fields_set
+        if own and self.role != "sensor":
+            raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
+        if self.of is not None and self.role not in ("sensor", "withheld"):
+            raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
         if self.role in ("input", "boundary") and self.noise is not None:
             raise ValueError(f"noise belongs to sensors, not to a channel of role {self.role}")
         return self
