@@ -632,6 +632,28 @@ def test_families(rod):
         cases.load(rod(("first =", "T_1 =")))
 
 
+def test_very_many_sensors_are_one_row(rod):
+    old = 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }'
+    new = 'W = { role = "withheld", column = "T_20{}", each = [0, 0.4, 50] }'
+    path = rod(
+        (old, new),
+        ("cells = 40", "cells = 4"),
+        ("start, stop", ""),
+        ("[data]", "[data]\nevery = 30"),
+    )
+    import pandas as pd
+
+    frame = pd.read_csv(path.parent / "rod.csv")
+    more = {f"T_20{k}": frame["T_20"] for k in range(50)}
+    frame.assign(**more).to_csv(path.parent / "rod.csv", index=False)
+    _, data = result_of(path)
+    rows = tables(data)[-1].rows
+    assert [row[:2] for row in rows] == [
+        ("T_10 ... T_30", "assimilated"),
+        ("W_0 ... W_49", "withheld"),
+    ]
+
+
 OFFSET = ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm", noise = "0.05 K", offset = "0.5 K"')
 
 

@@ -18,7 +18,7 @@ from livepde.cases.template import write_template
 from livepde.errors import LivepdeError
 from livepde.runs import Check, Outcome, Table
 
-COMMANDS = ("demo", "reproduce", "init", "check", "run", "report", "bench")
+COMMANDS = ("demo", "reproduce", "init", "equations", "check", "run", "report", "bench")
 
 
 @pytest.fixture
@@ -103,6 +103,14 @@ def test_main_returns_codes(monkeypatch, capsys):
 
 
 # --- cases -----------------------------------------------------------------------------------
+
+
+def test_equations(here):
+    assert "thermal response test" in call("equations")[1]
+    output = call("equations", "borehole")[1]
+    for word in ("R_b", "rho_c", "needed", "fluid", "[options]", "Length in m, time in s"):
+        assert word in output
+    assert "did you mean 'heat'" in bad("equations", "haet")
 
 
 def test_values_set_from_outside(rod, here, monkeypatch):

@@ -261,6 +261,41 @@ def init(
 
 
 @app.command()
+def equations(
+    name: Annotated[str, typer.Argument(help="Name of an equation; 'list' shows them.")] = "list",
+) -> None:
+    """Show the ready-made equations, and what a case says about one of them.
+
+    Example:  livepde equations heat
+    """
+    from livepde.models import EQUATIONS
+    from livepde.runs import Table
+
+    console = _console()
+    if name == "list":
+        for item in EQUATIONS.values():
+            console.print(f"[bold]{item.name}[/]  {escape(item.summary)}", soft_wrap=True)
+        return
+    found = _named(name, EQUATIONS, "equation")
+    console.print(f"[bold]{found.name}[/]  {escape(found.summary)}", soft_wrap=True)
+    console.print(escape(found.formula), soft_wrap=True)
+    rows = [("state", "u", found.state.text, found.state.unit, "")]
+    for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):
+        rows += [(table, key, item.text, item.unit, "") for key, item in known.items()]
+    for key, option in found.options.items():
+        default = "needed" if option.default is None else str(option.default)
+        choices = f" ({', '.join(option.choices)})" if option.choices else ""
+        rows.append(("[options]", key, option.text + choices, option.unit, default))
+    unit = found.state.unit
+    rows += [
+        ("[channels], quantity", key, item.text, unit, "") for key, item in found.quantities.items()
+    ]
+    columns = ("where", "name", "what", "unit", "default")
+    _print_table(console, Table("What a case says about it", columns, rows))
+    console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")
+
+
+@app.command()
 def check(
     case: CaseArgument,
     data: Annotated[

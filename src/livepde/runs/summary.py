@@ -13,6 +13,7 @@ from livepde.runs.outcome import Bound, Check, Sense, Table
 
 __all__ = ["checks_of", "digits", "measures", "tables"]
 
+MOST_ROWS = 40
 CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
 
 
@@ -49,6 +50,21 @@ def _scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
             errors = data[variable].values[kept, k]
             found[str(name)] = (role, errors[np.isfinite(errors)])
     return found
+
+
+def _grouped(
+    scored: Mapping[str, tuple[str, np.ndarray[Any, Any]]],
+) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
+    """Return what is short enough for a table: of very many channels one row for each role."""
+    if len(scored) <= MOST_ROWS:
+        return dict(scored)
+    roles: dict[str, list[str]] = {}
+    for name, (role, _) in scored.items():
+        roles.setdefault(role, []).append(name)
+    return {
+        f"{names[0]} ... {names[-1]}": (role, np.concatenate([scored[name][1] for name in names]))
+        for role, names in roles.items()
+    }
 
 
 def _rmse(errors: np.ndarray[Any, Any]) -> float:
@@ -146,7 +162,7 @@ def tables(data: xr.Dataset) -> list[Table]:
             len(errors),
             unit,
         )
-        for name, (role, errors) in _scored(data).items()
+        for name, (role, errors) in _grouped(_scored(data)).items()
     ]
     columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))
