@@ -133,27 +133,6 @@ class Model:
             )
         if not self.form_M.constant:
             raise ModelError("M may not depend on time or inputs: move the change into B or f.")
-        forms = {"A": A, "B": B, "f": f, "M": M, "dA": dA, "dB": dB, "initial": initial}
-        self._arguments: dict[str, Any] = {**forms, "inputs": inputs, "time_unit": time_unit}
-
-    def extended(self, unknowns: Mapping[str, Unknown]) -> Model:
-        """Return the model with more unknowns, which only sensors see: offsets, gains.
-
-        Raises
-        ------
-        ModelError
-            The forms take the one unknown itself, q instead of q.name; or a name is taken.
-        """
-        space = self.parameter_space
-        if space.single:
-            raise ModelError(
-                "sensors with unknowns of their own need a model with named ones: give "
-                'parameter={"k": ...}, and write q.k in its forms.'
-            )
-        for name in unknowns:
-            if name in space.unknowns:
-                raise ModelError(f"the model has an unknown '{name}' already: rename it.")
-        return Model(self.state, {**space.unknowns, **unknowns}, **self._arguments)
 
     def _form(
         self,

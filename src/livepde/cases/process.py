@@ -111,7 +111,7 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     if not own:
         return model
     try:
-        return model.extended(own)
+        return model.with_unknowns(own)
     except ModelError as error:
         raise frame.error("channels", str(error)) from None
 
