@@ -576,16 +576,21 @@ def test_regions_of_a_rectangle(tmp_path, regions, named):
     ],
 )
 def test_unknowns_that_move(rod, evolution, expected):
-    path = rod((NO_REPLAY[0], "#"), ("bounds = [", f"evolution = {{ {evolution} }}\nbounds = ["))
+    path = rod((NO_REPLAY[0], "#"), ("bounds = [", f"evolution = {{ {evolution} }} #"))
     unknown = cases.load(path).model.parameter_space.unknowns["alpha"]
     assert type(unknown.evolution) is type(expected)
     assert vars(unknown.evolution) == pytest.approx(vars(expected))
+    prepared = cases.load(path).prepare()
+    assert 0 < preview(prepared, prepared.stream)[0][0].left < 1
 
 
 def test_positive_unknowns(rod):
     path = rod(('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "log"'))
-    _, data = result_of(path)
+    prepared, data = result_of(path)
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+    (row,) = preview(prepared, prepared.stream)[0]
+    assert row.prior == pytest.approx(3e-5)
+    assert row.left < 0.05
     case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))
     assert case.model.parameter_space.unknowns["alpha"].transform == "log"
 
