@@ -16,14 +16,16 @@ from livepde.fem.fields import (
     Scalars,
     Unknown,
     interval,
+    line,
 )
 from livepde.fem.forms import Form
 from livepde.fem.latent import Composed, Latent, LatentPart, compose
-from livepde.fem.meshes import box, hermite, line, linear, quadratic, rectangle, smooth
+from livepde.fem.meshes import box, hermite, linear, quadratic, read_mesh, rectangle, smooth
 from livepde.fem.place import START, Inputs, Moment, Place
-from livepde.fem.shapes import ddot, div, dot, grad, hess, trace, transpose
+from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace
+from livepde.fem.upwind import upwind
 
 __all__ = [
     "START",
@@ -64,10 +66,13 @@ __all__ = [
     "linear",
     "maximum",
     "minimum",
+    "mul",
     "positive",
     "quadratic",
+    "read_mesh",
     "rectangle",
     "smooth",
     "trace",
     "transpose",
+    "upwind",
 ]

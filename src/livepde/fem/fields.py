@@ -27,6 +27,7 @@ __all__ = [
     "Scalars",
     "Unknown",
     "interval",
+    "line",
 ]
 
 Integrand: TypeAlias = Callable[..., Any]
@@ -88,6 +89,16 @@ def interval(
         {"left": lambda x: np.isclose(x[0], start), "right": lambda x: np.isclose(x[0], stop)}
     )
     return mesh.with_subdomains(dict(regions)) if regions else mesh
+
+
+def line(nodes: Sequence[float]) -> MeshLine:
+    """Return a mesh of an interval with the given nodes and boundaries "left" and "right"."""
+    x = np.asarray(nodes, dtype=float)
+    if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
+        raise SpaceError(f"line: needs at least two increasing nodes; got {x.tolist()}.")
+    return MeshLine(x).with_boundaries(
+        {"left": lambda p: np.isclose(p[0], x[0]), "right": lambda p: np.isclose(p[0], x[-1])}
+    )
 
 
 def _check_prior(

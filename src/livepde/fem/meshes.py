@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
 from typing import Any
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from skfem import (
@@ -31,8 +37,9 @@ from skfem.element import (
 )
 
 from livepde.errors import SpaceError
+from livepde.fem.fields import Predicate
 
-__all__ = ["box", "hermite", "line", "linear", "quadratic", "rectangle", "smooth"]
+__all__ = ["box", "hermite", "linear", "quadratic", "read_mesh", "rectangle", "smooth"]
 
 LINEAR: dict[Any, Any] = {
     MeshLine: ElementLineP1,
@@ -85,24 +92,23 @@ def hermite(mesh: Mesh) -> Element:
     return ElementLineHermite() if isinstance(mesh, MeshLine) else linear(mesh)
 
 
-def line(nodes: Sequence[float]) -> MeshLine:
-    """Return a mesh of an interval with the given nodes and boundaries "left" and "right"."""
-    x = np.asarray(nodes, dtype=float)
-    if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
-        raise SpaceError(f"line: needs at least two increasing nodes; got {x.tolist()}.")
-    return MeshLine(x).with_boundaries(
-        {"left": lambda p: np.isclose(p[0], x[0]), "right": lambda p: np.isclose(p[0], x[-1])}
-    )
+def rectangle(
+    x: tuple[float, float],
+    y: tuple[float, float],
+    cells: tuple[int, int],
+    *,
+    regions: Mapping[str, Predicate] | None = None,
+) -> MeshQuad:
+    """Return a mesh of [x0, x1] x [y0, y1] with boundaries "left", "right", "bottom", "top".
 
-
-def rectangle(x: tuple[float, float], y: tuple[float, float], cells: tuple[int, int]) -> MeshQuad:
-    """Return a mesh of [x0, x1] x [y0, y1] with boundaries "left", "right", "bottom", "top"."""
+    `regions` are named subdomains, each a predicate on the midpoints of the elements.
+    """
     if not (x[1] > x[0] and y[1] > y[0] and min(cells) >= 1):
         raise SpaceError(
             f"rectangle({x}, {y}, {cells}): needs increasing coordinates and cells >= 1."
         )
     mesh = MeshQuad.init_tensor(np.linspace(*x, cells[0] + 1), np.linspace(*y, cells[1] + 1))
-    return mesh.with_boundaries(
+    mesh = mesh.with_boundaries(
         {
             "left": lambda p: np.isclose(p[0], x[0]),
             "right": lambda p: np.isclose(p[0], x[1]),
@@ -110,6 +116,7 @@ def rectangle(x: tuple[float, float], y: tuple[float, float], cells: tuple[int, 
             "top": lambda p: np.isclose(p[1], y[1]),
         }
     )
+    return mesh.with_subdomains(dict(regions)) if regions else mesh
 
 
 def box(
@@ -117,10 +124,13 @@ def box(
     y: tuple[float, float],
     z: tuple[float, float],
     cells: tuple[int, int, int],
+    *,
+    regions: Mapping[str, Predicate] | None = None,
 ) -> MeshTet:
     """Return a mesh of tetrahedra of [x0, x1] x [y0, y1] x [z0, z1].
 
-    Its boundaries are "left" and "right" (x), "front" and "back" (y), "bottom" and "top" (z).
+    Its boundaries are "left" and "right" (x), "front" and "back" (y), "bottom" and "top" (z);
+    `regions` are named subdomains, each a predicate on the midpoints of the elements.
     """
     sides = (x, y, z)
     if not (all(b > a for a, b in sides) and min(cells) >= 1):
@@ -131,10 +141,103 @@ def box(
         *(np.linspace(*side, n + 1) for side, n in zip(sides, cells, strict=True))
     )
     names = (("left", "right"), ("front", "back"), ("bottom", "top"))
-    return mesh.with_boundaries(
+    mesh = mesh.with_boundaries(
         {
             name: lambda p, axis=axis, end=end: np.isclose(p[axis], end)
             for axis in range(3)
             for name, end in zip(names[axis], sides[axis], strict=True)
         }
     )
+    return mesh.with_subdomains(dict(regions)) if regions else mesh
+
+
+def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
+    """Return a mesh from a file in any format of meshio: Gmsh, VTK, Abaqus, XDMF, MED, ...
+
+    Cells are lines, triangles, quadrilaterals, tetrahedra or hexahedra; those of the highest
+    dimension are the mesh. Named groups (physical groups of Gmsh, sets of Abaqus) of cells become
+    its subdomains and those of sides its boundaries, for `On`, `Piecewise` and `dirichlet`.
+    Needs the extra `mesh`.
+
+    Parameters
+    ----------
+    path
+        The file; its ending tells the format.
+    scale
+        Unit of length of the file in that of the model: 1e-3 for a drawing in mm and a model in m.
+
+    Raises
+    ------
+    SpaceError
+        There is no such file, it cannot be read, or it holds no mesh.
+    """
+    path = Path(path)
+    if not (np.isfinite(scale) and scale > 0):
+        raise SpaceError(f"read_mesh: scale must be a positive number; got {scale}.")
+    if not path.is_file():
+        raise SpaceError(f"read_mesh: there is no file '{path}'.")
+    try:
+        import meshio
+        from skfem.io.meshio import from_meshio
+    except ImportError as error:
+        raise SpaceError(
+            "read_mesh needs meshio, which is not installed: pip install 'livepde[mesh]'."
+        ) from error
+    with _quiet():
+        mesh = _loaded(path, meshio, from_meshio)
+    if type(mesh) in LINEAR:  # centres of arcs and the like belong to no cell
+        mesh = mesh.remove_unused_nodes()
+    if scale != 1.0:
+        mesh = mesh.scaled(float(scale))
+    boundaries = {k: v for k, v in (mesh.boundaries or {}).items() if _is_name(k) and len(v)}
+    subdomains = {k: v for k, v in (mesh.subdomains or {}).items() if _is_name(k) and len(v)}
+    return replace(mesh, _boundaries=boundaries or None, _subdomains=subdomains or None)
+
+
+def _is_name(name: Any) -> bool:
+    return bool(name) and not str(name).startswith("gmsh:")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep a reader from printing: what is wrong with a file is told by an error."""
+    log = logging.getLogger("skfem")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with redirect_stdout(StringIO()), redirect_stderr(StringIO()), catch_warnings():
+            simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
+
+
+def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
+    # meshio leaves the interpreter (SystemExit) when it does not know a format.
+    try:
+        read = meshio.read(path)
+    except (Exception, SystemExit) as error:
+        raise SpaceError(
+            f"read_mesh: '{path}' cannot be read ({str(error) or type(error).__name__}): "
+            "check that its ending tells its format, or save it again as Gmsh 4.1 (.msh)."
+        ) from error
+    try:
+        mesh: Mesh = from_meshio(read, ignore_orientation=True)
+    except Exception as error:
+        kinds = sorted(read.cells_dict) or "none"
+        raise SpaceError(
+            f"read_mesh: '{path}' holds no mesh that livepde can use; its cells are {kinds}, "
+            "expected lines, triangles, quadrilaterals, tetrahedra or hexahedra."
+        ) from error
+    total = sum(len(block.data) for block in read.cells if block.dim == mesh.dim())
+    if total != mesh.nelements:
+        raise SpaceError(
+            f"read_mesh: '{path}' mixes cells of several kinds, {sorted(read.cells_dict)}; livepde "
+            "takes one kind: mesh it with one."
+        )
+    if np.ptp(read.points[:, mesh.dim() :], axis=0).any():
+        raise SpaceError(
+            f"read_mesh: the cells of '{path}' have dimension {mesh.dim()} but bend in space: "
+            f"put the mesh into the {('x axis', 'xy plane', '')[mesh.dim() - 1]}."
+        )
+    return mesh
