@@ -7,7 +7,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.diagnostics import CheckReport, check_observation
-from livepde.fem import FieldBlock
+from livepde.fem import FunctionSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class Differences(lp.Observation):
 
     pairs: tuple[tuple[float, float], ...]
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
         """Return G, one row for each pair; `state.probe` evaluates the state at points."""
         first = state.probe([[a for a, _ in self.pairs]])
         second = state.probe([[b for _, b in self.pairs]])

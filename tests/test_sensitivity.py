@@ -40,7 +40,7 @@ def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
     model = source_model()
     times = 0.1 * np.arange(21)
     data = noisy(model, [1.7, -0.4], times)
-    G = SENSORS.matrix(model.state_block)
+    G = SENSORS.matrix(model.state_space)
     runs = [truth(model, np.array(q), 0.0, times) for q in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])]
     zero, one, two = (np.concatenate([G @ u for u in run[1:]]) for run in runs)
     H = np.column_stack([one - zero, two - zero])
@@ -75,7 +75,7 @@ def warm(t):
 
 def stream(model, k, times, noise=0.0, seed=0):
     sensors = lp.Points({"T_1": 0.3, "T_2": 0.7}, noise=0.01)
-    G = sensors.matrix(model.state_block)
+    G = sensors.matrix(model.state_space)
     rng = np.random.default_rng(seed)
     states = truth(model, np.array([k]), 0.0, times, inputs=warm)
     samples = [
@@ -222,7 +222,7 @@ def test_a_nonlinear_model_finds_its_rate():
     start = 0.2
     times = 0.1 * np.arange(31)
     sensors = lp.Points([0.2, 0.8], noise=0.001)
-    G = sensors.matrix(model.state_block)
+    G = sensors.matrix(model.state_space)
     states = truth(model, np.array([1.6]), start, times)
     ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=5)), u0=start)
     for t, u in zip(times[1:], states[1:], strict=True):

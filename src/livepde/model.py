@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -34,21 +35,43 @@ from livepde.spaces import BorderedSpace, HilbertSpace, product
 
 __all__ = ["Model", "Source", "h1_form", "mass_form"]
 
-Source: TypeAlias = float | Callable[[Any, float], Any]
+Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
 
 
 def mass_form(u: Any, v: Any, x: Any) -> Any:
-    """The L2 inner product, u v."""
-    return u * v
+    """The L2 inner product, u v; of several components their sum."""
+    return _summed(lambda u, v: u * v, u, v)
+
+
+def _product(space: FunctionSpace) -> Integrand:
+    """Return the L2 inner product of a state: the sum over its components."""
+    products = {name: _pointwise(block) for name, block in space.fields.items()}
+    if space.single:
+        (single,) = products.values()
+        return lambda u, v, x: single(u, v)
+    return lambda u, v, x: sum(
+        form(getattr(u, name), getattr(v, name)) for name, form in products.items()
+    )
+
+
+def _pointwise(block: FieldBlock) -> Callable[[Any, Any], Any]:
+    """Return the product of two functions at a point: u v, of vectors u . v."""
+    return dot if block.vector else lambda u, v: u * v
 
 
 def h1_form(u: Any, v: Any, x: Any) -> Any:
-    """The H1 inner product, u v + grad u . grad v."""
-    return u * v + dot(grad(u), grad(v))
+    """The H1 inner product, u v + grad u . grad v; of several components their sum."""
+    return _summed(lambda u, v: u * v + dot(grad(u), grad(v)), u, v)
+
+
+def _summed(form: Callable[[Any, Any], Any], u: Any, v: Any) -> Any:
+    if not isinstance(u, SimpleNamespace):
+        return form(u, v)
+    return sum(form(part, getattr(v, name)) for name, part in vars(u).items())
 
 
 def _no_term(u: Any, v: Any, x: Any) -> Any:
-    return 0.0 * u * v
+    return 0.0 * x[0]
 
 
 class Model:
@@ -62,7 +85,8 @@ class Model:
     Parameters
     ----------
     state
-        The field u; its Dirichlet values may be numbers, functions g(x, t) or channels.
+        The field u, or a mapping of names to fields on one mesh, which forms see as u.c, v.c and so
+        on; Dirichlet values may be numbers, functions g(x, t) or channels.
     parameter
         What is unknown: a `Field`, `Scalar` or `Piecewise`, or a mapping of names to those.
     A
@@ -71,9 +95,10 @@ class Model:
     B
         Integrand (u, v, x), linear in v.
     f
-        Source density: a number or f(x, t).
+        Source density: a number or f(x, t); for several components a mapping of names to those.
     M
-        Integrand (u, v, x) of the mass term, symmetric positive; default u v.
+        Integrand (u, v, x) of the mass term, symmetric positive; default u v, or the sum of these
+        products over the components.
     dA, dB
         Optional integrands of the derivatives in u, (q, u, du, v, x) and (u, du, v, x). Without
         them a complex step is taken (exact for analytic integrands).
@@ -94,12 +119,12 @@ class Model:
 
     def __init__(
         self,
-        state: Field,
+        state: Field | Mapping[str, Field],
         parameter: Unknown | Mapping[str, Unknown],
         A: Integrand | On | Sequence[Integrand | On],
         B: Integrand | On | Sequence[Integrand | On] = _no_term,
         f: Source | On | Sequence[Source | On] = 0.0,
-        M: Integrand | On | Sequence[Integrand | On] = mass_form,
+        M: Integrand | On | Sequence[Integrand | On] | None = None,
         *,
         dA: Integrand | Sequence[Integrand] | None = None,
         dB: Integrand | Sequence[Integrand] | None = None,
@@ -114,17 +139,19 @@ class Model:
         self.state = state
         self.time_unit = time_unit
         self.state_space = FunctionSpace.of(state, "u")
+        self.mesh = _common_mesh(self.state_space)
         self.parameter_space = FunctionSpace.of(parameter, "q")
         self.inputs = tuple(inputs)
         self._check_parameter()
         x, q = self.state_space, self.parameter_space
         pair, triple = {"u": x, "v": x}, {"q": q, "u": x, "v": x}
-        self.form_M = self._form("M", M, pair)
+        self.form_M = self._form("M", _product(x) if M is None else M, pair)
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
         self.form_A = compose(self._form("A", A, triple, "u", dA, "q"), self.latent)
         sources = f if isinstance(f, Sequence) else [f]
-        self.form_F = self._form("f", [_as_integrand(item) for item in sources], {"v": x})
+        integrands = [_as_integrand(item, x) for item in sources]
+        self.form_F = self._form("f", integrands, {"v": x})
         self.form_initial: Form | Composed | None = None
         if initial is not None:
             pair = {"q": q, "v": x}
@@ -143,7 +170,7 @@ class Model:
         derivative: Any = None,
         parameter: str | None = None,
     ) -> Form:
-        mesh, order, inputs = self.state.mesh, self.order, self.inputs
+        mesh, order, inputs = self.mesh, self.order, self.inputs
         return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
 
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
@@ -163,6 +190,9 @@ class Model:
         return Model(self.state, unknowns, **self._parts, time_unit=self.time_unit)
 
     def _check_parameter(self) -> None:
+        both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
+        if both and not self.state_space.single:
+            raise ModelError(f"state and unknowns are both called {sorted(both)}: rename one.")
         for name, block in self.parameter_space.fields.items():
             if any(value != 0.0 for value in block.field.dirichlet.values()):
                 raise ModelError(
@@ -173,20 +203,24 @@ class Model:
     @cached_property
     def order(self) -> int:
         """Quadrature order: the state's, or exact for A(u) q with polynomial factors."""
-        if self.state.quadrature is not None:
-            return self.state.quadrature
+        states = [block.field for block in self.state_space.fields.values()]
+        given = [field.quadrature for field in states if field.quadrature is not None]
+        if given:
+            return max(given)
         degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
-        return 2 * int(self.state.element.maxdeg) + max([int(d) for d in degrees], default=0)
+        own = max(int(field.element.maxdeg) for field in states)
+        return 2 * own + max([int(d) for d in degrees], default=0)
 
     @cached_property
     def state_block(self) -> FieldBlock:
-        """The state's finite-element functions."""
-        return next(iter(self.state_space.fields.values()))
+        """The finite-element functions of a state of one component."""
+        return self.state_space.component()[0]
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
         """Names of all channels the model needs: inputs of forms and Dirichlet channels."""
-        values = self.state.dirichlet.values()
+        fields = [block.field for block in self.state_space.fields.values()]
+        values = [value for field in fields for value in field.dirichlet.values()]
         boundary = [value.name for value in values if isinstance(value, Channel)]
         return tuple(dict.fromkeys([*self.inputs, *boundary]))
 
@@ -290,10 +324,10 @@ class Model:
 
     def impose(self, u: Array, moment: Moment) -> Array:
         """Return u with the Dirichlet values of a moment."""
-        return self.state_block.impose(u, moment)
+        return self.state_space.impose(u, moment)
 
     def initial(self, u0: Any, moment: Moment = START) -> Array:
-        """Return coefficients of u0 (a number, a function of x, or coefficients)."""
+        """Return coefficients of u0: a number, a function of x, coefficients, or a mapping."""
         return self.impose(self.state_space.interpolate(u0), moment)
 
     def initial_state(self, q: Array, moment: Moment = START) -> Array:
@@ -307,7 +341,7 @@ class Model:
     @cached_property
     def _projection(self) -> HilbertSpace:
         """The state with the L2 inner product."""
-        return HilbertSpace(self.bilinear(mass_form), "L2", self.state_space.fixed)
+        return HilbertSpace(self.bilinear(_product(self.state_space)), "L2", self.state_space.fixed)
 
     def initial_directions(self, q: Array, directions: Array, moment: Moment = START) -> Array:
         """Return du_0/dq applied to columns of shape (m, k): shape (n, k); zero without initial."""
@@ -331,15 +365,48 @@ class Model:
         return q
 
 
-def _as_integrand(source: Source | On) -> Integrand | On:
+def _common_mesh(state: FunctionSpace) -> Any:
+    """Return the mesh of all components of the state."""
+    if len(state.fields) < len(state.blocks):
+        numbers = sorted(set(state.blocks) - set(state.fields))
+        raise ModelError(f"state: {numbers} must be a Field, on the mesh of the others.")
+    meshes = [block.field.mesh for block in state.fields.values()]
+    if any(mesh is not meshes[0] for mesh in meshes):
+        raise ModelError(
+            f"state: the components {list(state.fields)} must share one mesh object; their "
+            "elements may differ."
+        )
+    return meshes[0]
+
+
+def _as_integrand(source: Source | On, state: FunctionSpace) -> Integrand | On:
     """Return the source density as an integrand (v, x)."""
     if isinstance(source, On):
-        return On(source.name, _as_density(source.form))
-    return _as_density(source)
+        return On(source.name, _as_density(source.form, state))
+    return _as_density(source, state)
 
 
-def _as_density(source: Source) -> Integrand:
+def _as_density(source: Source, state: FunctionSpace) -> Integrand:
+    if isinstance(source, Mapping):
+        parts = {
+            name: _single_density(item, state.component(name)[0]) for name, item in source.items()
+        }
+        if state.single:
+            raise ModelError("f: a mapping is for a state of several components.")
+        return lambda v, x: sum(form(getattr(v, name), x) for name, form in parts.items())
+    if not callable(source) and float(source) == 0.0:
+        return lambda v, x: 0.0 * x[0]
+    if not state.single:
+        raise ModelError(
+            f"f: the state has the components {list(state.fields)}; give a mapping, such as "
+            f'f={{"{next(iter(state.fields))}": ...}}.'
+        )
+    return _single_density(source, state.component()[0])
+
+
+def _single_density(source: Any, block: FieldBlock) -> Integrand:
+    product = _pointwise(block)
     if callable(source):
-        return lambda v, x: source(x, x.t) * v
+        return lambda v, x: product(source(x, x.t), v)
     level = float(source)
     return lambda v, x: level * v

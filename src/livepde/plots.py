@@ -298,9 +298,8 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
     panels: list[Any] = []
     for name, labels in _scalars(data).items():
         panels.append(lambda ax, name=name, labels=labels: _scalar_panel(data, name, labels, ax))
-    state = str(data.attrs.get("state", ""))
-    fields = [*str(data.attrs.get("fields", "")).split(), *([state] if state in data else [])]
-    for name in fields:
+    state = [name for name in str(data.attrs.get("state", "")).split() if name in data]
+    for name in [*str(data.attrs.get("fields", "")).split(), *state]:
         panels += _field_panels(data, name, times)
     for variable, dimension, what in (
         ("innovation", "sensor", "innovation"),

@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from livepde import plots
+from livepde.fem import FieldBlock
 from livepde.laws import Belief, Status
 from livepde.linalg import Array
 from livepde.model import Model
@@ -128,13 +129,14 @@ class Result:
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
         """Return values and deviations of all fields at the vertices."""
         found: dict[str, Array] = {}
-        block, belief = self.model.state_block, estimate.belief
-        name = next(iter(self.model.state_space.blocks))
-        found[name] = block.at_vertices @ estimate.u
-        if belief.u_factor is not None:
-            found[f"{name}_std"] = belief.inflation * np.sqrt(
-                ((block.at_vertices @ belief.u_factor) ** 2).sum(axis=1)
-            )
+        belief = estimate.belief
+        for name, block in self.model.state_space.fields.items():
+            part = self.model.state_space.part(name)
+            found |= _split(name, block, block.at_vertices @ estimate.u[part])
+            if belief.u_factor is not None:
+                squares = (block.at_vertices @ belief.u_factor[part]) ** 2
+                deviation = belief.inflation * np.sqrt(squares.sum(axis=1))
+                found |= _split(name, block, deviation, "_std")
         for name, field in self.model.parameter_space.fields.items():
             part = self.model.parameter_space.part(name)
             found[name] = field.at_vertices @ estimate.q[part]
@@ -154,7 +156,7 @@ class Result:
         if self.last is not None and (not fields or fields[-1][0] != self.last.t):
             fields.append((self.last.t, self._profiles(self.last)))
         rows = list(zip(*self._rows, strict=True)) or [()] * 8
-        points = self.model.state.mesh.p
+        points = self.model.mesh.p
         order = np.argsort(points[0]) if len(points) == 1 else np.arange(points.shape[1])
         data = xr.Dataset(
             coords={
@@ -194,12 +196,16 @@ class Result:
             data[key] = ("time", np.array([notes.get(name, np.nan) for notes in rows[6]]))
         data.attrs["fields"] = " ".join(self.model.parameter_space.fields)
         data.attrs["scalars"] = "\n".join(self.model.parameter_space.labels)
-        data.attrs["state"] = next(iter(self.model.state_space.blocks))
+        components = self.model.state_space.fields.items()
+        data.attrs["state"] = " ".join(key for n, b in components for key in _variables(n, b))
         return data
 
     def _units(self) -> dict[str, str]:
         unknowns = {**self.model.state_space.unknowns, **self.model.parameter_space.unknowns}
-        return {name: unknown.unit for name, unknown in unknowns.items()}
+        found = {name: unknown.unit for name, unknown in unknowns.items()}
+        for name, block in self.model.state_space.fields.items():
+            found |= dict.fromkeys(_variables(name, block), found[name])
+        return found
 
     def table(self) -> dict[str, dict[str, float]]:
         """Return the last estimates and the root mean square errors of all sensors.
@@ -211,6 +217,20 @@ class Result:
     def plot(self, **options: Any) -> Any:
         """Draw the run and return the figure; needs the extra `plots`."""
         return plots.overview(self.to_xarray(), **options)
+
+
+def _variables(name: str, block: FieldBlock) -> list[str]:
+    """Return the variables of a component: itself, or one for each direction of a vector."""
+    if not block.vector:
+        return [name]
+    return [f"{name}_{axis}" for axis in "xyz"[: block.field.mesh.dim()]]
+
+
+def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
+    """Return the variables of a component with their values at the vertices."""
+    names = _variables(name, block)
+    rows = values.reshape(len(names), -1)
+    return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
 
 
 def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:

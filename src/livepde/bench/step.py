@@ -61,7 +61,7 @@ def _ratios(model: Model, observation: Subdomain, law: AnyLaw) -> list[float]:
         known = model.initial_parameter(q)
         return simulate(model, known, u0, times, Advance(ImplicitEuler()))
 
-    G = observation.matrix(model.state_block)
+    G = observation.matrix(model.state_space)
     samples = [(t, G @ u) for t, u in forward(seed.q_true)]
 
     def steps() -> float:

@@ -5,16 +5,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from skfem import Basis, FacetBasis, Mesh
+from scipy.sparse.linalg import spsolve
+from skfem import Basis, BilinearForm, FacetBasis, LinearForm, Mesh
 from skfem.element import DiscreteField, ElementQuadBFS
+from skfem.helpers import inner
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elements import own
 from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Scalars, Unknown
+from livepde.fem.periodic import tied
 from livepde.fem.place import Moment, Place
 from livepde.linalg import Array, IntArray
 
@@ -67,6 +71,19 @@ class Measure:
     def normal(self) -> Array | None:
         """Outward normals on a boundary."""
         return np.asarray(self._base.normals) if self.on_boundary else None
+
+    @cached_property
+    def diameter(self) -> Array:
+        """Largest distance of two vertices of each cell, shape (elements, 1)."""
+        cells = slice(None) if self._base.tind is None else self._base.tind
+        corners = self.mesh.p[:, self.mesh.t[:, cells]]
+        distances = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=0)
+        found: Array = distances.max(axis=(0, 1))[:, None]
+        return found
+
+    def place(self, moment: Moment) -> Place:
+        """Return what an integrand sees as x at a moment."""
+        return Place(self.points, self.normal, moment, self.diameter)
 
 
 @dataclass(frozen=True)
@@ -183,7 +200,42 @@ class FieldBlock(Block):
     def __init__(self, field: Field) -> None:
         self.field = field
         self.basis = Basis(field.mesh, own(field.element))
-        self.size = int(self.basis.N)
+        self._tie = tied(field, self.basis)
+        self.size = int(self._tie.max()) + 1
+
+    @cached_property
+    def element_dofs(self) -> IntArray:
+        """Coefficient of each local shape function, shape (local, elements)."""
+        found: IntArray = self._tie[self.basis.element_dofs]
+        return found
+
+    @cached_property
+    def doflocs(self) -> Array:
+        """Where each coefficient sits, shape (d, size)."""
+        _, first = np.unique(self._tie, return_index=True)
+        found: Array = self.basis.doflocs[:, first]
+        return found
+
+    @cached_property
+    def boundary(self) -> IntArray:
+        """The coefficients on the boundary of the mesh, without sides that are tied."""
+        mesh = self.field.mesh
+        free = mesh.boundary_facets()
+        for name in chain(*self.field.periodic):
+            free = np.setdiff1d(free, mesh.boundaries[name])
+        found: IntArray = np.unique(self._tie[self.basis.get_dofs(facets=free).all()])
+        return found
+
+    @cached_property
+    def _spread(self) -> sp.csr_array:
+        """The matrix from coefficients to those of scikit-fem, where sides are not tied."""
+        n = len(self._tie)
+        return sp.csr_array((np.ones(n), (np.arange(n), self._tie)), shape=(n, self.size))
+
+    @cached_property
+    def vector(self) -> bool:
+        """True if the function has values in R^d."""
+        return np.ndim(self.basis.basis[0][0]) > 2
 
     def local(self, measure: Measure) -> Local:
         if measure.mesh is not self.field.mesh:
@@ -206,7 +258,8 @@ class FieldBlock(Block):
                 array = np.asarray(phi) if jet == "value" else getattr(phi, jet)
                 stack[..., i, :, :] = array
             shapes.append(stack.reshape(-1, basis.Nbfun, elements, points))
-        return Local(np.asarray(basis.element_dofs), tuple(parts), np.concatenate(shapes))
+        dofs: IntArray = self._tie[basis.element_dofs]
+        return Local(dofs, tuple(parts), np.concatenate(shapes))
 
     def jet(self, parts: Local, values: Array) -> DiscreteField:
         arrays, start = {}, 0
@@ -235,16 +288,22 @@ class FieldBlock(Block):
                 return np.full(self.size, level)
             value = lambda x: np.full(np.shape(x[0]), level)  # noqa: E731
         if self.field.transform is not None:  # a projection need not stay within the bounds
-            nodes = self.basis.doflocs
+            nodes = self.doflocs
             return np.asarray(value(nodes) + 0.0 * nodes[0])
-        coefficients: Array = self.basis.project(lambda x: value(x) + 0.0 * x[0])
-        return coefficients
+        if not self.field.periodic:
+            coefficients: Array = self.basis.project(lambda x: value(x) + 0.0 * x[0])
+            return coefficients
+        mass = BilinearForm(lambda u, v, w: inner(u, v)).assemble(self.basis)
+        rhs = LinearForm(lambda v, w: inner(value(w.x) + 0.0 * w.x[0], v)).assemble(self.basis)
+        tie = self._spread
+        found: Array = spsolve(sp.csc_array(tie.T @ mass @ tie), tie.T @ rhs)
+        return found
 
     def _value_dofs(self, name: str) -> IntArray:
         dofs = self.basis.get_dofs() if name == "boundary" else self.basis.get_dofs(name)
         # Essential conditions fix values; derivative unknowns (u_x, u_n, ...) stay free.
         names = [n for n in (self.field.element.dofnames or []) if "_" not in n]
-        found: IntArray = dofs.all(names)
+        found: IntArray = np.unique(self._tie[dofs.all(names)])
         return found
 
     def _slope_dofs(self, name: str, axis: int) -> IntArray:
@@ -257,7 +316,8 @@ class FieldBlock(Block):
         across = np.abs(ends[1 - axis, 1] - ends[1 - axis, 0])
         along = np.abs(ends[axis, 1] - ends[axis, 0])
         sides = np.asarray(sides)[across <= 1e-9 * along]
-        found: IntArray = self.basis.get_dofs(facets=sides).all([("u_x", "u_y")[axis]])
+        names = [("u_x", "u_y")[axis]]
+        found: IntArray = np.unique(self._tie[self.basis.get_dofs(facets=sides).all(names)])
         return found
 
     @cached_property
@@ -296,7 +356,7 @@ class FieldBlock(Block):
             if isinstance(value, Channel):
                 u[dofs] = Place(u, None, moment).inputs[value.name]
             elif callable(value):
-                u[dofs] = value(self.basis.doflocs[:, dofs], moment.t)
+                u[dofs] = value(self.doflocs[:, dofs], moment.t)
             else:
                 u[dofs] = value
         return u
@@ -323,7 +383,7 @@ class FieldBlock(Block):
                     f"{what} {k} at {point.tolist()} lies outside of the mesh, which spans "
                     f"{low.tolist()} to {high.tolist()}: check its coordinates and their unit."
                 )
-        return sp.csr_array(self.basis.probes(np.clip(points.T, low, high).T))
+        return sp.csr_array(self.basis.probes(np.clip(points.T, low, high).T) @ self._spread)
 
     @cached_property
     def at_vertices(self) -> sp.csr_array:

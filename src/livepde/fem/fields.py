@@ -178,6 +178,9 @@ class Field(_Prior):
         As for `Scalar`; bounds need a transform, and a transform an element of first order.
     unit, name
         For tables and plots.
+    periodic
+        Pairs of boundaries of equal shape, as in (("left", "right"),): the function goes on behind
+        the second as behind the first.
     """
 
     mesh: Mesh
@@ -192,6 +195,7 @@ class Field(_Prior):
     bounds: tuple[float, float] = (-np.inf, np.inf)
     transform: str | None = None
     evolution: Evolution = CONSTANT
+    periodic: Sequence[tuple[str, str]] = ()
 
     def __post_init__(self) -> None:
         if isinstance(self.inner, str) and self.inner not in ("L2", "H1", "H2"):
@@ -204,6 +208,16 @@ class Field(_Prior):
             if name not in known:
                 raise SpaceError(
                     f"dirichlet: the mesh has no boundary '{name}'; it has {sorted(known)}."
+                )
+        for name in [name for pair in self.periodic for name in pair]:
+            if name not in known - {"boundary"}:
+                raise SpaceError(
+                    f"periodic: the mesh has no boundary '{name}'; it has {sorted(known)}."
+                )
+            if {name, "boundary"} & set(self.dirichlet):
+                raise SpaceError(
+                    f"'{name}' is periodic and has a Dirichlet value: leave one of both out, and "
+                    'name the other boundaries instead of "boundary".'
                 )
         self._check()
         if self.transform is None and np.isfinite(self.bounds).any():

@@ -50,7 +50,7 @@ class _Term:
     spaces: Mapping[str, LocalSpace]
 
     def evaluate(self, values: Mapping[str, Array], moment: Moment) -> tuple[Any, Place]:
-        place = Place(self.measure.points, self.measure.normal, moment)
+        place = self.measure.place(moment)
         jets = [self.spaces[name].jets(array) for name, array in values.items()]
         return self.integrand(*jets, place), place
 
@@ -255,7 +255,7 @@ class Form(FormMatrices):
     def _vector(self, slot: str, moment: Moment, coefficients: Mapping[str, Array]) -> Array:
         result = np.zeros(self.spaces[slot].dim)
         for term in self.terms:
-            place = Place(term.measure.points, term.measure.normal, moment)
+            place = term.measure.place(moment)
             jets = [
                 local.unit_jets(0, 1)
                 if key == slot
@@ -337,7 +337,7 @@ class Form(FormMatrices):
         Unit jets in arguments in which the form is linear; a complex step in one that is not; a
         central difference of complex steps if both are not (only Jacobians of iterations use it).
         """
-        place = Place(term.measure.points, term.measure.normal, moment)
+        place = term.measure.place(moment)
         if self.nonlinear not in (rows, cols):
             given = None
         curved = [axis for axis, key in enumerate((rows, cols)) if key in self._curved]

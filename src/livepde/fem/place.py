@@ -53,12 +53,16 @@ class Place:
     """The argument `x` of a weak form.
 
     `x[0], x[1], ...` are coordinates of the quadrature points; `x.t` the time; `x.inputs["Q"]` the
-    value of an input channel; `x.normal` the outward normal (on boundaries). What a form reads is
+    value of an input channel; `x.normal` the outward normal (on boundaries); `x.h` the diameter of
+    the cell, shape (elements, 1), on a boundary of the cell behind it. What a form reads is
     noted: a form that reads neither time nor inputs is constant in time and assembled once.
     """
 
-    def __init__(self, x: Array, normal: Array | None, moment: Moment) -> None:
+    def __init__(
+        self, x: Array, normal: Array | None, moment: Moment, diameter: Array | None = None
+    ) -> None:
         self._x = x
+        self._diameter = diameter
         self._normal = normal
         self._moment = moment
         self.used: set[str] = set()
@@ -78,6 +82,13 @@ class Place:
         """Values of the input channels."""
         self.used.add("inputs")
         return self._moment.inputs
+
+    @property
+    def h(self) -> Array:
+        """Diameter of each cell, shape (elements, 1): for stabilisation and penalties."""
+        if self._diameter is None:
+            raise AttributeError("x.h exists where a form is integrated over cells or boundaries.")
+        return self._diameter
 
     @property
     def normal(self) -> Array:

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from skfem.helpers import dd as hess
-from skfem.helpers import ddot, div, dot, grad, trace, transpose
+from skfem.helpers import ddot, div, dot, grad, mul, trace, transpose
 
-__all__ = ["ddot", "div", "dot", "grad", "hess", "trace", "transpose"]
+__all__ = ["ddot", "div", "dot", "grad", "hess", "mul", "trace", "transpose"]

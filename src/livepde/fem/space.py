@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from livepde.errors import SpaceError
 from livepde.fem.blocks import FieldBlock, Measure, block_of
 from livepde.fem.fields import Unknown
+from livepde.fem.place import Moment
 from livepde.linalg import Array, IntArray
 
 __all__ = ["FunctionSpace", "LocalSpace"]
@@ -161,6 +162,50 @@ class FunctionSpace:
         """Name -> block of each unknown that is a field."""
         return {n: block for n, block in self.blocks.items() if isinstance(block, FieldBlock)}
 
+    def component(self, of: str = "") -> tuple[FieldBlock, slice]:
+        """Return a component of the state and where its coefficients stand.
+
+        Parameters
+        ----------
+        of
+            Its name; empty stands for the only one.
+
+        Raises
+        ------
+        SpaceError
+            There is no such component, or several and none is named.
+        """
+        if not of and len(self.fields) == 1:
+            of = next(iter(self.fields))
+        if not of:
+            raise SpaceError(
+                f"the state has the components {list(self.fields)}: say which one is meant, as in "
+                f'of="{next(iter(self.fields), "u")}".'
+            )
+        if of not in self.fields:
+            raise SpaceError(f"of='{of}': the components of the state are {list(self.fields)}.")
+        return self.fields[of], self.part(of)
+
+    def widen(self, matrix: sp.csr_array, of: str = "") -> sp.csr_array:
+        """Return a matrix on the coefficients of one component as one on all, (k, dim)."""
+        _, part = self.component(of)
+        entries = (matrix.data, matrix.indices + part.start, matrix.indptr)
+        return sp.csr_array(entries, shape=(matrix.shape[0], self.dim))
+
+    def probe(self, points: Array, what: str = "point", of: str = "") -> sp.csr_array:
+        """Return the matrix (k, dim) that evaluates a component at points of shape (d, k)."""
+        return self.widen(self.component(of)[0].probe(points, what), of)
+
+    def impose(self, coefficients: Array, moment: Moment) -> Array:
+        """Return a copy of the coefficients with the Dirichlet values of all components."""
+        if len(self.blocks) == 1:
+            (block,) = self.fields.values()
+            return block.impose(coefficients, moment)
+        u = coefficients.copy()
+        for name, block in self.fields.items():
+            u[self.part(name)] = block.impose(u[self.part(name)], moment)
+        return u
+
     def local(self, measure: Measure) -> LocalSpace:
         """Return the space on a measure, built once: all forms share it."""
         key = (id(measure.mesh), measure.order, measure.name)
@@ -173,7 +218,10 @@ class FunctionSpace:
         return {}
 
     def interpolate(self, value: Any) -> Array:
-        """Return coefficients of a number, a function of x, coefficients, or a mapping by name."""
+        """Return coefficients of a number, a function of x, coefficients, or a mapping by name.
+
+        For several fields a number stands for all of them.
+        """
         if isinstance(value, Mapping):
             unknown = set(value) - set(self.blocks)
             if unknown:
@@ -186,6 +234,12 @@ class FunctionSpace:
             return result
         if self.single:
             return self._interpolate(next(iter(self.blocks)), value)
+        if len(self.fields) == len(self.blocks) and np.ndim(value) == 0 and not callable(value):
+            return np.concatenate([block.interpolate(value) for block in self.blocks.values()])
+        if callable(value):
+            raise SpaceError(
+                f"a function of x for {list(self.blocks)}: give a mapping, a function for each."
+            )
         array = np.asarray(value, dtype=float)
         if array.shape != (self.dim,):
             raise SpaceError(f"coefficients of shape {array.shape}; expected ({self.dim},).")

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from livepde.models.base import Equation, Option, Quantity, Variable
 from livepde.models.diffusion import HEAT, heat
+from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
+from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
 from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
+from livepde.models.wave import WAVE, wave
 
 __all__ = [
     "EQUATIONS",
@@ -14,11 +17,26 @@ __all__ = [
     "Quantity",
     "Variable",
     "borehole",
+    "fisher_kpp",
     "fluid",
+    "groundwater",
     "heat",
+    "porous_fisher",
+    "pumping_test",
     "reaction_diffusion",
+    "wave",
 ]
 
 EQUATIONS: dict[str, Equation] = {
-    equation.name: equation for equation in (HEAT, BOREHOLE, REACTION_DIFFUSION)
+    equation.name: equation
+    for equation in (
+        HEAT,
+        BOREHOLE,
+        REACTION_DIFFUSION,
+        FISHER_KPP,
+        POROUS_FISHER,
+        WAVE,
+        GROUNDWATER,
+        PUMPING_TEST,
+    )
 }

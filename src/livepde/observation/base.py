@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
-from livepde.fem import START, FieldBlock, FunctionSpace, Moment, Place
+from livepde.fem import START, FunctionSpace, Moment, Place
 from livepde.linalg import Array
 from livepde.observation.reconstruction import (
     Pseudoinverse,
@@ -55,8 +55,12 @@ class Observation(ABC):
     reconstruction: Reconstruction = field(default_factory=Pseudoinverse)
 
     @abstractmethod
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
-        """Return G on the coefficients of the state, shape (sensors, n)."""
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
+        """Return G on the coefficients of the state, shape (sensors, n).
+
+        `state.component(of)` is a component's block and where its coefficients stand;
+        `state.widen(matrix, of)` makes a matrix on that component one on the whole state.
+        """
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return a name for each sensor."""
@@ -139,8 +143,7 @@ class Observed:
         self.state = state
         self.X = X
         self.parameter = parameter
-        block = next(iter(state.fields.values()))
-        self.G = sp.csr_array(observation.matrix(block), copy=True).astype(float)
+        self.G = sp.csr_array(observation.matrix(state), copy=True).astype(float)
         if self.G.shape[1] != X.dim:
             raise ObservationError(
                 f"The observation matrix has {self.G.shape[1]} columns; the state has {X.dim}."

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, FunctionSpace, Moment
+from livepde.fem import FunctionSpace, Moment
 from livepde.linalg import Array
 from livepde.observation.base import Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
@@ -85,7 +85,7 @@ class Transformed(Observation):
         if not self.reach > 0:
             raise ObservationError(f"Transformed: reach must be positive; got {self.reach}.")
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
         return self.base.matrix(state)
 
     def names(self, count: int) -> tuple[str, ...]:

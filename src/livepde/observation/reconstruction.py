@@ -384,13 +384,17 @@ class _Inside:
 
     def __init__(self, observed: Observed, basis: Array) -> None:
         self.space: FunctionSpace = observed.state
-        self.block: FieldBlock = next(iter(self.space.fields.values()))
-        self.mask = np.ones(self.block.basis.element_dofs.shape[1])
+        if len(self.space.fields) > 1:
+            raise ObservationError(
+                "Tikhonov: norm 'V' and forms know states of one component; take norm='X'."
+            )
+        self.block: FieldBlock = self.space.component()[0]
+        self.mask = np.ones(self.block.element_dofs.shape[1])
         if observed.observation.nodal:
             known = np.zeros(self.block.size, dtype=bool)
             known[np.flatnonzero(np.abs(basis).any(axis=1))] = True
             known[self.block.fixed] = True
-            self.mask = known[self.block.basis.element_dofs].all(axis=0).astype(float)
+            self.mask = known[self.block.element_dofs].all(axis=0).astype(float)
 
     def matrix(self, integrand: Any) -> sp.csr_array:
         """Assemble a symmetric form (u, v, x) over the elements inside."""
@@ -412,8 +416,8 @@ class _Inside:
     def inner(self) -> Any:
         """Coefficients of which every element is inside, and that no boundary of the mesh holds."""
         touched = np.zeros(self.block.size, dtype=bool)
-        touched[self.block.basis.element_dofs[:, self.mask == 0.0]] = True
-        touched[self.block.basis.get_dofs().all()] = True
+        touched[self.block.element_dofs[:, self.mask == 0.0]] = True
+        touched[self.block.boundary] = True
         return ~touched
 
 

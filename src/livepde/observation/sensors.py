@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, Predicate
+from livepde.fem import FieldBlock, FunctionSpace, Predicate
 from livepde.observation.base import Direct, Observation
 
 __all__ = ["Averages", "Matrix", "Points"]
@@ -28,6 +28,8 @@ class Points(Observation):
     direct
         Sensor name -> (q, x) for sensors that see a parameter directly, linear in q:
         z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b * x.inputs["Q"] / H}.
+    of
+        Component of the state; may be left out if it has only one.
 
     >>> Points({"TS_10": 0.10, "TS_20": 0.20}, noise=0.1, unit="degC").names(2)
     ('TS_10', 'TS_20')
@@ -35,6 +37,7 @@ class Points(Observation):
 
     points: Mapping[str, Any] | Sequence[Any]
     direct: Mapping[str, Direct] = field(default_factory=dict)
+    of: str = ""
 
     def __post_init__(self) -> None:
         if len(self.points) == 0:
@@ -49,12 +52,12 @@ class Points(Observation):
     def directs(self) -> Mapping[str, Direct]:
         return self.direct
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
         mapping = isinstance(self.points, Mapping)
         positions = list(self.points.values()) if isinstance(self.points, Mapping) else self.points
         array = np.array([np.atleast_1d(p) for p in positions], dtype=float).T
         what = f"sensors {list(self.points)}: number" if mapping else "sensor"
-        return state.probe(array, what)
+        return state.probe(array, what, self.of)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +68,12 @@ class Averages(Observation):
     ----------
     regions
         Sensor name -> predicate on x, evaluated at the quadrature points of the mesh.
+    of
+        Component of the state; may be left out if it has only one.
     """
 
     regions: Mapping[str, Predicate]
+    of: str = ""
 
     def __post_init__(self) -> None:
         if not self.regions:
@@ -76,9 +82,10 @@ class Averages(Observation):
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.regions)
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
-        rows = [self._row(state, name, region) for name, region in self.regions.items()]
-        return sp.csr_array(np.array(rows))
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
+        block, _ = state.component(self.of)
+        rows = [self._row(block, name, region) for name, region in self.regions.items()]
+        return state.widen(sp.csr_array(np.array(rows)), self.of)
 
     @staticmethod
     def _row(state: FieldBlock, name: str, region: Predicate) -> Any:
@@ -90,7 +97,7 @@ class Averages(Observation):
         row = np.zeros(state.size)
         for i in range(basis.Nbfun):
             phi = np.asarray(basis.basis[i][0])
-            np.add.at(row, basis.element_dofs[i], (phi * weights).sum(axis=-1))
+            np.add.at(row, state.element_dofs[i], (phi * weights).sum(axis=-1))
         return row / size
 
 
@@ -116,11 +123,11 @@ class Matrix(Observation):
             raise ObservationError(f"Matrix: {len(self.labels)} labels for {count} rows.")
         return tuple(self.labels)
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
         given: Any = self.G if sp.issparse(self.G) else np.atleast_2d(self.G)
         matrix = sp.csr_array(given)
-        if matrix.shape[1] != state.size:
+        if matrix.shape[1] != state.dim:
             raise ObservationError(
-                f"Matrix: G has {matrix.shape[1]} columns; the state has {state.size} coefficients."
+                f"Matrix: G has {matrix.shape[1]} columns; the state has {state.dim} coefficients."
             )
         return matrix

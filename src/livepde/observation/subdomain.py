@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, Predicate
+from livepde.fem import FieldBlock, FunctionSpace, Predicate
 from livepde.linalg import IntArray
 from livepde.observation.base import Observation
 
@@ -27,13 +27,16 @@ class Subdomain(Observation):
     ----------
     omega
         Predicate on x of shape (d, points).
+    of
+        Component of the state; may be left out if it has only one.
     """
 
     omega: Predicate
+    of: str = ""
 
     def selected(self, state: FieldBlock) -> IntArray:
         """Return the free coefficients located in omega."""
-        inside = np.broadcast_to(self.omega(state.basis.doflocs), (state.size,)).copy()
+        inside = np.broadcast_to(self.omega(state.doflocs), (state.size,)).copy()
         inside[state.fixed] = False
         found: IntArray = np.flatnonzero(inside)
         if not len(found):
@@ -43,10 +46,11 @@ class Subdomain(Observation):
             )
         return found
 
-    def matrix(self, state: FieldBlock) -> sp.csr_array:
-        found = self.selected(state)
+    def matrix(self, state: FunctionSpace) -> sp.csr_array:
+        block, _ = state.component(self.of)
+        found = self.selected(block)
         entries = (np.ones(len(found)), (np.arange(len(found)), found))
-        return sp.csr_array(entries, shape=(len(found), state.size))
+        return state.widen(sp.csr_array(entries, shape=(len(found), block.size)), self.of)
 
     @property
     def nodal(self) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -26,6 +26,7 @@ from livepde.stepping import Advance, ImplicitEuler, Scheme, StepFailed, simulat
 __all__ = ["AbsoluteNoise", "Noise", "RelativeNoise", "Truth", "Twin"]
 
 Truth = Literal["analytic", "discrete", "fine"]
+Formula = Callable[[Any, float], Any]
 
 
 class Noise(ABC):
@@ -105,7 +106,7 @@ class Twin:
     times
         Sample times, increasing; the first is the initial time and its sample describes the start.
     u_true
-        Formula of the exact state, u(x, t).
+        Formula of the exact state, u(x, t); for several components a mapping of names to those.
     u0
         Initial state, if there is no formula: a number, a function of x, or coefficients.
     truth
@@ -160,7 +161,7 @@ class Twin:
     observation: Observation
     q_true: Any
     times: Sequence[float] | npt.NDArray[np.floating]
-    u_true: Callable[[Any, float], Any] | None = None
+    u_true: Formula | Mapping[str, Formula] | None = None
     u0: Any = None
     truth: Truth = "discrete"
     scheme: Scheme = field(default_factory=ImplicitEuler)
@@ -225,8 +226,13 @@ class Twin:
         return self.model.parameter_space.interpolate(self.q_true)
 
     def _start(self) -> Any:
-        formula, t = self.u_true, float(self.times[0])
-        return (lambda x: formula(x, t)) if formula is not None else self.u0
+        return self.u0 if self.u_true is None else self._exact(float(self.times[0]))
+
+    def _exact(self, t: float) -> Any:
+        """Return u_true at a time, a function of x or a mapping of those."""
+        if isinstance(self.u_true, Mapping):
+            return {name: partial(_at, formula, t) for name, formula in self.u_true.items()}
+        return partial(_at, self.u_true, t)
 
     def _simulated(self, model: Model, control: Advance) -> list[Array]:
         q = model.latent.inverse(model.parameter_space.interpolate(self.q_true))
@@ -250,22 +256,30 @@ class Twin:
         """Exact state at each time as coefficients of the estimator, each of shape (n,)."""
         if self.truth == "discrete":
             return tuple(self._simulated(self.model, Advance(self.scheme, self.dt_max)))
-        block = self.model.state_block
+        space = self.model.state_space
         if self.truth == "analytic" and self.u_true is not None:
-            formula = self.u_true
             return tuple(
-                self.model.impose(block.interpolate(lambda x, t=t: formula(x, t)), self._moment(t))
+                self.model.impose(space.interpolate(self._exact(t)), self._moment(t))
                 for t in map(float, self.times)
             )
         if self.fine is None:
             return tuple(self._fine_states)
-        points = np.asarray(block.basis.global_coordinates())
-        evaluate = self.fine.state_block.probe(points.reshape(len(points), -1))
+        fine = self.fine.state_space
+        evaluate = {}
+        for name, block in space.fields.items():
+            points = np.asarray(block.basis.global_coordinates())
+            probe = fine.probe(points.reshape(len(points), -1), of="" if space.single else name)
+            evaluate[name] = probe
+
+        def moved(u: Array) -> Array:
+            parts = [
+                block.interpolate(lambda x, E=evaluate[name]: (E @ u).reshape(x[0].shape))
+                for name, block in space.fields.items()
+            ]
+            return np.concatenate(parts)
+
         return tuple(
-            self.model.impose(
-                block.interpolate(lambda x, u=u: (evaluate @ u).reshape(x[0].shape)),
-                self._moment(float(t)),
-            )
+            self.model.impose(moved(u), self._moment(float(t)))
             for t, u in zip(self.times, self._fine_states, strict=True)
         )
 
@@ -336,6 +350,10 @@ class Twin:
         e = estimate.q - self.q
         r = self.observed.split().R @ (estimate.u - self.u(estimate.t))
         return self.model.Q.inner(e, e) / gain + self.model.X.inner(r, r)
+
+
+def _at(formula: Any, t: float, x: Any) -> Any:
+    return formula(x, t)
 
 
 def _bound(observation: Observation, model: Model) -> Observed:

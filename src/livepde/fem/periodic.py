@@ -1,0 +1,85 @@
+"""Periodic functions: coefficients on two boundaries that are one and the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from skfem.element import ElementLineHermite, ElementQuadBFS
+from skfem.element.element_global import ElementGlobal
+
+from livepde.errors import SpaceError
+from livepde.fem.fields import Field
+from livepde.linalg import IntArray
+
+__all__ = ["tied"]
+
+SLACK = 1e-6  # of the size of the mesh: how far apart two coefficients may be to count as one
+
+
+def tied(field: Field, basis: Any) -> IntArray:
+    """Return the coefficient that stands for each of scikit-fem's, shape (basis.N,).
+
+    Coefficients of a pair of periodic boundaries are tied if they are of one kind (value, slope)
+    and in the same place up to the translation of one boundary to the other.
+
+    Raises
+    ------
+    SpaceError
+        The element has no coefficients on its sides, or those of two boundaries do not match.
+    """
+    numbers: IntArray = np.arange(int(basis.N))
+    if not field.periodic:
+        return numbers
+    element = field.element
+    if isinstance(element, ElementGlobal) and not isinstance(
+        element, ElementLineHermite | ElementQuadBFS
+    ):
+        raise SpaceError(
+            f"periodic: {type(element).__name__} has normal derivatives, which change their sign "
+            "from one side to the other; take `linear`, `quadratic` or `smooth`."
+        )
+    pairs = [_matched(field, basis, *pair) for pair in field.periodic]
+    i, j = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(len(numbers), len(numbers)))
+    _, labels = connected_components(graph, directed=False)
+    _, first, renumbered = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))
+    tie: IntArray = rank[renumbered]
+    return tie
+
+
+def _matched(field: Field, basis: Any, one: str, other: str) -> tuple[IntArray, IntArray]:
+    names = dict.fromkeys(field.element.dofnames or [])
+    what = f"periodic: '{one}' and '{other}'"
+    i, j = [], []
+    for name in names:
+        left, right = (np.asarray(basis.get_dofs(side).all([name])) for side in (one, other))
+        if len(left) != len(right):
+            raise SpaceError(
+                f"{what} have {len(left)} and {len(right)} coefficients '{name}': their meshes "
+                "must match."
+            )
+        if not len(left):
+            continue
+        a, b = basis.doflocs[:, left], basis.doflocs[:, right]
+        shift = (b.mean(axis=1) - a.mean(axis=1))[:, None]
+        found, nearest = cKDTree((a + shift).T).query(b.T)
+        distance = float(np.max(found))
+        size = np.ptp(field.mesh.p, axis=1).max()
+        if distance > SLACK * size or len(np.unique(nearest)) < len(left):
+            raise SpaceError(
+                f"{what} do not match: shifted onto each other, their nodes are up to "
+                f"{distance:.3g} apart. Mesh both sides alike."
+            )
+        i.append(left[nearest])
+        j.append(right)
+    if not i:
+        raise SpaceError(
+            f"{what}: {type(field.element).__name__} has no coefficients there, so it cannot be "
+            "periodic; take a continuous element."
+        )
+    return np.concatenate(i), np.concatenate(j)

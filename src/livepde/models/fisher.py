@@ -1,0 +1,158 @@
+"""Populations that spread and grow: Fisher-KPP, and porous Fisher where the crowd moves faster."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import ModelError
+from livepde.fem import Field, Unknown, dot, grad, linear, positive
+from livepde.model import Model
+from livepde.models.base import Equation, Option, Variable
+
+__all__ = ["FISHER_KPP", "POROUS_FISHER", "fisher_kpp", "porous_fisher"]
+
+
+def fisher_kpp(
+    mesh: Any,
+    D: Unknown,
+    r: Unknown,
+    dirichlet: Mapping[str, Any] | None = None,
+    *,
+    K: float = 1.0,
+    element: Any = None,
+    unit: str = "1/mm^2",
+) -> Model:
+    """Return u_t = div(D grad u) + r u (1 - u/K) with unknown D and r (Fisher 1937, KPP 1937).
+
+    Parameters
+    ----------
+    mesh
+        Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in mm.
+    D, r
+        Diffusivity in mm^2/d and growth rate in 1/d: numbers, by region, or fields.
+    dirichlet
+        Boundary -> number, function g(x, t), or `Channel`. Nothing crosses the others.
+    K
+        Carrying capacity, the density at which growth ends, in the unit of u.
+    element
+        Element of the state; default of first order.
+    unit
+        Unit of u.
+
+    >>> import livepde as lp
+    >>> D, r = lp.Scalar(0.01, 0.01, transform="log"), lp.Scalar(1.0, 0.5, transform="log")
+    >>> fisher_kpp(lp.interval(0.0, 1.9, 38), D, r, K=1700.0).affine
+    False
+    """
+    _check("fisher_kpp", K)
+    return Model(
+        _state(mesh, dirichlet, element, unit),
+        {"D": D, "r": r},
+        A=lambda q, u, v, x: q.D * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v,
+        time_unit="d",
+    )
+
+
+def porous_fisher(
+    mesh: Any,
+    D: Unknown,
+    r: Unknown,
+    dirichlet: Mapping[str, Any] | None = None,
+    *,
+    K: float = 1.0,
+    m: float = 1.0,
+    element: Any = None,
+    unit: str = "1/mm^2",
+) -> Model:
+    """Return u_t = div(D (u/K)^m grad u) + r u (1 - u/K): Gurney and Nisbet (1975).
+
+    Where u falls below zero, which only errors of discretisation do, the diffusivity is zero.
+
+    Parameters
+    ----------
+    mesh, D, r, dirichlet, K, element, unit
+        As for `fisher_kpp`; D is the diffusivity at u = K.
+    m
+        Exponent, at least 1.
+
+    Raises
+    ------
+    ModelError
+        m below 1: the derivative of the diffusivity at u = 0 is not finite; K that is no positive
+        number.
+    """
+    _check("porous_fisher", K)
+    if not (np.isfinite(m) and m >= 1):
+        raise ModelError(f"porous_fisher: the exponent m must be at least 1; got {m}.")
+
+    return Model(
+        _state(mesh, dirichlet, element, unit),
+        {"D": D, "r": r},
+        A=lambda q, u, v, x: (
+            q.D * positive(u / K) ** m * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v
+        ),
+        time_unit="d",
+    )
+
+
+def _check(name: str, K: float) -> None:
+    if not (np.isfinite(K) and K > 0):
+        raise ModelError(f"{name}: the carrying capacity K must be a positive number; got {K}.")
+
+
+def _state(mesh: Any, dirichlet: Mapping[str, Any] | None, element: Any, unit: str) -> Field:
+    element = element or linear(mesh)
+    # u^2 v is integrated exactly.
+    order = 3 * int(element.maxdeg)
+    return Field(mesh, element, dirichlet=dict(dirichlet or {}), unit=unit, quadrature=order)
+
+
+def _build_kpp(
+    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, K: float
+) -> Model:
+    return fisher_kpp(mesh, unknowns["D"], unknowns["r"], dirichlet, K=K)
+
+
+def _build_porous(
+    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, K: float, m: float
+) -> Model:
+    return porous_fisher(mesh, unknowns["D"], unknowns["r"], dirichlet, K=K, m=m)
+
+
+DENSITY = Variable("1/mm^2", "density of the population")
+CAPACITY = Option("1/mm^2", "carrying capacity: the density at which growth ends")
+RATE = Variable("1/d", "growth rate at low density")
+
+FISHER_KPP = Equation(
+    name="fisher_kpp",
+    summary="a population that spreads by diffusion and grows logistically",
+    formula="u_t = div(D grad u) + r u (1 - u/K)",
+    state=DENSITY,
+    unknowns={"D": Variable("mm^2/d", "diffusivity: a number, by layer, or a field"), "r": RATE},
+    options={"K": CAPACITY},
+    build=_build_kpp,
+    element=linear,
+    length_unit="mm",
+    time_unit="d",
+)
+"""Fisher-KPP."""
+
+POROUS_FISHER = Equation(
+    name="porous_fisher",
+    summary="a population that spreads the faster the denser it is, and grows logistically",
+    formula="u_t = div(D (u/K)^m grad u) + r u (1 - u/K)",
+    state=DENSITY,
+    unknowns={"D": Variable("mm^2/d", "diffusivity at u = K"), "r": RATE},
+    options={
+        "K": CAPACITY,
+        "m": Option("", "exponent of the diffusivity, at least 1", 1.0),
+    },
+    build=_build_porous,
+    element=linear,
+    length_unit="mm",
+    time_unit="d",
+)
+"""Porous Fisher."""

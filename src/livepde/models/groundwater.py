@@ -1,0 +1,236 @@
+"""Groundwater flow: a confined aquifer in plan view, and the radial flow of a pumping test."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import pi
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import ModelError
+from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.models.base import Equation, Option, Variable
+
+__all__ = ["GROUNDWATER", "PUMPING_TEST", "groundwater", "pumping_test", "well"]
+
+
+def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any = None) -> Model:
+    """Return Ss r s_t - (k r s_r)_r = 0 for the drawdown s around a well that is pumped at Q(t).
+
+    At the wall of the well -2 pi r b k s_r = Q, far away s = 0. With a well of small radius this is
+    the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)) for a constant rate, but Q may
+    change: steps, recovery. Both unknowns are positive: give them transform="log".
+
+    Parameters
+    ----------
+    mesh
+        Radius in m, from the wall ("left") to where the test is not felt ("right"), a few times
+        sqrt(4 k t/Ss); best graded: `livepde.interval(0.1, 5000.0, 80, geometric=True)`.
+    k
+        Hydraulic conductivity in m/s.
+    Ss
+        Specific storage in 1/m.
+    b
+        Thickness of the aquifer in m; with 1 m the unknowns are transmissivity and storativity.
+
+    The rate in m^3/s, positive when water is taken out, is the input channel "Q".
+
+    Raises
+    ------
+    ModelError
+        The thickness is not positive.
+    """
+    if not b > 0:
+        raise ModelError(f"pumping_test: b, the thickness, must be positive; got {b}.")
+    # Of order four: the weight r and the elements of first order are integrated exactly.
+    state = Field(mesh, element or linear(mesh), dirichlet={"right": 0.0}, unit="m", quadrature=4)
+    return Model(
+        state,
+        {"k": k, "Ss": Ss},
+        A=[
+            lambda q, u, v, x: q.k / q.Ss * x[0] * dot(grad(u), grad(v)),
+            On("left", lambda q, u, v, x: -x.inputs["Q"] / (2 * pi * b * q.Ss) * v),
+        ],
+        M=lambda u, v, x: x[0] * u * v,
+        inputs=["Q"],
+        time_unit="s",
+    )
+
+
+def groundwater(
+    mesh: Any,
+    T: Unknown,
+    S: Unknown,
+    dirichlet: Mapping[str, Any] | None = None,
+    *,
+    wells: Mapping[str, Sequence[float]] | None = None,
+    radius: float = 1.0,
+    recharge: float = 0.0,
+    element: Any = None,
+) -> Model:
+    """Return S h_t - div(T grad h) = recharge - sum of Q_w delta_w for the head h of an aquifer.
+
+    Divided by S, so that the storativity may be unknown, too. Each well is a smooth, round source
+    (see `well`): beyond its radius the head is that of a point source, within it is not; so place
+    no sensor there. Give T and S transform="log": both are positive.
+
+    Parameters
+    ----------
+    mesh
+        Any mesh of a plane; coordinates in m.
+    T
+        Transmissivity in m^2/s: a number, by region, or a `Field`.
+    S
+        Storativity, without unit: a number or a `Field`. By region it would break the balance of
+        water where S jumps.
+    dirichlet
+        Boundary -> head in m: a number, a function g(x, t), or `Channel`. No flow where none is
+        given.
+    wells
+        Name -> (x, y). The name is the input channel of the rate in m^3/s, positive when water is
+        taken out.
+    radius
+        Radius of the wells' sources in m: at least the diameter of the cells around them.
+    recharge
+        Water gained from above, in m/s.
+    element
+        Element of the state; default of first order.
+
+    Raises
+    ------
+    ModelError
+        A well outside of the mesh or in cells wider than its radius, or S of a kind that is not
+        possible.
+
+    >>> import livepde as lp
+    >>> mesh = lp.rectangle((-50.0, 50.0), (-50.0, 50.0), (40, 40))
+    >>> T, S = (lp.Scalar(x, x, transform="log") for x in (1e-2, 1e-2))
+    >>> model = groundwater(mesh, T, S, {"boundary": 0.0}, wells={"Q": (0, 0)}, radius=5.0)
+    >>> model.inputs
+    ('Q',)
+    """
+    sources = {name: _place(mesh, name, at, radius) for name, at in (wells or {}).items()}
+    if not hasattr(S, "mesh") and hasattr(S, "regions"):
+        raise ModelError("groundwater: S by region is not possible; take a number or a Field.")
+    varies = isinstance(S, Field)
+
+    def flow(q: Any, u: Any, v: Any, x: Place) -> Any:
+        term = q.T / q.S * dot(grad(u), grad(v))
+        if varies:  # grad(v/S) = grad(v)/S - v grad(S)/S^2
+            term = term - q.T / q.S**2 * dot(grad(u), grad(q.S)) * v
+        return term
+
+    def taken(q: Any, u: Any, v: Any, x: Place) -> Any:
+        rate: Any = -recharge
+        for name, at in sources.items():
+            rate = rate + x.inputs[name] * well(x, at, radius)
+        return rate / q.S * v
+
+    # Of order four: the wells' sources are of that degree.
+    state = Field(
+        mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit="m", quadrature=4
+    )
+    return Model(state, {"T": T, "S": S}, A=[flow, taken], inputs=tuple(sources), time_unit="s")
+
+
+def well(x: Place, at: Sequence[float], radius: float) -> Array:
+    """Return the density of a round source of mass one, 3/(pi R^2) (1 - r^2/R^2)^2, in 1/m^2.
+
+    Parameters
+    ----------
+    x
+        Where the form is evaluated.
+    at
+        Position (x, y) of the well in m.
+    radius
+        R in m; beyond it the density is zero.
+    """
+    distance = ((x[0] - at[0]) ** 2 + (x[1] - at[1]) ** 2) / radius**2
+    return 3 / (pi * radius**2) * np.maximum(1 - distance, 0.0) ** 2
+
+
+def _place(mesh: Any, name: str, at: Sequence[float], radius: float) -> tuple[float, float]:
+    """Return the position of a well after checking it against the mesh."""
+    if mesh.dim() != 2 or len(at) != 2:
+        raise ModelError(f"groundwater: well '{name}' needs a mesh of a plane and a place (x, y).")
+    place = float(at[0]), float(at[1])
+    try:
+        cell = mesh.element_finder()(*(np.array([c]) for c in place))[0]
+    except ValueError:
+        raise ModelError(
+            f"groundwater: well '{name}' at {place} lies outside of the mesh."
+        ) from None
+    corners = mesh.p[:, mesh.t[:, cell]]
+    width = float(np.linalg.norm(np.ptp(corners, axis=1)))
+    if not radius >= width:
+        raise ModelError(
+            f"groundwater: well '{name}' lies in a cell of diameter {width:.3g} m; refine the mesh "
+            f"there, or give radius={width:.3g} or more (got {radius:g})."
+        )
+    return place
+
+
+def _build_radial(
+    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, b: float
+) -> Model:
+    return pumping_test(mesh, unknowns["k"], unknowns["Ss"], b=b)
+
+
+def _build_plane(
+    mesh: Any,
+    unknowns: Mapping[str, Unknown],
+    dirichlet: Mapping[str, Any],
+    *,
+    x: float,
+    y: float,
+    radius: float,
+    recharge: float,
+) -> Model:
+    return groundwater(
+        mesh,
+        unknowns["T"],
+        unknowns["S"],
+        dirichlet,
+        wells={"Q": (x, y)},
+        radius=radius,
+        recharge=recharge,
+    )
+
+
+PUMPING_TEST = Equation(
+    name="pumping_test",
+    summary="radial flow to a pumped well in a confined aquifer (Theis)",
+    formula="Ss r s_t = (k r s_r)_r,  -2 pi r b k s_r = Q at the well,  s = 0 far away",
+    state=Variable("m", "drawdown"),
+    unknowns={
+        "k": Variable("m/s", "hydraulic conductivity"),
+        "Ss": Variable("1/m", "specific storage"),
+    },
+    inputs={"Q": Variable("m^3/s", "rate of the well, positive when water is taken out")},
+    options={"b": Option("m", "thickness of the aquifer; with 1 m k is T and Ss is S")},
+    build=_build_radial,
+    element=linear,
+)
+
+GROUNDWATER = Equation(
+    name="groundwater",
+    summary="confined aquifer in plan view with a well; unknown transmissivity and storativity",
+    formula="S h_t = div(T grad h) + recharge - Q delta(x, y)",
+    state=Variable("m", "head"),
+    unknowns={
+        "T": Variable("m^2/s", "transmissivity: a number, by region, or a field"),
+        "S": Variable("", "storativity: a number or a field"),
+    },
+    inputs={"Q": Variable("m^3/s", "rate of the well, positive when water is taken out")},
+    options={
+        "x": Option("m", "position of the well", 0.0),
+        "y": Option("m", "position of the well", 0.0),
+        "radius": Option("m", "radius of the well's source, at least a cell", 1.0),
+        "recharge": Option("m/s", "water gained from above", 0.0),
+    },
+    build=_build_plane,
+    element=linear,
+)

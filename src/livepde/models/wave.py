@@ -1,0 +1,106 @@
+"""Waves with damping: w_tt + d w_t = div(c^2 grad w), as a system of first order in time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from livepde.errors import ModelError
+from livepde.fem import Field, Unknown, dot, grad, linear
+from livepde.model import Model, Source
+from livepde.models.base import Equation, Variable
+
+__all__ = ["WAVE", "wave"]
+
+
+def wave(
+    mesh: Any,
+    c2: Unknown,
+    d: Unknown | float = 0.0,
+    dirichlet: Mapping[str, Any] | None = None,
+    velocity: Mapping[str, Any] | None = None,
+    *,
+    f: Source = 0.0,
+    element: Any = None,
+) -> Model:
+    """Return w_tt + d w_t - div(c^2 grad w) = f, with unknown squared speed c^2 and damping d.
+
+    The state has two components, the displacement w and its velocity p:
+
+        w_t = p,    p_t + d p - div(c^2 grad w) = f.
+
+    Take the scheme `Alexander2`: implicit Euler damps waves strongly.
+
+    Parameters
+    ----------
+    mesh
+        Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
+    c2
+        Squared speed in m^2/s^2: a `Scalar`, a `Piecewise`, or a `Field`.
+    d
+        Damping in 1/s: known, or an unknown.
+    dirichlet
+        Boundary -> value of w: a number, a function g(x, t), or a `Channel`. Boundaries without one
+        reflect with a free end.
+    velocity
+        Boundary -> value of p where w moves, the time derivative of w there.
+    f
+        Force per mass: a number or f(x, t).
+    element
+        Element of both components; default of first order.
+
+    Raises
+    ------
+    ModelError
+        A boundary value of w may move, but its velocity is not given.
+
+    >>> import livepde as lp
+    >>> model = wave(lp.interval(0, 1, 20), lp.Scalar(1.0, 0.3), dirichlet={"left": 0.0})
+    >>> list(model.state_space.blocks)
+    ['w', 'p']
+    """
+    held, moved = dict(dirichlet or {}), dict(velocity or {})
+    for name, value in held.items():
+        if name not in moved:
+            if not isinstance(value, int | float):
+                raise ModelError(
+                    f"wave: w on '{name}' may move; give its time derivative, too: "
+                    f"velocity={{'{name}': ...}}."
+                )
+            moved[name] = 0.0
+    element = element or linear(mesh)
+    known = isinstance(d, int | float)
+    level = float(d) if isinstance(d, int | float) else 0.0
+
+    def stiffness(q: Any, u: Any, v: Any, x: Any) -> Any:
+        return q.c2 * dot(grad(u.w), grad(v.p))
+
+    return Model(
+        {
+            "w": Field(mesh, element, dirichlet=held, unit="m"),
+            "p": Field(mesh, element, dirichlet=moved, unit="m/s"),
+        },
+        {"c2": c2} if isinstance(d, int | float) else {"c2": c2, "d": d},
+        A=stiffness if known else lambda q, u, v, x: stiffness(q, u, v, x) + q.d * u.p * v.p,
+        B=lambda u, v, x: -u.p * v.w + level * u.p * v.p,
+        f={"p": f},
+        time_unit="s",
+    )
+
+
+def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
+    return wave(mesh, unknowns["c2"], unknowns["d"], dirichlet)
+
+
+WAVE = Equation(
+    name="wave",
+    summary="waves with damping; unknown squared speed and damping",
+    formula="w_tt + d w_t = div(c2 grad w), with the velocity p = w_t",
+    state=Variable("m", "displacement"),
+    unknowns={
+        "c2": Variable("m^2/s^2", "squared speed: a number, by region, or a field"),
+        "d": Variable("1/s", "damping"),
+    },
+    build=_build,
+    element=linear,
+)

@@ -1,0 +1,83 @@
+"""Fisher-KPP and porous Fisher: travelling waves, random parameters, what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import livepde as lp
+from livepde.diagnostics import check_model
+from livepde.models import EQUATIONS, fisher_kpp, porous_fisher
+from livepde.stepping import Advance, Alexander2, simulate
+
+ONE = lp.Scalar(1.0, 1.0)
+
+
+def kpp_wave(x, t):
+    """Ablowitz and Zeppetella (1979): speed 5/sqrt(6)."""
+    return (1.0 + np.exp((x - 5 / np.sqrt(6) * t) / np.sqrt(6))) ** -2.0
+
+
+def sharp_wave(x, t):
+    """Newman (1980): speed 1/sqrt(2), nothing beyond the front."""
+    return np.maximum(1.0 - np.exp((x - t / np.sqrt(2)) / np.sqrt(2)), 0.0)
+
+
+def error(function, wave, cells, span, **options):
+    mesh = lp.interval(*span, cells)
+    model = function(mesh, ONE, ONE, **options)
+    times = np.linspace(0.0, 6.0, cells // 5 + 1)
+    control = Advance(Alexander2())
+    *_, (t, u) = simulate(model, np.ones(2), lambda x: wave(x[0], 0.0), times, control)
+    return model.state_block.at_vertices @ u - wave(mesh.p[0], t)
+
+
+def test_the_exact_wave_of_fisher_kpp():
+    coarse, fine = (np.abs(error(fisher_kpp, kpp_wave, n, (-20, 40))).max() for n in (150, 300))
+    assert fine < 4e-4
+    assert coarse / fine > 3.5  # second order in space and time
+
+
+def test_the_sharp_wave_of_porous_fisher():
+    coarse, fine = (error(porous_fisher, sharp_wave, n, (-10, 20)) for n in (150, 600))
+    assert np.abs(fine).max() < 3e-3  # at the foot
+    assert np.abs(fine).mean() < 5e-5
+    assert np.abs(coarse).mean() / np.abs(fine).mean() > 8
+
+
+@settings(deadline=None, max_examples=8)
+@given(
+    D=st.floats(1e-4, 1.0),
+    r=st.floats(0.01, 5.0),
+    K=st.floats(1.0, 2000.0),
+    m=st.floats(1.0, 3.0),
+    porous=st.booleans(),
+)
+def test_checks_pass_for_random_parameters(D, r, K, m, porous):
+    unknowns = (lp.Scalar(value, value, transform="log") for value in (D, r))
+    options = {"m": m} if porous else {}
+    function = porous_fisher if porous else fisher_kpp
+    model = function(lp.interval(0.0, 2.0, 10), *unknowns, K=K, **options)
+    check_model(model, u=lambda x: K * (0.5 + 0.3 * np.sin(3 * x[0]))).raise_if_failed()
+
+
+@pytest.mark.parametrize("name", ["fisher_kpp", "porous_fisher"])
+def test_the_equations_build_by_region_and_in_the_plane(name):
+    equation = EQUATIONS[name]
+    halves = {"a": lambda x: x[0] < 1.0, "b": lambda x: x[0] >= 1.0}
+    unknowns = {"D": lp.Piecewise(halves, 0.01, 0.01, transform="log"), "r": lp.Scalar(1.0, 0.5)}
+    mesh = lp.rectangle((0.0, 2.0), (0.0, 1.0), (4, 2))
+    options = {"K": 1700.0} | ({"m": 1.5} if name == "porous_fisher" else {})
+    model = equation.build(mesh, unknowns, {"left": 100.0}, **options)
+    assert list(model.parameter_space.labels) == ["D[a]", "D[b]", "r"]
+    check_model(model, u=800.0).raise_if_failed()
+
+
+def test_what_is_refused():
+    mesh = lp.interval(0.0, 1.0, 4)
+    with pytest.raises(lp.ModelError, match="K must be a positive number"):
+        fisher_kpp(mesh, ONE, ONE, K=0.0)
+    with pytest.raises(lp.ModelError, match="m must be at least 1"):
+        porous_fisher(mesh, ONE, ONE, m=0.5)

@@ -1,0 +1,176 @@
+"""Groundwater: against Theis, the balance of water, the shipped checks, and published tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import exp1
+from skfem import ElementTriP1, MeshQuad
+
+import livepde as lp
+from livepde.diagnostics import check_model
+from livepde.errors import ModelError
+from livepde.models import EQUATIONS, groundwater, pumping_test
+from livepde.stepping import Advance, Alexander2, simulate
+
+k, Ss, b, Q = 7.6e-4, 2.5e-5, 7.0, 9.1e-3
+TIMES = np.concatenate([[0.0], np.geomspace(0.05, 5e4, 70)])
+
+
+def theis(r: Any, t: Any, T: float, S: float, rate: float) -> Any:
+    """Drawdown of a well that is pumped from time 0 on."""
+    return rate / (4 * np.pi * T) * exp1(r**2 * S / (4 * T * t))
+
+
+def positive(value: float) -> lp.Scalar:
+    return lp.Scalar(value, value, transform="log")
+
+
+def radial(cells: int = 80) -> lp.Model:
+    mesh = lp.interval(0.1, 5000.0, cells, geometric=True)
+    return pumping_test(mesh, positive(k), positive(Ss), b=b)
+
+
+def history(model: lp.Model, times: Any, at: Any, inputs: Any, q: Any = None) -> Any:
+    """Return the state at places of shape (d, n), for all times but the first."""
+    probe = model.state_block.probe(np.atleast_2d(at))
+    steps = simulate(model, model.initial_parameter(q), 0.0, times, Advance(Alexander2()), inputs)
+    return np.array([probe @ u for _, u in steps])[-(len(times) - 1) :]
+
+
+def test_drawdown_is_that_of_theis():
+    r = np.array([10.0, 30.0, 90.0, 300.0])
+    exact = theis(r, TIMES[1:, None], k * b, Ss * b, Q)
+    errors = []
+    for cells in (80, 160):
+        found = history(radial(cells), TIMES, r, lambda t: {"Q": Q})
+        errors.append(np.abs(found - exact).max())
+    assert errors[0] < 0.002 * exact.max()
+    assert errors[1] < 0.3 * errors[0]  # second order
+
+
+def test_drawdown_recovers_when_the_pump_stops():
+    """Theis with a second well of negative rate from then on."""
+    stop = 2000.0
+    times = np.concatenate([TIMES[stop > TIMES], stop + TIMES])
+    found = history(radial(), times, [30.0], lambda t: {"Q": Q if t <= stop else 0.0})[-30:, 0]
+    late = times[-30:]
+    exact = theis(30.0, late, k * b, Ss * b, Q) - theis(30.0, late - stop, k * b, Ss * b, Q)
+    assert np.abs(found - exact).max() < 0.02 * Q / (4 * np.pi * k * b)
+
+
+def plane(cell: float = 4.0) -> MeshQuad:
+    """A square of 6 km whose cells grow away from its middle."""
+    outer = np.cumsum(cell * 1.35 ** np.arange(1, 20))
+    half = np.concatenate([np.arange(0.0, 60.1, cell), 60.0 + outer[outer < 2940.0], [3000.0]])
+    axis = np.concatenate([-half[:0:-1], half])
+    return MeshQuad.init_tensor(axis, axis)
+
+
+def test_wells_in_the_plane_superpose():
+    T, S = 5e-3, 2e-3
+    wells = {"Q1": (-20.0, 0.0), "Q2": (21.0, 9.0)}
+    rates = {"Q1": 4e-3, "Q2": -2e-3}
+    model = groundwater(
+        plane(), positive(T), positive(S), {"boundary": 0.0}, wells=wells, radius=6.0
+    )
+    at = np.array([[0.0, -50.0, 21.0, 40.0], [0.0, 20.0, -30.0, 40.0]])
+    times = np.concatenate([[0.0], np.geomspace(5.0, 5e4, 40)])
+    found = history(model, times, at, lambda t: rates)
+    exact = np.zeros_like(found)
+    for name, (x, y) in wells.items():
+        r = np.hypot(at[0] - x, at[1] - y)
+        exact -= theis(r, times[1:, None], T, S, rates[name])
+    later = times[1:] > 100.0  # until then a wave passes that is not much wider than the cells
+    scale = rates["Q1"] / (4 * np.pi * T)
+    assert np.abs(found - exact)[later].max() < 0.03 * scale
+    assert np.abs(found - exact).max() < 0.1 * scale
+
+
+def test_water_is_kept_whatever_the_fields():
+    """No flow across the boundary: what the wells take is what the storage gives."""
+    mesh = lp.rectangle((0.0, 100.0), (0.0, 80.0), (10, 8)).to_meshtri()
+    element = ElementTriP1()
+    T, S = (lp.Field(mesh, element, prior=v, std=v, transform="log") for v in (1e-2, 1e-3))
+    model = groundwater(
+        mesh, T, S, wells={"Q": (40.0, 40.0)}, radius=25.0, recharge=1e-8, element=element
+    )
+    q = {
+        "T": lambda x: 1e-2 * np.exp(np.sin(x[0] / 9)),
+        "S": lambda x: 1e-3 * np.exp(np.cos(x[1] / 7)),
+    }
+    latent = model.initial_parameter(q)
+    S_values = model.latent.value(latent)[model.parameter_space.part("S")]
+    times = np.linspace(0.0, 3600.0, 13)
+    *_, (_, u) = simulate(model, latent, 0.0, times, Advance(Alexander2()), lambda t: {"Q": 2e-4})
+    rate = 1e-8 * 8000.0 - 2e-4
+    stored = S_values @ (model.mass @ u)
+    assert stored == pytest.approx(3600.0 * rate, rel=2e-3)  # the source's quadrature
+
+
+def test_a_constant_field_of_storativity_is_a_number():
+    mesh = lp.rectangle((0.0, 100.0), (0.0, 80.0), (10, 8)).to_meshtri()
+    element, given = ElementTriP1(), {"wells": {"Q": (40.0, 40.0)}, "radius": 25.0}
+    S = lp.Field(mesh, element, prior=1e-3, std=1e-3, transform="log")
+    model = groundwater(mesh, positive(1e-2), S, {"left": 0.0}, **given)
+    known = groundwater(mesh, positive(1e-2), positive(1e-3), {"left": 0.0}, **given)
+    u = model.initial(lambda x: np.sin(x[0] / 20) * x[1] / 80)
+    moment = lp.Moment(0.0, {"Q": 1e-3})
+    values = [m.form_A.vector("v", moment, u=u, q=m.initial_parameter()) for m in (model, known)]
+    assert np.allclose(*values)
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.floats(-7, -1), st.floats(-7, -1), st.integers(0, 1000))
+def test_radial_flow_passes_the_checks(log_k: float, log_Ss: float, seed: int):
+    mesh = lp.interval(0.1, 1000.0, 12, geometric=True)
+    model = pumping_test(mesh, positive(10**log_k), positive(10**log_Ss), b=5.0)
+    rng = np.random.default_rng(seed)
+    check_model(model, u=rng.normal(), inputs={"Q": rng.normal()}, seed=seed).raise_if_failed()
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.floats(-5, 0), st.floats(-5, 0), st.booleans(), st.integers(0, 1000))
+def test_flow_in_the_plane_passes_the_checks(log_T: float, log_S: float, field: bool, seed: int):
+    mesh = lp.rectangle((0.0, 60.0), (0.0, 60.0), (4, 4)).to_meshtri()
+    element = ElementTriP1()
+
+    def unknown(value: float) -> Any:
+        if field:
+            return lp.Field(mesh, element, prior=value, std=0.1 * value, transform="log")
+        return positive(value)
+
+    model = groundwater(
+        mesh,
+        unknown(10**log_T),
+        unknown(10**log_S),
+        {"left": 1.0},
+        wells={"Q1": (20.0, 20.0), "Q2": (40.0, 35.0)},
+        radius=25.0,
+        recharge=1e-8,
+    )
+    inputs = {"Q1": 1e-3, "Q2": -2e-3}
+    check_model(model, u=1.0, inputs=inputs, seed=seed).raise_if_failed()
+
+
+def test_what_is_wrong_is_said():
+    mesh, T = lp.rectangle((0.0, 60.0), (0.0, 60.0), (4, 4)), positive(1e-2)
+    with pytest.raises(ModelError, match=r"'Q' at \(70.0, 0.0\) lies outside"):
+        groundwater(mesh, T, T, wells={"Q": (70.0, 0.0)}, radius=30.0)
+    with pytest.raises(ModelError, match=r"radius=21.2 or more \(got 1\)"):
+        groundwater(mesh, T, T, wells={"Q": (30.0, 10.0)}, radius=1.0)
+    with pytest.raises(ModelError, match="S by region is not possible"):
+        groundwater(mesh, T, lp.Piecewise({"a": lambda x: x[0] > 30.0}, 1.0, 1.0))
+    with pytest.raises(ModelError, match="thickness, must be positive"):
+        pumping_test(lp.interval(0.1, 10.0, 5, geometric=True), T, T, b=0.0)
+    with pytest.raises(ModelError, match="needs a mesh of a plane"):
+        groundwater(lp.interval(0.0, 1.0, 5), T, T, wells={"Q": (0.5,)})
+
+
+def test_they_are_ready_made():
+    for name in ("groundwater", "pumping_test"):
+        assert EQUATIONS[name].name == name
