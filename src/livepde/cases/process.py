@@ -27,6 +27,7 @@ from livepde.fem import (
     interval,
     line,
     linear,
+    read_mesh,
     rectangle,
 )
 from livepde.model import Model
@@ -39,8 +40,6 @@ def mesh_of(frame: Frame) -> Any:
     """Return the mesh."""
     spec, unit = frame.spec.mesh, frame.equation.length_unit
     if spec.file is not None:
-        from livepde.fem import read_mesh
-
         scale = conversion(spec.unit or unit, unit, frame.where("mesh.unit")).factor
         file = frame.path.parent / spec.file
         return _built(frame, "mesh.file", lambda: read_mesh(file, scale))
