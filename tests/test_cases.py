@@ -659,6 +659,41 @@ def test_very_many_sensors_are_one_row(rod):
     ]
 
 
+TWO = """
+equation = "own.py:build"
+initial = { c = 1, s = 0 }
+mesh = { nodes = [0, 0.5, 1] }
+data = { reader = "own.py:read" }
+unknowns.k = { prior = 0.8, std = 0.3 }
+law = { kind = "sensitivity", noise = 0.01 }
+steps.scheme = "alexander2"
+[channels]
+c = { role = "sensor", column = "c", at = 0.5, of = "c" }
+s = { role = "withheld", column = "s{}", each = [0, 1, 2], of = "s" }
+"""
+TWO_CODE = """
+import numpy as np
+import livepde as lp
+from livepde.fem import linear
+
+def read(folder):
+    t = np.linspace(0, 1, 11)
+    return t, {"c": np.exp(-t), "s0": 1 - np.exp(-t), "s1": 1 - np.exp(-t)}
+
+def build(mesh, unknowns, dirichlet):
+    state = {name: lp.Field(mesh, linear(mesh)) for name in ("c", "s")}
+    return lp.Model(state, unknowns, A=lambda q, u, v, x: q.k * u.c * (v.c - v.s))
+"""
+
+
+def test_two_components(tmp_path):
+    (tmp_path / "own.py").write_text(TWO_CODE)
+    (tmp_path / "two.toml").write_text(TWO)
+    found = measures(result_of(tmp_path / "two.toml", allow_code=True)[1])
+    assert found["k"] == pytest.approx(1.0, abs=0.02)
+    assert found["rmse.s_0"] < 0.01
+
+
 OFFSET = ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm", noise = "0.05 K", offset = "0.5 K"')
 
 
