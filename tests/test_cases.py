@@ -13,9 +13,10 @@ import pytest
 import livepde as lp
 from livepde import cases
 from livepde.cases.preview import preview
+from livepde.cases.settings import parse, to_toml
 from livepde.cases.template import write_template
 from livepde.cases.units import convert
-from livepde.runs import checks_of, measures
+from livepde.runs import checks_of, measures, tables
 
 SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 
@@ -386,7 +387,11 @@ REFUSED = [
     (', noise = "0.05 K"', "", "law.noise is missing"),
     ('noise = "0.05 K"', 'noise = "0.05 m"', "T_10.noise: 'm' cannot"),
     ('noise = "0.05 K"', 'noise = "0 K"', "T_10.noise: got '0 K'"),
-    ('at = "10 cm", noise', 'over = [0.1, 0.2], noise', "all points (at) or all averages"),
+    ('at = "10 cm"', 'over = "lft"', "the mesh has no part 'lft'; did you mean 'left'?"),
+    ('at = "20 cm"', 'at = 0.2, offset = 1', "offset belongs to sensors that are assimilated"),
+    ('at = "left"', 'at = "left", of = "u"', "of belongs to sensors"),
+    ('at = "20 cm"', "each = [0, 0.4, 5]", "each needs column = a name with {}"),
+    ('noise = "0.05 K" }', 'noise = "0.05 K", correlated = { tim = 3 } }', "did you mean 'time'?"),
     ('role = "sensor"', 'role = "withheld"', "no sensor to learn from"),
     ("[law]", "[boundary]\nlft = 3\n[law]", "boundary: no boundary 'lft'"),
     ('rmse = "<= 0.15"', 'rmse = "lots"', "expect.rmse: got 'lots'; expected [low, high]"),
@@ -499,6 +504,486 @@ def test_borehole_needs_its_options_and_input(tmp_path):
         with pytest.raises(lp.CaseError) as error:
             cases.load(other)
         assert named in str(error.value)
+
+
+# --- meshes, regions, and unknowns that move or stay positive ---------------------------------
+
+
+def test_nodes(rod):
+    path = rod(('from = 0\nto = "40 cm"\ncells = 40', 'nodes = [0, "10 cm", 0.2, 0.3, "400 mm"] #'))
+    mesh = cases.load(path).mesh
+    np.testing.assert_allclose(mesh.p[0], [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert set(mesh.boundaries) == {"left", "right"}
+
+
+@pytest.mark.parametrize(
+    ("mesh", "named"),
+    [
+        ("nodes = [0, 0.4, 0.3]", "mesh.nodes: line: needs at least two increasing nodes"),
+        ("nodes = [0]", "mesh.nodes"),
+        ("nodes = [0, 0.4]\ncells = 3", "mesh: expected from and to"),
+        ('nodes = [0, 0.4]\nspacing = "geometric"', "spacing belongs to an interval with cells"),
+        ('nodes = [0, 0.4]\nunit = "mm"', "unit belongs to a file"),
+        ("from = 0\nto = 1", "mesh: expected from and to"),
+    ],
+)
+def test_meshes_that_are_refused(rod, mesh, named):
+    path = rod(('from = 0\nto = "40 cm"\ncells = 40', f"{mesh} #"))
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(path)
+    assert named in str(error.value)
+
+
+PLANE = """
+equation = "reaction_diffusion"
+initial = 1.0
+mesh = { x = [0, 2], y = [0, 1], cells = [4, 2] }
+data = { file = "data.csv", time = "t" }
+unknowns.q = { prior = 1.0, std = 1.0, regions = REGIONS }
+law = { kind = "sensitivity", noise = 0.1 }
+channels.a = { role = "sensor", column = "a", at = [0.5, 0.5] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("regions", "named"),
+    [
+        ("{ a = [0, 1, 0, 1], b = [1, 2, 0, 1] }", ""),
+        ("{ a = [0, 1, 0, 1] }", "lies in 0 regions"),
+        ("{ a = [0, 1, 0, 1], b = [0, 2, 0, 1] }", "lies in 2 regions"),
+        ("{ a = [0, 1] }", "expected [x0, x1, y0, y1]"),
+        ("{ a = [5, 6, 0, 1] }", "holds no cell of the mesh, which spans 0 to 2 x 0 to 1"),
+        ('{ a = "steel" }', "the mesh has no subdomain 'steel'"),
+    ],
+)
+def test_regions_of_a_rectangle(tmp_path, regions, named):
+    path = tmp_path / "case.toml"
+    path.write_text(PLANE.replace("REGIONS", regions))
+    if not named:
+        assert set(cases.load(path).model.parameter_space.labels) == {"q[a]", "q[b]"}
+        return
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(path)
+    assert named in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("evolution", "expected"),
+    [
+        ('kind = "random-walk", rate = "6e-6 m^2/s/min^0.5"', lp.RandomWalk(6e-6 / 60**0.5)),
+        ('kind = "mean-reverting", time = "2 h"', lp.MeanReverting(7200.0)),
+        ('kind = "periodic", period = "1 day", harmonics = 2', lp.Periodic(86400.0, 2)),
+    ],
+)
+def test_unknowns_that_move(rod, evolution, expected):
+    path = rod((NO_REPLAY[0], "#"), ("bounds = [", f"evolution = {{ {evolution} }} #"))
+    unknown = cases.load(path).model.parameter_space.unknowns["alpha"]
+    assert type(unknown.evolution) is type(expected)
+    assert vars(unknown.evolution) == pytest.approx(vars(expected))
+    prepared = cases.load(path).prepare()
+    assert 0 < preview(prepared, prepared.stream)[0][0].left < 1
+
+
+def test_positive_unknowns(rod):
+    path = rod(('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "log"'))
+    prepared, data = result_of(path)
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+    (row,) = preview(prepared, prepared.stream)[0]
+    assert row.prior == pytest.approx(3e-5)
+    assert row.left < 0.05
+    case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))
+    assert case.model.parameter_space.unknowns["alpha"].transform == "log"
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('evolution = { kind = "random-walk" }', "'random-walk' takes rate"),
+        ('evolution = { kind = "periodic", rate = 1 }', "takes harmonics and period"),
+        ('evolution = { kind = "perodic" }', "did you mean 'periodic'?"),
+        ('evolution = { kind = "periodic", perod = 1 }', "did you mean 'period'?"),
+        ('evolution = { kind = "mean-reverting", time = "2 m" }', "evolution.time: 'm' cannot"),
+        ('transform = "lg"', "did you mean 'log'?"),
+        ('transform = "logit"\n#', "unknowns.alpha: "),
+    ],
+)
+def test_evolutions_that_are_refused(rod, text, named):
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(rod(("bounds = [", f"{text}\nbounds = [" if "#" not in text else f"{text}[")))
+    assert named in str(error.value)
+
+
+def test_gate(rod):
+    assert cases.load(rod(("replay = true ", "gate = 5 #"))).law.gate == 5.0
+
+
+def test_the_initial_state_is_said_once(rod):
+    with pytest.raises(lp.CaseError, match="initial is missing"):
+        cases.load(rod(('initial = "interpolate"', ""))).prepare()
+
+
+# --- sensors ---------------------------------------------------------------------------------
+
+
+def test_families(rod):
+    old = 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }'
+    path = rod((old, 'T = { role = "withheld", column = "T_{}0", each = ["0 cm", "40 cm", 5] }'),
+               ("T_10 =", "first ="), ("T_30 =", "third ="))  # fmt: skip
+    case = cases.load(path)
+    assert case.withheld.names(5) == ("T_0", "T_1", "T_2", "T_3", "T_4")
+    np.testing.assert_allclose(list(case.withheld.points.values()), [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert case.columns["T_3"].names == ("T_30",)
+    with pytest.raises(lp.CaseError, match="there is a channel 'T_1' already"):
+        cases.load(rod(("first =", "T_1 =")))
+
+
+def test_very_many_sensors_are_one_row(rod):
+    old = 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }'
+    new = 'W = { role = "withheld", column = "T_20{}", each = [0, 0.4, 50] }'
+    path = rod(
+        (old, new),
+        ("cells = 40", "cells = 4"),
+        ("start, stop", ""),
+        ("[data]", "[data]\nevery = 30"),
+    )
+    import pandas as pd
+
+    frame = pd.read_csv(path.parent / "rod.csv")
+    more = {f"T_20{k}": frame["T_20"] for k in range(50)}
+    frame.assign(**more).to_csv(path.parent / "rod.csv", index=False)
+    _, data = result_of(path)
+    rows = tables(data)[-1].rows
+    assert [row[:2] for row in rows] == [
+        ("T_10 ... T_30", "assimilated"),
+        ("W_0 ... W_49", "withheld"),
+    ]
+
+
+TWO = """
+equation = "own.py:build"
+initial = { c = 1, s = 0 }
+mesh = { nodes = [0, 0.5, 1] }
+data = { reader = "own.py:read" }
+unknowns.k = { prior = 0.8, std = 0.3 }
+law = { kind = "sensitivity", noise = 0.01 }
+steps.scheme = "alexander2"
+[channels]
+c = { role = "sensor", column = "c", at = 0.5, of = "c" }
+s = { role = "withheld", column = "s{}", each = [0, 1, 2], of = "s" }
+"""
+TWO_CODE = """
+import numpy as np
+import livepde as lp
+from livepde.fem import linear
+
+def read(folder):
+    t = np.linspace(0, 1, 11)
+    return t, {"c": np.exp(-t), "s0": 1 - np.exp(-t), "s1": 1 - np.exp(-t)}
+
+def build(mesh, unknowns, dirichlet):
+    state = {name: lp.Field(mesh, linear(mesh)) for name in ("c", "s")}
+    return lp.Model(state, unknowns, A=lambda q, u, v, x: q.k * u.c * (v.c - v.s))
+"""
+
+
+def test_two_components(tmp_path):
+    (tmp_path / "own.py").write_text(TWO_CODE)
+    (tmp_path / "two.toml").write_text(TWO)
+    found = measures(result_of(tmp_path / "two.toml", allow_code=True)[1])
+    assert found["k"] == pytest.approx(1.0, abs=0.02)
+    assert found["rmse.s_0"] < 0.01
+
+
+OFFSET = ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm", noise = "0.05 K", offset = "0.5 K"')
+
+
+def test_unknowns_of_sensors_share_a_prior(rod):
+    more = ', offset = "0.5 K", gain = 0.05, correlated = { time = "1 h", std = "0.1 K" }'
+    path = rod((OFFSET[0], f'at = "10 cm", noise = "0.05 K"{more}'))
+    with pytest.raises(lp.CaseError, match=r"T_30.offset: differs from that of 'T_10'"):
+        cases.load(rod(('at = "30 cm", noise', 'at = "30 cm", offset = "0.4 K", noise')))
+    model = cases.load(rod(('offset = "0.4 K", noise', "noise"))).model
+    assert set(model.parameter_space.labels) == {
+        "alpha", "offset[T_10]", "gain[T_10]", "correlated[T_10]"
+    }  # fmt: skip
+    unknowns = model.parameter_space.unknowns
+    assert (unknowns["offset"].std, unknowns["offset"].unit) == (0.5, "K")
+    assert (unknowns["gain"].prior, unknowns["gain"].std) == (1.0, 0.05)
+    assert unknowns["correlated"].evolution == lp.MeanReverting(3600.0)
+    assert path.exists()
+
+
+def test_an_unknown_offset_is_found(rod):
+    import pandas as pd
+
+    path = rod(OFFSET, NO_REPLAY)
+    frame = pd.read_csv(path.parent / "rod.csv")
+    frame["T_10"] += 0.4
+    frame.to_csv(path.parent / "rod.csv", index=False)
+    _, data = result_of(path)
+    found = measures(data)
+    assert found["offset[T_10]"] == pytest.approx(0.4, abs=0.05)
+    assert found["alpha"] == pytest.approx(9.7e-5, rel=0.05)
+
+
+def test_points_and_averages_together(rod):
+    path = rod(('at = "30 cm", noise = "0.05 K"', 'over = ["28 cm", "32 cm"], noise = "0.07 K"'))
+    prepared, data = result_of(path)
+    assert prepared.identifier.observed.names == ("T_10", "T_30")
+    np.testing.assert_allclose(prepared.identifier.observed.noise, [0.05, 0.07])
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+
+
+# --- data that a function reads --------------------------------------------------------------
+
+READER = """
+import numpy as np
+import pandas as pd
+
+def read(folder, name="rod.csv", noise=0.0, seed=0):
+    frame = pd.read_csv(folder / name)
+    rng = np.random.default_rng(seed)
+    columns = {key: frame[key] + noise * rng.standard_normal(len(frame)) for key in frame}
+    return frame["time_s"], columns
+"""
+FROM_READER = ('file = "rod.csv"', 'reader = "own.py:read"\noptions = { noise = 0.0 } #')
+
+
+def with_reader(rod, body: str, *changes: tuple[str, str]) -> Path:
+    path = rod(FROM_READER, *changes)
+    (path.parent / "own.py").write_text(body)
+    return path
+
+
+def test_reader_gives_what_the_file_gives(rod, monkeypatch):
+    _, first = result_of(rod())
+    path = with_reader(rod, READER)
+    monkeypatch.setenv("LIVEPDE_DATA", str(path.parent))
+    with pytest.raises(lp.CaseError, match=r"data\.reader: .* add --allow-code"):
+        cases.load(path)
+    _, second = result_of(path, allow_code=True)
+    assert float(second.alpha[-1]) == float(first.alpha[-1])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("noise=0.0", "noize=0.0", "has no option 'noise'; did you mean 'noize'?"),
+        ("def read(", "def raed(", "has no function 'read'"),
+        ("return ", "return 3 #", "returned int; expected times and a mapping"),
+        ("return ", "raise ValueError('bad') #", "failed with ValueError: bad"),
+        ("rod.csv", "none.csv", "there is no file"),
+        ('frame["time_s"]', "[]", "holds no samples"),
+        ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is not later"),
+        ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (181,); there are 180 times"),
+        ("{key:", "{key + '_': ", "there is no column 'T_left'; did you mean 'T_left_'?"),
+        ("+ noise", "+ np.inf + noise", "is infinite in sample 0"),
+        ("frame[key] + noise * rng", "['a'] * 181 or rng", "does not hold numbers only"),
+    ],
+)
+def test_readers_that_fail(rod, monkeypatch, old, new, named):
+    assert old in READER
+    path = with_reader(rod, READER.replace(old, new))
+    monkeypatch.setenv("LIVEPDE_DATA", str(path.parent))
+    with pytest.raises(lp.LivepdeError) as error:
+        cases.load(path, allow_code=True).prepare()
+    message = str(error.value)
+    assert named in message
+    assert str(path) in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ('time = "time_s"', "", "time is missing"),
+        ("time_unit", "options = { a = 1 }\ntime_unit", "options belong to a reader"),
+        ("time_unit", 'reader = "a.py:b"\ntime_unit', "are two sources"),
+        ("time_unit", 'separator = "::"\ntime_unit', "data.separator"),
+    ],
+)
+def test_one_source_of_data(rod, old, new, named):
+    with pytest.raises(lp.CaseError, match=named):
+        cases.load(rod((old, new)))
+
+
+def test_semicolons(rod):
+    path = rod()
+    data = path.with_name("rod.csv")
+    data.write_text(data.read_text().replace(",", ";"))
+    with pytest.raises(lp.DataError, match="say separator = ';'"):
+        cases.load(path).prepare()
+    prepared = cases.load(rod(("time_unit", 'separator = ";"\ntime_unit'))).prepare()
+    assert len(prepared.stream) == 181
+
+
+def test_options_that_are_text_or_booleans(rod):
+    body = """
+from dataclasses import replace
+from livepde.models import EQUATIONS, Option
+
+def make(mesh, unknowns, dirichlet, *, shape, closed):
+    assert shape == "radial" and closed is True
+    return EQUATIONS["heat"].build(mesh, unknowns, dirichlet)
+
+options = {"shape": Option("", "coordinates", choices=("plane", "radial")),
+           "closed": Option("", "closed at the left", False)}
+build = replace(EQUATIONS["heat"], build=make, options=options)
+"""
+    path = own_code(rod, body)
+    text = path.read_text()
+    for given, named in (
+        ("", "options.shape is missing: the coordinates: one of plane, radial"),
+        ('shape = "radail"', "did you mean 'radial'?"),
+        ("shape = 3", "options.shape: got 3.0; expected text"),
+        ('shape = "radial"\nclosed = "yes"', "options.closed: got 'yes'; expected true or false"),
+        ('shape = "radial"\nclosed = true', ""),
+    ):
+        path.write_text(text.replace("[law]", f"[options]\n{given}\n[law]"))
+        if named:
+            with pytest.raises(lp.CaseError, match=named.replace("?", r"\?")):
+                cases.load(path, allow_code=True)
+        else:
+            cases.load(path, allow_code=True)
+
+
+def test_text_for_a_bare_function(rod):
+    body = "from livepde.models import heat\n\ndef build(mesh, unknowns, dirichlet, *, a, b, c):\n"
+    body += "    assert (a, b, c) == (2.0, 'x', True)\n"
+    body += "    return heat(mesh, unknowns['alpha'], dirichlet)\n"
+    path = own_code(rod, body)
+    text = path.read_text().replace(" m^2/s", "").replace(' K"', '"')
+    for number in ("5e-5", "3e-5", "1e-6", "1e-3", "0.05"):
+        text = text.replace(f'"{number}"', number)
+    path.write_text(text.replace("[law]", '[options]\na = 2\nb = "x"\nc = true\n[law]'))
+    cases.load(path, allow_code=True)
+
+
+# --- values set from outside -----------------------------------------------------------------
+
+
+def test_settings(rod):
+    path = rod()
+    given = parse(["law.noise=0.2 K", "law.replay=false", "law.memory='1 h'",
+                   "unknowns.alpha.prior=6e-5", "title=A rod", "channels.T_20.role=sensor",
+                   "channels.T_20.noise='1 K'"])  # fmt: skip
+    case = cases.load(path, settings=given)
+    assert (case.title, case.law.noise, case.law.memory) == ("A rod", 0.2, 3600.0)
+    assert case.model.parameter_space.prior[0] == 6e-5
+    assert case.withheld is None
+    assert case.original == path.read_text()
+    other = path.with_name("resolved.toml")
+    other.write_text(case.text)
+    again = cases.load(other, settings=given)
+    assert (again.title, again.law.noise, again.text) == ("A rod", 0.2, case.text)
+
+
+def test_tables_are_set_key_by_key(rod):
+    case = cases.load(rod(), settings={"steps": {"dt_max": "5 s"}, 'law."replay".first': 16})
+    assert (case.dt_max, case.frame.spec.steps.scheme) == (5.0, "alexander2")
+    assert case.law.replay == lp.Replay(first=16)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "named"),
+    [
+        ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
+        ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
+        ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),
+        ("channels.T_21.noise", 1, "did you mean 'T_20'?"),
+        ("law..noise", 1, "'law..noise' is no key"),
+        ("law.noise", "2 m", "law.noise: 'm' cannot be converted"),
+    ],
+)
+def test_settings_that_are_refused(rod, key, value, named):
+    path = rod()
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(path, settings={key: value})
+    assert named in str(error.value)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_settings_need_an_equals_sign():
+    with pytest.raises(lp.CaseError, match=r"--set law: expected key=value"):
+        parse(["law"])
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda path: path.stem)
+def test_documents_survive_being_written(path):
+    document = tomllib.loads(path.read_text())
+    document["odd"] = {"a b": 'x"\\\n\x07', "": [True, 1e300, {"y": {}}], "inf": float("inf")}
+    assert tomllib.loads(to_toml(document)) == document
+
+
+# --- references and variants -----------------------------------------------------------------
+
+REFERENCE = ("[expect]", '[reference]\nalpha = "0.97 cm^2/s"\nsource = "made up"\n[expect]')
+
+
+def described(path):
+    prepared, data = result_of(path)
+    prepared.describe(data)
+    return prepared.case, data
+
+
+def test_references(rod):
+    path = rod(REFERENCE, ("alpha = [9e-5, 1.05e-4]", 'alpha.error = "<= 0.03"'))
+    case, data = described(path)
+    assert case.references == {"alpha": pytest.approx(9.7e-5)}
+    assert case.source == "made up"
+    assert not case.notes
+    found = measures(data)
+    assert found["alpha.error"] == pytest.approx(abs(found["alpha"] / 9.7e-5 - 1))
+    assert all(check.ok for check in checks_of(case.expected, data))
+    table = tables(data)[0]
+    assert table.title.endswith("made up")
+    assert table.columns[-2:] == ("reference", "error")
+    assert table.rows[0][-2] == "9.7e-05"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ('alpha = "0.97', 'alhpa = "0.97', "reference: there is no unknown number 'alhpa'; did"),
+        ("cm^2/s", "cm/s", "reference.alpha: 'cm/s' cannot be converted"),
+    ],
+)
+def test_references_that_are_refused(rod, old, new, named):
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(rod((REFERENCE[0], REFERENCE[1].replace(old, new))))
+    assert named in str(error.value)
+
+
+VARIANTS = """
+[[variants]]
+name = "noisier"
+set = { law.noise = "1 K", "data.every" = 2 }
+seeds = 3
+expect = { rmse = "<= 1", alpha.error = "<= 0.1" }
+
+[expect]"""
+
+
+def test_variants(rod):
+    (variant,) = cases.load(rod(("[expect]", VARIANTS))).variants
+    assert variant.name == "noisier"
+    assert variant.seeds == 3
+    assert variant.expect == {"rmse": ("<=", 1.0), "alpha.error": ("<=", 0.1)}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("seeds", "sedes", "there is no key 'variants[0].sedes'; did you mean 'seeds'?"),
+        ("seeds = 3", 'seeds = 3\n[[variants]]\nname = "noisier"', "two have the name 'noisier'"),
+        ('name = "noisier"', "", "the key 'variants[0].name' is missing"),
+        ('rmse = "<= 1"', "rmse = 1", "variants[0].expect.rmse: got 1"),
+    ],
+)
+def test_variants_that_are_refused(rod, old, new, named):
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(rod(("[expect]", VARIANTS.replace(old, new))))
+    assert named in str(error.value)
 
 
 # --- shipped cases ---------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from livepde.cases.template import write_template
 from livepde.errors import LivepdeError
 from livepde.runs import Check, Outcome, Table
 
-COMMANDS = ("demo", "reproduce", "init", "check", "run", "report", "bench")
+COMMANDS = ("demo", "reproduce", "init", "equations", "check", "run", "report", "bench")
 
 
 @pytest.fixture
@@ -105,6 +105,31 @@ def test_main_returns_codes(monkeypatch, capsys):
 # --- cases -----------------------------------------------------------------------------------
 
 
+def test_equations(here):
+    assert "thermal response test" in call("equations")[1]
+    output = call("equations", "borehole")[1]
+    for word in ("R_b", "rho_c", "needed", "fluid", "[options]", "Length in m, time in s"):
+        assert word in output
+    assert "did you mean 'heat'" in bad("equations", "haet")
+
+
+def test_values_set_from_outside(rod, here, monkeypatch):
+    setting = ("--set", "data.every=9", "--set", "title=Thin")
+    assert call("check", rod, *setting)[1].startswith("Thin")
+    monkeypatch.setattr(sys, "argv", ["livepde", "run", rod, *setting])
+    code, output = call("run", rod, *setting)
+    assert code == 0
+    assert "21 samples" in output
+    folder = here / "runs" / "rod"
+    assert "every = 9" in (folder / "case.toml").read_text()
+    assert json.loads((folder / "run.json").read_text())["settings"] == [
+        "data.every=9",
+        "title=Thin",
+    ]
+    code, output = call("report", "runs/rod", "--theory", "--json")
+    assert code == 0
+
+
 def test_init_check_run_report(here):
     code, output = call("init", "mine")
     assert code == 0
@@ -122,16 +147,16 @@ def test_init_check_run_report(here):
     code, output = call("run", "mine/case.toml")
     assert code == 0
     assert "alpha" in output
-    assert "runs/case" in output
-    names = {p.name for p in (here / "runs" / "case").iterdir()}
+    assert "runs/mine" in output
+    names = {p.name for p in (here / "runs" / "mine").iterdir()}
     assert {"run.json", "case.toml", "estimates.nc", "checkpoint.npz", "report.md"} <= names
-    assert call("run", "mine/case.toml")[1].strip().endswith("runs/case-2")
+    assert call("run", "mine/case.toml")[1].strip().endswith("runs/mine-2")
 
-    before = (here / "runs" / "case" / "report.md").read_text()
-    code, output = call("report", "runs/case")
+    before = (here / "runs" / "mine" / "report.md").read_text()
+    code, output = call("report", "runs/mine")
     assert code == 0
     assert "T_20" in output
-    assert (here / "runs" / "case" / "report.md").read_text() == before
+    assert (here / "runs" / "mine" / "report.md").read_text() == before
 
 
 def test_run_as_json_with_checks(rod):

@@ -47,7 +47,18 @@ OutOption = Annotated[
 ]
 CodeOption = Annotated[
     bool,
-    typer.Option("--allow-code", help="Load an equation of your own that the case names."),
+    typer.Option(
+        "--allow-code", help="Load the equation or reader of your own that the case names."
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Another value than the case has, as law.noise='2 K'. Repeat it for more.",
+        show_default=False,
+    ),
 ]
 CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show_default=False)]
 
@@ -179,19 +190,55 @@ def reproduce(
 def bench(
     name: Annotated[str, typer.Argument(help="Name of the benchmark; 'list' shows them.")] = "list",
     as_json: JsonOption = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="With 'cases': only the case of this name. Repeat it for more."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="With 'cases': where they are. Default: the next folder 'cases'."),
+    ] = None,
+    gallery: Annotated[
+        Path | None,
+        typer.Option(help="With 'cases': folder for a page with tables and figures."),
+    ] = None,
 ) -> None:
-    """Measure what things cost, as ratios that hold on any machine.
+    """Measure what things cost, as ratios that hold on any machine, and what cases find.
+
+    'cases' runs every case of the project with its variants, and the code that they name.
 
     Example:  livepde bench step
+    Cases:    livepde bench cases --only soil_layers --json
     """
     from livepde.bench import BENCHMARKS
 
     if name == "list":
-        for key in BENCHMARKS:
+        for key in (*BENCHMARKS, "cases"):
             _console().print(key)
         return
-    outcome = _named(name, BENCHMARKS, "benchmark")()
+    if name == "cases":
+        _bench_cases(folder, only or [], gallery, as_json)
+        return
+    outcome = _named(name, {**BENCHMARKS, "cases": None}, "benchmark")()
     _report_outcome(outcome, ["livepde", "bench", name], as_json)
+
+
+def _bench_cases(
+    folder: Path | None, only: Sequence[str], gallery: Path | None, as_json: bool
+) -> None:
+    from livepde.bench import cases
+
+    known = {path.stem: path for path in cases.find_cases(folder)}
+    paths = [_named(name, known, "case") for name in only] or list(known.values())
+    pictures = None
+    if gallery is not None:
+        gallery.mkdir(parents=True, exist_ok=True)
+        pictures = gallery if _can_draw(_console(err=True)) else None
+    outcome, runs = cases.bench_cases(paths, progress=True, pictures=pictures)
+    if gallery is not None:
+        page = cases.gallery(runs, gallery)
+        _console(err=True).print(f"Gallery: {page}", soft_wrap=True)
+    _report_outcome(outcome, ["livepde", "bench", "cases"], as_json)
 
 
 # --- cases ---------------------------------------------------------------------------------------
@@ -214,6 +261,41 @@ def init(
 
 
 @app.command()
+def equations(
+    name: Annotated[str, typer.Argument(help="Name of an equation; 'list' shows them.")] = "list",
+) -> None:
+    """Show the ready-made equations, and what a case says about one of them.
+
+    Example:  livepde equations heat
+    """
+    from livepde.models import EQUATIONS
+    from livepde.runs import Table
+
+    console = _console()
+    if name == "list":
+        for item in EQUATIONS.values():
+            console.print(f"[bold]{item.name}[/]  {escape(item.summary)}", soft_wrap=True)
+        return
+    found = _named(name, EQUATIONS, "equation")
+    console.print(f"[bold]{found.name}[/]  {escape(found.summary)}", soft_wrap=True)
+    console.print(escape(found.formula), soft_wrap=True)
+    rows = [("state", "u", found.state.text, found.state.unit, "")]
+    for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):
+        rows += [(table, key, item.text, item.unit, "") for key, item in known.items()]
+    for key, option in found.options.items():
+        default = "needed" if option.default is None else str(option.default)
+        choices = f" ({', '.join(option.choices)})" if option.choices else ""
+        rows.append(("[options]", key, option.text + choices, option.unit, default))
+    unit = found.state.unit
+    rows += [
+        ("[channels], quantity", key, item.text, unit, "") for key, item in found.quantities.items()
+    ]
+    columns = ("where", "name", "what", "unit", "default")
+    _print_table(console, Table("What a case says about it", columns, rows))
+    console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")
+
+
+@app.command()
 def check(
     case: CaseArgument,
     data: Annotated[
@@ -221,16 +303,16 @@ def check(
         typer.Option(help="Other data than the case names (.csv, .jsonl).", show_default=False),
     ] = None,
     allow_code: CodeOption = False,
+    settings: SetOption = None,
 ) -> None:
     """Check a case and its data, and tell what its sensors can identify.
 
     Nothing is written. Example:  livepde check mycase/case.toml
     """
-    from livepde import cases
     from livepde.runs import Table
 
     console = _console()
-    loaded = cases.load(case, allow_code=allow_code)
+    loaded = _load(case, allow_code, settings)
     prepared = loaded.prepare(data)
     _show_model(console, prepared)
     samples: Samples = prepared.stream  # type: ignore[assignment]
@@ -248,6 +330,13 @@ def check(
     if failed:
         raise typer.Exit(CHECK_FAILED)
     console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
+
+
+def _load(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
+    from livepde import cases
+    from livepde.cases.settings import parse
+
+    return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 
 
 def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
@@ -352,6 +441,7 @@ def run(
     out: OutOption = None,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
+    settings: SetOption = None,
 ) -> None:
     """Identify: take every sample of a case, and write a run directory.
 
@@ -360,22 +450,23 @@ def run(
     Example:  livepde run mycase/case.toml
     Live:     logger | livepde run mycase/case.toml --data -
     """
-    from livepde import cases
     from livepde.runs import RunWriter, checks_of, drive, free_path, tables
     from livepde.streams import Table as Samples
 
-    loaded = cases.load(case, allow_code=allow_code)
+    loaded = _load(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
     if out is not None and out.exists():
         _must_be_empty(out)
     prepared = loaded.prepare(source)
-    folder = out or free_path(Path("runs") / case.stem)
+    folder = out or free_path(Path("runs") / loaded.name)
     writer = RunWriter.create(
         folder,
         version=__version__,
         command=["livepde", *sys.argv[1:]],
         title=loaded.title,
         case=loaded.text,
+        settings=settings or (),
+        original=loaded.original,
     )
     total = len(prepared.stream) if isinstance(prepared.stream, Samples) else None
     driven = drive(
@@ -386,9 +477,7 @@ def run(
         fields_every=loaded.fields_every,
     )
     dataset = driven.result.to_xarray()
-    dataset.attrs |= prepared.attributes
-    for axis in set("xyz") & set(dataset.coords):
-        dataset[axis].attrs["units"] = loaded.frame.equation.length_unit
+    prepared.describe(dataset)
     checks = checks_of(loaded.expected, dataset)
     notes = list(loaded.notes)
     if driven.status == "interrupted":
@@ -448,8 +537,8 @@ def report(
 ) -> None:
     """Show what a run found: tables, and figures into the run directory.
 
-    Example:  livepde report runs/case
-    Theory:   livepde report runs/case --theory
+    Example:  livepde report runs/mycase
+    Theory:   livepde report runs/mycase --theory
     """
     from livepde import runs
 
@@ -485,14 +574,13 @@ def report(
 
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
     """Take a run's samples again, and print and write what the theory says."""
-    from livepde import cases
     from livepde.diagnostics import theory_report
     from livepde.errors import CaseError, RunError
     from livepde.runs import Table
 
     case = opened.case_file()
     try:
-        prepared = cases.load(case, allow_code=allow_code).prepare(data or opened.data_file)
+        prepared = _load(case, allow_code, opened.settings).prepare(data or opened.data_file)
     except CaseError as error:
         if case.parent != opened.path:
             raise

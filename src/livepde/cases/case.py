@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
-from livepde.cases.data import assimilation_start, clock_of, read_data
+from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
+from livepde.cases.instruments import expanded
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
-from livepde.cases.read import did_you_mean, read_spec, read_text
-from livepde.cases.schema import GradientSpec, SensitivitySpec
+from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
+from livepde.cases.schema import GradientSpec, SensitivitySpec, VariantSpec
 from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
+from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError, LawError
 from livepde.identifier import Identifier, Sample
 from livepde.laws import (
@@ -84,8 +87,24 @@ class Prepared:
 
     @cached_property
     def u0(self) -> Any:
-        """The initial state: a number, or a function of x."""
-        return initial_of(self.case.frame, self.case.mesh, self.first)
+        """The initial state: a number, or a function of x; None if the model says it itself."""
+        frame = self.case.frame
+        if self.case.model.form_initial is None:
+            return initial_of(frame, self.case.mesh, self.first)
+        if frame.spec.initial is not None:
+            raise frame.error("initial", "the equation has its own initial state; leave it out.")
+        return None
+
+    def describe(self, data: xr.Dataset) -> None:
+        """Add to a run's dataset what its case knows: title, start, units of axes, references."""
+        data.attrs |= self.attributes
+        for axis in set("xyz") & set(data.coords):
+            data[axis].attrs["units"] = self.case.frame.equation.length_unit
+        for label, value in self.case.references.items():
+            if label in data:
+                data[label].attrs["reference"] = value
+        if self.case.source:
+            data.attrs["reference_source"] = self.case.source
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -99,7 +118,12 @@ class Prepared:
         return found
 
 
-def load(path: str | os.PathLike[str], *, allow_code: bool = False) -> Case:
+def load(
+    path: str | os.PathLike[str],
+    *,
+    allow_code: bool = False,
+    settings: Mapping[str, Any] | None = None,
+) -> Case:
     """Read and check a case file.
 
     Parameters
@@ -107,7 +131,9 @@ def load(path: str | os.PathLike[str], *, allow_code: bool = False) -> Case:
     path
         A TOML file.
     allow_code
-        Load an equation of the user's own ('module:function' or 'file.py:function').
+        Load an equation or a reader of the user's own ('module:function', 'file.py:function').
+    settings
+        Key -> value instead of what the file says, as {"law.noise": "2 K"}.
 
     Raises
     ------
@@ -115,9 +141,15 @@ def load(path: str | os.PathLike[str], *, allow_code: bool = False) -> Case:
         One sentence: which key, what it got, what was expected, and the remedy.
     """
     file = Path(path)
-    text = read_text(file)
-    spec = read_spec(text, str(file))
-    case = Case(Frame(file, spec, resolve(spec, file.parent, str(file), allow_code)), text)
+    text = original = read_text(file)
+    document = read_toml(text, str(file))
+    if settings:
+        document = apply(document, settings, str(file))
+        text = to_toml(document)
+    spec = read_spec(document, str(file))
+    place = (spec, file.parent, str(file), allow_code)
+    frame = expanded(Frame(file, spec, resolve(*place), reader_of(*place)))
+    case = Case(frame, text, original)
     case.check()
     return case
 
@@ -131,21 +163,56 @@ class Case:
     frame
         File, specification and equation.
     text
+        The case as it is run: the file's content, or with settings what it amounts to.
+    original
         The file's content.
     """
 
     frame: Frame
     text: str
+    original: str
 
     def check(self) -> None:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
-        _ = self.scheme, self.dt_max
+        _ = self.scheme, self.dt_max, self.references
+
+    @property
+    def name(self) -> str:
+        """A name for its runs: that of the file, of its folder if the file is just 'case.toml'."""
+        path = self.frame.path.absolute()
+        return path.stem if path.stem != "case" else path.parent.name or "case"
 
     @property
     def title(self) -> str:
         """The title, or the name of the file."""
         return self.frame.spec.title or self.frame.path.stem
+
+    @cached_property
+    def references(self) -> dict[str, float]:
+        """Label of an unknown -> what others found, in the model's unit."""
+        frame, space = self.frame, self.model.parameter_space
+        found = {}
+        for label, value in frame.spec.reference.items():
+            if label == "source" and label not in space.labels:
+                continue
+            if label not in space.labels:
+                text = f"there is no unknown number '{label}'; "
+                raise frame.error("reference", text + did_you_mean(label, space.labels))
+            unit = space.unknowns[label.split("[")[0]].unit
+            found[label] = frame.convert(value, unit, f"reference.{label}")
+        return found
+
+    @property
+    def source(self) -> str:
+        """Where the references come from."""
+        given = self.frame.spec.reference.get("source", "")
+        return given if isinstance(given, str) and "source" not in self.references else ""
+
+    @property
+    def variants(self) -> tuple[VariantSpec, ...]:
+        """The case with other values, by name."""
+        return self.frame.spec.variants
 
     @property
     def expected(self) -> dict[str, tuple[Sense, Bound]]:
@@ -163,7 +230,7 @@ class Case:
         return mesh_of(self.frame)
 
     @cached_property
-    def options(self) -> dict[str, float]:
+    def options(self) -> dict[str, Any]:
         """Known numbers of the equation."""
         return options_of(self.frame)
 
@@ -217,7 +284,8 @@ class Case:
         replay = Replay() if spec.replay is True else None
         if not isinstance(spec.replay, bool):
             replay = Replay(**spec.replay.model_dump())
-        return SensitivityLaw(spec.modes, noise, drift, memory, replay)
+        gate = float(np.inf) if spec.gate is None else spec.gate
+        return SensitivityLaw(spec.modes, noise, drift, memory, replay, gate=gate)
 
     @cached_property
     def scheme(self) -> Scheme:
@@ -256,6 +324,7 @@ class Case:
         known = [
             *labels,
             *(f"{label}.std" for label in labels),
+            *(f"{label}.error" for label in self.references),
             "rmse",
             *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
             "failed_steps",

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from livepde.cases.code import check_options, load_code
 from livepde.cases.frame import Frame
+from livepde.cases.schema import CaseSpec
 from livepde.cases.units import conversion
-from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines
+from livepde.errors import LivepdeError
+from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
 
-__all__ = ["assimilation_start", "clock_of", "read_data"]
+__all__ = ["assimilation_start", "clock_of", "read_data", "reader_of"]
 
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
@@ -47,10 +50,63 @@ def read_data(
     spec = frame.spec.data
     if source is not None and not isinstance(source, str):
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
+    if source is None and frame.reader is not None:
+        return _from_reader(frame, frame.reader, columns, clock)
     path = Path(source) if source is not None else _data_file(frame)
     if path.suffix in (".jsonl", ".ndjson"):
         return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
-    return read_csv(path, columns, clock, every=spec.every, missing=spec.missing)
+    return read_csv(
+        path,
+        columns,
+        clock,
+        every=spec.every,
+        missing=spec.missing,
+        separator=spec.separator,
+    )
+
+
+def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any:
+    """Return the function that reads the data; None if a file holds them."""
+    if spec.data.reader is None:
+        return None
+    expected = "(folder, **options) -> times, {column: values}"
+    key = f"{where}: data.reader"
+    found = load_code(spec.data.reader, folder, key, expected, allow_code)
+    check_options(found, spec.data.options, f"{where}: data.options")
+    return found
+
+
+def _from_reader(
+    frame: Frame, reader: Callable[..., Any], columns: Mapping[str, Column], clock: Clock
+) -> Table:
+    """Return what the user's function reads: times, and a mapping from column to values."""
+    spec, where = frame.spec.data, frame.where(f"data.reader: {frame.spec.data.reader}")
+    folder = _measurements(frame)
+    try:
+        found = reader(folder or frame.path.parent, **spec.options)
+    except LivepdeError:
+        raise
+    except FileNotFoundError as error:
+        raise frame.error(
+            "data.reader", f"there is no file '{error.filename}'.{_unset(folder)}"
+        ) from None
+    except Exception as error:
+        text = f"{spec.reader} failed with {type(error).__name__}: {error}."
+        raise frame.error("data.reader", text) from error
+    match found:
+        case (times, Mapping() as values):
+            pass
+        case _:
+            text = f"{spec.reader} returned {type(found).__name__}; expected times and a mapping "
+            raise frame.error("data.reader", text + "from column to values.")
+    return tabulated(
+        times, values, columns, clock, every=spec.every, missing=spec.missing, where=where
+    )
+
+
+def _unset(folder: Path | None) -> str:
+    remedy = f" {VARIABLE} is not set; set it to the folder that holds the measurements."
+    return "" if folder else remedy
 
 
 def _data_file(frame: Frame) -> Path:
@@ -67,6 +123,18 @@ def _data_file(frame: Frame) -> Path:
 
 
 def _data_folder(frame: Frame) -> Path:
+    folder = _measurements(frame)
+    if folder is None:
+        raise frame.error(
+            "data.file",
+            f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that "
+            "holds the measurements.",
+        )
+    return folder
+
+
+def _measurements(frame: Frame) -> Path | None:
+    """Return the folder of measurements that several cases share, if there is one."""
     named = os.environ.get("LIVEPDE_DATA")
     if named:
         return Path(named).absolute()
@@ -74,11 +142,7 @@ def _data_folder(frame: Frame) -> Path:
         folder = base.parent / "shared" / "data"
         if folder.is_dir():
             return folder
-    raise frame.error(
-        "data.file",
-        f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that "
-        "holds the measurements.",
-    )
+    return None
 
 
 def assimilation_start(frame: Frame, clock: Clock, origin: datetime | None) -> float:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from livepde.cases.code import load_code
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import CaseSpec
 from livepde.errors import CaseError, LivepdeError
@@ -33,47 +32,16 @@ def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equat
                 f"{did_you_mean(name, EQUATIONS)} An own one is 'file.py:function'."
             )
         return EQUATIONS[name]
-    if not allow_code:
-        raise CaseError(
-            f"{where}: equation: '{name}' is code that livepde would have to run; read it, and if "
-            "you trust it, add --allow-code to the command."
-        )
-    source, _, attribute = name.rpartition(":")
-    found = getattr(_module(source, folder, where), attribute, None)
-    if isinstance(found, Equation):
-        return found
-    if not callable(found):
-        raise CaseError(
-            f"{where}: equation: '{source}' has no function '{attribute}'; expected "
-            "(mesh, unknowns, dirichlet, **options) -> livepde.Model."
-        )
-    return _plain(name, found, spec, where)
-
-
-def _module(source: str, folder: Path, where: str) -> Any:
-    try:
-        if not source.endswith(".py"):
-            return importlib.import_module(source)
-        path = folder / source
-        loader = importlib.util.spec_from_file_location(path.stem, path)
-        if loader is None or loader.loader is None:
-            raise ImportError(f"{path} is not a Python file")
-        module = importlib.util.module_from_spec(loader)
-        loader.loader.exec_module(module)
-    except LivepdeError:
-        raise
-    except Exception as error:
-        raise CaseError(
-            f"{where}: equation: loading '{source}' failed with {type(error).__name__}: {error}."
-        ) from error
-    return module
+    expected = "(mesh, unknowns, dirichlet, **options) -> livepde.Model"
+    found = load_code(name, folder, f"{where}: equation", expected, allow_code)
+    return found if isinstance(found, Equation) else _plain(name, found, spec, where)
 
 
 def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
     """Return a bare function as an equation whose units are those the case writes."""
 
     def build(
-        mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: float
+        mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
     ) -> Model:
         try:
             model = function(mesh, unknowns, dirichlet, **options)
@@ -102,7 +70,14 @@ def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
             for key, item in spec.channels.items()
             if item.role == "input"
         },
-        options={key: Option("", "") for key in spec.options},
+        options={key: _option(value) for key, value in spec.options.items()},
         build=build,
         element=linear,
     )
+
+
+def _option(value: Any) -> Option:
+    """Return the option of a bare function: text without a number in front is text."""
+    if isinstance(value, str) and value[:1].strip("+-.0123456789 "):
+        return Option("", "", value)
+    return Option("", "", value if isinstance(value, bool) else None)

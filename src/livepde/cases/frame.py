@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,14 @@ class Frame:
         Its content, checked key by key.
     equation
         The PDE it names.
+    reader
+        The function that reads its data, if it names one.
     """
 
     path: Path
     spec: CaseSpec
     equation: Equation
+    reader: Callable[..., Any] | None = None
 
     def error(self, key: str, text: str) -> CaseError:
         """Return an error that names file and key."""

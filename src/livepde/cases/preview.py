@@ -70,7 +70,8 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> tuple[list[Identif
             break
     if factor is None or not count:
         return [], 0
-    before = linear.prepare(identifier.problem).Phi
+    latent = prepared.case.model.latent
+    before = latent.tangent(latent.prior, linear.prepare(identifier.problem).Phi)
     return _compare(prepared, before, factor), count
 
 

@@ -2,27 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from livepde.cases.frame import Frame
+from livepde.cases.instruments import unknowns_of
 from livepde.cases.read import did_you_mean
-from livepde.cases.schema import UnknownSpec
+from livepde.cases.schema import EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
-from livepde.fem import Channel, Field, Piecewise, Scalar, dot, grad, interval, rectangle
+from livepde.errors import ModelError, SpaceError
+from livepde.fem import (
+    Channel,
+    Evolution,
+    Field,
+    MeanReverting,
+    Periodic,
+    Piecewise,
+    RandomWalk,
+    Scalar,
+    dot,
+    grad,
+    interval,
+    line,
+    linear,
+    read_mesh,
+    rectangle,
+)
 from livepde.model import Model
+from livepde.models import Option
 
-__all__ = ["mesh_of", "model_of", "options_of", "process_notes"]
+__all__ = ["mesh_of", "model_of", "options_of", "process_notes", "sides_of"]
 
 
 def mesh_of(frame: Frame) -> Any:
     """Return the mesh."""
     spec, unit = frame.spec.mesh, frame.equation.length_unit
+    if spec.file is not None:
+        scale = conversion(spec.unit or unit, unit, frame.where("mesh.unit")).factor
+        file = frame.path.parent / spec.file
+        return _built(frame, "mesh.file", lambda: read_mesh(file, scale))
+    if spec.nodes is not None:
+        nodes = [frame.convert(node, unit, "mesh.nodes") for node in spec.nodes]
+        return _built(frame, "mesh.nodes", lambda: line(nodes))
     if spec.x is not None and spec.y is not None and isinstance(spec.cells, tuple):
         x, y = frame.pair(spec.x, unit, "mesh.x"), frame.pair(spec.y, unit, "mesh.y")
         return rectangle(x, y, spec.cells)
+    cells: Any = spec.cells  # a number: the schema has seen to it
     start = frame.convert(spec.start, unit, "mesh.from")
     stop = frame.convert(spec.stop, unit, "mesh.to")
     if not start < stop:
@@ -30,35 +57,62 @@ def mesh_of(frame: Frame) -> Any:
     geometric = spec.spacing == "geometric"
     if geometric and not start > 0:
         raise frame.error("mesh.spacing", "'geometric' needs from > 0.")
-    cells = spec.cells if isinstance(spec.cells, int) else spec.cells[0]
     return interval(start, stop, cells, geometric=geometric)
 
 
-def options_of(frame: Frame) -> dict[str, float]:
-    """Return the known numbers of the equation."""
+def _built(frame: Frame, key: str, build: Callable[[], Any]) -> Any:
+    """Return what is built; what does not fit is said with its key."""
+    try:
+        return build()
+    except SpaceError as error:
+        raise frame.error(key, str(error)) from None
+
+
+def options_of(frame: Frame) -> dict[str, Any]:
+    """Return the options of the equation: numbers in its units, text and booleans."""
     known, given = frame.equation.options, frame.spec.options
     frame.only(given, known, "options")
-    values = {}
+    values: dict[str, Any] = {}
     for name, option in known.items():
         key = f"options.{name}"
         if name in given:
-            values[name] = frame.convert(given[name], option.unit, key)
+            values[name] = _option(frame, option, given[name], key)
         elif option.default is not None:
             values[name] = option.default
         else:
-            raise frame.missing(key, f"the {option.text}, in {option.unit}.")
+            unit = f", in {option.unit}" if option.unit else ""
+            choices = f": one of {', '.join(option.choices)}" if option.choices else ""
+            raise frame.missing(key, f"the {option.text}{unit}{choices}.")
     return values
 
 
-def model_of(frame: Frame, mesh: Any, options: Mapping[str, float]) -> Model:
+def _option(frame: Frame, option: Option, value: Any, key: str) -> Any:
+    if option.kind is float and not isinstance(value, bool):
+        return frame.convert(value, option.unit, key)
+    if not isinstance(value, option.kind):
+        kind = {float: "a number", str: "text", bool: "true or false"}[option.kind]
+        raise frame.error(key, f"got {value!r}; expected {kind}.")
+    if option.choices and value not in option.choices:
+        raise frame.error(key, f"got '{value}'; {did_you_mean(str(value), option.choices)}")
+    return value
+
+
+def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     """Return the model."""
     inputs = frame.roles("input")
     frame.only(inputs, frame.equation.inputs, "channels (role input)")
     for name, variable in frame.equation.inputs.items():
-        if name not in inputs:
+        if name not in inputs and not variable.optional:
             raise frame.missing(f"channels.{name}", f"the {variable.text}, with role = 'input'.")
     unknowns = _unknowns(frame, mesh)
-    return frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
+    model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
+    own = unknowns_of(frame)
+    if not own:
+        return model
+    try:
+        return model.with_unknowns(own)
+    except ModelError as error:
+        raise frame.error("channels", str(error)) from None
 
 
 def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
@@ -82,7 +136,7 @@ def _unknowns(frame: Frame, mesh: Any) -> dict[str, Any]:
     known, given = frame.equation.unknowns, frame.spec.unknowns
     frame.only(given, known, "unknowns")
     for name, variable in known.items():
-        if name not in given:
+        if name not in given and not variable.optional:
             text = f"the {variable.text}, with prior and std in {variable.unit or 'no unit'}."
             raise frame.missing(f"unknowns.{name}", text)
     return {name: _unknown(frame, mesh, name, spec) for name, spec in given.items()}
@@ -101,22 +155,41 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     prior = value(spec.prior, "prior")
     given = spec.std if isinstance(spec.std, str) else rule.factor * spec.std
     std = frame.positive(given, unit, f"{key}.std")
-    if spec.field:
-        return _field(frame, mesh, spec, prior, std, name)
     low, high = -np.inf, np.inf
     if spec.bounds is not None:
         low, high = (value(bound, "bounds") for bound in spec.bounds)
         if not low <= prior <= high or low == high:
             text = f"got {list(spec.bounds)}; expected low < high with the prior {spec.prior!r}"
             raise frame.error(f"{key}.bounds", f"{text} between them.")
+    prior_of: dict[str, Any] = {"prior": prior, "std": std, "bounds": (low, high), "unit": unit}
+    prior_of["transform"] = spec.transform
+    if spec.evolution is not None:
+        prior_of["evolution"] = _evolution(frame, spec, spec.evolution, unit, f"{key}.evolution")
+    if spec.field:
+        return _built(frame, key, lambda: _field(frame, mesh, spec, name, prior_of))
     if spec.regions is None:
-        return Scalar(prior, std, (low, high), unit)
+        return _built(frame, key, lambda: Scalar(**prior_of))
     regions = _regions(frame, mesh, spec.regions, f"{key}.regions")
-    return Piecewise(regions, prior, std, (low, high), unit)
+    return _built(frame, key, lambda: Piecewise(regions, **prior_of))
+
+
+def _evolution(
+    frame: Frame, unknown: UnknownSpec, spec: EvolutionSpec, unit: str, key: str
+) -> Evolution:
+    """Return how an unknown moves; a rate is its deviation after one unit of time."""
+    time = frame.equation.time_unit
+    if spec.rate is not None:
+        # A difference, of the logarithm if that is what moves; "degC" cannot be divided.
+        moving = "1" if unknown.transform or not unit else unit.replace("degC", "K")
+        per = f"({moving})/({time})**0.5" if time else moving.removeprefix("1")
+        return RandomWalk(frame.positive(spec.rate, per, f"{key}.rate"))
+    if spec.time is not None:
+        return MeanReverting(frame.positive(spec.time, time, f"{key}.time"))
+    return Periodic(frame.positive(spec.period, time, f"{key}.period"), spec.harmonics)
 
 
 def _field(
-    frame: Frame, mesh: Any, spec: UnknownSpec, prior: float, std: float, name: str
+    frame: Frame, mesh: Any, spec: UnknownSpec, name: str, given: Mapping[str, Any]
 ) -> Field:
     length = float(np.ptp(mesh.p[0])) / 3
     if spec.length is not None:
@@ -128,40 +201,68 @@ def _field(
     def inner(u: Any, v: Any, x: Any) -> Any:
         return 0.5 * (u * v / length + length * dot(grad(u), grad(v)))
 
-    unit = frame.equation.unknowns[name].unit
-    element = frame.equation.element(mesh)
-    return Field(mesh, element, inner=inner, prior=prior, std=std, unit=unit)
+    # A transform acts on values at nodes.
+    element = linear(mesh) if spec.transform else frame.equation.element(mesh)
+    return Field(mesh, element, inner=inner, **given)
 
 
 def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return predicates of layers; they have to tile the mesh."""
-    if len(mesh.p) != 1:
-        raise frame.error(key, "layers need a mesh of an interval.")
+    """Return subdomains of the mesh by name, and predicates of layers and boxes.
+
+    Every point has to lie in exactly one.
+    """
     unit = frame.equation.length_unit
-    middle = mesh.p[0][mesh.t].mean(axis=0)
-    count = np.zeros(len(middle))
-    found = {}
-    for name, pair in regions.items():
-        low, high = frame.pair(pair, unit, f"{key}.{name}")
+    middle = mesh.p[:, mesh.t].mean(axis=1)
+    count = np.zeros(middle.shape[1])
+    found: dict[str, Any] = {}
+    for name, given in regions.items():
+        if isinstance(given, str):
+            known = mesh.subdomains or {}
+            if given not in known:
+                text = f"the mesh has no subdomain '{given}'; {did_you_mean(given, known)}"
+                raise frame.error(f"{key}.{name}", text)
+            found[name] = given
+            count[known[given]] += 1
+            continue
+        sides = sides_of(frame, given, len(mesh.p), f"{key}.{name}")
 
-        def inside(x: Any, low: float = low, high: float = high) -> Any:
-            return (x[0] >= low) & (x[0] < high)
+        def inside(x: Any, sides: list[tuple[float, float]] = sides) -> Any:
+            return np.logical_and.reduce(
+                [(x[k] >= low) & (x[k] < high) for k, (low, high) in enumerate(sides)]
+            )
 
-        here = inside(middle[None])
+        here = inside(middle)
         if not here.any():
+            spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
+            ends = " x ".join(f"{a:g} to {b:g}" for a, b in zip(*_ends(mesh), strict=True))
             raise frame.error(
                 f"{key}.{name}",
-                f"[{low:g}, {high:g}] {unit} holds no cell of the mesh, which spans "
-                f"{mesh.p.min():g} to {mesh.p.max():g} {unit}.",
+                f"{spans} {unit} holds no cell of the mesh, which spans {ends} {unit}.",
             )
         count += here
         found[name] = inside
     wrong = np.flatnonzero(count != 1)
     if len(wrong):
-        x, times = middle[wrong[0]], int(count[wrong[0]])
-        text = f"{x:.4g} {unit} lies in {times} layers; every point has to lie in exactly one."
-        raise frame.error(key, text)
+        x, times = middle[:, wrong[0]], int(count[wrong[0]])
+        what = "layers" if len(x) == 1 else "regions"
+        text = f"{', '.join(f'{c:.4g}' for c in x)} {unit} lies in {times} {what}; "
+        raise frame.error(key, text + "every point has to lie in exactly one.")
     return found
+
+
+def _ends(mesh: Any) -> tuple[Any, Any]:
+    return mesh.p.min(axis=1), mesh.p.max(axis=1)
+
+
+def sides_of(frame: Frame, given: Any, dimension: int, key: str) -> list[tuple[float, float]]:
+    """Return (low, high) for each coordinate."""
+    if len(given) != 2 * dimension:
+        expected = {1: "[from, to]", 2: "[x0, x1, y0, y1]"}.get(
+            dimension, "the name of a subdomain"
+        )
+        raise frame.error(key, f"got {list(given)}; expected {expected}.")
+    unit = frame.equation.length_unit
+    return [frame.pair((given[k], given[k + 1]), unit, key) for k in range(0, len(given), 2)]
 
 
 def process_notes(frame: Frame, mesh: Any) -> list[str]:
@@ -169,8 +270,10 @@ def process_notes(frame: Frame, mesh: Any) -> list[str]:
     found = []
     nodes = mesh.p[0]
     for name, unknown in frame.spec.unknowns.items():
-        for layer, pair in (unknown.regions or {}).items():
-            edges = frame.pair(pair, frame.equation.length_unit, f"unknowns.{name}.regions")
+        for layer, given in (unknown.regions or {}).items():
+            if isinstance(given, str) or len(given) != 2:
+                continue
+            edges = frame.pair(given, frame.equation.length_unit, f"unknowns.{name}.regions")
             inner = [edge for edge in edges if nodes.min() < edge < nodes.max()]
             if any(np.abs(nodes - edge).min() > 1e-6 * np.ptp(nodes) for edge in inner):
                 found.append(

@@ -13,7 +13,9 @@ from pydantic import BaseModel, ValidationError
 from livepde.cases.schema import (
     CaseSpec,
     ChannelSpec,
+    CorrelatedSpec,
     DataSpec,
+    EvolutionSpec,
     GradientSpec,
     MeshSpec,
     OutputSpec,
@@ -21,10 +23,11 @@ from livepde.cases.schema import (
     SensitivitySpec,
     StepsSpec,
     UnknownSpec,
+    VariantSpec,
 )
 from livepde.errors import CaseError
 
-__all__ = ["did_you_mean", "read_spec", "read_text"]
+__all__ = ["did_you_mean", "read_spec", "read_text", "read_toml"]
 
 EXPECTED = {
     "int_type": "a whole number",
@@ -50,6 +53,9 @@ TABLES: dict[str, type[BaseModel]] = {
     "unknowns.*": UnknownSpec,
     "channels.*": ChannelSpec,
     "law.replay": ReplaySpec,
+    "variants.*": VariantSpec,
+    "*.evolution": EvolutionSpec,
+    "*.correlated": CorrelatedSpec,
 }
 
 
@@ -71,12 +77,16 @@ def _cases_in(folder: Path) -> list[str]:
     return [file.name for file in folder.glob("*.toml")] if folder.is_dir() else []
 
 
-def read_spec(text: str, where: str) -> CaseSpec:
-    """Return the checked content of a case file; raises `CaseError`."""
+def read_toml(text: str, where: str) -> dict[str, Any]:
+    """Return the document of a case file; raises `CaseError`."""
     try:
-        raw = tomllib.loads(text)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise CaseError(f"{where}: is not valid TOML: {error}.") from None
+
+
+def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
+    """Return the checked content of a case's document; raises `CaseError`."""
     try:
         return CaseSpec.model_validate(raw)
     except ValidationError as error:
@@ -147,7 +157,9 @@ def _keys(path: list[str], raw: Mapping[str, Any]) -> list[str]:
         kind = raw["law"].get("kind") if isinstance(raw.get("law"), dict) else ""
         model = GradientSpec if kind == "gradient" else SensitivitySpec
     elif path:
-        model = TABLES.get(".".join(path)) or TABLES.get(f"{path[0]}.*")
+        first = path[0].partition("[")[0]  # variants[0] is one of the variants
+        names = (".".join(path), f"*.{path[-1]}", f"{first}.*")
+        model = next((TABLES[name] for name in names if name in TABLES), None)
     if model is None:
         return []
     return [item.alias or name for name, item in model.model_fields.items()]

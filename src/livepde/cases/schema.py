@@ -13,6 +13,7 @@ from pydantic import (
     Field,
     PositiveFloat,
     PositiveInt,
+    StrictBool,
     model_validator,
 )
 
@@ -21,13 +22,16 @@ from livepde.runs.outcome import Bound, Sense
 __all__ = [
     "CaseSpec",
     "ChannelSpec",
+    "CorrelatedSpec",
     "DataSpec",
+    "EvolutionSpec",
     "GradientSpec",
     "MeshSpec",
     "SensitivitySpec",
     "StepsSpec",
     "TikhonovSpec",
     "UnknownSpec",
+    "VariantSpec",
 ]
 
 
@@ -54,8 +58,23 @@ def _bound(value: Any) -> Any:
     raise ValueError('expected [low, high], "<= number" or ">= number"')
 
 
+def _flat(value: Any) -> Any:
+    """{"k": {"error": x}} -> {"k.error": x}: TOML reads k.error = x as a table."""
+    if not isinstance(value, dict):
+        return value
+    found: dict[str, Any] = {}
+    for name, item in value.items():
+        inner = _flat(item)
+        if isinstance(inner, dict):
+            found |= {f"{name}.{key}": one for key, one in inner.items()}
+        else:
+            found[name] = item
+    return found
+
+
 Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
 Pair: TypeAlias = tuple[Quantity, Quantity]
+Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
 Instant: TypeAlias = date | datetime | float | str
 Name: TypeAlias = Annotated[str, Field(min_length=1)]
 Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
@@ -68,40 +87,82 @@ class Spec(BaseModel):
 
 
 class MeshSpec(Spec):
-    """An interval (from, to, cells) or a rectangle (x, y, cells)."""
+    """An interval (from, to, cells; or nodes), a rectangle (x, y, cells), or a file."""
 
     start: Quantity | None = Field(None, alias="from")
     stop: Quantity | None = Field(None, alias="to")
+    nodes: tuple[Quantity, ...] | None = Field(None, min_length=2)
     x: Pair | None = None
     y: Pair | None = None
-    cells: PositiveInt | tuple[PositiveInt, PositiveInt]
+    file: Name | None = None
+    unit: str | None = None
+    cells: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
     spacing: Literal["uniform", "geometric"] = "uniform"
 
     @model_validator(mode="after")
     def _one_kind(self) -> MeshSpec:
-        given = {"from": self.start, "to": self.stop, "x": self.x, "y": self.y}
-        names = {name for name, value in given.items() if value is not None}
-        line, plane = names == {"from", "to"}, names == {"x", "y"}
-        if not (line or plane):
-            raise ValueError("expected from and to (an interval), or x and y (a rectangle)")
-        if line and not isinstance(self.cells, int):
-            raise ValueError("cells: expected one number for an interval")
-        if plane and (isinstance(self.cells, int) or self.spacing != "uniform"):
-            raise ValueError("expected cells = [nx, ny] and uniform spacing for a rectangle")
+        given = self.model_fields_set - {"spacing", "unit"}
+        if given in ({"nodes"}, {"file"}):
+            if "spacing" in self.model_fields_set:
+                raise ValueError("spacing belongs to an interval with cells")
+        elif given == {"start", "stop", "cells"}:
+            if not isinstance(self.cells, int):
+                raise ValueError("cells: expected one number for an interval")
+        elif given == {"x", "y", "cells"}:
+            if isinstance(self.cells, int) or self.spacing != "uniform":
+                raise ValueError("expected cells = [nx, ny] and uniform spacing for a rectangle")
+        else:
+            raise ValueError(
+                "expected from and to (an interval) or x and y (a rectangle), with cells; or nodes "
+                "(an interval); or file"
+            )
+        if self.unit is not None and self.file is None:
+            raise ValueError("unit belongs to a file")
         return self
 
 
 class DataSpec(Spec):
-    """The data file and its time column."""
+    """The data file and its time column, or a function that reads them."""
 
     file: Name | None = None
-    time: Name
+    separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
+    reader: Name | None = None
+    options: dict[Identifier, Any] = Field(default_factory=dict)
+    time: Name = "time"
     time_unit: str | None = None
     start: Instant | None = None
     stop: Instant | None = None
     assimilate_from: Instant | None = None
     every: PositiveInt = 1
     missing: tuple[float, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> DataSpec:
+        if self.reader is None and "time" not in self.model_fields_set:
+            raise ValueError("time is missing: the name of the column of times")
+        if self.reader is None and self.options:
+            raise ValueError("options belong to a reader")
+        if self.reader is not None and self.file is not None:
+            raise ValueError("file and reader are two sources: keep one")
+        return self
+
+
+class EvolutionSpec(Spec):
+    """How an unknown moves by itself."""
+
+    kind: Literal["random-walk", "mean-reverting", "periodic"]
+    rate: Quantity | None = None
+    time: Quantity | None = None
+    period: Quantity | None = None
+    harmonics: PositiveInt = 1
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> EvolutionSpec:
+        needed = {"random-walk": "rate", "mean-reverting": "time", "periodic": "period"}[self.kind]
+        known = {"kind", needed, *(["harmonics"] if self.kind == "periodic" else [])}
+        if getattr(self, needed) is None or self.model_fields_set - known:
+            raise ValueError(f"'{self.kind}' takes {' and '.join(sorted(known - {'kind'}))}")
+        return self
 
 
 class UnknownSpec(Spec):
@@ -111,17 +172,26 @@ class UnknownSpec(Spec):
     std: Quantity
     bounds: Pair | None = None
     unit: str | None = None
-    regions: dict[Name, Pair] | None = None
+    regions: dict[Name, Pair | Box | Name] | None = None
     field: bool = False
     length: Quantity | None = None
+    transform: Literal["log", "logit"] | None = None
+    evolution: EvolutionSpec | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> UnknownSpec:
-        if self.field and (self.regions or self.bounds):
-            raise ValueError("a field takes no regions and no bounds")
+        if self.field and (self.regions or (self.bounds and not self.transform)):
+            raise ValueError("a field takes no regions, and bounds with a transform only")
         if self.length is not None and not self.field:
             raise ValueError("length belongs to a field: add field = true")
         return self
+
+
+class CorrelatedSpec(Spec):
+    """An error of a sensor that fades within `time`, with the deviation `std`."""
+
+    time: Quantity
+    std: Quantity
 
 
 class ChannelSpec(Spec):
@@ -131,22 +201,38 @@ class ChannelSpec(Spec):
     column: Name | None = None
     columns: tuple[Name, ...] | None = None
     at: Quantity | tuple[Quantity, ...] | None = None
-    over: Pair | None = None
+    over: Pair | Box | Name | None = None
+    each: tuple[Quantity, Quantity, PositiveInt] | None = None
     quantity: str | None = None
+    of: Name | None = None
     noise: Quantity | None = None
     unit: str | None = None
+    offset: Quantity | None = None
+    gain: PositiveFloat | None = None
+    correlated: CorrelatedSpec | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> ChannelSpec:
         if (self.column is None) == (not self.columns):
             raise ValueError("expected column = name, or columns = [names] that are averaged")
-        placed = (self.at is not None) + (self.over is not None) + (self.quantity is not None)
+        places = (self.at, self.over, self.quantity, self.each)
+        placed = sum(place is not None for place in places)
         if self.role == "input" and placed:
-            raise ValueError("an input has no place: leave out at, over and quantity")
+            raise ValueError("an input has no place: leave out at, over, each and quantity")
         if self.role == "boundary" and not isinstance(self.at, str):
             raise ValueError('a boundary channel needs at = the name of a boundary, as "left"')
         if self.role in ("sensor", "withheld") and placed != 1:
-            raise ValueError("expected one of: at = position, over = [from, to], quantity = name")
+            raise ValueError(
+                "expected one of: at = position, over = [from, to], each = [from, to, count], "
+                "quantity = name"
+            )
+        if self.each is not None and "{}" not in (self.column or ""):
+            raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
+        own = {"offset", "gain", "correlated"} & self.model_fields_set
+        if own and self.role != "sensor":
+            raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
+        if self.of is not None and self.role not in ("sensor", "withheld"):
+            raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
         if self.role in ("input", "boundary") and self.noise is not None:
             raise ValueError(f"noise belongs to sensors, not to a channel of role {self.role}")
         return self
@@ -174,6 +260,7 @@ class SensitivitySpec(Spec):
     drift: Quantity = 0.0
     memory: Quantity | None = None
     replay: bool | ReplaySpec = False
+    gate: PositiveFloat | None = None
 
 
 class TikhonovSpec(Spec):
@@ -215,6 +302,21 @@ class OutputSpec(Spec):
     fields_every: PositiveInt = 24
 
 
+Expected: TypeAlias = Annotated[
+    dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_bound)]], BeforeValidator(_flat)
+]
+
+
+class VariantSpec(Spec):
+    """The case with other values: what 'livepde bench cases' runs beside it."""
+
+    name: Name
+    set: dict[str, Any] = Field(default_factory=dict)
+    seeds: PositiveInt = 1
+    reference: dict[Name, Quantity] = Field(default_factory=dict)
+    expect: Expected = Field(default_factory=dict)
+
+
 Law: TypeAlias = Annotated[SensitivitySpec | GradientSpec, Field(discriminator="kind")]
 
 
@@ -223,9 +325,9 @@ class CaseSpec(Spec):
 
     title: str = ""
     equation: Name
-    initial: Quantity
+    initial: Quantity | dict[Name, Quantity] | None = None
     mesh: MeshSpec
-    options: dict[Identifier, Quantity] = Field(default_factory=dict)
+    options: dict[Identifier, StrictBool | Quantity] = Field(default_factory=dict)
     boundary: dict[Name, Quantity] = Field(default_factory=dict)
     data: DataSpec
     unknowns: dict[Identifier, UnknownSpec] = Field(min_length=1)
@@ -233,6 +335,14 @@ class CaseSpec(Spec):
     law: Law
     steps: StepsSpec = Field(default_factory=StepsSpec)
     output: OutputSpec = Field(default_factory=OutputSpec)
-    expect: dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_bound)]] = Field(
-        default_factory=dict
-    )
+    reference: dict[Name, Quantity] = Field(default_factory=dict)
+    expect: Expected = Field(default_factory=dict)
+    variants: tuple[VariantSpec, ...] = ()
+
+    @model_validator(mode="after")
+    def _names_once(self) -> CaseSpec:
+        names = [variant.name for variant in self.variants]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"variants: two have the name '{name}'")
+        return self

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.frame import Frame
+from livepde.cases.instruments import calibrated
+from livepde.cases.process import sides_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.identifier import Sample
 from livepde.observation import (
     Averages,
+    Combined,
     Discrepancy,
     Observation,
     Points,
@@ -37,34 +40,73 @@ def columns_of(frame: Frame) -> dict[str, Column]:
 
 
 def observation_of(
-    frame: Frame, mesh: Any, options: Mapping[str, float], role: str
+    frame: Frame, mesh: Any, options: Mapping[str, Any], role: str
 ) -> Observation | None:
     """Return what the channels of a role see; None if there are none."""
     channels = frame.roles(role)
     if not channels:
         return None
-    unit, noise = frame.equation.state.unit, noise_of(frame, role)
     how = _reconstruction(frame) if role == "sensor" else Pseudoinverse()
-    spans = {
-        name: frame.pair(item.over, frame.equation.length_unit, f"channels.{name}.over")
-        for name, item in channels.items()
-        if item.over is not None
+    kinds: dict[tuple[bool, str], dict[str, ChannelSpec]] = {}
+    for name, channel in channels.items():
+        kinds.setdefault((channel.over is not None, channel.of or ""), {})[name] = channel
+    names = [name for members in kinds.values() for name in members]
+    levels = noise_of(frame, role)
+    outer: dict[str, Any] = {
+        "noise": None if levels is None else [levels[name] for name in names],
+        "unit": frame.equation.state.unit,
+        "reconstruction": how,
     }
-    if spans and len(spans) < len(channels):
-        raise frame.error(
-            "channels",
-            "sensors of one role are all points (at) or all averages (over); averages are "
-            f"{', '.join(spans)}.",
-        )
-    if spans:
-        regions = {name: _inside(*span) for name, span in spans.items()}
-        return Averages(regions, noise=noise, unit=unit, reconstruction=how)
+    own = any(item.offset or item.gain or item.correlated for item in channels.values())
+    common = {} if own or len(kinds) > 1 else outer
+    parts = []
+    for (averages, of), members in kinds.items():
+        make = _averages if averages else _points
+        component = {"of": of} if of else {}
+        parts.append(make(frame, mesh, options, members, {**component, **common}))
+    if len(parts) > 1:
+        whole: Observation = Combined(parts, **({} if own else outer))
+    else:
+        (whole,) = parts
+    return calibrated(frame, whole, names, **outer) if own else whole
+
+
+def _averages(
+    frame: Frame,
+    mesh: Any,
+    options: Mapping[str, Any],
+    channels: Mapping[str, ChannelSpec],
+    common: Mapping[str, Any],
+) -> Observation:
+    """Return means over parts of the mesh."""
+    known = {**(mesh.boundaries or {}), **(mesh.subdomains or {})}
+    regions: dict[str, Any] = {}
+    for name, item in channels.items():
+        key = f"channels.{name}.over"
+        if isinstance(item.over, str):
+            if item.over not in known:
+                text = f"the mesh has no part '{item.over}'; {did_you_mean(item.over, known)}"
+                raise frame.error(key, text)
+            regions[name] = item.over
+        else:
+            regions[name] = _inside(sides_of(frame, item.over, len(mesh.p), key))
+    return Averages(regions, **common)
+
+
+def _points(
+    frame: Frame,
+    mesh: Any,
+    options: Mapping[str, Any],
+    channels: Mapping[str, ChannelSpec],
+    common: Mapping[str, Any],
+) -> Observation:
+    """Return values at points, with what a quantity sees beside them."""
     points, direct = {}, {}
     for name, channel in channels.items():
         points[name] = _position(frame, mesh, name, channel)
         if channel.quantity is not None:
             direct[name] = frame.equation.quantities[channel.quantity].direct(options)
-    return Points(points, direct, noise=noise, unit=unit, reconstruction=how)
+    return Points(points, direct, **common)
 
 
 def _reconstruction(frame: Frame) -> Reconstruction:
@@ -81,8 +123,10 @@ def _reconstruction(frame: Frame) -> Reconstruction:
     return Tikhonov(spec.norm, alpha)
 
 
-def _inside(low: float, high: float) -> Any:
-    return lambda x: (x[0] >= low) & (x[0] <= high)
+def _inside(sides: list[tuple[float, float]]) -> Any:
+    return lambda x: np.logical_and.reduce(
+        [(x[k] >= low) & (x[k] <= high) for k, (low, high) in enumerate(sides)]
+    )
 
 
 def _position(frame: Frame, mesh: Any, name: str, channel: ChannelSpec) -> Any:
@@ -112,14 +156,14 @@ def _position(frame: Frame, mesh: Any, name: str, channel: ChannelSpec) -> Any:
     return inside[0] if len(inside) == 1 else inside
 
 
-def noise_of(frame: Frame, role: str) -> list[float] | None:
+def noise_of(frame: Frame, role: str) -> dict[str, float] | None:
     """Return the noise of each sensor of a role; None if none is given."""
     channels, unit = frame.roles(role), frame.equation.state.unit
-    levels = [
-        frame.positive(channel.noise, unit, f"channels.{name}.noise")
+    levels = {
+        name: frame.positive(channel.noise, unit, f"channels.{name}.noise")
         for name, channel in channels.items()
         if channel.noise is not None
-    ]
+    }
     if levels and len(levels) < len(channels):
         missing = next(name for name, item in channels.items() if item.noise is None)
         text = "give every sensor its noise, or none and law.noise instead."
@@ -128,11 +172,16 @@ def noise_of(frame: Frame, role: str) -> list[float] | None:
 
 
 def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
-    """Return the initial state: a number, or the first sample interpolated.
+    """Return the initial state: a number (of each component), or the first sample interpolated.
 
     Withheld channels take no part.
     """
     initial = frame.spec.initial
+    if initial is None:
+        raise frame.missing("initial", "a number, or 'interpolate' from the first sample.")
+    if isinstance(initial, dict):
+        unit = frame.equation.state.unit
+        return {name: frame.convert(v, unit, f"initial.{name}") for name, v in initial.items()}
     if initial != "interpolate":
         if isinstance(initial, str) and not any(letter.isdigit() for letter in initial):
             text = f"got '{initial}'; {did_you_mean(initial, ['interpolate', 'a number'])}"

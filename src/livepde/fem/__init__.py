@@ -16,6 +16,7 @@ from livepde.fem.fields import (
     Scalars,
     Unknown,
     interval,
+    line,
 )
 from livepde.fem.forms import Form
 from livepde.fem.latent import Composed, Latent, LatentPart, compose
@@ -61,6 +62,7 @@ __all__ = [
     "hermite",
     "hess",
     "interval",
+    "line",
     "linear",
     "maximum",
     "minimum",

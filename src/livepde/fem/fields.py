@@ -27,6 +27,7 @@ __all__ = [
     "Scalars",
     "Unknown",
     "interval",
+    "line",
 ]
 
 Integrand: TypeAlias = Callable[..., Any]
@@ -90,6 +91,16 @@ def interval(
     return mesh.with_subdomains(dict(regions)) if regions else mesh
 
 
+def line(nodes: Sequence[float]) -> MeshLine:
+    """Return a mesh of an interval with the given nodes and boundaries "left" and "right"."""
+    x = np.asarray(nodes, dtype=float)
+    if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
+        raise SpaceError(f"line: needs at least two increasing nodes; got {x.tolist()}.")
+    return MeshLine(x).with_boundaries(
+        {"left": lambda p: np.isclose(p[0], x[0]), "right": lambda p: np.isclose(p[0], x[-1])}
+    )
+
+
 def is_nodal(element: Element) -> bool:
     """Return true if coefficients are values at nodes or in cells: elements of first order."""
     inner = element.facet_dofs + element.edge_dofs
@@ -145,9 +156,9 @@ class _Prior:
     def _check(self) -> None:
         what = type(self).__name__
         _check_prior(what, self.std, self.bounds, self.prior, self.transform)
-        if self.evolution.copies > 1 and self.transform is not None:
+        if self.evolution.copies > 1 and (self.transform or np.isfinite(self.bounds).any()):
             raise SpaceError(
-                f"{what}: a transform together with Periodic is not possible; choose one."
+                f"{what}: bounds or a transform together with Periodic are not possible; choose."
             )
 
 

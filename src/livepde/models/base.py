@@ -14,19 +14,31 @@ __all__ = ["Equation", "Option", "Quantity", "Variable"]
 
 @dataclass(frozen=True)
 class Variable:
-    """An unknown, the state, or an input: its unit and what it is."""
+    """An unknown, the state, or an input: its unit, what it is, and whether it may be left out."""
 
     unit: str
     text: str
+    optional: bool = False
 
 
 @dataclass(frozen=True)
 class Option:
-    """A known number of an equation; `default` None means that it must be given."""
+    """A known number of an equation; `default` None means that it must be given.
+
+    An option whose default is text or a boolean, or that has `choices`, takes such a value.
+    """
 
     unit: str
     text: str
-    default: float | None = None
+    default: float | str | bool | None = None
+    choices: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> type[float] | type[str] | type[bool]:
+        """What it takes."""
+        if isinstance(self.default, bool):
+            return bool
+        return str if self.choices or isinstance(self.default, str) else float
 
 
 @dataclass(frozen=True)
@@ -45,7 +57,7 @@ class Quantity:
 
     text: str
     at: Callable[[float, float], float]
-    direct: Callable[[Mapping[str, float]], Callable[[Any, Place], Any]]
+    direct: Callable[[Mapping[str, Any]], Callable[[Any, Place], Any]]
 
 
 @dataclass(frozen=True)

@@ -81,8 +81,21 @@ class RunWriter:
         command: Sequence[str],
         title: str,
         case: str | None = None,
+        settings: Sequence[str] = (),
+        original: str | None = None,
     ) -> RunWriter:
         """Make the directory with its record and a copy of the case.
+
+        Parameters
+        ----------
+        path, version, command, title
+            Where, and what the record says.
+        case
+            The case as it is run.
+        settings
+            What was set from outside, 'key=value'.
+        original
+            The case file as it stands, if that is another text.
 
         Raises
         ------
@@ -102,7 +115,9 @@ class RunWriter:
             }
             if case is not None:
                 (path / CASE).write_text(case, encoding="utf-8")
-                record["case_sha256"] = hashlib.sha256(case.encode()).hexdigest()
+                record["case_sha256"] = hashlib.sha256((original or case).encode()).hexdigest()
+            if settings:
+                record["settings"] = list(settings)
             writer = cls(path, record)
             writer._save_record()
         except RunError:
@@ -224,6 +239,11 @@ class Run:
                 if hashlib.sha256(text.encode()).hexdigest() == self.record.get("case_sha256"):
                     return original
         return copy
+
+    @property
+    def settings(self) -> list[str]:
+        """What was set from outside, 'key=value'."""
+        return [str(item) for item in self.record.get("settings", [])]
 
     @property
     def data_file(self) -> str | None:

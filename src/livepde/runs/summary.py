@@ -13,6 +13,7 @@ from livepde.runs.outcome import Bound, Check, Sense, Table
 
 __all__ = ["checks_of", "digits", "measures", "tables"]
 
+MOST_ROWS = 40
 CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
 
 
@@ -51,6 +52,21 @@ def _scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
     return found
 
 
+def _grouped(
+    scored: Mapping[str, tuple[str, np.ndarray[Any, Any]]],
+) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
+    """Return what is short enough for a table: of very many channels one row for each role."""
+    if len(scored) <= MOST_ROWS:
+        return dict(scored)
+    roles: dict[str, list[str]] = {}
+    for name, (role, _) in scored.items():
+        roles.setdefault(role, []).append(name)
+    return {
+        f"{names[0]} ... {names[-1]}": (role, np.concatenate([scored[name][1] for name in names]))
+        for role, names in roles.items()
+    }
+
+
 def _rmse(errors: np.ndarray[Any, Any]) -> float:
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
 
@@ -59,10 +75,17 @@ def _scalars(data: xr.Dataset) -> list[str]:
     return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
 
 
+def _error(data: xr.Dataset, label: str) -> float:
+    """Return the relative error of the last estimate to the reference, NaN without one."""
+    reference = float(data[label].attrs.get("reference", math.nan))
+    return abs(float(data[label][-1]) - reference) / abs(reference) if reference else math.nan
+
+
 def measures(data: xr.Dataset) -> dict[str, float]:
     """Return every number of a run that a case may expect something of, by name.
 
-    Each scalar unknown by its label, with `.std` behind it its deviation; `rmse` one-step, of all
+    Each scalar unknown by its label, with `.std` behind it its deviation and with `.error` the
+    relative error to a reference; `rmse` one-step, of all
     sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`, `rmse.CHANNEL`;
     `failed_steps`.
     """
@@ -71,6 +94,8 @@ def measures(data: xr.Dataset) -> dict[str, float]:
         for label in _scalars(data):
             found[label] = float(data[label][-1])
             found[f"{label}.std"] = float(data[f"{label}_std"][-1])
+            if "reference" in data[label].attrs:
+                found[f"{label}.error"] = _error(data, label)
     scored = _scored(data)
     parts = [errors for _, errors in scored.values()]
     found["rmse"] = _rmse(np.concatenate(parts)) if parts else math.nan
@@ -94,15 +119,27 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 
 
 def tables(data: xr.Dataset) -> list[Table]:
-    """Return the tables of a run: estimates, and errors of each channel."""
+    """Return the tables of a run: estimates with references, and errors of each channel."""
     result: list[Table] = []
     labels = _scalars(data) if data.sizes["time"] else []
     rows: list[tuple[Any, ...]] = []
     if labels:
+        compared = any("reference" in data[label].attrs for label in labels)
         for label in labels:
             value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
-            rows.append((label, *digits(value, std), data[label].attrs.get("units", "")))
-        result.append(Table("Estimates", ("unknown", "value", "± deviation", "unit"), rows))
+            cells = [*digits(value, std), data[label].attrs.get("units", "")]
+            if compared:
+                error, attrs = _error(data, label), data[label].attrs
+                cells.append(f"{attrs['reference']:.5g}" if "reference" in attrs else "–")
+                cells.append(f"{100 * error:.2g} %" if math.isfinite(error) else "–")
+            rows.append((label, *cells))
+        columns: tuple[str, ...] = ("unknown", "value", "± deviation", "unit")
+        title = "Estimates"
+        if compared:
+            columns += ("reference", "error")
+            source = str(data.attrs.get("reference_source", ""))
+            title += f"; reference: {source}" if source else ""
+        result.append(Table(title, columns, rows))
     fields = [name for name in str(data.attrs.get("fields", "")).split() if name in data]
     if fields:
         rows = []
@@ -125,7 +162,7 @@ def tables(data: xr.Dataset) -> list[Table]:
             len(errors),
             unit,
         )
-        for name, (role, errors) in _scored(data).items()
+        for name, (role, errors) in _grouped(_scored(data)).items()
     ]
     columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))

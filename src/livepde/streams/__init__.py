@@ -9,7 +9,15 @@ from livepde.streams.smoothing import (
     Smoother,
     WindowAverage,
 )
-from livepde.streams.table import Clock, Column, JsonLines, Table, read_csv, read_json_lines
+from livepde.streams.table import (
+    Clock,
+    Column,
+    JsonLines,
+    Table,
+    read_csv,
+    read_json_lines,
+    tabulated,
+)
 from livepde.streams.twin import AbsoluteNoise, Noise, RelativeNoise, Twin
 
 __all__ = [
@@ -28,4 +36,5 @@ __all__ = [
     "WindowAverage",
     "read_csv",
     "read_json_lines",
+    "tabulated",
 ]

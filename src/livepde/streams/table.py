@@ -18,7 +18,7 @@ from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.identifier import Sample
 from livepde.linalg import Array
 
-__all__ = ["Clock", "Column", "JsonLines", "Table", "read_csv", "read_json_lines"]
+__all__ = ["Clock", "Column", "JsonLines", "Table", "read_csv", "read_json_lines", "tabulated"]
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "#n/a"})
 Instant: TypeAlias = float | str | date | datetime
@@ -117,6 +117,7 @@ def read_csv(
     *,
     every: int = 1,
     missing: Iterable[float] = (),
+    separator: str = ",",
 ) -> Table:
     """Read channels from a CSV file with one header line.
 
@@ -128,6 +129,8 @@ def read_csv(
         Keep every so many rows.
     missing
         Numbers that mean a missing sample (-9999). Empty cells and NaN always do.
+    separator
+        What stands between two fields, as "," or ";".
 
     Raises
     ------
@@ -140,17 +143,17 @@ def read_csv(
     path = Path(path)
     needed = [clock.name, *(name for column in columns.values() for name in column.names)]
     try:
-        header = list(pd.read_csv(path, nrows=0, skipinitialspace=True).columns)
-        for name in needed:
-            if name not in header:
-                raise SampleError(f"{path}: there is no column '{name}'{_hint(name, header)}")
-        _check_widths(path, len(header))
+        header = list(pd.read_csv(path, nrows=0, skipinitialspace=True, sep=separator).columns)
+        _check_separator(path, header, separator)
+        _check_columns(str(path), needed, header)
+        _check_widths(path, len(header), separator)
         frame = pd.read_csv(
             path,
             usecols=sorted(set(needed)),
             dtype=str,
             keep_default_na=False,
             skipinitialspace=True,
+            sep=separator,
             skip_blank_lines=False,
         )
     except (OSError, pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
@@ -163,23 +166,103 @@ def read_csv(
     times, dates = _times(
         frame[clock.name].tolist(), clock, lambda k: f"{path}, row {rows[k]}, column"
     )
-    low, high = clock.bounds(dates, str(path))
+
+    def numbers(name: str, use: Any) -> Array:
+        return _numbers(frame[name].to_numpy()[use], rows[use], f"{path}", name)
+
+    def where(k: int) -> str:
+        return f"{path}, row {rows[k]}, column '{clock.name}'"
+
+    return _table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
+
+
+def tabulated(
+    times: Iterable[Any],
+    values: Mapping[str, Any],
+    columns: Mapping[str, Column],
+    clock: Clock,
+    *,
+    every: int = 1,
+    missing: Iterable[float] = (),
+    where: str = "data",
+) -> Table:
+    """Return channels of columns that are in memory already.
+
+    Parameters
+    ----------
+    times
+        Numbers, dates, or dates as text.
+    values
+        Column -> numbers, as many as there are times; NaN where missing.
+    columns, clock, every, missing
+        As for `read_csv`.
+    where
+        For messages: what the columns come from.
+
+    Raises
+    ------
+    DataError
+        No such column; another length; no finite number; times that do not increase.
+    """
+    moments = times.tolist() if hasattr(times, "tolist") else list(times)
+    if not moments:
+        raise SampleError(f"{where}: holds no samples.")
+    needed = [name for column in columns.values() for name in column.names]
+    _check_columns(where, needed, list(values))
+    found, dates = _times(moments, clock, lambda k: f"{where}, sample {k}, times")
+
+    def numbers(name: str, use: Any) -> Array:
+        try:
+            column: Array = np.asarray(values[name], dtype=float)
+        except (TypeError, ValueError):
+            raise SampleError(f"{where}: column '{name}' does not hold numbers only.") from None
+        if column.shape != (len(moments),):
+            raise SampleError(
+                f"{where}: column '{name}' has shape {column.shape}; there are {len(moments)} "
+                "times."
+            )
+        infinite = np.flatnonzero(np.isinf(column))
+        if len(infinite):
+            raise SampleError(
+                f"{where}: column '{name}' is infinite in sample {infinite[0]}; NaN is missing."
+            )
+        chosen: Array = column[use]
+        return chosen
+
+    def here(k: int) -> str:
+        return f"{where}, sample {k}"
+
+    return _table(found, dates, numbers, columns, clock, every, missing, (where, here))
+
+
+def _table(
+    times: Array,
+    dates: bool,
+    numbers: Callable[[str, Any], Array],
+    columns: Mapping[str, Column],
+    clock: Clock,
+    every: int,
+    missing: Iterable[float],
+    where: tuple[str, Callable[[int], str]],
+) -> Table:
+    """Return the channels between start and stop; `numbers` gives the chosen rows of a column."""
+    source, row = where
+    low, high = clock.bounds(dates, source)
     use = np.flatnonzero((times >= low) & (times <= high))
     if not len(use):
-        raise DataError(f"{path}: no row lies between start and stop; check both.")
+        raise DataError(f"{source}: no row lies between start and stop; check both.")
     use = use[::every]
     late = np.flatnonzero(np.diff(times[use]) <= 0)
     if len(late):
-        raise _disorder(f"{path}, row {rows[use[late[0] + 1]]}, column '{clock.name}'")
+        raise _disorder(row(int(use[late[0] + 1])))
     holes = tuple(float(number) for number in missing)
-    numbers = {
-        name: _numbers(frame[name].to_numpy()[use], rows[use], f"{path}", name, holes)
-        for name in dict.fromkeys(needed[1:])
-    }
+    names = dict.fromkeys(name for column in columns.values() for name in column.names)
+    found = {name: numbers(name, use) for name in names}
+    for name, column in found.items():
+        found[name] = np.where(np.isin(column, holes), np.nan, column)
     values = np.column_stack(
         [
-            column.factor * np.mean([numbers[name] for name in column.names], axis=0)
-            + column.offset
+            column.factor * np.mean([found[name] for name in column.names], axis=0) + column.offset
             for column in columns.values()
         ]
         or [np.zeros((len(use), 0))]
@@ -260,10 +343,28 @@ class JsonLines:
         return column.factor * sum(numbers) / len(numbers) + column.offset
 
 
-def _check_widths(path: Path, width: int) -> None:
+def _check_columns(where: str, needed: Iterable[str], known: list[str]) -> None:
+    for name in needed:
+        if name not in known:
+            raise SampleError(f"{where}: there is no column '{name}'{_hint(name, known)}")
+
+
+def _check_separator(path: Path, header: list[str], separator: str) -> None:
+    """Refuse a header that another separator would divide."""
+    if len(header) > 1:
+        return
+    for other in {",", ";", "\t"} - {separator}:
+        if header and other in header[0]:
+            raise SampleError(
+                f"{path}: the header is one field with {separator!r} between fields, and "
+                f"{header[0].count(other) + 1} with {other!r}: say separator = {other!r}."
+            )
+
+
+def _check_widths(path: Path, width: int, separator: str) -> None:
     """Refuse a row with more fields than the header: pandas would cut it without a word."""
     with path.open(newline="", encoding="utf-8") as file:
-        for number, row in enumerate(csv.reader(file), start=1):
+        for number, row in enumerate(csv.reader(file, delimiter=separator), start=1):
             if any(field.strip() for field in row[width:]):
                 raise SampleError(
                     f"{path}, row {number}: {len(row)} fields, but the header has {width}; "
@@ -311,7 +412,7 @@ def _number(value: Any, where: str) -> float:
     return number
 
 
-def _numbers(cells: Any, rows: Any, where: str, name: str, missing: tuple[float, ...]) -> Array:
+def _numbers(cells: Any, rows: Any, where: str, name: str) -> Array:
     """Return a column of text as numbers; its row is looked for only if one is wrong."""
     try:
         found: Array = np.array([c if c else "nan" for c in cells], dtype=float)
@@ -324,15 +425,13 @@ def _numbers(cells: Any, rows: Any, where: str, name: str, missing: tuple[float,
                 for cell, row in zip(cells, rows, strict=True)
             ]
         )
-    if missing:
-        found[np.isin(found, missing)] = np.nan
     return found
 
 
 def _times(cells: list[Any], clock: Clock, where: Callable[[int], str]) -> tuple[Array, bool]:
     """Return times in the model's unit, and whether they are dates; `where` names a cell."""
     first = cells[0]
-    dates = isinstance(first, str) and not _is_number(first)
+    dates = isinstance(first, date) or (isinstance(first, str) and not _is_number(first))
     times = np.empty(len(cells))
     for k, cell in enumerate(cells):
         value = _stamp(cell) if dates else _float(cell)

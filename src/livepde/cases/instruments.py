@@ -1,0 +1,103 @@
+"""What sensors add: families of them, and unknown offsets, gains and correlated errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from livepde.cases.frame import Frame
+from livepde.cases.schema import CaseSpec, ChannelSpec
+from livepde.fem import MeanReverting, Scalars, Unknown
+from livepde.observation import Calibrated, Observation
+
+__all__ = ["calibrated", "expanded", "unknowns_of"]
+
+
+def expanded(frame: Frame) -> Frame:
+    """Return the frame with every family of channels, `each`, as single ones."""
+    channels: dict[str, ChannelSpec] = {}
+    for name, channel in frame.spec.channels.items():
+        if channel.each is None:
+            channels[name] = channel
+            continue
+        start, stop, count = channel.each
+        unit, key = frame.equation.length_unit, f"channels.{name}.each"
+        ends = (frame.convert(start, unit, key), frame.convert(stop, unit, key))
+        for k, x in enumerate(np.linspace(*ends, count).tolist()):
+            member = {"each": None, "at": x, "column": str(channel.column).replace("{}", str(k))}
+            if f"{name}_{k}" in frame.spec.channels:
+                raise frame.error(key, f"there is a channel '{name}_{k}' already; rename it.")
+            channels[f"{name}_{k}"] = channel.model_copy(update=member)
+    spec: CaseSpec = frame.spec.model_copy(update={"channels": channels})
+    return Frame(frame.path, spec, frame.equation, frame.reader)
+
+
+def unknowns_of(frame: Frame) -> dict[str, Unknown]:
+    """Return the unknowns of the sensors: offset, gain, correlated, one number for each."""
+    unit = frame.equation.state.unit
+    found: dict[str, Unknown] = {}
+    offsets = {
+        name: frame.positive(item.offset, unit, f"channels.{name}.offset")
+        for name, item in frame.roles("sensor").items()
+        if item.offset is not None
+    }
+    if offsets:
+        std = _common(frame, offsets, "offset")
+        found["offset"] = Scalars(tuple(offsets), 0.0, std, unit=_difference(unit))
+    gains = {
+        name: item.gain for name, item in frame.roles("sensor").items() if item.gain is not None
+    }
+    if gains:
+        found["gain"] = Scalars(tuple(gains), 1.0, _common(frame, gains, "gain"))
+    errors = {}
+    for name, item in frame.roles("sensor").items():
+        if item.correlated is not None:
+            key = f"channels.{name}.correlated"
+            std = frame.positive(item.correlated.std, unit, f"{key}.std")
+            time = frame.positive(item.correlated.time, frame.equation.time_unit, f"{key}.time")
+            errors[name] = (std, time)
+    if errors:
+        std, time = _common(frame, errors, "correlated")
+        fades = MeanReverting(time)
+        found["correlated"] = Scalars(
+            tuple(errors), 0.0, std, unit=_difference(unit), evolution=fades
+        )
+    return found
+
+
+def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:
+    """Return what all sensors have in common: they share a prior."""
+    (first, value), *others = given.items()
+    for name, other in others:
+        if other != value:
+            text = f"differs from that of '{first}'; all sensors share one prior."
+            raise frame.error(f"channels.{name}.{key}", text)
+    return value
+
+
+def _difference(unit: str) -> str:
+    return "K" if unit == "degC" else unit
+
+
+def calibrated(
+    frame: Frame, base: Observation, names: Sequence[str], **options: Any
+) -> Observation:
+    """Return what the instruments show: gain * (what the base sees) + offset + correlated."""
+    channels = frame.spec.channels
+
+    def reading(y: Any, q: Any, x: Any) -> Any:
+        shown = []
+        for value, name in zip(y, names, strict=True):
+            channel = channels[name]
+            if channel.gain is not None:
+                value = q.gain[name] * value
+            if channel.offset is not None:
+                value = value + q.offset[name]
+            if channel.correlated is not None:
+                value = value + q.correlated[name]
+            shown.append(value)
+        return np.array(shown)
+
+    return Calibrated(base, reading, **options)
