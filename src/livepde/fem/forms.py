@@ -336,7 +336,8 @@ class Form(FormMatrices):
         """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P).
 
         Unit jets in arguments in which the form is linear; a complex step in one that is not; a
-        central difference of complex steps if both are not (only Jacobians of iterations use it).
+        central difference of complex steps if both are not (only Jacobians of iterations use it),
+        in the one in which the form is affine, where there is one: then it is exact.
         """
         place = term.measure.place(moment)
         if self.nonlinear not in (rows, cols):
@@ -344,6 +345,8 @@ class Form(FormMatrices):
         curved = [axis for axis, key in enumerate((rows, cols)) if key in self._curved]
         if given is not None:  # the user's derivative takes the place of one complex step
             curved = [axis for axis in curved if (rows, cols)[axis] != self.nonlinear]
+        if len(curved) == 2 and rows != cols == self.nonlinear and self.affine:
+            curved.reverse()
         stepped = curved[-1] if curved else None
         shifted = curved[0] if len(curved) == 2 else None
 
@@ -360,7 +363,7 @@ class Form(FormMatrices):
                     continue
                 value: Any = here[:, None, None]
                 if shifted in axes:
-                    value = value + shift * _scale(here) * local.units(0, 2)
+                    value = value + shift * _scale(here) * local.units(axes[0], 2)
                 if stepped in axes:
                     value = value + 1j * STEP * local.units(axes[-1], 2)
                 jets.append(local.jets(value))
@@ -372,12 +375,13 @@ class Form(FormMatrices):
 
         if shifted is None:
             return evaluate(0.0)
-        local = term.spaces[rows]
-        here = local.values(coefficients[rows]) if rows in coefficients else local.zeros()
+        key = (rows, cols)[shifted]
+        local = term.spaces[key]
+        here = local.values(coefficients[key]) if key in coefficients else local.zeros()
         near = evaluate(SHIFT) - evaluate(-SHIFT)
         far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
         difference = (8.0 * near - far) / (12.0 * SHIFT)
-        scaled: Array = difference / _scale(here)[:, 0]
+        scaled: Array = difference / np.swapaxes(_scale(here)[:, 0], 0, shifted)
         return scaled
 
     def _constant(self, rows: str, cols: str) -> Array:
