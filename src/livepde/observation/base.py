@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
-from livepde.fem import FunctionSpace, Moment, Place
+from livepde.fem import FunctionSpace, Moment, Place, Scalars
 from livepde.linalg import Array
 from livepde.observation.reconstruction import (
     Pseudoinverse,
@@ -366,11 +366,11 @@ def _is_selection(G: sp.csr_array) -> bool:
 def numbers(parameter: FunctionSpace, q: Array) -> Any:
     """Return the parameter as functions of sensors see it: numbers, arrays, mappings by name."""
     seen: dict[str, Any] = {}
-    for name, block in parameter.blocks.items():
+    for name in parameter.blocks:
         part = q[parameter.part(name)]
-        keys = getattr(getattr(block, "unknown", None), "names", None)  # Scalars
-        if keys is not None:
-            seen[name] = dict(zip(keys, part, strict=True))
+        unknown = parameter.unknowns[name]
+        if isinstance(unknown, Scalars):
+            seen[name] = dict(zip(unknown.names, part, strict=True))
         else:
             seen[name] = part[0] if len(part) == 1 else part
     if parameter.single:

@@ -231,7 +231,12 @@ class CalibratedObserved(Observed):
         return np.asarray(np.imag(self._read(y, q, moment)) / STEP)
 
     def available(self, moment: Moment) -> Array:
-        return self.base.available(moment)
+        seen = self.base.available(moment)
+        if seen.all():
+            return seen
+        # What is made of a missing reading is missing, too.
+        z = self._read(np.where(seen, 1.0, np.nan), self.parameter.prior, moment)
+        return np.asarray(np.logical_and(seen, np.logical_not(np.isnan(z))))
 
 
 def _nudged(values: Array, k: int) -> Any:

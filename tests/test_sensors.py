@@ -1,0 +1,398 @@
+"""Sensors of every kind: exact values for polynomials, derivatives, and what they identify."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from problems import observe
+from skfem import (
+    ElementLineHermite,
+    ElementLineP1,
+    ElementLineP2,
+    ElementQuad1,
+    ElementTetP1,
+    ElementTriP2,
+    MeshTri,
+)
+
+import livepde as lp
+from livepde.fem import Inputs, Moment, box
+from livepde.streams import AbsoluteNoise, Twin
+
+REGIONS = {"core": lambda x: x[0] < 0.5}
+PLANE = MeshTri.init_tensor(np.linspace(0, 1, 6), np.linspace(0, 1, 5)).with_boundaries(
+    {"right": lambda x: np.isclose(x[0], 1.0), "top": lambda x: np.isclose(x[1], 1.0)}
+)
+
+
+def rod(cells=10, element=None, **unknowns):
+    unknowns = unknowns or {"k": lp.Scalar(2.0, std=0.5)}
+    return lp.Model(
+        lp.Field(lp.interval(0.0, 1.0, cells, regions=REGIONS), element or ElementLineP2()),
+        unknowns,
+        A=lambda q, u, v, x: next(iter(vars(q).values())) * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
+def plate(element=None, mesh=PLANE):
+    return lp.Model(
+        lp.Field(mesh, element or ElementTriP2()),
+        {"k": lp.Scalar(2.0, std=0.5)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
+def at(t=0.0, **inputs):
+    return Moment(t, Inputs(inputs))
+
+
+def read(model, sensors, u, q=None, moment=None):
+    observed = observe(model, sensors)
+    q = model.initial_parameter(q)
+    return observed.predict(model.state_space.interpolate(u), q, moment or at())
+
+
+def test_averages_over_named_parts_and_boundaries():
+    sensors = lp.Averages({"core": "core", "end": "right", "where": lambda x: x[0] > 0.5})
+    z = read(rod(), sensors, lambda x: 3 * x[0] ** 2)
+    np.testing.assert_allclose(z, [0.25, 3.0, 1.75], rtol=1e-12)
+    z = read(plate(), lp.Averages({"r": "right", "t": "top"}), lambda x: x[0] ** 2 + 3 * x[1] ** 2)
+    np.testing.assert_allclose(z, [2.0, 1 / 3 + 3.0], rtol=1e-12)
+    with pytest.raises(lp.ObservationError, match=r"region 'a' is 'nowhere'; the mesh names"):
+        observe(rod(), lp.Averages({"a": "nowhere"}))
+
+
+@pytest.mark.parametrize("mean", [True, False])
+def test_line_integrals_are_exact(mean):
+    lines = {"a": (0.13, 0.77), "whole": (1.0, 0.0)}
+    z = read(rod(element=ElementLineHermite()), lp.LineIntegrals(lines, mean), lambda x: x[0] ** 3)
+    exact = np.array([(0.77**4 - 0.13**4) / 4, 0.25])
+    np.testing.assert_allclose(z, exact / [0.64, 1.0] if mean else exact, rtol=1e-11)
+
+    a, b = np.array([0.1, 0.05]), np.array([0.9, 0.8])
+    z = read(plate(), lp.LineIntegrals({"beam": (a, b)}, mean), lambda x: x[0] * x[1])
+    s = np.polynomial.Polynomial
+    average = (s([a[0], b[0] - a[0]]) * s([a[1], b[1] - a[1]])).integ()(1.0)
+    length = np.linalg.norm(b - a)
+    np.testing.assert_allclose(z, average if mean else average * length, rtol=1e-12)
+
+
+def test_line_integrals_follow_kinks_from_cell_to_cell():
+    """A function with random values at the nodes of P1 elements, against a fine sum."""
+    model = rod(7, ElementLineP1())
+    u = np.random.default_rng(0).standard_normal(8)
+    x = np.linspace(0.05, 0.93, 200_001)
+    exact = np.trapezoid(np.interp(x, model.state.mesh.p[0], u), x)
+    G = observe(model, lp.LineIntegrals({"a": (0.05, 0.93)})).G
+    assert (G @ u)[0] == pytest.approx(exact, abs=1e-8)
+    for owner, ends in (
+        (plate(), ([0.03, 0.9], [0.95, 0.2])),
+        (plate(ElementQuad1(), lp.rectangle((0, 1), (0, 1), (4, 3))), ([0.1, 0.1], [0.9, 0.8])),
+        (
+            plate(ElementTetP1(), box((0, 1), (0, 1), (0, 1), (2, 2, 2))),
+            ([0.1] * 3, [0.9, 0.4, 0.6]),
+        ),
+    ):
+        block, (a, b) = owner.state_block, np.array(ends)
+        u = np.random.default_rng(1).standard_normal(block.size)
+        s = (np.arange(4000) + 0.5) / 4000
+        fine = (block.probe(a[:, None] + (b - a)[:, None] * s) @ u).mean()
+        found = observe(owner, lp.LineIntegrals({"a": ends}, mean=True)).G @ u
+        assert found[0] == pytest.approx(fine, abs=1e-5)
+
+
+def test_bad_lines():
+    with pytest.raises(lp.ObservationError, match="line 'a' has no length"):
+        observe(rod(), lp.LineIntegrals({"a": (0.2, 0.2)}))
+    with pytest.raises(lp.ObservationError, match=r"line 'a': point .* lies outside of the mesh"):
+        observe(rod(), lp.LineIntegrals({"a": (0.2, 1.2)}))
+    with pytest.raises(lp.ObservationError, match="the mesh has 1 coordinates"):
+        observe(rod(), lp.LineIntegrals({"a": ([0.2, 0.1], [0.3, 0.1])}))
+
+
+def test_functionals_are_integrals_of_forms():
+    flux = lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))
+    sensors = lp.Functionals(
+        {
+            "flux": flux,
+            "energy": lambda q, u, x: q.k * u**2 / 2,
+            "heat": lp.On("core", lambda q, u, x: x.inputs["c"] * u + x.t),
+        },
+        inputs=("c",),
+    )
+    z = read(rod(), sensors, lambda x: x[0] ** 2, moment=at(3.0, c=6.0))
+    np.testing.assert_allclose(z, [-4.0, 0.2, 6.0 / 24 + 1.5], rtol=1e-12)
+    observed = observe(rod(), sensors)
+    assert (observed.names, observed.linear) == (("flux", "energy", "heat"), False)
+    H_u, H_q = observed.jacobian(np.ones(21), np.array([2.0]), at(3.0, c=6.0))
+    assert H_u.shape == (3, 21)
+    np.testing.assert_allclose(H_u.sum(axis=1), [0.0, 2.0, 3.0], atol=1e-11)
+    np.testing.assert_allclose(H_q, [[0.0], [0.5], [0.0]], atol=1e-12)
+    with pytest.raises(lp.ObservationError, match=r"no matrix G .* use SensitivityLaw"):
+        observed.split()
+    with pytest.raises(lp.ObservationError, match=r"sensor 'bad'.*failed at its first evaluation"):
+        observe(rod(), lp.Functionals({"bad": lambda q, u, x: q.nothing * u}))
+
+
+def test_functionals_of_fields_and_single_unknowns():
+    field = lp.Field(lp.interval(0.0, 1.0, 5), ElementLineP1(), prior=1.0)
+    model = lp.Model(lp.Field(field.mesh, ElementLineP2()), field, A=lambda q, u, v, x: q * u * v)
+    z = read(model, lp.Functionals({"z": lambda q, u, x: q**2 * u}), lambda x: x[0], lambda x: x[0])
+    np.testing.assert_allclose(z, [0.25], rtol=1e-12)
+
+
+def test_moving_sensors():
+    sensors = lp.Moving({"probe": "x", "other": "y"}, noise=0.1)
+    assert sensors.inputs == ("x", "y")
+    observed, u = observe(rod(), sensors), rod().state_space.interpolate(lambda x: x[0] ** 2)
+    for moment, expected in (
+        (at(x=0.3, y=0.55), [0.09, 0.3025]),
+        (at(x=0.3, y=1.01), [0.09, np.nan]),
+        (at(x=np.nan, y=1.0), [np.nan, 1.0]),
+        (at(y=0.5), [np.nan, 0.25]),
+        (at(), [np.nan, np.nan]),
+    ):
+        np.testing.assert_allclose(observed.predict(u, np.ones(1), moment), expected, atol=1e-14)
+        seen = observed.available(moment)
+        np.testing.assert_array_equal(seen, np.isfinite(expected))
+        H, direct = observed.jacobian(u, np.ones(1), moment)
+        np.testing.assert_allclose((H @ u)[seen], np.array(expected)[seen], atol=1e-14)
+        assert direct is None
+    scan = lp.Moving({"s": ("x", "y")})
+    z = read(plate(), scan, lambda x: x[0] * x[1], moment=at(x=0.31, y=0.72))
+    np.testing.assert_allclose(z, [0.31 * 0.72], rtol=1e-12)
+    with pytest.raises(lp.ObservationError, match=r"position channels .*'x'.*has 2 coordinates"):
+        observe(plate(), lp.Moving({"s": "x"}))
+
+
+def test_combined_sensors():
+    parts = [
+        lp.Points({"a": 0.3}, noise=0.1),
+        lp.Averages({"b": "core", "c": "right"}, noise=0.5),
+        lp.Moving({"d": "x"}, noise=0.2),
+    ]
+    observed = observe(rod(), lp.Combined(parts))
+    assert observed.names == ("a", "b", "c", "d")
+    assert observed.observation.inputs == ("x",)
+    np.testing.assert_array_equal(observed.noise, [0.1, 0.5, 0.5, 0.2])
+    np.testing.assert_array_equal(observed.available(at()), [True, True, True, False])
+    z = read(rod(), lp.Combined(parts), lambda x: x[0], moment=at(x=0.7))
+    np.testing.assert_allclose(z, [0.3, 0.25, 1.0, 0.7], rtol=1e-12)
+    assert not observed.linear
+    linear = observe(rod(), lp.Combined(parts[:2]))
+    assert linear.linear
+    lp.check_observation(linear).raise_if_failed()
+    np.testing.assert_array_equal(observe(rod(), lp.Combined([lp.Full()], noise=2.0)).noise, 2.0)
+    with pytest.raises(lp.ObservationError, match="names must differ"):
+        observe(rod(), lp.Combined([lp.Points({"a": 0.3}), lp.Points({"a": 0.4})]))
+    with pytest.raises(lp.ObservationError, match="not to both"):
+        lp.Combined(parts, noise=1.0)
+    with pytest.raises(lp.ObservationError, match="at least one"):
+        lp.Combined([])
+
+
+def gained(y, q, x):
+    return q.gain * y + q.R[0] * x.inputs["Q"] * y**2
+
+
+CALIBRATION = {"gain": lp.Scalar(1.2), "R": lp.Piecewise({"a": "core"}, prior=0.5)}
+
+
+def test_calibrated_sensors():
+    model = rod(**{**CALIBRATION, "R": lp.Piecewise({"a": "core", "b": "core"}, prior=0.5)})
+    sensors = lp.Calibrated(lp.Points([0.3, 0.6]), gained, inputs=("Q",), noise=0.1)
+    z = read(model, sensors, lambda x: x[0], moment=at(Q=2.0))
+    np.testing.assert_allclose(z, [0.36 + 0.09, 0.72 + 0.36], rtol=1e-12)
+    observed = observe(model, sensors)
+    H_u, H_q = observed.jacobian(
+        model.state_space.interpolate(1.0), model.initial_parameter(), at(Q=2.0)
+    )
+    np.testing.assert_allclose(H_u.sum(axis=1), [1.2 + 2.0] * 2, rtol=1e-12)
+    np.testing.assert_allclose(H_q, [[1.0, 2.0, 0.0]] * 2, rtol=1e-12)
+    moving = lp.Calibrated(lp.Moving({"m": "x", "n": "y"}), lambda y, q, x: q.gain * y.mean() + y)
+    seen = observe(model, moving)
+    assert not seen.available(at(x=0.5)).any()  # the mean of both needs both
+    moving = lp.Calibrated(lp.Moving({"m": "x", "n": "y"}), lambda y, q, x: q.gain * y)
+    seen = observe(model, moving)
+    np.testing.assert_array_equal(seen.available(at(x=0.5)), [True, False])
+    H_u, H_q = seen.jacobian(np.ones(21), model.initial_parameter(), at(x=0.5))
+    np.testing.assert_allclose(H_u.sum(axis=1), [1.2, 0.0], rtol=1e-12)
+    np.testing.assert_allclose(H_q, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], rtol=1e-12)
+    with pytest.raises(lp.ObservationError, match="give noise= to it and not to its base"):
+        lp.Calibrated(lp.Points([0.3], noise=1.0), gained)
+    with pytest.raises(lp.ObservationError, match=r"shape \(\) for 2 sensors"):
+        read(model, lp.Calibrated(lp.Points([0.3, 0.4]), lambda y, q, x: y.sum()), 0.0)
+
+
+def test_the_gradient_law_names_the_other_one():
+    model = rod()
+    for sensors in (
+        lp.Moving({"m": "x"}),
+        lp.Functionals({"f": lambda q, u, x: u}),
+        lp.Calibrated(lp.Points([0.3]), lambda y, q, x: q.k * y),
+        lp.Points({"a": 0.3}, {"a": lambda q, x: q.k}),
+        lp.Combined([lp.Points([0.3]), lp.Moving({"m": "x"})]),
+    ):
+        with pytest.raises(lp.LawError, match="use SensitivityLaw"):
+            lp.Identifier(model, sensors, lp.GradientLaw())
+
+
+inside = st.floats(0.01, 0.99)
+anything = st.floats(-3.0, 3.0)
+
+
+@st.composite
+def sensors_of_any_kind(draw):
+    """Every class of sensors, with random positions, weights, gains and powers."""
+    a, b, c = draw(inside), draw(inside), draw(anything)
+    power = draw(st.integers(1, 4))
+    base = [
+        lp.Points([a]),
+        lp.Points({"p": a}, {"p": lambda q, x: c * q.gain - x.inputs["x"] * q.R}, inputs=("x",)),
+        lp.Averages({"A": "core", "B": "left", "C": lambda x: x[0] > 0.4}),
+        lp.LineIntegrals({"l": (a, b + 1e-3 if a == b else b)}, mean=draw(st.booleans())),
+        lp.Functionals(
+            {
+                "f": lambda q, u, x: c * q.gain**2 * u**power * x[0] + q.R / q.gain * x.inputs["x"],
+                "g": lp.On("right", lambda q, u, x: -q.R * lp.dot(lp.grad(u), x.normal) * x.t),
+            },
+            inputs=("x",),
+        ),
+        lp.Moving({"m": "x", "n": "missing"}),
+        lp.Transformed(lp.Points({"t": a}), lambda y: np.exp(c * y / 2)),
+    ]
+    kind = draw(st.integers(0, len(base) + 1))
+    if kind < len(base):
+        return base[kind]
+    both = lp.Combined([base[k] for k in (1, 2, 3, 4, 5, 6)])
+    if kind == len(base):
+        return both
+    return lp.Calibrated(both, lambda y, q, x: q.gain * y + c * q.R * x.inputs["x"] * y[0] * y**2)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(sensors=sensors_of_any_kind(), position=inside, seed=st.integers(0, 2**31))
+def test_any_sensor_passes_the_checks(sensors, position, seed):
+    model = rod(6, **CALIBRATION)
+    inputs = {name: position for name in ("x",) if name in sensors.inputs}
+    inputs |= {name: 2.0 for name in ("missing",) if name in sensors.inputs}  # outside
+    lp.check_observation(sensors, model, seed=seed, inputs=inputs).raise_if_failed()
+
+
+def test_a_wrong_jacobian_is_found():
+    class Wrong(type(observe(rod(), lp.Points([0.3])))):
+        def jacobian(self, u, q, moment):
+            return 1.01 * self.G, np.ones((1, 1))
+
+    model = rod()
+    wrong = Wrong(lp.Points([0.3]), model.state_space, model.X, model.parameter_space)
+    failed = [line.name for line in lp.check_observation(wrong).lines if not line.ok]
+    assert failed == ["G'(u) by differences", "G'(q) by differences"]
+
+
+def heated(**more):
+    """A rod heated at its left end by a channel, cooled at its right end."""
+    return lp.Model(
+        lp.Field(lp.interval(0.0, 1.0, 20), ElementLineP1(), dirichlet={"right": 0.0}),
+        {"k": lp.Scalar(1.0, std=0.5, bounds=(0.05, 10.0)), **more},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+        f=[0.0, lp.On("left", lambda x, t: 1.0 + np.sin(3 * t))],
+    )
+
+
+def identified(model, sensors, truth, noise, inputs=None, steps=120, check=None):
+    """Return estimate and deviation of every number."""
+    twin = Twin(
+        model=model,
+        observation=sensors,
+        q_true=truth,
+        u0=0.0,
+        times=0.05 * np.arange(steps + 1),
+        noise=AbsoluteNoise(noise),
+        inputs=inputs,
+    )
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+    identifier = lp.Identifier(model, sensors, law)
+    result = identifier.run(twin)
+    assert result.last.status.ok
+    found = result.last.parameters
+    for name, value in truth.items():
+        estimate, std = found[name]
+        assert abs(estimate - value) < 4 * std + 1e-3, (name, estimate, std)
+        assert std < 0.1, (name, std)
+    return found
+
+
+def test_a_boundary_flux_and_one_point_find_the_conductivity():
+    flux = lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))
+    sensors = lp.Combined(
+        [lp.Functionals({"flux": flux}, noise=0.01), lp.Points({"T": 0.4}, noise=0.01)]
+    )
+    identified(heated(), sensors, {"k": 0.6}, 0.01)
+
+
+def test_a_moving_sensor_finds_the_conductivity():
+    def inputs(t):
+        return {"x": np.nan if t < 0.3 else 0.5 + 0.6 * np.sin(t)}  # out of the rod at times
+
+    identified(heated(), lp.Moving({"T": "x"}, noise=0.01), {"k": 0.6}, 0.01, inputs)
+
+
+def test_offsets_by_direct_and_gain_by_calibration():
+    model = heated(a=lp.Scalar(0.0, std=0.3), b=lp.Scalar(0.0, std=0.3))
+    direct = {"A": lambda q, x: q.a, "B": lambda q, x: q.b}
+    offsets = lp.Points({"A": 0.2, "B": 0.5, "C": 0.8}, direct, noise=0.005)
+    identified(model, offsets, {"k": 0.6, "a": 0.2, "b": -0.1}, 0.005)
+    gains = lp.Calibrated(
+        lp.Points({"A": 0.2, "B": 0.6}),
+        lambda y, q, x: y * np.array([q.gain, 1.0]),
+        noise=0.005,
+    )
+    identified(heated(gain=lp.Scalar(1.0, std=0.2)), gains, {"k": 0.6, "gain": 1.15}, 0.005)
+
+
+def test_positions_are_inputs_that_may_be_missing(tmp_path):
+    model, law = heated(), lp.SensitivityLaw()
+    sensors = lp.Combined(
+        [
+            lp.Moving({"T": "x"}, noise=0.01),
+            lp.Functionals({"Q": lambda q, u, x: x.inputs["c"] * u}, inputs=("c",), noise=0.01),
+        ]
+    )
+    assert sensors.inputs == ("x", "c")
+    assert sensors.optional == {"x"}
+    identifier = lp.Identifier(model, sensors, law)
+    assert identifier.channels == ("T", "Q", "x", "c")
+    with pytest.raises(lp.MissingInputError, match="No estimate before the first sample"):
+        identifier.estimate()
+    with pytest.raises(lp.MissingInputError, match=r"input 'c' has no value.*all of \['c'\]"):
+        identifier.step(0.0, {"T": 0.0})
+    identifier.step(0.0, {"T": 0.0, "c": 1.0})
+    estimate = identifier.step(0.1, {"T": 5.0, "Q": np.nan})
+    assert estimate.held == ("c",)
+    assert np.isnan(estimate.innovation).all()
+    assert estimate.q == pytest.approx(model.initial_parameter())
+    estimate = identifier.step(0.2, {"T": 0.1, "x": 0.3})
+    assert np.isfinite(estimate.innovation[0])
+    identifier.save(tmp_path / "state")
+    again = lp.Identifier(model, sensors, law)
+    again.load(tmp_path / "state")
+    for one in (identifier, again):
+        estimate = one.step(0.3, {"T": 0.1, "Q": 0.1, "x": 7.0})
+        assert np.isnan(estimate.innovation[0])
+    np.testing.assert_array_equal(identifier.estimate().q, again.estimate().q)
+    # The channels of withheld sensors are inputs, too.
+    hidden = lp.Identifier(
+        model, lp.Points({"P": 0.5}, noise=0.1), law, withheld=lp.Moving({"T": "x"})
+    )
+    assert hidden.inputs == ("x",)
+    hidden.step(0.0, {"P": 0.0, "T": 1.0})
+    assert np.isnan(hidden.step(0.1, {"P": 0.0, "T": 1.0}).withheld_error).all()
+    assert np.isfinite(hidden.step(0.2, {"P": 0.0, "T": 1.0, "x": 0.2}).withheld_error).all()
+
+
+def test_the_component_must_exist():
+    with pytest.raises(lp.ObservationError, match=r"no component 'c'.*one of \['u'\]"):
+        observe(rod(), lp.Points([0.3], of="c"))
