@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
 from livepde.models.base import Equation, Option, Quantity, Variable
-from livepde.models.diffusion import HEAT, heat
+from livepde.models.diffusion import CONDUCTION, HEAT, conduction, heat
 from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
 from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
 from livepde.models.radial import BOREHOLE, borehole, fluid
@@ -16,7 +17,9 @@ __all__ = [
     "Option",
     "Quantity",
     "Variable",
+    "advection_diffusion",
     "borehole",
+    "conduction",
     "fisher_kpp",
     "fluid",
     "groundwater",
@@ -31,6 +34,8 @@ EQUATIONS: dict[str, Equation] = {
     equation.name: equation
     for equation in (
         HEAT,
+        CONDUCTION,
+        ADVECTION_DIFFUSION,
         BOREHOLE,
         REACTION_DIFFUSION,
         FISHER_KPP,

@@ -1,15 +1,18 @@
-"""Heat conduction, or any diffusion: u_t = div(alpha grad u)."""
+"""Heat conduction, or any diffusion, with side loss, heat transfer at boundaries and sources."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from livepde.fem import Field, Unknown, dot, grad, linear
+from livepde.errors import ModelError
+from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Variable
+from livepde.models.base import Equation, Option, Variable
 
-__all__ = ["HEAT", "heat"]
+__all__ = ["CONDUCTION", "HEAT", "conduction", "heat"]
+
+AMBIENT = "ambient"
 
 
 def heat(
@@ -17,48 +20,195 @@ def heat(
     alpha: Unknown,
     dirichlet: Mapping[str, Any] | None = None,
     *,
+    loss: Unknown | None = None,
+    transfer: Unknown | None = None,
+    source: Unknown | None = None,
     element: Any = None,
     unit: str = "degC",
 ) -> Model:
-    """Return u_t - div(alpha grad u) = 0 in any dimension, with unknown diffusivity alpha.
+    """Return u_t - div(alpha grad u) + loss (u - ambient) = source in any dimension.
+
+    At boundaries without a value -alpha u_n = transfer (u - ambient): Robin (Newton's law of
+    cooling). What is left out is zero: without `transfer` these boundaries are insulated.
 
     Parameters
     ----------
     mesh
         Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
     alpha
-        Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`.
+        Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`. The flux alpha u_n
+        is continuous between layers: their heat capacities are equal (else: `conduction`).
     dirichlet
-        Boundary -> number, function g(x, t), or `Channel`. Boundaries without one are insulated.
+        Boundary -> number, function g(x, t), or `Channel`.
+    loss
+        Rate of exchange with the surroundings all along, in 1/s: a rod without insulation.
+    transfer
+        Heat-transfer coefficient over volumetric heat capacity, in m/s.
+    source
+        Heat gained, in K/s. With `evolution=MeanReverting(...)` it stands for whatever the equation
+        leaves out: rain, evaporation, flow from the side.
     element
         Element of the state; default of first order.
     unit
         Unit of u.
+
+    With `loss` or `transfer` the temperature of the surroundings is the input channel "ambient".
+
+    Raises
+    ------
+    ModelError
+        `transfer` without a boundary that is free for it.
 
     >>> import livepde as lp
     >>> model = heat(lp.interval(0, 1, 10), lp.Scalar(5e-7, 2e-7), {"left": lp.Channel("T0")})
     >>> model.channels
     ('T0',)
     """
-    state = Field(mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit=unit)
+    unknowns = {"alpha": alpha, "loss": loss, "transfer": transfer, "source": source}
+    return _model("heat", mesh, "alpha", unknowns, dirichlet, lambda x: 1.0, element, unit)
+
+
+def conduction(
+    mesh: Any,
+    k: Unknown,
+    dirichlet: Mapping[str, Any] | None = None,
+    *,
+    C: float | Callable[[Place], Any],
+    loss: Unknown | None = None,
+    transfer: Unknown | None = None,
+    source: Unknown | None = None,
+    element: Any = None,
+    unit: str = "degC",
+) -> Model:
+    """Return C u_t - div(k grad u) + loss (u - ambient) = source with known heat capacity C.
+
+    At boundaries without a value -k u_n = transfer (u - ambient).
+
+    Parameters
+    ----------
+    mesh, dirichlet, element, unit
+        As for `heat`.
+    k
+        Conductivity in W/(m K).
+    C
+        Volumetric heat capacity in J/(m^3 K): a number, or a function of x.
+    loss, transfer, source
+        In W/(m^3 K), W/(m^2 K) and W/m^3.
+
+    Raises
+    ------
+    ModelError
+        C is not positive, or `transfer` without a boundary that is free for it.
+
+    >>> import livepde as lp
+    >>> layers = lp.interval(0.0, 0.5, 50)
+    >>> dry, wet = 1.3e6, 2.9e6
+    >>> model = conduction(
+    ...     layers,
+    ...     lp.Scalar(1.0, 0.5),
+    ...     {"boundary": 10.0},
+    ...     C=lambda x: dry + (wet - dry) * (x[0] > 0.2),
+    ... )
+    """
+    if not callable(C) and not C > 0:
+        raise ModelError(f"conduction: the heat capacity C must be positive; got {C}.")
+    capacity = C if callable(C) else lambda x: C
+    unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
+    return _model("conduction", mesh, "k", unknowns, dirichlet, capacity, element, unit)
+
+
+def _model(
+    name: str,
+    mesh: Any,
+    conductivity: str,
+    unknowns: Mapping[str, Unknown | None],
+    dirichlet: Mapping[str, Any] | None,
+    capacity: Callable[[Place], Any],
+    element: Any,
+    unit: str,
+) -> Model:
+    held = dict(dirichlet or {})
+    given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
+    terms: list[Any] = [
+        lambda q, u, v, x: getattr(q, conductivity) * dot(grad(u), grad(v)),
+    ]
+    if "loss" in given:
+        terms.append(lambda q, u, v, x: q.loss * (u - x.inputs[AMBIENT]) * v)
+    if "transfer" in given:
+        free = _free(name, mesh, held)
+        terms += [
+            On(side, lambda q, u, v, x: q.transfer * (u - x.inputs[AMBIENT]) * v) for side in free
+        ]
+    if "source" in given:
+        terms.append(lambda q, u, v, x: -q.source * v)
     return Model(
-        state,
-        {"alpha": alpha},
-        A=lambda q, u, v, x: q.alpha * dot(grad(u), grad(v)),
+        Field(mesh, element or linear(mesh), dirichlet=held, unit=unit),
+        given,
+        A=terms,
+        M=lambda u, v, x: capacity(x) * u * v,
+        inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
         time_unit="s",
     )
 
 
-def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
-    return heat(mesh, unknowns["alpha"], dirichlet)
+def _free(name: str, mesh: Any, held: Mapping[str, Any]) -> list[str]:
+    """Return the named boundaries without a value."""
+    free = (
+        [] if "boundary" in held else [side for side in mesh.boundaries or {} if side not in held]
+    )
+    if not free:
+        raise ModelError(
+            f"{name}: transfer acts at named boundaries without a value, and there is none: leave "
+            "it out, or leave one out of dirichlet."
+        )
+    return free
 
+
+def _build_heat(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
+    given: dict[str, Any] = dict(unknowns)
+    return heat(mesh, dirichlet=dirichlet, **given)
+
+
+def _build_conduction(
+    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, C: float
+) -> Model:
+    given: dict[str, Any] = dict(unknowns)
+    return conduction(mesh, dirichlet=dirichlet, C=C, **given)
+
+
+SURROUNDINGS = {
+    AMBIENT: Variable("degC", "temperature of the surroundings, for loss and transfer", True)
+}
 
 HEAT = Equation(
     name="heat",
-    summary="heat conduction without sources; unknown diffusivity",
-    formula="u_t = div(alpha grad u)",
+    summary="heat conduction by diffusivity, with side loss, heat transfer and sources",
+    formula="u_t = div(alpha grad u) - loss (u - ambient) + source",
     state=Variable("degC", "temperature"),
-    unknowns={"alpha": Variable("m^2/s", "diffusivity: a number, by layer, or a field")},
-    build=_build,
+    unknowns={
+        "alpha": Variable("m^2/s", "diffusivity: a number, by layer, or a field"),
+        "loss": Variable("1/s", "rate of exchange with the surroundings", True),
+        "transfer": Variable("m/s", "heat transfer over heat capacity, free boundaries", True),
+        "source": Variable("K/s", "heat gained over heat capacity", True),
+    },
+    inputs=SURROUNDINGS,
+    build=_build_heat,
+    element=linear,
+)
+
+CONDUCTION = Equation(
+    name="conduction",
+    summary="heat conduction by conductivity and known heat capacity",
+    formula="C u_t = div(k grad u) - loss (u - ambient) + source",
+    state=Variable("degC", "temperature"),
+    unknowns={
+        "k": Variable("W/(m K)", "conductivity: a number, by layer, or a field"),
+        "loss": Variable("W/(m^3 K)", "exchange with the surroundings", True),
+        "transfer": Variable("W/(m^2 K)", "heat transfer at free boundaries", True),
+        "source": Variable("W/m^3", "heat gained", True),
+    },
+    inputs=SURROUNDINGS,
+    options={"C": Option("J/(m^3 K)", "volumetric heat capacity")},
+    build=_build_conduction,
     element=linear,
 )

@@ -1,0 +1,116 @@
+"""Advection and diffusion along a column: against formulas, and the checks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import livepde as lp
+from livepde.diagnostics import check_model
+from livepde.errors import ModelError
+from livepde.models import advection_diffusion
+from livepde.stepping import Advance, Alexander2, simulate
+
+
+def number(value: float) -> lp.Scalar:
+    return lp.Scalar(value, max(abs(value), 1.0))
+
+
+def run(model, u0, times, inputs=None):
+    """Return the state at the vertices at the last time."""
+    steps = simulate(model, model.initial_parameter(), u0, times, Advance(Alexander2()), inputs)
+    *_, (_, u) = steps
+    return model.state_block.at_vertices @ u
+
+
+def steady(x, w, kappa):
+    return np.expm1(w * x / kappa) / np.expm1(w / kappa)
+
+
+@pytest.mark.parametrize("w", [-3.0, 0.5, 2.0])
+def test_steady_profile(w):
+    errors = []
+    for cells in (20, 40):
+        mesh = lp.interval(0.0, 1.0, cells)
+        model = advection_diffusion(mesh, number(0.5), {"left": 0.0, "right": 1.0}, v=number(w))
+        found = run(model, 0.0, np.linspace(0, 20, 41))
+        errors.append(np.abs(found - steady(mesh.p[0], w, 0.5)).max())
+    assert errors[0] < 0.02
+    assert errors[1] < 0.27 * errors[0]  # second order
+
+
+def test_stabilised_it_is_exact_at_the_vertices_however_fast():
+    mesh = lp.interval(0.0, 1.0, 10)
+    sides = {"left": 0.0, "right": 1.0}
+    model = advection_diffusion(mesh, number(0.01), sides, v=number(1.0), stabilise=True)
+    found = run(model, 0.0, np.linspace(0, 20, 41))
+    assert found == pytest.approx(steady(mesh.p[0], 1.0, 0.01), abs=1e-9)
+
+
+def test_a_warm_spot_drifts_with_the_water_and_spreads():
+    """A Gaussian; the water follows the head, w = ratio K dH(t)/L, here back and forth."""
+    kappa, K, L, ratio, start = 0.02, 3.0, 2.0, 1.5, 0.05
+    mesh = lp.interval(-4.0, 4.0, 400)
+    model = advection_diffusion(
+        mesh, number(kappa), {"boundary": 0.0}, K=number(K), L=L, ratio=ratio
+    )
+    end = 2.0
+    found = run(
+        model,
+        lambda x: np.exp(-(x[0] ** 2) / (4 * start)),
+        np.linspace(0, end, 201),
+        lambda t: {"dH": np.cos(t)},
+    )
+    moved, wide = ratio * K / L * np.sin(end), start + kappa * end
+    exact = np.sqrt(start / wide) * np.exp(-((mesh.p[0] - moved) ** 2) / (4 * wide))
+    assert np.abs(found - exact).max() < 2e-3
+
+
+def test_dispersion_grows_with_the_speed_of_either_sign():
+    mesh = lp.interval(0.0, 1.0, 40)
+    sides = {"left": 0.0, "right": 1.0}
+    for w in (-2.0, 2.0):
+        model = advection_diffusion(mesh, number(0.3), sides, v=number(w), dispersivity=number(0.1))
+        plain = advection_diffusion(mesh, number(0.5), sides, v=number(w))
+        times = np.linspace(0, 5, 11)
+        assert np.allclose(run(model, 0.0, times), run(plain, 0.0, times))
+
+
+def test_flux_and_head_add_up():
+    mesh = lp.interval(0.0, 1.0, 20)
+    sides, times = {"left": 1.0, "right": 0.0}, np.linspace(0, 0.5, 11)
+    both = advection_diffusion(mesh, number(0.1), sides, v=number(0.5), K=number(2.0), L=4.0)
+    one = advection_diffusion(mesh, number(0.1), sides, v=number(0.75))
+    found = run(both, 0.0, times, lambda t: {"dH": 0.5})
+    assert np.allclose(found, run(one, 0.0, times))
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(1e-7, 1e-5), st.floats(-1e-4, 1e-4), st.floats(1e-4, 1e-1), st.integers(0, 99))
+def test_random_columns_pass_the_checks(kappa, flux, dispersivity, seed):
+    mesh = lp.interval(0.0, 0.5, 10)
+    halves = {"gravel": lambda x: x[0] < 0.2, "clay": lambda x: x[0] >= 0.2}
+    model = advection_diffusion(
+        mesh,
+        lp.Piecewise(halves, kappa, kappa / 2, transform="log"),
+        {"left": lp.Channel("T"), "right": 12.0},
+        v=lp.Scalar(flux, 1e-5),
+        K=lp.Scalar(1e-5, 1e-5),
+        dispersivity=lp.Scalar(dispersivity, dispersivity, transform="log"),
+        source=lp.Scalar(0.0, 1e-5, evolution=lp.MeanReverting(3600.0)),
+        stabilise=bool(seed % 2),
+        L=0.5,
+        ratio=1.5,
+    )
+    inputs = {"T": 14.0, "dH": 0.03}
+    check_model(model, u=13.0, inputs=inputs, seed=seed).raise_if_failed()
+
+
+def test_what_cannot_be_is_said():
+    mesh = lp.interval(0.0, 1.0, 4)
+    with pytest.raises(ModelError, match="give v"):
+        advection_diffusion(mesh, number(1.0))
+    with pytest.raises(ModelError, match="L must be positive"):
+        advection_diffusion(mesh, number(1.0), v=number(1.0), L=0.0)
