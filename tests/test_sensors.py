@@ -394,5 +394,20 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
 
 
 def test_the_component_must_exist():
-    with pytest.raises(lp.ObservationError, match=r"no component 'c'.*one of \['u'\]"):
+    with pytest.raises(lp.SpaceError, match=r"of='c': the components of the state are \['u'\]"):
         observe(rod(), lp.Points([0.3], of="c"))
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: lp.Combined([lp.Points([0.5])], of="u"),
+        lambda: lp.Calibrated(lp.Points([0.5]), lambda y, q, x: y, of="u"),
+        lambda: lp.Transformed(lp.Points([0.5]), lambda y: y, of="u"),
+        lambda: lp.Functionals({"f": lambda q, u, x: u}, of="u"),
+        lambda: lp.Matrix(np.eye(3), of="u"),
+    ],
+)
+def test_a_component_that_says_nothing_is_refused(build):
+    with pytest.raises(lp.ObservationError, match="of='u' says nothing"):
+        build()

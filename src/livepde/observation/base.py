@@ -67,6 +67,11 @@ class Observation:
             "projections R and P: use SensitivityLaw."
         )
 
+    def _sees_all(self, remedy: str) -> None:
+        """Refuse `of` where it would say nothing."""
+        if self.of:
+            raise ObservationError(f"{type(self).__name__}: of='{self.of}' says nothing; {remedy}")
+
     def names(self, count: int) -> tuple[str, ...]:
         """Return a name for each sensor."""
         return tuple(f"z{k}" for k in range(count))

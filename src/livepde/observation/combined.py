@@ -41,6 +41,7 @@ class Combined(Observation):
     parts: Sequence[Observation]
 
     def __post_init__(self) -> None:
+        self._sees_all("give of= to the observations it is made of.")
         if not self.parts:
             raise ObservationError("Combined: give at least one observation.")
         if self.noise is not None and any(part.noise is not None for part in self.parts):
@@ -155,6 +156,7 @@ class Calibrated(Observation):
     function: Calibration
 
     def __post_init__(self) -> None:
+        self._sees_all("give of= to the observations it is made of.")
         if self.base.noise is not None:
             raise ObservationError(
                 "Calibrated: give noise= to it and not to its base: it is that of the readings."

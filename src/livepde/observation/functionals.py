@@ -45,6 +45,7 @@ class Functionals(Observation):
     order: int | None = None
 
     def __post_init__(self) -> None:
+        self._sees_all("an integrand names its component, as u.c.")
         if not self.integrands:
             raise ObservationError("Functionals: give at least one integrand.")
 

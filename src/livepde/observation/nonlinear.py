@@ -74,6 +74,7 @@ class Transformed(Observation):
     reach: float = np.inf
 
     def __post_init__(self) -> None:
+        self._sees_all("give of= to the observations it is made of.")
         if self.base.noise is not None:
             raise ObservationError(
                 "Transformed: give noise= to it and not to its base: it is that of the readings."

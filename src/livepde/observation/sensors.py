@@ -214,6 +214,9 @@ class Matrix(Observation):
     G: Any
     labels: Sequence[str] | None = None
 
+    def __post_init__(self) -> None:
+        self._sees_all("G stands on all components.")
+
     def names(self, count: int) -> tuple[str, ...]:
         if self.labels is None:
             return super().names(count)
