@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
 from livepde.models.base import Equation, Option, Quantity, Variable
+from livepde.models.borehole import GROUTED_BOREHOLE, grouted_borehole
 from livepde.models.diffusion import CONDUCTION, HEAT, conduction, heat
 from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
 from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
@@ -23,6 +24,7 @@ __all__ = [
     "fisher_kpp",
     "fluid",
     "groundwater",
+    "grouted_borehole",
     "heat",
     "porous_fisher",
     "pumping_test",
@@ -37,6 +39,7 @@ EQUATIONS: dict[str, Equation] = {
         CONDUCTION,
         ADVECTION_DIFFUSION,
         BOREHOLE,
+        GROUTED_BOREHOLE,
         REACTION_DIFFUSION,
         FISHER_KPP,
         POROUS_FISHER,

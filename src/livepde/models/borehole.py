@@ -1,0 +1,178 @@
+"""The thermal response test with the borehole's inside: fluid, pipes, grout, casing, ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import log, pi
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import ModelError
+from livepde.fem import Field, On, Place, Scalar, Unknown, dot, grad, linear
+from livepde.model import Model
+from livepde.models.base import Equation, Option, Variable
+
+__all__ = ["GROUTED_BOREHOLE", "grouted_borehole"]
+
+
+def grouted_borehole(
+    mesh: Any,
+    k: Unknown,
+    rho_c: Unknown,
+    R_b: Unknown,
+    share: Unknown,
+    *,
+    H: float,
+    r_p: float,
+    r_b: float,
+    C_f: float,
+    C_p: float,
+    C_g: float,
+    T0: float,
+    C_c: float = 0.0,
+) -> Model:
+    """Return radial conduction from the fluid of a heated borehole into the ground.
+
+    The pipes are one pipe of as large a cross-section, sqrt(2) times the radius for a U-tube,
+
+        fluid    C_f T_t = Q/H - (T - T(r_p))/R_p                       R_p = share R_b
+        grout    C_g r T_t = (k_g r T_r)_r,       r_p < r < r_b         ln(r_b/r_p)/(2 pi k_g) =
+        ground   rho_c r T_t = (k r T_r)_r,       r_b < r                        (1 - share) R_b
+
+    and T = T0 at the right end. The state at the left end of the mesh is the fluid: a sensor there
+    sees its mean temperature. All unknowns are positive: give them transform="log", and the share
+    "logit".
+
+    So that the capacity of the ground may be unknown, radii there are counted by the heat they
+    hold: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x the capacity is
+    known, and k appears as k (rho_c/rho_0) r^2/x. The right end in r moves with rho_c.
+
+    Parameters
+    ----------
+    mesh
+        Radius in m, best graded: `livepde.interval(0.9 * r_p, r_far, 60, geometric=True)`. It
+        begins a bit below r_p, the fluid; the nodes next to r_p and r_b are moved onto them.
+    k
+        Conductivity of the ground in W/(m K).
+    rho_c
+        Volumetric heat capacity of the ground in J/(m^3 K), a `Scalar`.
+    R_b
+        Resistance between fluid and wall of the borehole in m K/W.
+    share
+        Part of R_b that the pipes make: film and wall. The rest is the grout.
+    H
+        Length of the borehole in m.
+    r_p, r_b
+        Outer radius of the pipes, as one, and radius of the borehole in m.
+    C_f, C_p, C_c
+        Heat capacities of the fluid, of the walls of the pipes, and of a casing at r_b, for each
+        metre of the borehole, in J/(m K).
+    C_g
+        Volumetric heat capacity of the grout in J/(m^3 K).
+    T0
+        Undisturbed temperature.
+
+    The power in W is the input channel "Q".
+
+    Raises
+    ------
+    ModelError
+        The radii do not lie inside of the mesh in this order, or rho_c is not a `Scalar`.
+    """
+    if not isinstance(rho_c, Scalar):
+        raise ModelError("grouted_borehole: rho_c must be one number, a Scalar.")
+    layered = _layered(mesh, r_p, r_b)
+    thickness, around, rho_0 = r_p - float(mesh.p.min()), log(r_b / r_p), rho_c.prior
+    # Of order four: the weight r and the elements of first order are integrated exactly.
+    state = Field(layered, linear(layered), dirichlet={"right": T0}, unit="degC", quadrature=4)
+
+    def pipes(q: Any, u: Any, v: Any, x: Place) -> Any:
+        return thickness / (2 * pi * q.share * q.R_b) * dot(grad(u), grad(v))
+
+    def grout(q: Any, u: Any, v: Any, x: Place) -> Any:
+        return around / (2 * pi * (1 - q.share) * q.R_b) * x[0] * dot(grad(u), grad(v))
+
+    def ground(q: Any, u: Any, v: Any, x: Place) -> Any:
+        more = q.rho_c / rho_0
+        square = r_b**2 + (x[0] ** 2 - r_b**2) / more
+        return q.k * more * square / x[0] * dot(grad(u), grad(v))
+
+    return Model(
+        state,
+        {"k": k, "rho_c": rho_c, "R_b": R_b, "share": share},
+        A=[On("pipes", pipes), On("grout", grout), On("ground", ground)],
+        M=[
+            On("left", lambda u, v, x: C_f / (2 * pi) * u * v),
+            On("pipes", lambda u, v, x: C_p / (2 * pi * thickness) * u * v),
+            On("grout", lambda u, v, x: C_g * x[0] * u * v),
+            On("wall", lambda u, v, x: C_c / (2 * pi) * u * v),
+            On("ground", lambda u, v, x: rho_0 * x[0] * u * v),
+        ],
+        f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
+        inputs=["Q"],
+        time_unit="s",
+    )
+
+
+def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
+    """Return the mesh with nodes at both radii, subdomains between them, and the facet "wall"."""
+    nodes = mesh.p.copy()
+    first, last = float(nodes.min()), float(nodes.max())
+    inner, wall = (int(np.abs(nodes[0] - r).argmin()) for r in (r_p, r_b))
+    if not first < r_p < r_b < last or inner == wall or {inner, wall} & set(_ends(nodes[0])):
+        raise ModelError(
+            f"grouted_borehole: the radii r_p = {r_p:g} m and r_b = {r_b:g} m must lie inside of "
+            f"the mesh, {first:g} to {last:g} m, with cells of their own: let it begin a bit below "
+            "r_p, and take more cells or geometric spacing."
+        )
+    nodes[0, inner], nodes[0, wall] = r_p, r_b
+    moved = replace(mesh, doflocs=nodes)
+    facet = int(np.flatnonzero(np.isclose(moved.p[0, moved.facets[0]], r_b))[0])
+    return moved.with_boundaries({"wall": np.array([facet])}).with_subdomains(
+        {
+            "pipes": lambda x: x[0] < r_p,
+            "grout": lambda x: (x[0] > r_p) & (x[0] < r_b),
+            "ground": lambda x: x[0] > r_b,
+        }
+    )
+
+
+def _ends(x: Any) -> tuple[int, int]:
+    return int(x.argmin()), int(x.argmax())
+
+
+def _build(
+    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: float
+) -> Model:
+    k, rho_c, R_b, share = (unknowns[name] for name in ("k", "rho_c", "R_b", "share"))
+    return grouted_borehole(mesh, k, rho_c, R_b, share, **options)
+
+
+GROUTED_BOREHOLE = Equation(
+    name="grouted_borehole",
+    summary="thermal response test with fluid, pipes, grout and ground",
+    formula="C_f T_t = Q/H - (T - T(r_p))/R_p,  C_g r T_t = (k_g r T_r)_r,  "
+    "rho_c r T_t = (k r T_r)_r,  T = T0 far away",
+    state=Variable("degC", "temperature: of the fluid at the left end, then of grout and ground"),
+    unknowns={
+        "k": Variable("W/(m K)", "conductivity of the ground"),
+        "rho_c": Variable("J/(m^3 K)", "volumetric heat capacity of the ground"),
+        "R_b": Variable("m K/W", "resistance between fluid and wall of the borehole"),
+        "share": Variable("", "part of R_b that the pipes make"),
+    },
+    inputs={"Q": Variable("W", "power given to the fluid")},
+    options={
+        "H": Option("m", "length of the borehole"),
+        "r_p": Option("m", "outer radius of the pipes, as one pipe"),
+        "r_b": Option("m", "radius of the borehole"),
+        "C_f": Option("J/(m K)", "heat capacity of the fluid, for each metre"),
+        "C_p": Option("J/(m K)", "heat capacity of the walls of the pipes, for each metre"),
+        "C_c": Option("J/(m K)", "heat capacity of a casing, for each metre", 0.0),
+        "C_g": Option("J/(m^3 K)", "volumetric heat capacity of the grout"),
+        "T0": Option("degC", "undisturbed temperature of the ground"),
+    },
+    build=_build,
+    element=linear,
+)

@@ -1,0 +1,174 @@
+"""The grouted borehole: against steady states, balances, the line source, and a twin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import livepde as lp
+from livepde.diagnostics import check_model
+from livepde.errors import ModelError
+from livepde.models import EQUATIONS, grouted_borehole
+from livepde.stepping import Advance, Alexander2, simulate
+from livepde.streams import AbsoluteNoise, Twin
+
+KNOWN = {
+    "H": 20.0,
+    "r_p": 0.0236,
+    "r_b": 0.063,
+    "C_f": 4900.0,
+    "C_p": 1000.0,
+    "C_g": 3.8e6,
+    "T0": 10.0,
+}
+TRUTH = {"k": 2.5, "rho_c": 2.3e6, "R_b": 0.15, "share": 0.3}
+POWER = 1000.0
+HOUR = 3600.0
+
+
+def unknown(name: str) -> lp.Scalar:
+    if name == "share":
+        return lp.Scalar(TRUTH[name], 0.05, (0.0, 1.0), transform="logit")
+    return lp.Scalar(TRUTH[name], 0.3 * TRUTH[name], (0.0, np.inf), transform="log")
+
+
+def model(
+    cells: int = 80, far: float = 12.0, rho_c: lp.Scalar | None = None, **more: float
+) -> lp.Model:
+    mesh = lp.interval(0.02, far, cells, geometric=True)
+    unknowns = {name: unknown(name) for name in TRUTH} | ({"rho_c": rho_c} if rho_c else {})
+    return grouted_borehole(mesh, **unknowns, **(KNOWN | more))
+
+
+def final(process: lp.Model, times: Any, q: Any = None) -> Any:
+    """Return the state at the nodes, in order of the radius, and the radii, after a heating."""
+    start = process.initial_parameter(q or TRUTH)
+    *_, (_, u) = simulate(
+        process, start, 10.0, times, Advance(Alexander2()), lambda t: {"Q": POWER}
+    )
+    x = process.state.mesh.p[0]
+    order = np.argsort(x)
+    return x[order], (process.state_block.at_vertices @ u)[order]
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    k=st.floats(0.5, 6.0),
+    rho_c=st.floats(1e6, 5e6),
+    R_b=st.floats(0.05, 0.4),
+    share=st.floats(0.1, 0.7),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_forms_pass_the_shipped_checks(k, rho_c, R_b, share, seed):
+    q = {"k": k, "rho_c": rho_c, "R_b": R_b, "share": share}
+    check_model(
+        model(30, C_c=1900.0), q=q, u=30.0, spread=5.0, inputs={"Q": POWER}, seed=seed
+    ).raise_if_failed()
+
+
+def test_at_rest_the_fluid_is_warmer_by_the_resistances():
+    x, T = final(model(160, far=2.0), np.linspace(0.0, 1e4 * HOUR, 200))
+    per_metre = POWER / KNOWN["H"]
+    wall = T[np.isclose(x, KNOWN["r_b"])][0]
+    pipe = T[np.isclose(x, KNOWN["r_p"])][0]
+    around = np.log(2.0 / KNOWN["r_b"]) / (2 * np.pi * TRUTH["k"])
+    assert T[0] - wall == pytest.approx(per_metre * TRUTH["R_b"], rel=1e-3)
+    assert T[0] - pipe == pytest.approx(per_metre * TRUTH["R_b"] * TRUTH["share"], rel=1e-6)
+    assert wall - 10.0 == pytest.approx(per_metre * around, rel=1e-3)
+
+
+def test_no_heat_is_lost():
+    process = model(C_c=1900.0)
+    start = process.initial_parameter(TRUTH)
+    times = np.linspace(0.0, 10 * HOUR, 61)
+    *_, (_, u) = simulate(
+        process, start, 10.0, times, Advance(Alexander2()), lambda t: {"Q": POWER}
+    )
+    rise = u - process.initial(10.0)
+    held = 2 * np.pi * KNOWN["H"] * (process.mass @ rise).sum()
+    assert held == pytest.approx(POWER * times[-1], rel=1e-6)
+
+
+def test_late_the_fluid_follows_the_line_source():
+    """T_fluid = T0 + Q/(4 pi k H) E1(rho_c r_b^2/(4 k t)) + R_b Q/H, after some days."""
+    from scipy.special import exp1
+
+    times = np.concatenate([[0.0], np.geomspace(60.0, 200 * HOUR, 150)])
+    _, T = final(model(160), times)
+    x = TRUTH["rho_c"] * KNOWN["r_b"] ** 2 / (4 * TRUTH["k"] * times[-1])
+    rise = POWER / KNOWN["H"] * (exp1(x) / (4 * np.pi * TRUTH["k"]) + TRUTH["R_b"])
+    assert T[0] - 10.0 == pytest.approx(rise, rel=3e-3)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_an_unknown_capacity_is_that_capacity(factor):
+    """Radii counted by the heat they hold change nothing that is measured at the borehole."""
+    times = np.concatenate([[0.0], np.geomspace(60.0, 60 * HOUR, 80)])
+    capacity = lp.Scalar(factor * TRUTH["rho_c"], 1e6, transform="log")
+    scaled, plain = model(160), model(160, rho_c=capacity)
+    q = TRUTH | {"rho_c": factor * TRUTH["rho_c"]}
+    (_, one), (_, other) = final(scaled, times, q), final(plain, times, q)
+    assert one[0] == pytest.approx(other[0], abs=0.01)
+    assert abs(final(scaled, times)[1][0] - one[0]) > 0.3  # and it matters
+
+
+def test_a_twin_finds_conductivity_and_resistance():
+    process = model(50)
+    sensor = lp.Points({"T": 0.02}, noise=0.02)
+    steps = {"dt_max": 0.2 * HOUR, "scheme": lp.Alexander2()}
+    true = TRUTH | {"k": 3.2, "R_b": 0.12}
+    twin = Twin(
+        model=process,
+        observation=sensor,
+        q_true=true,
+        u0=10.0,
+        times=np.linspace(0.0, 50 * HOUR, 251),
+        noise=AbsoluteNoise(0.02),
+        inputs=lambda t: {"Q": POWER},
+        seed=3,
+        **steps,
+    )
+    law = lp.SensitivityLaw(replay=lp.Replay(first=16))
+    identifier = lp.Identifier(process, sensor, law, u0=10.0, **steps)
+    for sample in twin:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+    for name in ("k", "R_b"):
+        value, std = estimate.parameters[name]
+        assert abs(value - true[name]) < 3 * std
+        assert abs(value / true[name] - 1) < 0.05
+
+
+def test_nodes_are_moved_onto_the_radii():
+    mesh = model(37).state.mesh
+    for radius in (KNOWN["r_p"], KNOWN["r_b"]):
+        assert np.isclose(mesh.p[0], radius).any()
+    assert set(mesh.subdomains) == {"pipes", "grout", "ground"}
+    assert sum(len(cells) for cells in mesh.subdomains.values()) == mesh.nelements
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "cells"), [(0.03, 6.0, 50), (0.02, 0.05, 50), (0.02, 6.0, 3)]
+)
+def test_a_mesh_without_room_for_the_layers_is_refused(start, stop, cells):
+    mesh = lp.interval(start, stop, cells, geometric=True)
+    with pytest.raises(ModelError, match="must lie inside"):
+        grouted_borehole(mesh, **{name: unknown(name) for name in TRUTH}, **KNOWN)
+
+
+def test_capacity_is_one_number():
+    layers = lp.Piecewise({"a": lambda x: x[0] > 0.0}, 2e6, 1e6)
+    unknowns = {name: unknown(name) for name in TRUTH} | {"rho_c": layers}
+    with pytest.raises(ModelError, match="Scalar"):
+        grouted_borehole(lp.interval(0.02, 6.0, 40, geometric=True), **unknowns, **KNOWN)
+
+
+def test_the_equation_builds_it():
+    equation = EQUATIONS["grouted_borehole"]
+    mesh = lp.interval(0.02, 6.0, 40, geometric=True)
+    built = equation.build(mesh, {name: unknown(name) for name in TRUTH}, {}, C_c=0.0, **KNOWN)
+    assert tuple(built.parameter_space.unknowns) == tuple(equation.unknowns)
+    assert built.channels == tuple(equation.inputs)
