@@ -450,7 +450,7 @@ def run(
     Example:  livepde run mycase/case.toml
     Live:     logger | livepde run mycase/case.toml --data -
     """
-    from livepde.runs import RunWriter, checks_of, drive, free_path, tables
+    from livepde.runs import RunWriter, checks_of, doubts, drive, free_path, tables
     from livepde.streams import Table as Samples
 
     loaded = _load(case, allow_code, settings)
@@ -479,7 +479,7 @@ def run(
     dataset = driven.result.to_xarray()
     prepared.describe(dataset)
     checks = checks_of(loaded.expected, dataset)
-    notes = list(loaded.notes)
+    notes = [*loaded.notes, *doubts(dataset)]
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:

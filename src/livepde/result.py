@@ -171,9 +171,12 @@ class Result:
             }
         )
         units = self._units()
+        unknowns = self.model.parameter_space.unknowns
         for k, label in enumerate(self.model.parameter_space.labels):
-            unit = {"units": units.get(label.split("[")[0], "")}
-            data[label] = ("time", np.array([row[k] for row in rows[1]], dtype=float), unit)
+            unknown: Any = unknowns[label.split("[")[0]]
+            values = np.array([row[k] for row in rows[1]], dtype=float)
+            unit = {"units": unknown.unit}
+            data[label] = ("time", values, {**unit, **_prior(unknown)})
             data[f"{label}_std"] = ("time", np.array([row[k] for row in rows[2]]), unit)
         for name in fields[0][1] if fields else ():
             values = np.array([profile[name][order] for _, profile in fields])
@@ -231,6 +234,15 @@ def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[s
     names = _variables(name, block)
     rows = values.reshape(len(names), -1)
     return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
+
+
+def _prior(unknown: Any) -> dict[str, float]:
+    """Return prior and finite bounds of a scalar unknown as attributes of its variable."""
+    bounds = zip(("lower_bound", "upper_bound"), unknown.bounds, strict=True)
+    found = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
+    if not unknown.evolution.moves:  # one that moves is never known better for good
+        found["prior_std"] = float(unknown.std)
+    return found
 
 
 def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:

@@ -327,6 +327,7 @@ class Case:
             *(f"{label}.error" for label in self.references),
             "rmse",
             *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
+            "innovation_ratio",
             "failed_steps",
         ]
         return [

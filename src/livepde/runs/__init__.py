@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from livepde.runs.directory import Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
+from livepde.runs.doubts import doubts
 from livepde.runs.drive import Driven, drive
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.runs.summary import checks_of, measures, tables
@@ -16,6 +17,7 @@ __all__ = [
     "RunWriter",
     "Table",
     "checks_of",
+    "doubts",
     "drive",
     "free_path",
     "measures",

@@ -11,7 +11,7 @@ import xarray as xr
 
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
-__all__ = ["checks_of", "digits", "measures", "tables"]
+__all__ = ["checks_of", "digits", "measures", "scalars", "scored", "tables"]
 
 MOST_ROWS = 40
 CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
@@ -38,7 +38,7 @@ def digits(value: float, std: float) -> tuple[str, str]:
     return f"{value / scale:.{places}f}{exponent}", f"{std / scale:.{places}f}{exponent}"
 
 
-def _scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
+def scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
     """Return channel -> (role, errors) from the start of the assimilation on."""
     start = float(data.attrs.get("assimilate_from", -math.inf))
     kept = data["time"].values >= start
@@ -71,7 +71,8 @@ def _rmse(errors: np.ndarray[Any, Any]) -> float:
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
 
 
-def _scalars(data: xr.Dataset) -> list[str]:
+def scalars(data: xr.Dataset) -> list[str]:
+    """Return the labels of the scalar unknowns."""
     return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
 
 
@@ -87,24 +88,26 @@ def measures(data: xr.Dataset) -> dict[str, float]:
     Each scalar unknown by its label, with `.std` behind it its deviation and with `.error` the
     relative error to a reference; `rmse` one-step, of all
     sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`, `rmse.CHANNEL`;
-    `failed_steps`.
+    `innovation_ratio` at the end, of squared innovations to what is expected; `failed_steps`.
     """
     found: dict[str, float] = {}
     if data.sizes["time"]:
-        for label in _scalars(data):
+        for label in scalars(data):
             found[label] = float(data[label][-1])
             found[f"{label}.std"] = float(data[f"{label}_std"][-1])
             if "reference" in data[label].attrs:
                 found[f"{label}.error"] = _error(data, label)
-    scored = _scored(data)
-    parts = [errors for _, errors in scored.values()]
+    channels = scored(data)
+    parts = [errors for _, errors in channels.values()]
     found["rmse"] = _rmse(np.concatenate(parts)) if parts else math.nan
     for role in ("assimilated", "withheld"):
-        some = [errors for kind, errors in scored.values() if kind == role]
+        some = [errors for kind, errors in channels.values() if kind == role]
         if some:
             found[f"rmse.{role}"] = _rmse(np.concatenate(some))
-    for name, (_, errors) in scored.items():
+    for name, (_, errors) in channels.items():
         found[f"rmse.{name}"] = _rmse(errors)
+    if "innovation_ratio" in data and data.sizes["time"]:
+        found["innovation_ratio"] = float(data["innovation_ratio"].values[-1])
     found["failed_steps"] = float((data["status"].values != 0).sum())
     return found
 
@@ -121,7 +124,7 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run: estimates with references, and errors of each channel."""
     result: list[Table] = []
-    labels = _scalars(data) if data.sizes["time"] else []
+    labels = scalars(data) if data.sizes["time"] else []
     rows: list[tuple[Any, ...]] = []
     if labels:
         compared = any("reference" in data[label].attrs for label in labels)
@@ -162,7 +165,7 @@ def tables(data: xr.Dataset) -> list[Table]:
             len(errors),
             unit,
         )
-        for name, (role, errors) in _grouped(_scored(data)).items()
+        for name, (role, errors) in _grouped(scored(data)).items()
     ]
     columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))

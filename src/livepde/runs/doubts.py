@@ -1,0 +1,84 @@
+"""What a run's numbers say against its estimates, in plain sentences."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from livepde.runs.summary import scalars, scored
+
+__all__ = ["MODEL_ERROR", "doubts"]
+
+MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: twice as large
+OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
+SETTLED = 0.25  # share of a run after which means are taken
+HARDLY = 0.9  # of the prior deviation left: nothing was learned
+
+
+def doubts(data: xr.Dataset) -> list[str]:
+    """Return what a user should know before he believes the estimates.
+
+    The model does not explain the data if at the end the mean square of the innovations, over the
+    last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
+    bound, or keeps more than 0.9 of its prior deviation: the data did not tell.
+    """
+    if not data.sizes["time"]:
+        return []
+    return [*_model_error(data), *_unknowns(data)]
+
+
+def _model_error(data: xr.Dataset) -> list[str]:
+    if "innovation_ratio" not in data:
+        return []
+    ratio = float(data["innovation_ratio"].values[-1])
+    if not ratio > MODEL_ERROR:
+        return []
+    found = [
+        "The model does not explain the data: the sensors miss what is expected of them by "
+        f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
+        f"{ratio:.1f}, bound {MODEL_ERROR:g}). The deviations are widened, and yet do not trust "
+        "them."
+    ]
+    unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
+    off = []
+    for name, (role, errors) in scored(data).items():
+        late = errors[int(SETTLED * len(errors)) :]
+        if role != "assimilated" or not len(late):
+            continue
+        mean = float(late.mean())
+        if abs(mean) > OFFSET * float(np.sqrt((late**2).mean())):
+            side = "above" if mean > 0 else "below"
+            off.append(f"{name} reads {abs(mean):.2g} {unit}".rstrip() + f" {side} it")
+    if off:
+        found.append(
+            f"{'; '.join(off)} nearly all the time: give these sensors an unknown offset, or a "
+            "process is missing in the model."
+        )
+    else:
+        found.append(
+            "What is left changes with time: layers, a source, or an unknown that moves "
+            "(evolution) may be missing in the model; or the noise is larger than stated."
+        )
+    return found
+
+
+def _unknowns(data: xr.Dataset) -> list[str]:
+    found = []
+    for label in scalars(data):
+        attrs: dict[Any, Any] = data[label].attrs
+        value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
+        for bound in ("lower_bound", "upper_bound"):
+            if value == attrs.get(bound):
+                found.append(
+                    f"{label} ends at its bound {value:g}: the bound decides, not the data."
+                )
+        prior = float(attrs.get("prior_std", math.nan))
+        if std > HARDLY * prior:
+            found.append(
+                f"{label}: the data have told hardly anything; its deviation is still about "
+                "that of the prior."
+            )
+    return found

@@ -1,0 +1,93 @@
+"""What a run says against its own estimates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde.runs import doubts, measures
+from livepde.streams import AbsoluteNoise, Twin
+
+SENSORS = {"A": 0.25, "B": 0.5, "C": 0.75}
+TIMES = 0.05 * np.arange(401)
+
+
+def rod(a: Any, loss: float = 0.0) -> lp.Model:
+    mesh = lp.interval(0.0, 1.0, 20)
+    ends = {"left": lambda x, t: 5 * np.sin(t) + 0.0 * x[0], "right": 0.0}
+    return lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
+        a if isinstance(a, dict) else {"a": a},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: loss * (u - 2.0) * v,
+    )
+
+
+def run(model: lp.Model, truth: lp.Model, shift: Any = 0.0, **options: Any) -> Any:
+    """Return the dataset of a run with noise 0.05, data of `truth` with a = 0.3."""
+    points = lp.Points(SENSORS, noise=0.05, unit="degC")
+    twin = Twin(
+        model=truth,
+        observation=points,
+        q_true={"a": 0.3},
+        u0=0.0,
+        times=TIMES,
+        noise=AbsoluteNoise(0.05),
+    )
+    samples = [(t, z + np.asarray(shift)) for t, z, *_ in map(as_tuple, twin)]
+    return (
+        lp.Identifier(model, points, lp.SensitivityLaw(**options), u0=0.0).run(samples).to_xarray()
+    )
+
+
+def as_tuple(item: Any) -> tuple[float, Any]:
+    return (item.t, item.z) if isinstance(item, lp.Sample) else (item[0], item[1])
+
+
+def test_the_right_model_raises_no_doubts():
+    model = rod(lp.Scalar(0.2, 0.1))
+    data = run(model, model)
+    assert doubts(data) == []
+    assert measures(data)["innovation_ratio"] == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_process_that_is_missing_is_said():
+    found = doubts(run(rod(lp.Scalar(0.2, 0.1)), rod(lp.Scalar(0.2), loss=1.0)))
+    assert "The model does not explain the data" in found[0]
+
+
+def test_a_sensor_that_is_always_off_is_named():
+    model = rod(lp.Scalar(0.2, 0.1))
+    found = doubts(run(model, model, shift=[0.0, 1.0, 0.0], replay=lp.Replay()))
+    assert "The model does not explain the data" in found[0]
+    assert "B reads" in found[1]
+    assert "above it nearly all the time" in found[1]
+    assert "C reads" not in found[1]
+
+
+def test_an_estimate_at_its_bound_is_said():
+    narrow = rod(lp.Scalar(0.2, 0.1, bounds=(0.0, 0.25)))
+    found = doubts(run(narrow, rod(lp.Scalar(0.2))))
+    assert any("a ends at its bound 0.25" in sentence for sentence in found)
+
+
+def test_an_unknown_that_nothing_shows_is_said():
+    unseen = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
+    data = run(rod(unseen), rod(lp.Scalar(0.2)))
+    assert doubts(data) == [
+        "b: the data have told hardly anything; of its prior deviation 100 % are left."
+    ]
+    moving = {**unseen, "b": lp.Scalar(1.0, 0.5, evolution=lp.MeanReverting(1.0))}
+    assert doubts(run(rod(moving), rod(lp.Scalar(0.2)))) == []
+
+
+def test_the_gradient_law_has_no_innovations_to_judge():
+    model = rod(lp.Scalar(0.2, 0.1))
+    identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=0.0)
+    z = np.zeros(identifier.observed.size)
+    assert doubts(identifier.run([(0.1, z), (0.2, z)]).to_xarray()) == []
+    assert doubts(identifier.run([]).to_xarray()) == []
