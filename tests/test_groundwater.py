@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +14,13 @@ from scipy.special import exp1
 from skfem import ElementTriP1, MeshQuad
 
 import livepde as lp
+from livepde.bench.cases import bench_cases
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.models import EQUATIONS, groundwater, pumping_test
 from livepde.stepping import Advance, Alexander2, simulate
 
+ROOT = Path(__file__).parents[1]
 k, Ss, b, Q = 7.6e-4, 2.5e-5, 7.0, 9.1e-3
 TIMES = np.concatenate([[0.0], np.geomspace(0.05, 5e4, 70)])
 
@@ -174,3 +178,19 @@ def test_what_is_wrong_is_said():
 def test_they_are_ready_made():
     for name in ("groundwater", "pumping_test"):
         assert EQUATIONS[name].name == name
+
+
+@pytest.mark.parametrize("name", ["oude_korendijk", "sioux", "horkheim"])
+def test_published_tests_are_found_again(name: str, data_dir: Any, monkeypatch: Any):
+    """Whatever the prior: each case runs with its variants, which expect something, too."""
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+    outcome, runs = bench_cases([ROOT / "cases" / f"{name}.toml"])
+    assert len(runs) == 2
+    assert len(outcome.checks) >= 4
+    assert outcome.ok
+
+
+def test_the_page_runs():
+    page = (ROOT / "docs" / "models" / "groundwater.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    exec(compile(block, "groundwater.md", "exec"), {"__name__": "page"})
