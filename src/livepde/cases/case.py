@@ -324,7 +324,7 @@ class Case:
         known = [
             *labels,
             *(f"{label}.std" for label in labels),
-            *(f"{label}.error" for label in self.references),
+            *(f"{label}.{of}" for label in self.references for of in ("error", "deviations")),
             "rmse",
             *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
             "innovation_ratio",

@@ -82,11 +82,19 @@ def _error(data: xr.Dataset, label: str) -> float:
     return abs(float(data[label][-1]) - reference) / abs(reference) if reference else math.nan
 
 
+def _deviations(data: xr.Dataset, label: str) -> float:
+    """Return how many deviations lie between the last estimate and the reference."""
+    distance = abs(float(data[label][-1]) - float(data[label].attrs["reference"]))
+    std = float(data[f"{label}_std"][-1])
+    return distance / std if std else math.inf
+
+
 def measures(data: xr.Dataset) -> dict[str, float]:
     """Return every number of a run that a case may expect something of, by name.
 
     Each scalar unknown by its label, with `.std` behind it its deviation and with `.error` the
-    relative error to a reference; `rmse` one-step, of all
+    relative error to a reference, with `.deviations` the distance from it in
+    deviations; `rmse` one-step, of all
     sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`, `rmse.CHANNEL`;
     `innovation_ratio` at the end, of squared innovations to what is expected; `failed_steps`.
     """
@@ -97,6 +105,7 @@ def measures(data: xr.Dataset) -> dict[str, float]:
             found[f"{label}.std"] = float(data[f"{label}_std"][-1])
             if "reference" in data[label].attrs:
                 found[f"{label}.error"] = _error(data, label)
+                found[f"{label}.deviations"] = _deviations(data, label)
     channels = scored(data)
     parts = [errors for _, errors in channels.values()]
     found["rmse"] = _rmse(np.concatenate(parts)) if parts else math.nan
