@@ -1,0 +1,104 @@
+"""What a law has to forget to follow a jump: a diffusivity that rises by a fifth at t = 20.
+
+python experiments/jumps.py
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde.stepping import ForwardStage
+
+TIMES = np.arange(0.0, 40.05, 0.05)
+JUMP, BEFORE, AFTER = 20.0, 0.3, 0.36
+NOISE, SEEDS = 0.01, 5
+MESH = lp.interval(0.0, 1.0, 30)
+POINTS = [0.25, 0.5, 0.75]
+
+
+def rod(a: lp.Scalar) -> lp.Model:
+    """Return a rod whose left end swings."""
+    ends = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
+    state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
+    return lp.Model(state, {"a": a}, A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
+
+
+def truth(t: float) -> float:
+    """Return the diffusivity."""
+    return AFTER if t >= JUMP else BEFORE
+
+
+def states() -> list[tuple[float, Any]]:
+    """Return the exact states."""
+    model = rod(lp.Scalar(BEFORE))
+    forward, u = ForwardStage(model), model.initial(0.0)
+    found = [(0.0, u)]
+    for t0, t1 in pairwise(TIMES.tolist()):
+        u = forward.solve(u, np.array([truth(t1)]), t1 - t0, lp.Moment(t1))
+        found.append((t1, u))
+    return found
+
+
+def measured(law: lp.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: int) -> Any:
+    """Return error before the jump, time until nine tenths of it are followed, error at the end."""
+    rng, model = np.random.default_rng(seed), rod(unknown)
+    sensors = lp.Points(POINTS, noise=NOISE)
+    if isinstance(law, lp.GradientLaw):
+        sensors = lp.Averages({f"z{k}": around(x) for k, x in enumerate(POINTS)}, noise=NOISE)
+    identifier = lp.Identifier(model, sensors, law, u0=0.0)
+    G, values = identifier.observed.G, []
+    for t, u in exact:
+        z = G @ u + NOISE * rng.standard_normal(len(POINTS))
+        values.append(identifier.step(t, z).parameters["a"][0])
+    a = np.array(values)
+    before = np.sqrt(np.mean((a - BEFORE)[(TIMES > 15) & (TIMES < JUMP)] ** 2))
+    end = np.sqrt(np.mean((a - AFTER)[TIMES > 35] ** 2))
+    late = TIMES >= JUMP
+    there = np.flatnonzero(np.abs(a[late] - AFTER) < 0.1 * (AFTER - BEFORE))
+    return before, TIMES[late][there[0]] - JUMP if len(there) else np.inf, end
+
+
+def around(x: float) -> Any:
+    """Return the predicate of a short interval."""
+    return lambda p: np.abs(p[0] - x) < 0.05
+
+
+def main() -> None:
+    """Print the table."""
+    walk = {rate: lp.Scalar(0.2, 0.2, evolution=lp.RandomWalk(rate)) for rate in (0.005, 0.02, 0.1)}
+    constant, S = lp.Scalar(0.2, 0.2), lp.SensitivityLaw
+    rows: dict[str, tuple[Any, lp.Scalar]] = {
+        "constant": (S(), constant),
+        "constant, memory 2": (S(memory=2.0), constant),
+        "constant, replay": (S(replay=lp.Replay()), constant),
+        **{f"random walk {rate:g}": (S(), unknown) for rate, unknown in walk.items()},
+        "random walk 0.02, memory 2": (S(memory=2.0), walk[0.02]),
+        "random walk 0.02, narrow factor": (S(rank=1), walk[0.02]),
+        "random walk 0.02, wide factor": (S(rank=30), walk[0.02]),
+        **{
+            f"gradient law, gain {gain:g}": (
+                lp.GradientLaw(gain, lp.ResidualDamping(10.0)),
+                constant,
+            )
+            for gain in (1e3, 1e5)
+        },
+    }
+    exact = states()
+    table = Table(title=f"A jump from {BEFORE} to {AFTER}; noise {NOISE}; mean of {SEEDS} seeds")
+    for column in ("law", "error before", "time to follow", "error at the end"):
+        table.add_column(column)
+    for name, (law, unknown) in rows.items():
+        found = np.array([measured(law, unknown, exact, seed) for seed in range(SEEDS)])
+        table.add_row(name, *(f"{value:.3g}" for value in found.mean(axis=0)))
+    Console(width=100).print(table)
+
+
+if __name__ == "__main__":
+    main()
