@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import livepde as lp
+from livepde import cases
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.models import EQUATIONS, grouted_borehole
@@ -172,3 +174,17 @@ def test_the_equation_builds_it():
     built = equation.build(mesh, {name: unknown(name) for name in TRUTH}, {}, C_c=0.0, **KNOWN)
     assert tuple(built.parameter_space.unknowns) == tuple(equation.unknowns)
     assert built.channels == tuple(equation.inputs)
+
+
+def test_the_sandbox_from_five_hours_on(data_dir, monkeypatch):
+    """k was measured independently; from about a day on the estimate agrees within 5 %."""
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+    path = Path(__file__).resolve().parents[1] / "cases" / "thermal_response_grout.toml"
+    prepared = cases.load(path).prepare()
+    data = prepared.identifier.run(prepared.stream, fields_every=1000).to_xarray()
+    hours, k, std = data["time"] / 3600.0, data["k"], data["k_std"]
+    off = np.abs(k - 2.88)
+    assert (off[hours > 27.0] < 0.05 * 2.88).all()
+    assert (off < 1.96 * std)[hours > 14.0].all()
+    assert (off < 1.96 * std)[hours > 5.0].mean() > 0.93
+    assert std[-1] < 0.05 * 2.88
