@@ -398,7 +398,14 @@ class FieldBlock(Block):
     @cached_property
     def at_vertices(self) -> sp.csr_array:
         """Matrix that evaluates the function at the vertices of the mesh."""
-        return self.probe(self.field.mesh.p, "vertex")
+        element, mesh = self.field.element, self.field.mesh
+        names = element.dofnames or []
+        if element.nodal_dofs and names and names[0] == "u":  # a coefficient is the value there
+            dofs = self.basis.nodal_dofs[0]
+            entries = (np.ones(len(dofs)), (np.arange(len(dofs)), dofs))
+            values = sp.csr_array(entries, shape=(len(dofs), int(self.basis.N)))
+            return sp.csr_array(values @ self._spread)
+        return self.probe(mesh.p, "vertex")
 
 
 def _slope(g: Any, axis: int, width: float) -> Any:
