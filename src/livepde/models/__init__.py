@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
+from livepde.models.allen_cahn import ALLEN_CAHN, allen_cahn
 from livepde.models.base import Equation, Option, Quantity, Variable
 from livepde.models.borehole import GROUTED_BOREHOLE, grouted_borehole
+from livepde.models.burgers import BURGERS, burgers
 from livepde.models.diffusion import CONDUCTION, HEAT, conduction, heat
 from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
 from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
+from livepde.models.kdv import KDV, kdv
+from livepde.models.kuramoto_sivashinsky import KURAMOTO_SIVASHINSKY, kuramoto_sivashinsky
 from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
 from livepde.models.wave import WAVE, wave
@@ -19,13 +23,17 @@ __all__ = [
     "Quantity",
     "Variable",
     "advection_diffusion",
+    "allen_cahn",
     "borehole",
+    "burgers",
     "conduction",
     "fisher_kpp",
     "fluid",
     "groundwater",
     "grouted_borehole",
     "heat",
+    "kdv",
+    "kuramoto_sivashinsky",
     "porous_fisher",
     "pumping_test",
     "reaction_diffusion",
@@ -44,6 +52,10 @@ EQUATIONS: dict[str, Equation] = {
         FISHER_KPP,
         POROUS_FISHER,
         WAVE,
+        BURGERS,
+        KDV,
+        KURAMOTO_SIVASHINSKY,
+        ALLEN_CAHN,
         GROUNDWATER,
         PUMPING_TEST,
     )

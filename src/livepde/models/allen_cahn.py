@@ -1,0 +1,73 @@
+"""Allen-Cahn: u_t = D lap u + r (u - u^3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from livepde.fem import Unknown, dot, grad, hermite
+from livepde.model import Model
+from livepde.models.base import Equation, Variable
+from livepde.models.evolution import Coefficients, Number, beginning, state
+
+__all__ = ["ALLEN_CAHN", "allen_cahn"]
+
+
+def allen_cahn(
+    mesh: Any,
+    D: Number,
+    r: Number,
+    u0: Unknown | None = None,
+    dirichlet: Mapping[str, Any] | None = None,
+    *,
+    element: Any = None,
+) -> Model:
+    """Return u_t - D div(grad u) - r (u - u^3) = 0: two phases, u = 1 and u = -1.
+
+    Parameters
+    ----------
+    mesh
+        Any mesh. A front is about 4 (2 D/r)^(1/2) wide and wants some cells across.
+    D
+        Diffusivity: unknown or a number.
+    r
+        Rate of reaction: unknown or a number.
+    u0
+        Unknown initial state, usually a `Field` on the same mesh; None leaves it to the
+        `Identifier`.
+    dirichlet
+        Boundary -> number, function g(x, t), or `Channel`, {} for no flux everywhere; None:
+        periodic from side to side.
+    element
+        Element of the state; default cubic Hermite on a line, else first order.
+    """
+    u = state(mesh, element or hermite(mesh), dirichlet)
+    c = Coefficients({"D": D, "r": r})
+    begun, initial = beginning(u0, u)
+    return Model(
+        u,
+        {**c.unknown, **begun},
+        A=lambda q, u, v, x: c(q, "D") * dot(grad(u), grad(v)) + c(q, "r") * (u**3 - u) * v,
+        initial=initial,
+    )
+
+
+def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
+    return allen_cahn(mesh, dirichlet=dirichlet or None, **unknowns)
+
+
+ALLEN_CAHN = Equation(
+    name="allen_cahn",
+    summary="two phases with a front between them, with unknown initial state",
+    formula="u_t = D div(grad u) + r (u - u^3)",
+    state=Variable("", "phase, from -1 to 1"),
+    unknowns={
+        "D": Variable("", "diffusivity"),
+        "r": Variable("", "rate of reaction"),
+        "u0": Variable("", "initial state, a field"),
+    },
+    build=_build,
+    element=hermite,
+    length_unit="",
+    time_unit="",
+)

@@ -1,0 +1,75 @@
+"""Viscous Burgers: u_t + a u u_x = nu u_xx."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from livepde.fem import Unknown, dot, grad, hermite
+from livepde.model import Model
+from livepde.models.base import Equation, Variable
+from livepde.models.evolution import Coefficients, Number, beginning, state
+
+__all__ = ["BURGERS", "burgers"]
+
+
+def burgers(
+    mesh: Any,
+    nu: Number,
+    advection: Number = 1.0,
+    u0: Unknown | None = None,
+    dirichlet: Mapping[str, Any] | None = None,
+    *,
+    element: Any = None,
+) -> Model:
+    """Return u_t + a u u_x - nu u_xx = 0 on an interval.
+
+    Parameters
+    ----------
+    mesh
+        `livepde.interval(...)` or `livepde.line(...)`. A shock is about 4 nu/(a jump) wide and
+        wants some cells of the default element across.
+    nu
+        Viscosity: unknown or a number.
+    advection
+        The coefficient a: unknown or a number.
+    u0
+        Unknown initial state, usually a `Field` on the same mesh; None leaves it to the
+        `Identifier`.
+    dirichlet
+        Boundary -> number, function g(x, t), or `Channel`; None: periodic.
+    element
+        Element of the state; default cubic Hermite.
+    """
+    u = state(mesh, element or hermite(mesh), dirichlet)
+    c = Coefficients({"advection": advection, "nu": nu})
+    begun, initial = beginning(u0, u)
+    return Model(
+        u,
+        {**c.unknown, **begun},
+        A=lambda q, u, v, x: (
+            c(q, "advection") * u * grad(u)[0] * v + c(q, "nu") * dot(grad(u), grad(v))
+        ),
+        initial=initial,
+    )
+
+
+def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
+    return burgers(mesh, dirichlet=dirichlet or None, **unknowns)
+
+
+BURGERS = Equation(
+    name="burgers",
+    summary="viscous Burgers, periodic or between given values, with unknown initial state",
+    formula="u_t + a u u_x = nu u_xx",
+    state=Variable("", "velocity"),
+    unknowns={
+        "nu": Variable("", "viscosity"),
+        "advection": Variable("", "coefficient a of the advection"),
+        "u0": Variable("", "initial state, a field"),
+    },
+    build=_build,
+    element=hermite,
+    length_unit="",
+    time_unit="",
+)

@@ -1,0 +1,62 @@
+"""What the equations of nonlinear waves have in common: coefficients, sides, where u begins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+from livepde.errors import ModelError
+from livepde.fem import Field, Integrand, Unknown
+
+__all__ = ["Coefficients", "Number", "beginning", "ring", "state"]
+
+Number: TypeAlias = Unknown | float
+"""A coefficient of an equation: unknown, or a known number."""
+
+SIDES = (("left", "right"), ("bottom", "top"), ("front", "back"))
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """Coefficients of an equation by name, each of them known or unknown."""
+
+    given: Mapping[str, Number]
+
+    @property
+    def unknown(self) -> dict[str, Unknown]:
+        """Those that are unknown."""
+        return {k: v for k, v in self.given.items() if not isinstance(v, int | float)}
+
+    def __call__(self, q: Any, name: str) -> Any:
+        """Return a coefficient as a form sees it."""
+        value = self.given[name]
+        return float(value) if isinstance(value, int | float) else getattr(q, name)
+
+
+def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: str = "") -> Field:
+    """Return the state: periodic from side to side, or with Dirichlet values."""
+    if dirichlet is not None:
+        return Field(mesh, element, dirichlet=dict(dirichlet), unit=unit)
+    pairs = [pair for pair in SIDES if set(pair) <= set(mesh.boundaries or {})]
+    return Field(mesh, element, periodic=pairs, unit=unit)
+
+
+def ring(name: str, mesh: Any, dirichlet: Mapping[str, Any]) -> Any:
+    """Return the mesh of an equation that is periodic always; refuse boundary values."""
+    if dirichlet:
+        raise ModelError(f"{name} is periodic: leave out the values on {sorted(dirichlet)}.")
+    return mesh
+
+
+def beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
+    """Return an unknown initial state by name, and the form `initial` of a model.
+
+    A field takes over the state's sides: periodic, or zero where the state is held at zero.
+    """
+    if u0 is None:
+        return {}, None
+    if isinstance(u0, Field):
+        held = {name: 0.0 for name, value in u.dirichlet.items() if value == 0.0}
+        u0 = replace(u0, dirichlet=held, periodic=u.periodic)
+    return {"u0": u0}, lambda q, v, x: q.u0 * v

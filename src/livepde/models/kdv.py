@@ -1,0 +1,63 @@
+"""Korteweg-de Vries: u_t + a u u_x + b u_xxx = 0 on a ring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from livepde.fem import Unknown, grad, hess, smooth
+from livepde.model import Model
+from livepde.models.base import Equation, Variable
+from livepde.models.evolution import Coefficients, Number, beginning, ring, state
+
+__all__ = ["KDV", "kdv"]
+
+
+def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = None) -> Model:
+    """Return u_t + a u u_x + b u_xxx = 0 on a ring (Korteweg and de Vries).
+
+    The weak form is -b (u_xx, v_x), for elements of class C^1: cubic Hermite. Take the scheme
+    `Alexander2`, which hardly damps what the grid resolves; implicit Euler damps solitons.
+
+    Parameters
+    ----------
+    mesh
+        `livepde.interval(...)`, whose ends are one point of the ring.
+    advection, dispersion
+        The coefficients a and b: unknown or numbers.
+    u0
+        Unknown initial state, usually a `Field` on the same mesh; None leaves it to the
+        `Identifier`.
+    """
+    u = state(mesh, smooth(mesh), None)
+    c = Coefficients({"advection": advection, "dispersion": dispersion})
+    begun, initial = beginning(u0, u)
+    return Model(
+        u,
+        {**c.unknown, **begun},
+        A=lambda q, u, v, x: (
+            c(q, "advection") * u * grad(u)[0] * v - c(q, "dispersion") * hess(u)[0, 0] * grad(v)[0]
+        ),
+        initial=initial,
+    )
+
+
+def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
+    return kdv(ring("kdv", mesh, dirichlet), **unknowns)
+
+
+KDV = Equation(
+    name="kdv",
+    summary="Korteweg-de Vries on a ring, with unknown initial state",
+    formula="u_t + a u u_x + b u_xxx = 0",
+    state=Variable("", "height of the wave"),
+    unknowns={
+        "advection": Variable("", "coefficient a of u u_x"),
+        "dispersion": Variable("", "coefficient b of u_xxx"),
+        "u0": Variable("", "initial state, a field"),
+    },
+    build=_build,
+    element=smooth,
+    length_unit="",
+    time_unit="",
+)

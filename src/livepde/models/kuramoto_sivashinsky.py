@@ -1,0 +1,71 @@
+"""Kuramoto-Sivashinsky: u_t + a u u_x + b u_xx + c u_xxxx = 0 on a ring."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from livepde.fem import Unknown, grad, hess, smooth
+from livepde.model import Model
+from livepde.models.base import Equation, Variable
+from livepde.models.evolution import Coefficients, Number, beginning, ring, state
+
+__all__ = ["KURAMOTO_SIVASHINSKY", "kuramoto_sivashinsky"]
+
+
+def kuramoto_sivashinsky(
+    mesh: Any,
+    advection: Number,
+    instability: Number,
+    damping: Number,
+    u0: Unknown | None = None,
+) -> Model:
+    """Return u_t + a u u_x + b u_xx + c u_xxxx = 0 on a ring (Kuramoto and Sivashinsky).
+
+    Waves longer than 2 pi (c/b)^(1/2) grow, shorter ones decay: chaos, in which two states part
+    quickly. Sensors have to keep the state, so observe several points, and often.
+
+    Parameters
+    ----------
+    mesh
+        `livepde.interval(...)`, whose ends are one point of the ring.
+    advection, instability, damping
+        The coefficients a, b and c: unknown or numbers.
+    u0
+        Unknown initial state; None leaves it to the `Identifier`.
+    """
+    u = state(mesh, smooth(mesh), None)
+    c = Coefficients({"advection": advection, "instability": instability, "damping": damping})
+    begun, initial = beginning(u0, u)
+    return Model(
+        u,
+        {**c.unknown, **begun},
+        A=lambda q, u, v, x: (
+            c(q, "advection") * u * grad(u)[0] * v
+            - c(q, "instability") * grad(u)[0] * grad(v)[0]
+            + c(q, "damping") * hess(u)[0, 0] * hess(v)[0, 0]
+        ),
+        initial=initial,
+    )
+
+
+def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
+    return kuramoto_sivashinsky(ring("kuramoto_sivashinsky", mesh, dirichlet), **unknowns)
+
+
+KURAMOTO_SIVASHINSKY = Equation(
+    name="kuramoto_sivashinsky",
+    summary="Kuramoto-Sivashinsky (chaotic) on a ring, with unknown initial state",
+    formula="u_t + a u u_x + b u_xx + c u_xxxx = 0",
+    state=Variable("", "velocity of the front"),
+    unknowns={
+        "advection": Variable("", "coefficient a of u u_x"),
+        "instability": Variable("", "coefficient b of u_xx"),
+        "damping": Variable("", "coefficient c of u_xxxx"),
+        "u0": Variable("", "initial state, a field"),
+    },
+    build=_build,
+    element=smooth,
+    length_unit="",
+    time_unit="",
+)

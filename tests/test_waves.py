@@ -1,0 +1,189 @@
+"""Burgers, Korteweg-de Vries, Kuramoto-Sivashinsky, Allen-Cahn: exact solutions, checks, data."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skfem import ElementLineHermite
+
+import livepde as lp
+from livepde.diagnostics import check_model
+from livepde.models import EQUATIONS, allen_cahn, burgers, kdv, kuramoto_sivashinsky
+from livepde.stepping import Advance, Alexander2, simulate
+
+ONE = lp.Scalar(1.0, 1.0)
+
+
+def cole_hopf(x, t, nu):
+    """u = -2 nu phi_x/phi with phi = 1.5 + exp(-nu t) cos x, for a = 1."""
+    phi, slope = 1.5 + np.exp(-nu * t) * np.cos(x), -np.exp(-nu * t) * np.sin(x)
+    return -2 * nu * slope / phi
+
+
+def soliton(x, t, a, b, speed, start):
+    """Height 3 speed/a, on the whole line."""
+    return 3 * speed / a / np.cosh(np.sqrt(speed / b) / 2 * (x - start - speed * t)) ** 2
+
+
+def front(x, t, D, r):
+    """u = 1 grows into u = 0 at the speed 3 (r D/2)^(1/2)."""
+    return 0.5 - 0.5 * np.tanh(np.sqrt(r / D / 8) * (x - 3 * np.sqrt(r * D / 2) * t))
+
+
+def error(model, q, exact, times):
+    """Return the largest error at the end at the vertices."""
+    stream = simulate(model, np.array(q), lambda x: exact(x[0], 0.0), times, Advance(Alexander2()))
+    *_, (t, u) = stream
+    found = model.state_block.at_vertices @ u - exact(model.state.mesh.p[0], t)
+    return np.abs(found).max()
+
+
+def orders(build, q, exact, cells, stop):
+    """Return errors for a number of cells, and for twice as many with half the steps."""
+    return [error(build(n), q, exact, np.linspace(0.0, stop, n + 1)) for n in (cells, 2 * cells)]
+
+
+def test_burgers_is_the_solution_of_cole_and_hopf():
+    nu, a = 0.3, 1.0
+    coarse, fine = orders(
+        lambda n: burgers(lp.interval(0.0, 2 * np.pi, n), ONE, ONE),
+        [a, nu],
+        lambda x, t: cole_hopf(x, t, nu),
+        20,
+        3.0,
+    )
+    assert fine < 2e-5
+    assert coarse / fine > 3.5  # second order in time
+
+
+def test_burgers_scales_with_its_advection():
+    """a u obeys the equation with a = 1."""
+    mesh, nu, a = lp.interval(0.0, 2 * np.pi, 30), 0.3, 2.5
+    model = burgers(mesh, ONE, a)
+    scaled = lambda x, t: cole_hopf(x, t, nu) / a  # noqa: E731
+    assert error(model, [nu], scaled, np.linspace(0, 3, 61)) < 2e-5
+
+
+def test_a_soliton_keeps_its_height():
+    a, b = 6.0, 1.0
+    coarse, fine = orders(
+        lambda n: kdv(lp.interval(0.0, 40.0, n), ONE, ONE),
+        [a, b],
+        lambda x, t: soliton(x, t, a, b, 1.0, 15.0),
+        80,
+        8.0,
+    )
+    assert fine < 1e-3  # of a height of 0.5
+    assert coarse / fine > 3.5
+
+
+def test_the_front_of_allen_cahn():
+    D, r = 0.02, 3.0
+    coarse, fine = orders(
+        lambda n: allen_cahn(lp.interval(-2.0, 3.0, n), ONE, ONE, dirichlet={}),
+        [D, r],
+        lambda x, t: front(x, t, D, r),
+        40,
+        2.0,
+    )
+    assert fine < 1e-3
+    assert coarse / fine > 3.5
+
+
+def test_small_waves_of_kuramoto_sivashinsky_grow_as_they_must():
+    mesh, k = lp.interval(0.0, 4 * np.pi, 40), 0.5
+    model = kuramoto_sivashinsky(mesh, 1.0, ONE, ONE)
+    b, c = 1.5, 0.8
+    rate = b * k**2 - c * k**4
+    small = lambda x, t: 1e-7 * np.exp(rate * t) * np.cos(k * x)  # noqa: E731
+    assert error(model, [b, c], small, np.linspace(0.0, 2.0, 41)) < 1e-4 * 1e-7
+
+
+def unknowns(mesh, *values):
+    start = lp.Field(mesh, ElementLineHermite(), inner="H1", std=1.0)
+    return *(lp.Scalar(v, v, transform="log") for v in values), start
+
+
+@settings(deadline=None, max_examples=6)
+@given(st.floats(1e-3, 2.0), st.floats(0.1, 6.0), st.floats(0.1, 3.0))
+def test_checks_pass_for_random_parameters(small, one, other):
+    mesh = lp.interval(0.0, 3.0, 8)
+    wave = lambda x: np.sin(2 * np.pi * x[0] / 3.0)  # noqa: E731
+    small, one, other, start = unknowns(mesh, small, one, other)
+    for model in (
+        burgers(mesh, small, one, start),
+        burgers(mesh, small, 1.0, start, {"left": 0.0, "right": 0.5}),
+        kdv(mesh, one, small, start),
+        kuramoto_sivashinsky(mesh, one, other, small, start),
+        allen_cahn(mesh, small, one, start),
+    ):
+        check_model(model, u=wave).raise_if_failed()
+
+
+def test_an_unknown_start_takes_over_the_sides():
+    mesh = lp.interval(0.0, 1.0, 6)
+    nu, start = unknowns(mesh, 0.1)
+    ring = burgers(mesh, nu, u0=start)
+    assert ring.parameter_space.fields["u0"].size == ring.X.dim == 12
+    held = burgers(mesh, nu, u0=start, dirichlet={"left": 0.0, "right": 1.0})
+    fixed = held.parameter_space.fixed - 1  # behind nu
+    assert held.parameter_space.fields["u0"].field.dirichlet == {"left": 0.0}
+    assert fixed.tolist() == [0]
+
+
+def test_the_equations_build_and_a_ring_has_no_ends():
+    mesh = lp.interval(0.0, 1.0, 6)
+    for name in ("burgers", "kdv", "kuramoto_sivashinsky", "allen_cahn"):
+        equation = EQUATIONS[name]
+        start = lp.Field(mesh, equation.element(mesh))
+        given = {key: start if key == "u0" else ONE for key in equation.unknowns}
+        model = equation.build(mesh, given, {})
+        assert model.state.periodic
+        assert set(model.parameter_space.unknowns) == set(equation.unknowns)
+    with pytest.raises(lp.ModelError, match=r"kdv is periodic: leave out .*'left'"):
+        EQUATIONS["kdv"].build(mesh, given, {"left": 0.0})
+
+
+def reader():
+    path = Path(__file__).parents[1] / "cases" / "discovery.py"
+    spec = importlib.util.spec_from_file_location("discovery", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.field
+
+
+def test_the_reader_adds_noise_to_all_and_hides_some(data_dir):
+    field = reader()
+    t, clean = field(data_dir, "pde_find/burgers.mat")
+    assert (len(t), len(clean), t[0], t[-1]) == (101, 256, 0.0, 10.0)
+    u = np.array(list(clean.values()))
+    assert u[:, 0] == pytest.approx(np.exp(-((np.arange(256) / 16 - 6) ** 2)), abs=1e-6)
+    noisy = np.array(list(field(data_dir, "pde_find/burgers.mat", noise=0.1, seed=1)[1].values()))
+    for part in (noisy - u, (noisy - u)[:, :1]):
+        assert part.std() == pytest.approx(0.1 * u.std(), rel=0.15)
+    rare = np.array(list(field(data_dir, "pde_find/burgers.mat", share=0.2)[1].values()))
+    assert np.isfinite(rare).mean() == pytest.approx(0.2, rel=0.05)
+    assert np.nanmax(np.abs(rare - u)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("noise", "share", "bound"), [(0, 1, 1e-3), (0.1, 1, 0.029), (0.05, 0.2, 0.032)]
+)
+def test_burgers_from_a_published_field(data_dir, noise, share, bound):
+    """Every other column and the first half of what the case takes in full."""
+    t, columns = reader()(data_dir, "pde_find/burgers.mat", noise=noise, share=share)
+    z = np.array(list(columns.values())).T[:, ::2]
+    mesh = lp.interval(-8.0, 8.0, 80)
+    start = lp.Field(mesh, ElementLineHermite(), inner="H1", std=1.0)
+    model = burgers(mesh, lp.Scalar(0.3, 0.3, transform="log"), lp.Scalar(0.5, 0.5), start)
+    sensors = lp.Points(list(np.arange(-8.0, 8.0, 0.125)), noise=max(0.1814 * noise, 2e-4))
+    law = lp.SensitivityLaw(modes=40, replay=lp.Replay(first=25))
+    identifier = lp.Identifier(model, sensors, law, scheme=Alexander2(), dt_max=0.05)
+    found = identifier.run(zip(t[:51], z[:51], strict=True)).last.parameters
+    assert abs(found["nu"][0] / 0.1 - 1) < bound
+    assert abs(found["advection"][0] - 1) < bound
