@@ -145,6 +145,9 @@ def test_the_equations_build_and_a_ring_has_no_ends():
         model = equation.build(mesh, given, {})
         assert model.state.periodic
         assert set(model.parameter_space.unknowns) == set(equation.unknowns)
+    known = EQUATIONS["burgers"].build(mesh, {"nu": ONE}, {"left": 0.0, "right": 0.0})
+    assert known.form_initial is None
+    assert list(known.parameter_space.unknowns) == ["nu"]
     with pytest.raises(lp.ModelError, match=r"kdv is periodic: leave out .*'left'"):
         EQUATIONS["kdv"].build(mesh, given, {"left": 0.0})
 

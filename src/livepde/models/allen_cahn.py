@@ -8,7 +8,7 @@ from typing import Any
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
 from livepde.models.base import Equation, Variable
-from livepde.models.evolution import Coefficients, Number, beginning, state
+from livepde.models.common import Coefficients, Number, beginning, state
 
 __all__ = ["ALLEN_CAHN", "allen_cahn"]
 
@@ -64,7 +64,7 @@ ALLEN_CAHN = Equation(
     unknowns={
         "D": Variable("", "diffusivity"),
         "r": Variable("", "rate of reaction"),
-        "u0": Variable("", "initial state, a field"),
+        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
     build=_build,
     element=hermite,

@@ -8,7 +8,7 @@ from typing import Any
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
 from livepde.models.base import Equation, Variable
-from livepde.models.evolution import Coefficients, Number, beginning, state
+from livepde.models.common import Coefficients, Number, beginning, state
 
 __all__ = ["BURGERS", "burgers"]
 
@@ -65,8 +65,8 @@ BURGERS = Equation(
     state=Variable("", "velocity"),
     unknowns={
         "nu": Variable("", "viscosity"),
-        "advection": Variable("", "coefficient a of the advection"),
-        "u0": Variable("", "initial state, a field"),
+        "advection": Variable("", "coefficient a of the advection; else 1", optional=True),
+        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
     build=_build,
     element=hermite,

@@ -8,7 +8,7 @@ from typing import Any
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
 from livepde.models.base import Equation, Variable
-from livepde.models.evolution import Coefficients, Number, beginning, ring, state
+from livepde.models.common import Coefficients, Number, beginning, ring, state
 
 __all__ = ["KDV", "kdv"]
 
@@ -54,7 +54,7 @@ KDV = Equation(
     unknowns={
         "advection": Variable("", "coefficient a of u u_x"),
         "dispersion": Variable("", "coefficient b of u_xxx"),
-        "u0": Variable("", "initial state, a field"),
+        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
     build=_build,
     element=smooth,

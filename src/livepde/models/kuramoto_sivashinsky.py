@@ -8,7 +8,7 @@ from typing import Any
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
 from livepde.models.base import Equation, Variable
-from livepde.models.evolution import Coefficients, Number, beginning, ring, state
+from livepde.models.common import Coefficients, Number, beginning, ring, state
 
 __all__ = ["KURAMOTO_SIVASHINSKY", "kuramoto_sivashinsky"]
 
@@ -62,7 +62,7 @@ KURAMOTO_SIVASHINSKY = Equation(
         "advection": Variable("", "coefficient a of u u_x"),
         "instability": Variable("", "coefficient b of u_xx"),
         "damping": Variable("", "coefficient c of u_xxxx"),
-        "u0": Variable("", "initial state, a field"),
+        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
     build=_build,
     element=smooth,
