@@ -133,3 +133,12 @@ def test_parameter_boundary_values_must_be_zero():
 def test_initial_state_of_a_wrong_shape():
     with pytest.raises(lp.SpaceError, match=r"'u': coefficients of shape \(3,\); expected \(13,\)"):
         reaction(line(), ElementLineP1()).initial(np.zeros(3))
+
+
+def test_a_name_that_is_no_unknown_is_said():
+    with pytest.raises(lp.ModelError, match=r"there is no 'd'; there are \['D', 'r'\]"):
+        lp.Model(
+            lp.Field(line(), ElementLineP1()),
+            {"D": lp.Scalar(1.0), "r": lp.Scalar(1.0)},
+            A=lambda q, u, v, x: q.d * u * v,
+        )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -22,6 +21,7 @@ from livepde.fem import (
     Integrand,
     Latent,
     Moment,
+    Named,
     On,
     Sobolev,
     Unknown,
@@ -65,7 +65,7 @@ def h1_form(u: Any, v: Any, x: Any) -> Any:
 
 
 def _summed(form: Callable[[Any, Any], Any], u: Any, v: Any) -> Any:
-    if not isinstance(u, SimpleNamespace):
+    if not isinstance(u, Named):
         return form(u, v)
     return sum(form(part, getattr(v, name)) for name, part in vars(u).items())
 

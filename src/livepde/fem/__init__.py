@@ -24,7 +24,7 @@ from livepde.fem.meshes import box, hermite, linear, quadratic, read_mesh, recta
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
-from livepde.fem.space import FunctionSpace
+from livepde.fem.space import FunctionSpace, Named
 from livepde.fem.upwind import upwind
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "LatentPart",
     "MeanReverting",
     "Moment",
+    "Named",
     "On",
     "Periodic",
     "Piecewise",

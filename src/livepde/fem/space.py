@@ -17,7 +17,14 @@ from livepde.fem.fields import Unknown
 from livepde.fem.place import Moment
 from livepde.linalg import Array, IntArray
 
-__all__ = ["FunctionSpace", "LocalSpace"]
+__all__ = ["FunctionSpace", "LocalSpace", "Named"]
+
+
+class Named(SimpleNamespace):
+    """What forms and sensors see of several unknowns or components: q.D, u.c."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"there is no '{name}'; there are {sorted(vars(self))}")
 
 
 class LocalSpace:
@@ -84,7 +91,7 @@ class LocalSpace:
             start = stop
         if self.space.single:
             return jets[0]
-        return SimpleNamespace(**dict(zip(self.space.blocks, jets, strict=True)))
+        return Named(**dict(zip(self.space.blocks, jets, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
-from livepde.fem import FunctionSpace, Moment, Place, Scalars
+from livepde.fem import FunctionSpace, Moment, Named, Place, Scalars
 from livepde.linalg import Array
 from livepde.observation.reconstruction import (
     Pseudoinverse,
@@ -380,4 +379,4 @@ def numbers(parameter: FunctionSpace, q: Array) -> Any:
             seen[name] = part[0] if len(part) == 1 else part
     if parameter.single:
         return next(iter(seen.values()))
-    return SimpleNamespace(**seen)
+    return Named(**seen)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ModelError, ObservationError
-from livepde.fem import Field, Form, FunctionSpace, Integrand, Moment, On, Scalar
+from livepde.fem import Field, Form, FunctionSpace, Integrand, Moment, Named, On, Scalar
 from livepde.linalg import Array
 from livepde.observation.base import Observation, Observed
 from livepde.spaces import HilbertSpace
@@ -130,4 +129,4 @@ def _quadrature(field: Field) -> int:
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
     """Return state or parameter as forms see it."""
     jets = {name: getattr(uq, prefix + name) for name in space.unknowns}
-    return next(iter(jets.values())) if space.single else SimpleNamespace(**jets)
+    return next(iter(jets.values())) if space.single else Named(**jets)
