@@ -28,19 +28,36 @@ def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
     return leaves
 
 
-def rebuild(template: Any, leaves: Mapping[str, Array], prefix: str = "state") -> Any:
-    """Return a value shaped like `template` with the leaves given."""
+def rebuild(
+    template: Any, leaves: Mapping[str, Array], prefix: str = "state", grows: int = 0
+) -> Any:
+    """Return a value shaped like `template` with the leaves given.
+
+    One axis of an array may have another length: the first one (stored samples), or what the
+    metadata of its dataclass field say, as in field(metadata={"grows": 1}).
+    """
     if is_dataclass(template) and not isinstance(template, type):
         parts = {
-            item.name: rebuild(getattr(template, item.name), leaves, f"{prefix}.{item.name}")
+            item.name: rebuild(
+                getattr(template, item.name),
+                leaves,
+                f"{prefix}.{item.name}",
+                item.metadata.get("grows", 0),
+            )
             for item in fields(template)
         }
         return type(template)(**parts)
     array = leaves[prefix]
-    # The first axis may grow (stored samples); the others are the problem's.
-    if isinstance(template, np.ndarray) and array.shape[1:] != template.shape[1:]:
+    if not isinstance(template, np.ndarray):
+        return type(template)(array.item())
+    if _others(array, grows) != _others(template, grows):
         raise ValueError(f"{prefix} has shape {array.shape}, needs {template.shape}")
-    return array if isinstance(template, np.ndarray) else type(template)(array.item())
+    return array
+
+
+def _others(array: Array, axis: int) -> list[int]:
+    """Return the lengths of all axes but one."""
+    return [length for k, length in enumerate(array.shape) if k != axis]
 
 
 def write(

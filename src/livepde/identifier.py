@@ -138,7 +138,7 @@ class Identifier:
             u0 = self.model.initial_state(self._q0, moment)
         else:
             u0 = self.model.impose(self._u0, moment)
-        self._state = self.law.init(self._work, self._q0, u0)
+        self._state = self.law.start(self._work, self._q0, u0, moment)
         self._inputs = inputs
 
     @property

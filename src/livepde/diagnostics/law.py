@@ -13,6 +13,7 @@ import numpy as np
 from livepde import checkpoint
 from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.errors import LawError
+from livepde.fem import Moment
 from livepde.identifier import Identifier, Sample
 from livepde.laws import AnyLaw, Belief, Law, Problem, Report
 from livepde.linalg import Array
@@ -154,7 +155,7 @@ def _unusable(estimate: Estimate) -> int:
 
 
 def _outside(identifier: Identifier, estimates: list[Estimate]) -> int:
-    lower, upper = identifier.model.latent.bounds
+    lower, upper = identifier.model.latent.limits
     return sum(int(((e.q < lower) | (e.q > upper)).sum()) for e in estimates)
 
 
@@ -201,6 +202,12 @@ class _Wrapped(Law[Any, Any]):
 
     def init(self, work: Any, q0: Array, u0: Array) -> Any:
         return self.law.init(work, q0, u0)
+
+    def start(self, work: Any, q0: Array, u0: Array, moment: Moment) -> Any:
+        return self.law.start(work, q0, u0, moment)
+
+    def begin(self, work: Any, state: Any, interval: Interval) -> Any:
+        return self.law.begin(work, state, interval)
 
     def step(self, work: Any, state: Any, interval: Interval) -> tuple[Any, Report]:
         return self.law.step(work, state, interval)

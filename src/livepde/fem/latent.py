@@ -156,8 +156,10 @@ class Latent:
 
     @cached_property
     def prior(self) -> Array:
-        """Prior mean of the latent coefficients, shape (dim,)."""
-        return self.inverse(self.space.prior)
+        """Prior mean of the latent coefficients, shape (dim,); zero where they are fixed."""
+        prior = self.inverse(self.space.prior).copy()
+        prior[self.fixed] = 0.0
+        return prior
 
     @cached_property
     def deviations(self) -> Array:
@@ -169,6 +171,15 @@ class Latent:
         """Lower and upper bounds of the latent coefficients, as laws have to respect them."""
         pairs = [p.unknown.latent_bounds for p in self.parts.values()]
         return self._filled(iter([p[0] for p in pairs])), self._filled(iter([p[1] for p in pairs]))
+
+    @cached_property
+    def limits(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the coefficients of q, each of shape (m,)."""
+        parts = self.parts.values()
+        lower, upper = (
+            np.repeat([p.unknown.bounds[k] for p in parts], [p.size for p in parts]) for k in (0, 1)
+        )
+        return lower, upper
 
     @cached_property
     def fixed(self) -> IntArray:

@@ -158,6 +158,13 @@ class Law(ABC, Generic[Work, State]):
     def init(self, work: Work, q0: Array, u0: Array) -> State:
         """Return the state at the start, from coefficients q0 (m,) and u0 (n,)."""
 
+    def start(self, work: Work, q0: Array, u0: Array, moment: Moment) -> State:
+        """Return the state at the start of a run, at a moment; here that of `init`.
+
+        For a law that knows how the initial state depends on the parameter (`Model.initial`).
+        """
+        return self.init(work, q0, u0)
+
     def begin(self, work: Work, state: State, interval: Interval) -> State:
         """Return the state after a sample at the initial time; here the same.
 

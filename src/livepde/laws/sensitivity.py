@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -12,7 +13,7 @@ from livepde.fem import Evolution, FieldBlock, Inputs, Moment, RandomWalk
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
 from livepde.linalg import Array
-from livepde.stepping import ForwardStage, Interval, advance
+from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
 __all__ = ["Replay", "SensitivityLaw", "SensitivityState"]
 
@@ -77,8 +78,8 @@ class Point:
     q: Array
     du: Array
     da: Array
-    U: Array
-    C: Array
+    U: Array = field(metadata={"grows": 1})
+    C: Array = field(metadata={"grows": 1})
     consistency: Consistency
     refused: Array
 
@@ -117,6 +118,8 @@ class SensitivityState:
         What was measured in between; empty without replay.
     assimilated, due
         Samples used since the start of the window, and at how many the next replay is due.
+    initial
+        True while the window begins with the initial state that the model says (`Model.initial`).
     """
 
     now: Point
@@ -124,6 +127,7 @@ class SensitivityState:
     samples: Samples
     assimilated: int
     due: int
+    initial: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +156,11 @@ class Motion:
         gained = self.evolution.growth(h, self.std)
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
 
+    def backward(self, h: float) -> Array:
+        """Return what the coordinates are expected to have been a time h before: matrix on them."""
+        F = self.transition(h)
+        return np.asarray(np.linalg.solve(F @ F.T + np.diag(self.growth(h)), F).T)
+
 
 @dataclass(frozen=True, eq=False)
 class SensitivityWork:
@@ -168,6 +177,44 @@ class SensitivityWork:
     noise: Array
     scale: Array
     rank: int
+
+    @cached_property
+    def moves(self) -> bool:
+        """True if an unknown moves by itself."""
+        return any(motion.evolution.moves for motion in self.motions)
+
+    def moved(self, point: Point, h: float) -> Point:
+        """Return a point whose unknowns have moved for a time h; those of its state have not.
+
+        What they gain is in new columns of the factor, in the same order for every h.
+        """
+        if not self.moves or h == 0.0:
+            return point
+        F = block_diag(*(motion.transition(h) for motion in self.motions))
+        gained = np.sqrt(np.concatenate([motion.growth(h) for motion in self.motions]))
+        new = np.diag(gained)[:, gained > 0.0]
+        q = self.problem.model.latent.moved(point.q, h)
+        U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
+        return replace(point, q=q, da=F @ point.da, U=U, C=np.hstack([F @ point.C, new]))
+
+    def traced(self, q: Array, start: Array, h: float) -> Array:
+        """Return the latent parameter that is expected to have become q in a time h.
+
+        Parameters
+        ----------
+        start
+            One at that time; what no mode sees is taken from it.
+        """
+        if not self.moves:
+            return q
+        prior = self.problem.model.latent.prior
+        back = block_diag(*(motion.backward(h) for motion in self.motions))
+        return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
+
+    def directions(self, point: Point) -> Array:
+        """Return the columns of the factor and da in latent coefficients, shape (m, r + 1)."""
+        directions: Array = self.Phi @ np.column_stack([point.C, point.da])
+        return directions
 
     def latent(self, point: Point) -> Array:
         """Return the estimated latent parameter, not yet bounded."""
@@ -319,21 +366,30 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return Phi, tuple(motions)
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
-        k, model = work.Phi.shape[1], work.problem.model
+        k = work.Phi.shape[1]
         sensors, channels = work.problem.observed.size, work.problem.channels
         start = Point(
             u0,
             q0,
             np.zeros(len(u0)),
             np.zeros(k),
-            model.initial_directions(q0, work.Phi),
+            np.zeros((len(u0), k)),
             np.eye(k),
             Consistency.start(sensors),
             np.zeros(sensors, dtype=np.int64),
         )
         empty = Samples(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, len(channels))))
         due = self.replay.first if self.replay else 0
-        return SensitivityState(start, start, empty, 0, due)
+        return SensitivityState(start, start, empty, 0, due, False)
+
+    def start(
+        self, work: SensitivityWork, q0: Array, u0: Array, moment: Moment
+    ) -> SensitivityState:
+        state, model = self.init(work, q0, u0), work.problem.model
+        if model.form_initial is None:
+            return state
+        point = replace(state.start, U=model.initial_directions(q0, work.Phi, moment))
+        return replace(state, start=point, now=point, initial=True)
 
     def begin(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
@@ -369,7 +425,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if len(state.samples.t) > self.replay.window:
             start = _recentre(work, state.now)
             empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
-            state = SensitivityState(start, start, empty, 0, self.replay.first)
+            state = SensitivityState(start, start, empty, 0, self.replay.first, False)
         return state, report
 
     def _store(
@@ -387,20 +443,26 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def _replayed(self, work: SensitivityWork, state: SensitivityState) -> tuple[Point, Status]:
         """Run the stored samples again about a reference at the estimate, or on the way to it."""
-        start, samples = state.start, state.samples
+        start, samples, model = state.start, state.samples, work.problem.model
         reference = state.now.q
         step = work.reduced(work.bounded(work.latent(state.now)) - reference)
         step = step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
-        q = reference + work.Phi @ step
+        q = work.traced(reference + work.Phi @ step, start.q, samples.t[-1] - samples.t[0])
         shift = work.reduced(q - start.q)
-        along = _along(start, shift)
-        point = replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
         channels = work.problem.channels
         named = [dict(zip(channels, row, strict=True)) for row in samples.inputs]
+        first = Moment(samples.t[0], Inputs(named[0]))
+        if state.initial:
+            U = model.initial_directions(q, work.Phi, first)
+            u, du = model.initial_state(q, first), -U @ shift
+            point = replace(start, q=q, u=u, du=du, da=-shift, U=U)
+        else:
+            along = _along(start, shift)
+            point = replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
         if np.isfinite(samples.z[0]).any():
-            end, z = Moment(samples.t[0], Inputs(named[0])), samples.z[0]
-            at = Interval(end.t, end.t, end.inputs, end.inputs, z, z)
-            point, _ = self._update(work, point, at, work.predict(point, end))
+            z = samples.z[0]
+            at = Interval(first.t, first.t, first.inputs, first.inputs, z, z)
+            point, _ = self._update(work, point, at, work.predict(point, first))
         for k in range(1, len(samples.t)):
             interval = Interval(
                 samples.t[k - 1],
@@ -419,32 +481,21 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         self, work: SensitivityWork, point: Point, interval: Interval
     ) -> tuple[Point, Report]:
         """Predict over an interval and update at its end, linear about the reference."""
-        model = work.problem.model
-        before = point
-        point = self._moved(work, point, interval.t1 - interval.t0)
-        direction = work.Phi @ np.column_stack([point.C, point.da])
-        columns = [point.u, point.U, point.du]
-
-        def stage(c: Array, t: float, h: float) -> Array:
-            moment = interval.at(t)
-            u = work.forward.solve(c[:, 0], point.q, h, moment)
-            factor = work.forward.tangent(u, point.q, h, moment)
-            forcing = model.form_A.product("v", "q", direction, moment, u=u, q=point.q)
-            rhs = (model.mass @ c[:, 1:]) / h - forcing
-            return np.column_stack([u, factor.solve(rhs * model.X.free[:, None])])
-
-        control = work.problem.control
-        y, steps, failure = advance(control, stage, np.column_stack(columns), interval)
 
         def failed(status: Status) -> tuple[Point, Report]:
-            return before, Report(status, work.predict(before, interval.end))
+            return point, Report(status, work.predict(point, interval.end))
 
-        if failure is not None:
-            return failed(Status.of(failure))
-        if not np.isfinite(y).all():
+        # What unknowns gain in one substep is independent of what they gain in the next.
+        count = work.problem.control.count(interval) if work.moves else 1
+        moved, steps = point, 0
+        for part in interval.divided(count):
+            moved, taken, failure = _predicted(work, moved, part)
+            steps += taken
+            if failure is not None:
+                return failed(Status.of(failure))
+        if not all(np.isfinite(x).all() for x in (moved.u, moved.U, moved.du)):
             return failed(Status("not_finite", "the prediction is not finite"))
-        fade = np.exp(-(interval.t1 - interval.t0) / self.memory)
-        moved = replace(point, u=y[:, 0], U=fade * y[:, 1:-1], du=y[:, -1])
+        moved = replace(moved, U=np.exp(-(interval.t1 - interval.t0) / self.memory) * moved.U)
         predicted = work.predict(moved, interval.end)
         new, refused = self._update(work, moved, interval, predicted)
         if not np.isfinite(new.da).all():
@@ -456,20 +507,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if np.isfinite(self.gate):
             notes["refused"] = float(refused)
         return new, Report(Status(), predicted, steps, notes)
-
-    def _moved(self, work: SensitivityWork, point: Point, h: float) -> Point:
-        """Let the unknowns move by themselves for a time h; the state follows in the prediction."""
-        latent = work.problem.model.latent
-        if not any(motion.evolution.moves for motion in work.motions):
-            return point
-        F = block_diag(*(motion.transition(h) for motion in work.motions))
-        gained = np.sqrt(np.concatenate([motion.growth(h) for motion in work.motions]))
-        new = np.diag(gained)[:, gained > 0.0]
-        C = np.hstack([F @ point.C, new])
-        U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
-        if C.shape[1] > work.rank:
-            U, C = _compressed(U, C, work.scale, work.rank)
-        return replace(point, q=latent.moved(point.q, h), da=F @ point.da, U=U, C=C)
 
     def _update(
         self, work: SensitivityWork, point: Point, interval: Interval, predicted: Array
@@ -511,6 +548,34 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             now.U,
             now.consistency.inflation,
         )
+
+
+def _predicted(
+    work: SensitivityWork, point: Point, interval: Interval
+) -> tuple[Point, int, StepFailed | None]:
+    """Return the filter at the end of an interval, substeps taken, and why it failed or None."""
+    model, end = work.problem.model, work.moved(point, interval.t1 - interval.t0)
+    at_end = work.directions(end)
+
+    def stage(c: Array, t: float, h: float) -> Array:
+        moment, q, directions = interval.at(t), end.q, at_end
+        if work.moves and t != interval.t1:
+            now = work.moved(point, t - interval.t0)
+            q, directions = now.q, work.directions(now)
+        u = work.forward.solve(c[:, 0], q, h, moment)
+        factor = work.forward.tangent(u, q, h, moment)
+        forcing = model.form_A.product("v", "q", directions, moment, u=u, q=q)
+        rhs = (model.mass @ c[:, 1:]) / h - forcing
+        return np.column_stack([u, factor.solve(rhs * model.X.free[:, None])])
+
+    columns = np.column_stack([end.u, end.U, end.du])
+    y, steps, failure = advance(work.problem.control, stage, columns, interval)
+    if failure is not None or not np.isfinite(y).all():
+        return replace(end, u=y[:, 0], U=y[:, 1:-1], du=y[:, -1]), steps, failure
+    U, C = y[:, 1:-1], end.C
+    if C.shape[1] > work.rank:
+        U, C = _compressed(U, C, work.scale, work.rank)
+    return replace(end, u=y[:, 0], U=U, C=C, du=y[:, -1]), steps, None
 
 
 def _along(point: Point, shift: Array) -> Array:

@@ -54,6 +54,19 @@ class Interval:
         """Time and inputs at the end."""
         return Moment(self.t1, Inputs(self.inputs1))
 
+    def divided(self, count: int) -> list[Interval]:
+        """Return the interval as equal parts, in time order."""
+        if count == 1:
+            return [self]
+        share = [k / count for k in range(count + 1)]
+        times = [self.t0, *(self.t0 + s * (self.t1 - self.t0) for s in share[1:-1]), self.t1]
+        inputs = [self.inputs0, *(self.at(t).inputs for t in times[1:-1]), self.inputs1]
+        z = [self.z0, *(self.z(t) for t in times[1:-1]), self.z1]
+        return [
+            Interval(times[k], times[k + 1], inputs[k], inputs[k + 1], z[k], z[k + 1])
+            for k in range(count)
+        ]
+
     @cached_property
     def present(self) -> Array:
         """Sensors with a value at the end, shape (sensors,)."""

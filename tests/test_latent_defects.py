@@ -1,0 +1,239 @@
+"""Defects of moving and transformed unknowns found in review, each with the case that showed it."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde.diagnostics import check_law
+from livepde.fem.evolution import Constant
+from livepde.linalg import Array
+from livepde.stepping import ForwardStage
+
+NOISE = 0.02
+SENSORS = {"a": 0.3, "b": 0.55, "c": 0.8}
+EVOLUTIONS = {
+    "constant": Constant(),
+    "walk": lp.RandomWalk(0.4),
+    "reverting": lp.MeanReverting(0.8),
+    "periodic": lp.Periodic(2.0, 2),
+}
+mesh = lp.interval(0.0, 1.0, 6)
+
+
+def linear_model(evolution: Any) -> lp.Model:
+    """Return a rod with an unknown source, offsets of two sensors, and an unknown initial state."""
+    unknowns = {
+        "s": lp.Scalar(0.5, 0.7, evolution=evolution),
+        "off": lp.Scalars(("a", "b"), 0.1, 0.2, evolution=lp.MeanReverting(1.5)),
+        "u0": lp.Field(mesh, ElementLineP1(), inner="H1", prior=0.3, std=0.6),
+    }
+    return lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"left": lambda x, t: np.sin(t) + 0 * x[0]}),
+        unknowns,
+        A=lambda q, u, v, x: -q.s * (1 + x[0]) * v,
+        B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)) + 0.4 * u * v,
+        initial=lambda q, v, x: q.u0 * v,
+    )
+
+
+def sensors() -> lp.Points:
+    direct = {"a": lambda q, x: q.off["a"], "b": lambda q, x: q.off["b"]}
+    return lp.Points(SENSORS, noise=NOISE, direct=direct)
+
+
+def samples(count: int = 30, missing: bool = True) -> list[tuple[float, Array]]:
+    """Return irregular samples, from time zero on; some values are missing, two samples whole."""
+    rng = np.random.default_rng(0)
+    times = np.cumsum(np.append(0.0, rng.uniform(0.05, 0.2, count)))
+    z = np.outer(np.sin(times), [0.7, 0.5, 0.2]) + 0.4 + 0.3 * np.cos(2 * times)[:, None]
+    z += 0.05 * rng.standard_normal(z.shape)
+    if missing:
+        z[rng.random(z.shape) < 0.2] = np.nan
+        z[10:12] = np.nan
+    return list(zip(times.tolist(), z, strict=True))
+
+
+class Dense:
+    """The Kalman filter of (u, latent) with dense matrices, for models linear in both."""
+
+    def __init__(self, model: lp.Model, observed: Any) -> None:
+        self.model, n, k = model, model.X.dim, model.latent.dim
+        self.n, self.k = n, k
+        q = model.initial_parameter()
+        self.x = np.concatenate([model.initial_state(q), q])
+        self.prior = np.linalg.inv(model.Q.gram.toarray())
+        J = np.vstack([model.initial_directions(q, np.eye(k)), np.eye(k)])
+        self.P = J @ self.prior @ J.T
+        H_u, H_q = observed.jacobian(self.x[:n], model.latent.value(q), lp.Moment(0.0))
+        self.H = np.hstack([H_u.toarray(), H_q @ model.latent.V.toarray()])
+
+    def predict(self, t0: float, t1: float, substeps: int) -> None:
+        model, n, k = self.model, self.n, self.k
+        M, zero = model.mass.toarray(), np.zeros(n)
+        B, A = model.form_B.matrix("v", "u", u=zero).toarray(), model.A(zero).matrix.toarray()
+        free, h = model.X.free.astype(bool), (t1 - t0) / substeps
+        for t in t0 + h * np.arange(1, substeps + 1):
+            F, gained = np.zeros((k, k)), np.zeros((k, k))
+            for p in model.latent.parts.values():
+                F[p.part, p.part] = np.kron(p.evolution.transition(h), np.eye(p.size))
+                grown = np.repeat(p.evolution.growth(h, p.unknown.latent_std), p.size)
+                gained[p.part, p.part] = grown[:, None] * self.prior[p.part, p.part]
+            prior = model.latent.prior
+            a = prior + F @ (self.x[n:] - prior)
+            S, u = M / h + B, model.impose(self.x[:n], lp.Moment(t))
+            load = M @ self.x[:n] / h - A @ a + model.F(lp.Moment(t)) - S @ u
+            step = np.zeros((n, n))
+            step[np.ix_(free, free)] = np.linalg.inv(S[np.ix_(free, free)])
+            J = np.block([[step @ M / h, -step @ A @ F], [np.zeros((k, n)), F]])
+            N = np.vstack([-step @ A, np.eye(k)])
+            self.x = np.concatenate([u + step @ load, a])
+            self.P = J @ self.P @ J.T + N @ gained @ N.T
+
+    def update(self, z: Array) -> None:
+        seen = np.isfinite(z)
+        H = self.H[seen]
+        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + NOISE**2 * np.eye(len(H)))
+        self.x = self.x + K @ (z[seen] - H @ self.x)
+        self.P = self.P - K @ H @ self.P
+
+    def parameter(self) -> tuple[Array, Array]:
+        V = self.model.latent.V.toarray()
+        variance = np.diag(V @ self.P[self.n :, self.n :] @ V.T)
+        return V @ self.x[self.n :], np.sqrt(variance)
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+@pytest.mark.parametrize("replay", [None, lp.Replay(first=4), lp.Replay(first=4, window=11)])
+@pytest.mark.parametrize("name", EVOLUTIONS)
+def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: Any, substeps: int):
+    model = linear_model(EVOLUTIONS[name])
+    law = lp.SensitivityLaw(modes=7, rank=30, replay=replay)
+    # Samples at equal distances: dt_max then divides each step alike.
+    stream = [(0.1 * k, z) for k, (_, z) in enumerate(samples())]
+    identifier = lp.Identifier(model, sensors(), law, dt_max=0.1 / substeps)
+    dense, before = Dense(model, identifier.observed), 0.0
+    for t, z in stream:
+        estimate = identifier.step(t, z)
+        if t > before:
+            dense.predict(before, t, substeps)
+        dense.update(z)
+        before, (q, std) = t, dense.parameter()
+        np.testing.assert_allclose(estimate.q, q, atol=1e-9)
+        np.testing.assert_allclose(estimate.u, dense.x[: dense.n], atol=1e-9)
+        factor = estimate.belief.q_factor
+        assert factor is not None
+        np.testing.assert_allclose(np.sqrt((factor**2).sum(axis=1)), std, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", EVOLUTIONS)
+@pytest.mark.parametrize("replay", [None, lp.Replay(first=3, window=9)])
+def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
+    model = linear_model(EVOLUTIONS[name])
+    law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0)
+    stream = samples(12, missing=False)
+    check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
+
+
+def test_a_checkpoint_of_other_modes_is_refused_whatever_its_width(tmp_path: Path):
+    model = linear_model(lp.RandomWalk(0.4))
+    first, other = (
+        lp.Identifier(model, sensors(), lp.SensitivityLaw(modes=modes)) for modes in (3, 4)
+    )
+    for t, z in samples(4):
+        first.step(t, z)
+    first.save(tmp_path / "state.npz")
+    with pytest.raises(lp.RunError, match=r"state\.now\.da|state\.now\.C"):
+        other.load(tmp_path / "state.npz")
+
+
+def test_an_initial_state_may_read_channels():
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        {"gain": lp.Scalar(0.0, 1.0)},
+        A=lambda q, u, v, x: 0.1 * u * v + 0.0 * q.gain * v,
+        initial=lambda q, v, x: q.gain * x.inputs["T"] * v,
+        inputs=["T"],
+    )
+    identifier = lp.Identifier(model, lp.Points([0.3], noise=1e-3), lp.SensitivityLaw())
+    estimate = identifier.step(0.0, [3.0], {"T": 2.0})
+    assert estimate.parameters["gain"][0] == pytest.approx(1.5, rel=1e-5)
+    np.testing.assert_allclose(estimate.u, 3.0, rtol=1e-5)
+
+
+def test_replays_linearise_the_initial_state_anew():
+    unknown = lp.Scalar(1.0, 1.0, transform="log")
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        {"u0": unknown},
+        A=lambda q, u, v, x: 0.1 * u * v,
+        initial=lambda q, v, x: q.u0 * v,
+    )
+    truth = model.initial_parameter({"u0": 5.0})
+    forward, u = ForwardStage(model), model.initial_state(truth)
+    law = lp.SensitivityLaw(replay=lp.Replay(first=2))
+    identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law)
+    identifier.step(0.0, identifier.observed.G @ u)
+    for k in range(1, 20):
+        u = forward.solve(u, truth, 0.1, lp.Moment(0.1 * k))
+        estimate = identifier.step(0.1 * k, identifier.observed.G @ u)
+    value, std = estimate.parameters["u0"]
+    assert abs(value - 5.0) < std < 0.01
+
+
+def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
+    def a(t: float) -> float:
+        return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
+
+    def rod(unknown: lp.Scalar) -> lp.Model:
+        fine = lp.interval(0.0, 1.0, 20)
+        left = lambda x, t: np.sin(3.0 * t) + 0.0 * x[0]  # noqa: E731
+        state = lp.Field(fine, ElementLineP1(), dirichlet={"left": left, "right": 0.0})
+        return lp.Model(
+            state, {"a": unknown}, lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v))
+        )
+
+    truth, rng = rod(lp.Scalar(1.0)), np.random.default_rng(0)
+    model = rod(lp.Scalar(0.2, 0.2, evolution=lp.Periodic(10.0)))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+    identifier = lp.Identifier(model, lp.Points(SENSORS, noise=0.01), law)
+    forward, u = ForwardStage(truth), truth.initial(0.0)
+    errors = []
+    for t0, t1 in itertools.pairwise(np.arange(0.0, 20.0, 0.05).tolist()):
+        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
+        estimate = identifier.step(t1, identifier.observed.G @ u + 0.01 * rng.standard_normal(3))
+        value, std = estimate.parameters["a"]
+        errors.append([value - a(t1), std])
+    late = np.array(errors[200:])
+    assert np.sqrt((late[:, 0] ** 2).mean()) < 0.002
+    assert np.sqrt(((late[:, 0] / late[:, 1]) ** 2).mean()) < 2.0
+
+
+@pytest.mark.parametrize("law", [lp.SensitivityLaw(modes=3), lp.GradientLaw()])
+def test_a_moving_field_keeps_its_boundary_value(law: Any):
+    field = lp.Field(
+        mesh,
+        ElementLineP1(),
+        inner="H1",
+        prior=1.0,
+        dirichlet={"left": 0.0},
+        evolution=lp.MeanReverting(1.0),
+    )
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        {"s": field},
+        A=lambda q, u, v, x: -q.s * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    identifier = lp.Identifier(model, lp.Points([0.3], noise=0.1), law)
+    for k in range(4):
+        estimate = identifier.step(0.5 * k, [1.0 + 0.5 * k])
+    fixed = model.parameter_space.fixed
+    assert len(fixed) == 1
+    np.testing.assert_array_equal(estimate.q[fixed], 0.0)
