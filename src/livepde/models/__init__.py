@@ -5,6 +5,7 @@ from __future__ import annotations
 from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
 from livepde.models.allen_cahn import ALLEN_CAHN, allen_cahn
 from livepde.models.base import Equation, Option, Quantity, Variable
+from livepde.models.battery import BATTERY_PARTICLE, battery_particle
 from livepde.models.borehole import GROUTED_BOREHOLE, grouted_borehole
 from livepde.models.burgers import BURGERS, burgers
 from livepde.models.diffusion import CONDUCTION, HEAT, conduction, heat
@@ -24,6 +25,7 @@ __all__ = [
     "Variable",
     "advection_diffusion",
     "allen_cahn",
+    "battery_particle",
     "borehole",
     "burgers",
     "conduction",
@@ -58,5 +60,6 @@ EQUATIONS: dict[str, Equation] = {
         ALLEN_CAHN,
         GROUNDWATER,
         PUMPING_TEST,
+        BATTERY_PARTICLE,
     )
 }

@@ -1,0 +1,124 @@
+"""A particle of a battery's electrode: spherical diffusion of lithium."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from numpy import exp
+
+from livepde.errors import ModelError
+from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
+from livepde.model import Model
+from livepde.models.base import Equation, Option, Variable
+
+__all__ = ["BATTERY_PARTICLE", "FARADAY", "battery_particle"]
+
+FARADAY = 96485.33212  # C/mol
+
+
+def battery_particle(
+    mesh: Any,
+    D: Unknown,
+    slope: Unknown | None = None,
+    *,
+    area: float,
+    c_max: float,
+    element: Any = None,
+) -> Model:
+    """Return r^2 c_t = (D(c) r^2 c_r)_r in a sphere that a current I(t) empties or fills.
+
+    The single-particle model of an electrode: all of its particles are one, and the current is
+    spread over their surface,
+
+        -D(c) c_r = I/(F area)  at the surface,      D(c) = D exp(slope (c/c_max - 1/2)).
+
+    I > 0 takes lithium out, as a discharge does with the negative electrode. The concentration at
+    the surface is the state at the right end of the mesh; a voltage is a function of it, see
+    `livepde.Calibrated`.
+
+    Parameters
+    ----------
+    mesh
+        Radius in m, from 0 ("left") to the surface ("right"); cells of the size sqrt(D h) there
+        for time steps h.
+    D
+        Diffusivity of lithium at half filling in m^2/s; positive: transform="log".
+    slope
+        How the logarithm of the diffusivity grows with the filling; default 0, D is constant.
+    area
+        Surface of all particles in m^2: 3/R times their volume.
+    c_max
+        Concentration of the full particle in mol/m^3.
+    element
+        Element of the state; default of first order.
+
+    The current in A is the input channel "I".
+
+    Raises
+    ------
+    ModelError
+        area or c_max is not positive, or the mesh does not begin at 0.
+
+    >>> import livepde as lp
+    >>> D = lp.Scalar(1e-14, 1e-14, transform="log")
+    >>> model = battery_particle(lp.interval(0.0, 1e-5, 40), D, area=1.0, c_max=30000.0)
+    >>> model.channels
+    ('I',)
+    """
+    for name, value in {"area": area, "c_max": c_max}.items():
+        if not value > 0:
+            raise ModelError(f"battery_particle: {name} must be positive; got {value}.")
+    if abs(float(mesh.p.min())) > 1e-9 * float(mesh.p.max()):
+        raise ModelError(
+            f"battery_particle: the mesh begins at {float(mesh.p.min()):g} m; a particle begins at "
+            "its centre, 0."
+        )
+    R = float(mesh.p.max())
+    unknowns = {"D": D} if slope is None else {"D": D, "slope": slope}
+
+    # Weights are (r/R)^2, so that they are of order one; of order four they are exact.
+    def diffusion(q: Any, c: Any, v: Any, x: Place) -> Any:
+        mobility = q.D if slope is None else q.D * exp(q.slope * (c / c_max - 0.5))
+        return mobility * (x[0] / R) ** 2 * dot(grad(c), grad(v))
+
+    return Model(
+        Field(mesh, element or linear(mesh), unit="mol/m^3", quadrature=4),
+        unknowns,
+        A=diffusion,
+        M=lambda c, v, x: (x[0] / R) ** 2 * c * v,
+        f=On("right", lambda x, t: -x.inputs["I"] / (FARADAY * area)),
+        inputs=["I"],
+        time_unit="s",
+    )
+
+
+def _build(
+    mesh: Any,
+    unknowns: Mapping[str, Unknown],
+    dirichlet: Mapping[str, Any],
+    *,
+    area: float,
+    c_max: float,
+) -> Model:
+    return battery_particle(mesh, unknowns["D"], unknowns.get("slope"), area=area, c_max=c_max)
+
+
+BATTERY_PARTICLE = Equation(
+    name="battery_particle",
+    summary="spherical diffusion of lithium in a particle of an electrode",
+    formula="r^2 c_t = (D(c) r^2 c_r)_r,  D(c) = D exp(slope (c/c_max - 1/2)),  "
+    "-D(c) c_r = I/(F area) at the surface",
+    state=Variable("mol/m^3", "concentration of lithium"),
+    unknowns={
+        "D": Variable("m^2/s", "diffusivity at half filling"),
+        "slope": Variable("", "growth of the logarithm of D with the filling", optional=True),
+    },
+    inputs={"I": Variable("A", "current, positive when lithium leaves the particle")},
+    options={
+        "area": Option("m^2", "surface of all particles"),
+        "c_max": Option("mol/m^3", "concentration of the full particle"),
+    },
+    build=_build,
+    element=linear,
+)

@@ -1,0 +1,204 @@
+"""The battery particle: against the sphere with a constant flux, balances, and twins."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+import livepde as lp
+from livepde.diagnostics import check_model
+from livepde.errors import ModelError
+from livepde.models import EQUATIONS, battery_particle
+from livepde.models.battery import FARADAY
+from livepde.stepping import Advance, Alexander2, simulate
+from livepde.streams import AbsoluteNoise, Twin
+
+R, AREA, FULL = 5e-6, 1.0, 30555.0
+D = 5e-14
+START = 0.8 * FULL
+CURRENT = 1.0
+
+
+def particle(
+    cells: int = 30, slope: lp.Scalar | None = None, evolution: Any = None, std: float = D
+) -> lp.Model:
+    moving = {"evolution": evolution} if evolution else {}
+    return battery_particle(
+        lp.interval(0.0, R, cells),
+        lp.Scalar(D, std, transform="log", **moving),
+        slope,
+        area=AREA,
+        c_max=FULL,
+    )
+
+
+def discharged(model: lp.Model, times: Any, q: Any = None) -> Any:
+    """Return radii and concentrations after a discharge with a constant current."""
+    constant = lambda t: {"I": CURRENT}  # noqa: E731
+    start = model.initial_parameter(q)
+    *_, (_, c) = simulate(model, start, START, times, Advance(Alexander2()), constant)
+    order = np.argsort(model.state.mesh.p[0])
+    return model.state.mesh.p[0][order], (model.state_block.at_vertices @ c)[order]
+
+
+def crank(r: Any, t: float) -> Any:
+    """Concentration in a sphere that loses a constant flux (Crank, section 6.3)."""
+    f = lambda x: np.sin(x) - x * np.cos(x)  # noqa: E731
+    roots = np.array([brentq(f, n * np.pi + 0.1, (n + 0.5) * np.pi) for n in range(1, 60)])[:, None]
+    tau, x = D * t / R**2, np.maximum(r / R, 1e-6)
+    modes = np.sin(roots * x) / (roots**2 * np.sin(roots)) * np.exp(-(roots**2) * tau)
+    shape = 3 * tau + x**2 / 2 - 0.3 - 2 / x * modes.sum(axis=0)
+    return START - CURRENT / (FARADAY * AREA) * R / D * shape
+
+
+TIMES = np.concatenate([[0.0], np.geomspace(0.05, 600.0, 200)])
+
+
+def test_constant_flux_is_that_of_the_textbook():
+    errors = []
+    for cells in (20, 40):
+        r, c = discharged(particle(cells), TIMES)
+        exact = crank(r, TIMES[-1])
+        errors.append(np.abs(c - exact).max() / np.ptp(exact))
+    assert errors[0] < 5e-3
+    assert errors[1] < 0.4 * errors[0]
+
+
+def test_what_leaves_is_the_charge():
+    model = particle(slope=lp.Scalar(-1.0, 1.0))
+    _, c = discharged(model, TIMES)
+    mesh = model.state.mesh
+    assert np.all(np.diff(mesh.p[0]) > 0)  # c is in the order of the coefficients
+    volume = (model.mass @ np.ones(len(c))).sum()
+    lost = START - (model.mass @ c).sum() / volume
+    assert lost == pytest.approx(3 * CURRENT * TIMES[-1] / (FARADAY * AREA * R), rel=1e-6)
+
+
+def test_diffusivity_follows_the_filling():
+    """Near the surface -D(c) c_r is the flux."""
+    r, c = discharged(particle(400, slope=lp.Scalar(2.0, 1.0)), TIMES)
+    middle = (c[-1] + c[-2]) / 2
+    mobility = D * np.exp(2.0 * (middle / FULL - 0.5))
+    flux = -mobility * (c[-1] - c[-2]) / (r[-1] - r[-2])
+    assert flux == pytest.approx(CURRENT / (FARADAY * AREA), rel=0.01)
+    _, without = discharged(particle(30, slope=lp.Scalar(0.0, 1.0)), TIMES)
+    _, constant = discharged(particle(30), TIMES)
+    assert np.allclose(without, constant)
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    value=st.floats(1e-15, 1e-12),
+    slope=st.none() | st.floats(-3.0, 3.0),
+    filling=st.floats(0.1, 0.9),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_forms_pass_the_shipped_checks(value, slope, filling, seed):
+    model = particle(15, slope=None if slope is None else lp.Scalar(slope, 0.5))
+    q = {"D": value} | ({} if slope is None else {"slope": slope})
+    u = filling * FULL
+    check_model(model, q=q, u=u, spread=0.1 * FULL, inputs={"I": 1.0}, seed=seed).raise_if_failed()
+
+
+def pulses(t: float) -> dict[str, float]:
+    return {"I": 1.36 * (t // 300 % 2 < 1) * (1 if t // 3600 % 2 < 1 else -1)}
+
+
+def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
+    model = particle(slope=lp.Scalar(0.0, 1.0))
+    sensor = lp.Points({"surface": R}, noise=50.0)
+    true = {"D": 2e-14, "slope": -1.5}
+    times = np.arange(0.0, 7201.0, 30.0)
+    twin = Twin(
+        model=model,
+        observation=sensor,
+        q_true=true,
+        u0=START,
+        times=times,
+        inputs=pulses,
+        noise=AbsoluteNoise(50.0),
+        seed=2,
+    )
+    law = lp.SensitivityLaw(replay=lp.Replay(first=16))
+    identifier = lp.Identifier(model, sensor, law, u0=START)
+    for sample in twin:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+    for name, truth in true.items():
+        value, std = estimate.parameters[name]
+        assert abs(value - truth) < 3 * std
+        assert std < 0.1 * abs(truth)
+
+
+def graphite(x: Any) -> Any:
+    """Open-circuit voltage, Safari and Delacourt (2011)."""
+    return (
+        0.6379
+        + 0.5416 * np.exp(-305.5309 * x)
+        + 0.044 * np.tanh((0.1958 - x) / 0.1088)
+        - 0.1978 * np.tanh((x - 1.0571) / 0.0854)
+        - 0.6875 * np.tanh((x + 0.0117) / 0.0529)
+        - 0.0175 * np.tanh((x - 0.5692) / 0.0875)
+    )
+
+
+def test_an_ageing_diffusivity_is_followed_through_a_voltage():
+    """ln D falls by one in eight hours; seen is a voltage behind an unknown resistance."""
+    noise, end = 1e-3, 8 * 3600.0
+    model = particle(20, evolution=lp.RandomWalk(0.1 / 60.0), std=D).with_unknowns(
+        {"R_0": lp.Scalar(0.03, 0.02, transform="log")}
+    )
+    voltage = lp.Calibrated(
+        lp.Points({"V": R}),
+        lambda c, q, x: graphite(c / FULL) + q.R_0 * x.inputs["I"],
+        inputs=("I",),
+        noise=noise,
+    )
+    observed = voltage.bind(model.state_space, model.X, model.parameter_space)
+    identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(rank=40), u0=START)
+    rng = np.random.default_rng(0)
+    c = model.initial(START)
+    times = np.arange(0.0, end + 1.0, 40.0)
+    identifier.step(0.0, {"V": np.nan}, pulses(0.0))
+    ratios = []
+    for before, t in pairwise(times):
+        q = {"D": 2 * D * np.exp(-t / end), "R_0": 0.05}
+        latent, now = model.initial_parameter(q), pulses(t)
+        inputs = lambda t, now=now: now  # noqa: E731
+        steps = simulate(model, latent, c, [before, t], Advance(lp.ImplicitEuler()), inputs)
+        *_, (_, c) = steps
+        z = observed.predict(c, model.latent.value(latent), lp.Moment(t, now))
+        estimate = identifier.step(t, {"V": z[0] + noise * rng.normal()}, now)
+        ratios.append(estimate.parameters["D"][0] / q["D"])
+    late = np.array(ratios[len(ratios) // 2 :])
+    assert np.abs(late - 1).mean() < 0.15
+    assert estimate.parameters["R_0"][0] == pytest.approx(0.05, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"area": 0.0}, "area must be positive"), ({"c_max": -1.0}, "c_max must be positive")],
+)
+def test_options_that_make_no_sense_are_refused(change, message):
+    options = {"area": AREA, "c_max": FULL} | change
+    with pytest.raises(ModelError, match=message):
+        battery_particle(lp.interval(0.0, R, 10), lp.Scalar(D, D), **options)
+
+
+def test_a_particle_begins_at_its_centre():
+    with pytest.raises(ModelError, match="centre"):
+        battery_particle(lp.interval(0.1 * R, R, 10), lp.Scalar(D, D), area=AREA, c_max=FULL)
+
+
+@pytest.mark.parametrize("names", [("D",), ("D", "slope")])
+def test_the_equation_builds_it(names):
+    unknowns = {name: lp.Scalar(1e-14, 1e-14) for name in names}
+    equation = EQUATIONS["battery_particle"]
+    built = equation.build(lp.interval(0.0, R, 10), unknowns, {}, area=AREA, c_max=FULL)
+    assert tuple(built.parameter_space.unknowns) == names
+    assert built.channels == tuple(equation.inputs)
