@@ -382,7 +382,7 @@ REFUSED = [
     ('role = "boundary", column = "T_left", at = "left"', 'role = "input", column = "T_left"',
      "has no 'T_left' here"),
     ('role = "boundary", column = "T_left", at = "left"',
-     'role = "input", column = "T_left", at = 1', "an input has no place"),
+     'role = "input", column = "T_left", at = 1', "role input has no place"),
     ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm"', "T_10.noise is missing"),
     (', noise = "0.05 K"', "", "law.noise is missing"),
     ('noise = "0.05 K"', 'noise = "0.05 m"', "T_10.noise: 'm' cannot"),
@@ -732,6 +732,36 @@ def test_points_and_averages_together(rod):
     assert prepared.identifier.observed.names == ("T_10", "T_30")
     np.testing.assert_allclose(prepared.identifier.observed.noise, [0.05, 0.07])
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+
+
+def test_means_along_a_line(rod):
+    path = rod(('at = "30 cm", noise = "0.05 K"', 'along = ["28 cm", 0.32], noise = "0.07 K"'))
+    prepared, data = result_of(path)
+    assert prepared.identifier.observed.names == ("T_10", "T_30")
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+    with pytest.raises(lp.CaseError, match=r"channels.T_30.along: 1 m lies outside"):
+        cases.load(rod(('along = ["28 cm", 0.32]', 'along = ["28 cm", "1 m"]')))
+
+
+def test_a_sensor_that_moves(rod):
+    import pandas as pd
+
+    place = 'where = { role = "position", column = "x_cm", unit = "cm" }\n'
+    path = rod(
+        ('at = "30 cm", noise = "0.05 K"', 'follows = "where", noise = "0.05 K"'),
+        ("T_10 = {", place + "T_10 = {"),
+    )
+    frame = pd.read_csv(path.parent / "rod.csv")
+    frame["x_cm"] = 30.0
+    up = np.arange(len(frame)) % 2 == 1
+    frame.loc[up, "x_cm"], frame.loc[up, "T_30"] = 20.0, frame.loc[up, "T_20"]
+    frame.loc[5, "x_cm"] = np.nan
+    frame.to_csv(path.parent / "rod.csv", index=False)
+    _, data = result_of(path)
+    assert np.isnan(data.innovation.sel(sensor="T_30").values[5])
+    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
+    with pytest.raises(lp.CaseError, match="there is no channel 'wehre' of role position"):
+        cases.load(rod(('follows = "where"', 'follows = "wehre"')))
 
 
 # --- data that a function reads --------------------------------------------------------------

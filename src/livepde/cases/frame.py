@@ -82,4 +82,6 @@ class Frame:
         """Return the model's unit of a channel."""
         if self.spec.channels[channel].role == "input":
             return self.equation.inputs[channel].unit
+        if self.spec.channels[channel].role == "position":
+            return self.equation.length_unit
         return self.equation.state.unit

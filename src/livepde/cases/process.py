@@ -106,6 +106,10 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
             raise frame.missing(f"channels.{name}", f"the {variable.text}, with role = 'input'.")
     unknowns = _unknowns(frame, mesh)
     model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
+    for name in model.inputs:
+        if name not in inputs and name in frame.equation.inputs:
+            text = f"the {frame.equation.inputs[name].text}, with role = 'input'."
+            raise frame.missing(f"channels.{name}", text)
     own = unknowns_of(frame)
     if not own:
         return model

@@ -74,6 +74,7 @@ def _flat(value: Any) -> Any:
 
 Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
 Pair: TypeAlias = tuple[Quantity, Quantity]
+Point: TypeAlias = Quantity | tuple[Quantity, ...]
 Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
 Instant: TypeAlias = date | datetime | float | str
 Name: TypeAlias = Annotated[str, Field(min_length=1)]
@@ -197,11 +198,13 @@ class CorrelatedSpec(Spec):
 class ChannelSpec(Spec):
     """One channel of the stream and its role."""
 
-    role: Literal["boundary", "sensor", "withheld", "input"]
+    role: Literal["boundary", "sensor", "withheld", "input", "position"]
     column: Name | None = None
     columns: tuple[Name, ...] | None = None
     at: Quantity | tuple[Quantity, ...] | None = None
     over: Pair | Box | Name | None = None
+    along: tuple[Point, Point] | None = None
+    follows: Name | tuple[Name, ...] | None = None
     each: tuple[Quantity, Quantity, PositiveInt] | None = None
     quantity: str | None = None
     of: Name | None = None
@@ -215,16 +218,16 @@ class ChannelSpec(Spec):
     def _consistent(self) -> ChannelSpec:
         if (self.column is None) == (not self.columns):
             raise ValueError("expected column = name, or columns = [names] that are averaged")
-        places = (self.at, self.over, self.quantity, self.each)
+        places = (self.at, self.over, self.along, self.follows, self.quantity, self.each)
         placed = sum(place is not None for place in places)
-        if self.role == "input" and placed:
-            raise ValueError("an input has no place: leave out at, over, each and quantity")
+        if self.role in ("input", "position") and placed:
+            raise ValueError(f"a channel of role {self.role} has no place: leave it out")
         if self.role == "boundary" and not isinstance(self.at, str):
             raise ValueError('a boundary channel needs at = the name of a boundary, as "left"')
         if self.role in ("sensor", "withheld") and placed != 1:
             raise ValueError(
-                "expected one of: at = position, over = [from, to], each = [from, to, count], "
-                "quantity = name"
+                "expected one of: at = position, over = [from, to], along = [start, end], "
+                "follows = channel, each = [from, to, count], quantity = name"
             )
         if self.each is not None and "{}" not in (self.column or ""):
             raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
@@ -233,7 +236,7 @@ class ChannelSpec(Spec):
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
         if self.of is not None and self.role not in ("sensor", "withheld"):
             raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
-        if self.role in ("input", "boundary") and self.noise is not None:
+        if self.role not in ("sensor", "withheld") and self.noise is not None:
             raise ValueError(f"noise belongs to sensors, not to a channel of role {self.role}")
         return self
 

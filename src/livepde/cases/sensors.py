@@ -18,6 +18,8 @@ from livepde.observation import (
     Averages,
     Combined,
     Discrepancy,
+    LineIntegrals,
+    Moving,
     Observation,
     Points,
     Pseudoinverse,
@@ -47,9 +49,9 @@ def observation_of(
     if not channels:
         return None
     how = _reconstruction(frame) if role == "sensor" else Pseudoinverse()
-    kinds: dict[tuple[bool, str], dict[str, ChannelSpec]] = {}
+    kinds: dict[tuple[Any, str], dict[str, ChannelSpec]] = {}
     for name, channel in channels.items():
-        kinds.setdefault((channel.over is not None, channel.of or ""), {})[name] = channel
+        kinds.setdefault((_kind(channel), channel.of or ""), {})[name] = channel
     names = [name for members in kinds.values() for name in members]
     levels = noise_of(frame, role)
     outer: dict[str, Any] = {
@@ -60,8 +62,7 @@ def observation_of(
     own = any(item.offset or item.gain or item.correlated for item in channels.values())
     common = {} if own or len(kinds) > 1 else outer
     parts = []
-    for (averages, of), members in kinds.items():
-        make = _averages if averages else _points
+    for (make, of), members in kinds.items():
         component = {"of": of} if of else {}
         parts.append(make(frame, mesh, options, members, {**component, **common}))
     if len(parts) > 1:
@@ -69,6 +70,15 @@ def observation_of(
     else:
         (whole,) = parts
     return calibrated(frame, whole, names, **outer) if own else whole
+
+
+def _kind(channel: ChannelSpec) -> Any:
+    """Return what makes an observation of channels like this one."""
+    if channel.over is not None:
+        return _averages
+    if channel.along is not None:
+        return _lines
+    return _points if channel.follows is None else _moving
 
 
 def _averages(
@@ -109,6 +119,48 @@ def _points(
     return Points(points, direct, **common)
 
 
+def _lines(
+    frame: Frame,
+    mesh: Any,
+    options: Mapping[str, Any],
+    channels: Mapping[str, ChannelSpec],
+    common: Mapping[str, Any],
+) -> Observation:
+    """Return means along lines."""
+    ends = {name: item.along for name, item in channels.items() if item.along is not None}
+    lines = {
+        name: (
+            _inside_mesh(frame, mesh, start, f"channels.{name}.along"),
+            _inside_mesh(frame, mesh, end, f"channels.{name}.along"),
+        )
+        for name, (start, end) in ends.items()
+    }
+    return LineIntegrals(lines, mean=True, **common)
+
+
+def _moving(
+    frame: Frame,
+    mesh: Any,
+    options: Mapping[str, Any],
+    channels: Mapping[str, ChannelSpec],
+    common: Mapping[str, Any],
+) -> Observation:
+    """Return sensors whose positions are channels."""
+    positions: dict[str, tuple[str, ...]] = {}
+    known = frame.roles("position")
+    for name, item in channels.items():
+        given = item.follows if isinstance(item.follows, tuple) else (str(item.follows),)
+        for channel in given:
+            if channel not in known:
+                text = f"there is no channel '{channel}' of role position; "
+                raise frame.error(f"channels.{name}.follows", text + did_you_mean(channel, known))
+        if len(given) != len(mesh.p):
+            text = f"got {len(given)} channels; needs one for each of {len(mesh.p)} coordinates."
+            raise frame.error(f"channels.{name}.follows", text)
+        positions[name] = given
+    return Moving(positions, **common)
+
+
 def _reconstruction(frame: Frame) -> Reconstruction:
     """Return how the observed part is reconstructed: what law.tikhonov says."""
     law = frame.spec.law
@@ -139,7 +191,13 @@ def _position(frame: Frame, mesh: Any, name: str, channel: ChannelSpec) -> Any:
             text = f"'{frame.equation.name}' has no quantity '{asked}'; "
             raise frame.error(f"channels.{name}.quantity", text + did_you_mean(asked, known))
         return known[asked].at(float(low[0]), float(high[0]))
-    given = channel.at if isinstance(channel.at, tuple) else (channel.at,)
+    return _inside_mesh(frame, mesh, channel.at, key)
+
+
+def _inside_mesh(frame: Frame, mesh: Any, at: Any, key: str) -> Any:
+    """Return a position in the mesh: a number, or a list of coordinates."""
+    low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+    given = at if isinstance(at, tuple) else (at,)
     unit = frame.equation.length_unit
     point = [frame.convert(value, unit, key) for value in given]
     if len(point) != len(low):
@@ -195,7 +253,7 @@ def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
     for name, channel in frame.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:
             pairs.append((ends[str(channel.at)], values[name]))
-        elif channel.role == "sensor" and channel.over is None and channel.quantity is None:
+        elif channel.role == "sensor" and channel.at is not None:
             pairs.append((_position(frame, mesh, name, channel), values[name]))
     present = sorted(pair for pair in pairs if np.isfinite(pair[1]))
     if not present:
