@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import livepde as lp
+from livepde.cases import load
 from livepde.diagnostics import check_model
-from livepde.errors import ModelError
+from livepde.errors import CaseError, ModelError
 from livepde.models import advection_diffusion
 from livepde.stepping import Advance, Alexander2, simulate
 
@@ -114,3 +115,31 @@ def test_what_cannot_be_is_said():
         advection_diffusion(mesh, number(1.0))
     with pytest.raises(ModelError, match="L must be positive"):
         advection_diffusion(mesh, number(1.0), v=number(1.0), L=0.0)
+
+
+CASE = """
+equation = "advection_diffusion"
+initial = 10.0
+mesh = { from = 0, to = 1, cells = 10 }
+options = { stabilise = true, ratio = 1.5 }
+data = { file = "bed.csv", time = "t", time_unit = "s" }
+law = { kind = "sensitivity" }
+
+[unknowns]
+kappa = { prior = 1e-6, std = 1e-7, regions = { a = [0, 0.5], b = [0.5, 1] } }
+K = { prior = 0, std = 1e-5 }
+
+[channels]
+T_0 = { role = "boundary", column = "T_0", at = "left" }
+T_5 = { role = "sensor", column = "T_5", at = 0.5, noise = 0.1 }
+"""
+
+
+def test_in_a_case_the_head_goes_with_the_conductivity(tmp_path):
+    case = tmp_path / "bed.toml"
+    (tmp_path / "bed.csv").write_text("t,T_0,T_5,dH\n0,10,10,0.1\n600,11,10,0.1\n")
+    case.write_text(CASE)
+    with pytest.raises(CaseError, match="head difference"):
+        load(case).prepare()
+    case.write_text(CASE + 'dH = { role = "input", column = "dH" }\n')
+    assert load(case).model.channels == ("dH", "T_0")

@@ -116,11 +116,10 @@ def _build(
     *,
     L: float,
     ratio: float,
-    stabilise: float,
+    stabilise: bool,
 ) -> Model:
-    given: dict[str, Any] = dict(unknowns)
-    fast = bool(stabilise)
-    return advection_diffusion(mesh, dirichlet=dirichlet, L=L, ratio=ratio, stabilise=fast, **given)
+    given: dict[str, Any] = {**unknowns, "L": L, "ratio": ratio, "stabilise": stabilise}
+    return advection_diffusion(mesh, dirichlet=dirichlet, **given)
 
 
 ADVECTION_DIFFUSION = Equation(
@@ -139,7 +138,7 @@ ADVECTION_DIFFUSION = Equation(
     options={
         "L": Option("m", "length over which the head falls by dH", 1.0),
         "ratio": Option("", "velocity over flux: C of water over C of the wet bed", 1.0),
-        "stabilise": Option("", "1 adds the diffusion that fast flows need", 0.0),
+        "stabilise": Option("", "whether to add the diffusion that fast flows need", False),
     },
     build=_build,
     element=linear,
