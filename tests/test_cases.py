@@ -525,6 +525,11 @@ def test_nodes(rod):
         ('nodes = [0, 0.4]\nspacing = "geometric"', "spacing belongs to an interval with cells"),
         ('nodes = [0, 0.4]\nunit = "mm"', "unit belongs to a file"),
         ("from = 0\nto = 1", "mesh: expected from and to"),
+        (
+            "x = [0, 1, 2]\ny = [0, 1]\ncells = [2, 2]",
+            "x and y: expected [from, to] each; or nodes",
+        ),
+        ("x = [0, 2, 1]\ny = [0, 1]", "mesh: grid: needs at least two increasing nodes"),
     ],
 )
 def test_meshes_that_are_refused(rod, mesh, named):

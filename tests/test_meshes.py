@@ -5,7 +5,8 @@ import pytest
 from skfem import ElementLineP1, ElementTriP1, MeshQuad, MeshTri
 
 import livepde as lp
-from livepde.fem import box, linear
+from livepde.errors import SpaceError
+from livepde.fem import box, grid, linear
 
 meshio = pytest.importorskip("meshio")
 
@@ -216,3 +217,17 @@ def test_a_penalty_imposes_an_unknown_boundary_value():
     for t in np.arange(0.1, 3.0, 0.1):
         last = ident.step(t, [1.5 if t > 1.0 else np.nan])
     assert last.parameters["T0"][0] == pytest.approx(3.0, rel=5e-3)
+
+
+def test_a_grid_has_the_nodes_it_is_given():
+    mesh = grid([-9.0, -1.0, 0.0, 2.0], [0.0, 0.5, 3.0])
+    assert mesh.nelements == 6
+    assert set(mesh.p[0]) == {-9.0, -1.0, 0.0, 2.0}
+    assert {name: len(facets) for name, facets in mesh.boundaries.items()} == {
+        "left": 2,
+        "right": 2,
+        "bottom": 3,
+        "top": 3,
+    }
+    with pytest.raises(SpaceError, match="two increasing nodes"):
+        grid([0.0, 1.0, 1.0], [0.0, 1.0])

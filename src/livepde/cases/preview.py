@@ -60,19 +60,20 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> tuple[list[Identif
         return [], 0
     linear = SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
     identifier = prepared.identifier_with(linear)
-    count, factor = 0, None
+    count = 0
     for sample in samples:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        factor = estimate.belief.q_factor
         if sample.t >= prepared.assimilate_from:
             count += bool(np.isfinite(estimate.innovation).any())
         if count >= MOST_SAMPLES:
             break
-    if factor is None or not count:
+    factor = identifier.latent_belief().q_factor if count else None
+    if factor is None:
         return [], 0
     latent = prepared.case.model.latent
-    before = latent.tangent(latent.prior, linear.prepare(identifier.problem).Phi)
-    return _compare(prepared, before, factor), count
+    Phi = linear.prepare(identifier.problem).Phi
+    before, after = (latent.tangent(latent.prior, root) for root in (Phi, factor))
+    return _compare(prepared, before, after), count
 
 
 def _compare(prepared: Prepared, before: Array, after: Array) -> list[Identified]:

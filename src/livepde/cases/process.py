@@ -24,6 +24,7 @@ from livepde.fem import (
     Scalar,
     dot,
     grad,
+    grid,
     interval,
     line,
     linear,
@@ -46,9 +47,13 @@ def mesh_of(frame: Frame) -> Any:
     if spec.nodes is not None:
         nodes = [frame.convert(node, unit, "mesh.nodes") for node in spec.nodes]
         return _built(frame, "mesh.nodes", lambda: line(nodes))
-    if spec.x is not None and spec.y is not None and isinstance(spec.cells, tuple):
-        x, y = frame.pair(spec.x, unit, "mesh.x"), frame.pair(spec.y, unit, "mesh.y")
-        return rectangle(x, y, spec.cells)
+    if spec.x is not None and spec.y is not None:
+        x = [frame.convert(node, unit, "mesh.x") for node in spec.x]
+        y = [frame.convert(node, unit, "mesh.y") for node in spec.y]
+        if isinstance(spec.cells, tuple):
+            number = spec.cells
+            return _built(frame, "mesh", lambda: rectangle((x[0], x[1]), (y[0], y[1]), number))
+        return _built(frame, "mesh", lambda: grid(x, y))
     cells: Any = spec.cells  # a number: the schema has seen to it
     start = frame.convert(spec.start, unit, "mesh.from")
     stop = frame.convert(spec.stop, unit, "mesh.to")

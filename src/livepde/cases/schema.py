@@ -88,13 +88,13 @@ class Spec(BaseModel):
 
 
 class MeshSpec(Spec):
-    """An interval (from, to, cells; or nodes), a rectangle (x, y, cells), or a file."""
+    """An interval (from, to, cells; or nodes), a rectangle (x, y, cells; or nodes), or a file."""
 
     start: Quantity | None = Field(None, alias="from")
     stop: Quantity | None = Field(None, alias="to")
     nodes: tuple[Quantity, ...] | None = Field(None, min_length=2)
-    x: Pair | None = None
-    y: Pair | None = None
+    x: tuple[Quantity, ...] | None = Field(None, min_length=2)
+    y: tuple[Quantity, ...] | None = Field(None, min_length=2)
     file: Name | None = None
     unit: str | None = None
     cells: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
@@ -103,7 +103,7 @@ class MeshSpec(Spec):
     @model_validator(mode="after")
     def _one_kind(self) -> MeshSpec:
         given = self.model_fields_set - {"spacing", "unit"}
-        if given in ({"nodes"}, {"file"}):
+        if given in ({"nodes"}, {"file"}, {"x", "y"}):
             if "spacing" in self.model_fields_set:
                 raise ValueError("spacing belongs to an interval with cells")
         elif given == {"start", "stop", "cells"}:
@@ -112,6 +112,8 @@ class MeshSpec(Spec):
         elif given == {"x", "y", "cells"}:
             if isinstance(self.cells, int) or self.spacing != "uniform":
                 raise ValueError("expected cells = [nx, ny] and uniform spacing for a rectangle")
+            if any(side is None or len(side) != 2 for side in (self.x, self.y)):
+                raise ValueError("x and y: expected [from, to] each; or nodes, and no cells")
         else:
             raise ValueError(
                 "expected from and to (an interval) or x and y (a rectangle), with cells; or nodes "

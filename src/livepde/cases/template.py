@@ -52,7 +52,7 @@ T_right = {{ role = "boundary", column = "T_right", at = "right" }}
 
 [law]
 kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
-replay = true                  # constant unknowns; drifting ones: drift = "0.1 1/h", memory = "1 h"
+replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead
 
 [steps]
 scheme = "alexander2"          # second order; or "implicit-euler"

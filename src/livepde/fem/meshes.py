@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
@@ -38,6 +38,7 @@ from skfem.element import (
 
 from livepde.errors import SpaceError
 from livepde.fem.fields import Predicate
+from livepde.linalg import Array
 
 __all__ = ["box", "hermite", "linear", "quadratic", "read_mesh", "rectangle", "smooth"]
 
@@ -107,13 +108,30 @@ def rectangle(
         raise SpaceError(
             f"rectangle({x}, {y}, {cells}): needs increasing coordinates and cells >= 1."
         )
-    mesh = MeshQuad.init_tensor(np.linspace(*x, cells[0] + 1), np.linspace(*y, cells[1] + 1))
-    mesh = mesh.with_boundaries(
+    return grid(np.linspace(*x, cells[0] + 1), np.linspace(*y, cells[1] + 1), regions=regions)
+
+
+def grid(
+    x: Sequence[float] | Array,
+    y: Sequence[float] | Array,
+    *,
+    regions: Mapping[str, Predicate] | None = None,
+) -> MeshQuad:
+    """Return a rectangle with a node at every (x, y) of two increasing lists.
+
+    For cells that grow away from where it matters. Boundaries and regions as for `rectangle`.
+
+    >>> grid([-100, -10, 0, 10, 100], [0, 1, 4]).nelements
+    8
+    """
+    if not all(len(side) > 1 and (np.diff(side) > 0).all() for side in (x, y)):
+        raise SpaceError("grid: needs at least two increasing nodes in x and in y.")
+    mesh = MeshQuad.init_tensor(np.array(x), np.array(y)).with_boundaries(
         {
             "left": lambda p: np.isclose(p[0], x[0]),
-            "right": lambda p: np.isclose(p[0], x[1]),
+            "right": lambda p: np.isclose(p[0], x[-1]),
             "bottom": lambda p: np.isclose(p[1], y[0]),
-            "top": lambda p: np.isclose(p[1], y[1]),
+            "top": lambda p: np.isclose(p[1], y[-1]),
         }
     )
     return mesh.with_subdomains(dict(regions)) if regions else mesh

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import LawError
+from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.coupled import CoupledStage, Gains
 from livepde.laws.damping import Damping, ResidualDamping
@@ -114,6 +115,15 @@ class GradientLaw(Law[GradientWork, GradientState]):
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         return GradientState(u0, q0, np.zeros(len(u0) + len(q0)))
+
+    def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
+        form = work.problem.model.form_initial
+        if form is not None and form.data("v", "q", moment, q=q0).any():
+            raise LawError(
+                "the initial state depends on unknowns (initial=), which this law cannot learn: "
+                "use SensitivityLaw, or leave out initial= and give u0."
+            )
+        return self.init(work, q0, u0)
 
     def step(
         self, work: GradientWork, state: GradientState, interval: Interval

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import LawError
+from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report
 from livepde.laws.coupled import Gains
 from livepde.laws.damping import Damping, Residual
@@ -75,6 +76,9 @@ class _Relative(Law[GradientWork, GradientState]):
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         return self._base.init(work, q0, u0)
+
+    def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
+        return self._base.start(work, q0, u0, moment)
 
     def step(
         self, work: GradientWork, state: GradientState, interval: Interval

@@ -166,8 +166,8 @@ class Motion:
 class SensitivityWork:
     """The problem, its forward stage and the reduction a_latent = prior + Phi a.
 
-    `scale` makes columns of U comparable with those of C when a factor is compressed: the square
-    root of the mass of each coefficient, in units of the noise.
+    `scale` weighs the coefficients of the state when a factor is compressed: the square root of the
+    mass of each.
     """
 
     problem: Problem
@@ -332,7 +332,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 f"got {rank}."
             )
         mass = np.maximum(model.mass.diagonal(), 0.0)
-        scale = np.sqrt(mass / mass.sum()) / float(np.median(noise))
+        scale = np.sqrt(mass / mass.sum())
         forward = ForwardStage(model)
         return SensitivityWork(problem, forward, Phi, motions, noise, scale, rank)
 
@@ -617,8 +617,19 @@ def _recentre(work: SensitivityWork, point: Point) -> Point:
 
 
 def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:
-    """Return the factor with its `rank` leading directions, states measured by `scale`."""
-    weighted = np.vstack([scale[:, None] * U, C])
+    """Return the factor with `rank` columns.
+
+    A rotation gathers all that is uncertain about the parameters, and the state with them, in the
+    first columns: they stay as they are. Of the rest, which is the state's alone, the leading
+    directions are kept, measured by `scale`.
+    """
+    k = len(C)
+    rotation, root = np.linalg.qr(C.T, mode="complete")
+    rotated = U @ rotation
+    alone = rotated[:, k:]
+    weighted = scale[:, None] * alone
     _, vectors = np.linalg.eigh(weighted.T @ weighted)
-    kept = vectors[:, ::-1][:, :rank]
-    return U @ kept, C @ kept
+    kept = alone @ vectors[:, ::-1][:, : rank - k]
+    square: Array = np.zeros((k, rank))
+    square[:, :k] = root[:k].T
+    return np.hstack([rotated[:, :k], kept]), square
