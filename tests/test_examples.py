@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde.cli import app
+from livepde.models import EQUATIONS
 from livepde.streams import AbsoluteNoise, Twin
 
 ROOT = Path(__file__).parents[1]
@@ -113,6 +114,28 @@ def test_blocks_of_the_pages_run(page):
     namespace = {}
     for block in BLOCK.findall(page.read_text()):
         exec(compile(block, str(page), "exec"), namespace)
+
+
+def test_every_page_of_an_equation_is_in_the_navigation():
+    named = re.findall(r"models/(\w+)\.md", (ROOT / "mkdocs.yml").read_text())
+    assert sorted(named) == sorted(path.stem for path in (ROOT / "docs" / "models").glob("*.md"))
+
+
+@pytest.mark.parametrize("name", EQUATIONS)
+def test_every_equation_has_a_page_and_a_line(name):
+    """The page names it and has an example that runs; the table of the cases leads there."""
+    pages = {path.stem: path.read_text() for path in (ROOT / "docs" / "models").glob("*.md")}
+    described = [stem for stem, text in pages.items() if f"`{name}`" in text and BLOCK.search(text)]
+    assert described
+    lines = (ROOT / "docs" / "cases.md").read_text().splitlines()
+    links = [line for line in lines if line.startswith(f"| [`{name}`](models/")]
+    assert [re.search(r"models/(\w+)\.md", line)[1] in described for line in links] == [True]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_formulas_are_written_in_unicode(page):
+    """The pages load nothing from elsewhere, so that nothing would draw LaTeX."""
+    assert "$$" not in page.read_text()
 
 
 def test_the_readme_has_python_to_run():
