@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import livepde as lp
+from livepde import cases
 from livepde.diagnostics import check_model
 from livepde.models import EQUATIONS, fisher_kpp, porous_fisher
 from livepde.stepping import Advance, Alexander2, simulate
 
 ONE = lp.Scalar(1.0, 1.0)
+CASE = Path(__file__).parents[1] / "cases" / "scratch_assay.toml"
 
 
 def kpp_wave(x, t):
@@ -81,3 +85,16 @@ def test_what_is_refused():
         fisher_kpp(mesh, ONE, ONE, K=0.0)
     with pytest.raises(lp.ModelError, match="m must be at least 1"):
         porous_fisher(mesh, ONE, ONE, m=0.5)
+
+
+@pytest.mark.parametrize(
+    ("density", "D", "r"), [(10, 0.0074, 1.05), (14, 0.0164, 1.16), (18, 0.0177, 1.30)]
+)
+@pytest.mark.parametrize("prior", [0.003, 0.05])
+def test_scratch_assays_find_the_published_values(density, D, r, prior, data_dir, monkeypatch):
+    """Whatever the prior of D; Lagergren et al. (2020)."""
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+    wide = {"unknowns.D": {"prior": prior, "std": prior}, "data.options.density": density}
+    prepared = cases.load(CASE, allow_code=True, settings=wide).prepare()
+    prepared.identifier.run(prepared.stream)
+    assert prepared.identifier.estimate().q == pytest.approx([D, r], rel=0.15)

@@ -15,6 +15,12 @@ from livepde.models.kdv import KDV, kdv
 from livepde.models.kuramoto_sivashinsky import KURAMOTO_SIVASHINSKY, kuramoto_sivashinsky
 from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
+from livepde.models.transport import (
+    ADVECTION_DISPERSION,
+    MOBILE_IMMOBILE,
+    advection_dispersion,
+    mobile_immobile,
+)
 from livepde.models.wave import WAVE, wave
 
 __all__ = [
@@ -24,6 +30,7 @@ __all__ = [
     "Quantity",
     "Variable",
     "advection_diffusion",
+    "advection_dispersion",
     "allen_cahn",
     "battery_particle",
     "borehole",
@@ -36,6 +43,7 @@ __all__ = [
     "heat",
     "kdv",
     "kuramoto_sivashinsky",
+    "mobile_immobile",
     "porous_fisher",
     "pumping_test",
     "reaction_diffusion",
@@ -61,5 +69,7 @@ EQUATIONS: dict[str, Equation] = {
         GROUNDWATER,
         PUMPING_TEST,
         BATTERY_PARTICLE,
+        ADVECTION_DISPERSION,
+        MOBILE_IMMOBILE,
     )
 }
