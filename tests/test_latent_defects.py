@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,14 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.diagnostics import check_law
+from livepde import cases
+from livepde.cases.preview import preview
+from livepde.cases.template import write_template
+from livepde.diagnostics import check_law, theory_report
 from livepde.fem.evolution import Constant
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
+from livepde.streams import Twin
 
 NOISE = 0.02
 SENSORS = {"a": 0.3, "b": 0.55, "c": 0.8}
@@ -237,3 +242,77 @@ def test_a_moving_field_keeps_its_boundary_value(law: Any):
     fixed = model.parameter_space.fixed
     assert len(fixed) == 1
     np.testing.assert_array_equal(estimate.q[fixed], 0.0)
+
+
+def reacting(first: lp.Scalar) -> lp.Model:
+    return lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"right": 0.0}),
+        {"a": first, "b": lp.Scalar(0.3, 0.2)},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.b * u * v,
+    )
+
+
+def theory(model: lp.Model) -> Any:
+    full, start = lp.Full(noise=0.01), lambda x: 1 - x[0] ** 2
+    times, q = np.arange(0.0, 2.0, 0.1), {"a": 0.6, "b": 0.5}
+    twin = Twin(model=model, observation=full, q_true=q, u0=start, times=times)
+    identifier = lp.Identifier(model, full, lp.GradientLaw(gain=10.0), u0=start)
+    return twin, theory_report(identifier, twin, twin=twin)
+
+
+def test_the_theory_of_a_periodic_unknown_is_that_of_its_visible_part():
+    _, plain = theory(reacting(lp.Scalar(0.4, 0.2)))
+    twin, report = theory(reacting(lp.Scalar(0.4, 0.2, evolution=lp.Periodic(1.0, 2))))
+    assert report.constants is not None
+    assert report.constants.C_A > 0.99 * plain.constants.C_A
+    (sheet,) = (table for table in report.tables if "Excitation" in table.title)
+    assert {row[3] for row in sheet.rows} == {"a", "b"}
+    assert any("constant parameter" in note for note in report.notes)
+    q = twin.model.parameter_space.interpolate(twin.q_true)
+    assert twin.error(q) == 0.0
+
+
+def test_the_theory_does_not_speak_of_models_nonlinear_in_what_is_estimated():
+    _, report = theory(reacting(lp.Scalar(0.4, 0.2, transform="log")))
+    assert report.constants is None
+    assert any("not linear in what is estimated" in note for note in report.notes)
+
+
+def starting(unknown: lp.Scalar) -> lp.Model:
+    return lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        {"u0": unknown},
+        A=lambda q, u, v, x: 0.1 * u * v,
+        initial=lambda q, v, x: q.u0 * v,
+    )
+
+
+def test_a_twin_starts_where_its_model_says():
+    model, times = starting(lp.Scalar(1.0, 1.0)), [0.0, 0.1, 0.2]
+    twin = Twin(model=model, observation=lp.Points([0.3]), q_true={"u0": 5.0}, times=times)
+    assert next(iter(twin)).z == pytest.approx([5.0])
+    with pytest.raises(lp.ConfigurationError, match="leave out u0"):
+        Twin(model=model, observation=lp.Points([0.3]), q_true=5.0, times=times, u0=1.0)
+
+
+@pytest.mark.parametrize("law", [lp.GradientLaw(), lp.KueglerLaw(), lp.BaumeisterLaw()])
+def test_an_unknown_initial_state_is_not_for_the_gradient_law(law: Any):
+    with pytest.raises(lp.LawError, match="which this law cannot learn: use SensitivityLaw"):
+        lp.Identifier(starting(lp.Scalar(1.0, 1.0)), lp.Full(), law)
+
+
+def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
+    path, _ = write_template(tmp_path)
+    text = path.read_text()
+    path.write_text(text.replace('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "log"'))
+    prepared = cases.load(path).prepare()
+    stream = list(prepared.stream)[:60]
+    warmer = [
+        replace(item, z={**item.z, "T_10": item.z["T_10"] + 0.3 * k})
+        for k, item in enumerate(stream)
+        if isinstance(item.z, dict)
+    ]
+    assert len(warmer) == len(stream)
+    (row,), _ = preview(prepared, stream)
+    (other,), _ = preview(prepared, warmer)
+    assert other.posterior == pytest.approx(row.posterior, rel=1e-6)

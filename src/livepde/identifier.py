@@ -215,10 +215,17 @@ class Identifier:
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held)
 
+    def latent_belief(self) -> Belief:
+        """Return what the law itself believes: q and its factor in latent coefficients.
+
+        Those are the coefficients of `Model.Q`: of logarithms, say, or of harmonics.
+        """
+        belief: Belief = self.law.belief(self._work, self._state)
+        return belief
+
     def _belief(self) -> Belief:
         """Return what the law believes, of the physical parameter."""
-        belief: Belief = self.law.belief(self._work, self._state)
-        latent = self.model.latent
+        belief, latent = self.latent_belief(), self.model.latent
         if latent.plain:
             return belief
         factor = belief.q_factor

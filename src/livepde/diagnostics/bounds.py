@@ -97,6 +97,11 @@ class TwinTracker:
     reconstruct
         z -> u_alpha as the law takes it; default that of the observation.
 
+    Raises
+    ------
+    ConfigurationError
+        An unknown moves, or the model is not linear in what is estimated.
+
     Examples
     --------
     ::
@@ -115,6 +120,12 @@ class TwinTracker:
         damping: Damping | None = None,
         reconstruct: Callable[[Array], Array] | None = None,
     ) -> None:
+        model = twin.model
+        if model.latent.moves or not model.form_A.linear_in_parameter:
+            raise ConfigurationError(
+                "TwinTracker: the paper's errors are those of a constant parameter in which the "
+                "model is linear; leave out `transform` and `evolution` of the unknowns."
+            )
         self.twin = twin
         self.spaces = spaces
         self.gain = gain

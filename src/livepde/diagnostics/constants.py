@@ -25,6 +25,10 @@ __all__ = ["Part", "Spaces", "constants"]
 DENSE = 400  # eigenproblems up to this size are solved densely, larger ones by Lanczos
 LARGEST_DENSE_BASIS = 2000  # unknowns, where R is not a selection
 LARGEST_TRACE = 2e7  # m n^2 up to which the bound of A(v) is computed over all of Q
+NONLINEAR = (
+    "The constants are those of C(q, u) = A(u) q + B(u) (ass:equation). This model is not linear "
+    "in what is estimated (a transform, or a form nonlinear in q): the paper's theory is silent."
+)
 Map = Callable[[Array], Array]
 
 
@@ -386,14 +390,22 @@ def constants(
     spaces
         Norms.
     q
-        Coefficients of the parameter at which C is taken, q* in a twin, shape (m,).
+        Coefficients of the (physical) parameter at which C is taken, q* in a twin, shape (m,).
     states
         Coefficients of states along the run, at least one.
     gain
         That of the law: it divides the inner product of Q, so C_A grows with its square root.
+
+    Raises
+    ------
+    ConfigurationError
+        No state is given, or C is not linear in the (latent) parameter.
     """
     if not len(states):
         raise ConfigurationError("constants: give at least one state.")
+    if not spaces.model.form_A.linear_in_parameter:
+        raise ConfigurationError(NONLINEAR)
+    q = spaces.model.latent.inverse(q)
     model, seen, hidden = spaces.model, spaces.observed_part, spaces.hidden_part
     sampled = []
     lipschitz = 0.0

@@ -302,15 +302,18 @@ def theory_report(
     if window is None:
         window = max((items[-1].t - items[0].t) / 20.0, 1e-12)
     tracker = OnlineTracker(identifier, window, noise)
+    notes: list[str] = []
     followed = None
     if twin is not None:
-        followed = TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+        try:
+            followed = TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+        except ConfigurationError as error:
+            notes.append(str(error))
     for sample in items:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         tracker.add(estimate, sample)
         if followed is not None and estimate.status.ok:
             followed.add(estimate, sample.z)
-    notes: list[str] = []
     tables: list[Sheet] = []
     found: Constants | None = None
     try:
@@ -419,12 +422,12 @@ def _spectrum(tracker: OnlineTracker, tables: list[Sheet], notes: list[str]) -> 
     except LivepdeError as error:
         notes.append(f"Excitation Gramian: {error}")
         return None
-    space = tracker.identifier.model.parameter_space
+    parts = tracker.identifier.model.latent.parts
     rows = []
     for k in range(min(SHOWN, len(spectrum.strength))):
         mode = spectrum.modes[:, k]
-        labels = [name for name in space.blocks if np.abs(mode[space.part(name)]).any()]
-        largest = max(labels, key=lambda name: float(np.linalg.norm(mode[space.part(name)])))
+        sizes = {name: float(np.linalg.norm(mode[item.part])) for name, item in parts.items()}
+        largest = max(sizes, key=lambda name: sizes[name])
         first = float(spectrum.strength[0]) or 1.0
         strength = float(spectrum.strength[k])
         rows.append((k + 1, strength, strength / first, largest))

@@ -108,7 +108,8 @@ class Twin:
     u_true
         Formula of the exact state, u(x, t); for several components a mapping of names to those.
     u0
-        Initial state, if there is no formula: a number, a function of x, or coefficients.
+        Initial state, if there is no formula: a number, a function of x, or coefficients. Without
+        both that of q_true, where the model says one (`initial`).
     truth
         Where the exact data come from.
 
@@ -182,7 +183,10 @@ class Twin:
             raise ConfigurationError("times must be two or more increasing numbers.")
         if self.truth == "analytic" and self.u_true is None:
             raise ConfigurationError("truth='analytic' needs the formula u_true(x, t).")
-        if self.u_true is None and self.u0 is None:
+        begun = self.model.form_initial is not None
+        if begun and self.u0 is not None:
+            raise ConfigurationError("the model has an initial state of its own: leave out u0.")
+        if self.u_true is None and self.u0 is None and not begun:
             raise ConfigurationError("give u_true(x, t), or the initial state u0.")
         if self.truth == "fine" and self.fine is None and not np.isfinite(self.fine_dt):
             raise ConfigurationError("truth='fine' needs a model `fine`, a `fine_dt`, or both.")
@@ -225,8 +229,11 @@ class Twin:
         """Coefficients of q_true in the estimator's Q, shape (m,)."""
         return self.model.parameter_space.interpolate(self.q_true)
 
-    def _start(self) -> Any:
-        return self.u0 if self.u_true is None else self._exact(float(self.times[0]))
+    def _start(self, model: Model, q: Array) -> Any:
+        t = float(self.times[0])
+        if self.u_true is not None:
+            return self._exact(t)
+        return model.initial_state(q, self._moment(t)) if self.u0 is None else self.u0
 
     def _exact(self, t: float) -> Any:
         """Return u_true at a time, a function of x or a mapping of those."""
@@ -238,7 +245,7 @@ class Twin:
         q = model.latent.inverse(model.parameter_space.interpolate(self.q_true))
         times = [float(t) for t in self.times]
         try:
-            run = simulate(model, q, self._start(), times, control, self._inputs)
+            run = simulate(model, q, self._start(model, q), times, control, self._inputs)
             return [u for _, u in run]
         except StepFailed as failure:
             raise ConfigurationError(
@@ -335,14 +342,16 @@ class Twin:
     def energy(self, estimate: Estimate, gain: float = 1.0) -> float:
         """Return ||e||_Q^2 + ||r||_X^2 with e = q - q_true and r = R (u - u_true).
 
-        The quantity that never grows along the exact-data method (align:neplusnr).
+        The quantity that never grows along the exact-data method (align:neplusnr), for a constant
+        parameter in which the model is linear. e is the difference of latent coefficients.
 
         Parameters
         ----------
         gain
             That of the law: it divides the inner product of Q.
         """
-        e = estimate.q - self.q
+        latent = self.model.latent
+        e = latent.inverse(estimate.q) - latent.inverse(self.q)
         r = self.observed.split().R @ (estimate.u - self.u(estimate.t))
         return self.model.Q.inner(e, e) / gain + self.model.X.inner(r, r)
 
