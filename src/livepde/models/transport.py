@@ -180,7 +180,7 @@ def _build_immobile(
 
 
 COLUMN = {
-    "D": Variable("cm^2/h", "coefficient of dispersion"),
+    "D": Variable("cm^2/h", "coefficient of dispersion: a number, or by layer"),
     "v": Variable("cm/h", "mean pore velocity"),
 }
 INFLOW = {"c_in": Variable("", "concentration that flows in")}
