@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
+from threadpoolctl import threadpool_limits
 
 from livepde import __version__
 from livepde.errors import ConfigurationError, LivepdeError
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app", "main"]
 
+MOST_CHANNELS = 40  # rows of the table of channels
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 FIGURES_MISSING = "No figures: they need Matplotlib, pip install 'livepde[plots]'."
 
@@ -66,7 +68,9 @@ CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show
 def main() -> int:
     """Run the command line and return its exit code."""
     try:
-        app(standalone_mode=True)
+        # The dense matrices of a step are small: threads for them cost more than they save.
+        with threadpool_limits(1):
+            app(standalone_mode=True)
     except LivepdeError as error:
         _console(err=True).print(f"[bold red]Error:[/] {escape(str(error))}", soft_wrap=True)
         return BAD_INPUT
@@ -381,8 +385,13 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: Sample
     if len(steps):
         text += f"; step {np.median(steps):g} {unit}, longest {steps.max():g} {unit}"
     console.print(text + ".", soft_wrap=True)
-    rows = []
+    rows: list[tuple[Any, ...]] = []
+    many = len(samples.names) > MOST_CHANNELS
     for name, values in zip(samples.names, samples.values.T, strict=True):
+        if many and len(rows) == MOST_CHANNELS:
+            more = len(samples.names) - MOST_CHANNELS
+            rows.append((f"and {more} more", "", "", "", "", "", ""))
+            break
         present = values[np.isfinite(values)]
         least, largest = (
             (f"{present.min():.4g}", f"{present.max():.4g}") if len(present) else ("–", "–")
@@ -417,8 +426,10 @@ def _show_checks(console: Console, prepared: Prepared) -> bool:
     case, first = prepared.case, prepared.first
     values = first.z if isinstance(first.z, Mapping) else {}
     inputs = {name: values[name] for name in case.model.channels if values[name] == values[name]}
-    model = check_model(case.model, u=prepared.u0, t=first.t, inputs=inputs)
-    reports = [model, check_observation(prepared.identifier.observed)]
+    report = check_model(case.model, u=prepared.u0, t=first.t, inputs=inputs)
+    observed, size = prepared.identifier.observed, prepared.typical(inputs)
+    read = {name: values[name] for name in observed.observation.inputs}
+    reports = [report, check_observation(observed, at=size, inputs=read)]
     for item in reports:
         if item.ok:
             console.print(f"{item.name}: [green]ok[/] ({len(item.lines)} properties)")

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from threadpoolctl import threadpool_limits
 
 from livepde.cases import Prepared, load
 from livepde.errors import CaseError, LivepdeError
@@ -103,6 +104,11 @@ def find_cases(folder: Path | None = None) -> list[Path]:
     )
 
 
+def _one_thread() -> None:
+    """Keep a worker to one thread: its dense matrices are small, and all cores have a worker."""
+    threadpool_limits(1)
+
+
 def bench_cases(
     paths: Sequence[Path], *, progress: bool = False, pictures: Path | None = None
 ) -> tuple[Outcome, list[tuple[Job, Run]]]:
@@ -125,7 +131,7 @@ def bench_cases(
         Means over the seeds: of each case, and of each variant.
     """
     # A fresh interpreter for each worker: nothing of this one, such as its threads, is copied.
-    with ProcessPoolExecutor(WORKERS, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(WORKERS, get_context("spawn"), _one_thread) as pool:
         found, failed = _collect(pool, paths, progress, pictures)
     runs = [(job, _mean(several)) for job, several in _grouped(found)] + failed
     runs.sort(key=lambda item: [path.name for path in paths].index(item[0].path.name))

@@ -24,6 +24,7 @@ from livepde.cases.schema import GradientSpec, SensitivitySpec, VariantSpec
 from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
 from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError, LawError
+from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
 from livepde.laws import (
     AnyLaw,
@@ -94,6 +95,15 @@ class Prepared:
         if frame.spec.initial is not None:
             raise frame.error("initial", "the equation has its own initial state; leave it out.")
         return None
+
+    def typical(self, inputs: Mapping[str, float]) -> float:
+        """Return the size of the initial state, 1 if it is zero; for checks."""
+        model, moment = self.case.model, Moment(float(self.first.t), Inputs(inputs))
+        if self.u0 is None:
+            u = model.initial_state(model.initial_parameter(), moment)
+        else:
+            u = model.initial(self.u0, moment)
+        return float(np.abs(u).mean()) or 1.0
 
     def describe(self, data: xr.Dataset) -> None:
         """Add to a run's dataset what its case knows: title, start, units of axes, references."""

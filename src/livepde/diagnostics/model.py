@@ -28,7 +28,7 @@ def check_model(
     model: Model,
     *,
     q: Any = None,
-    u: Any = 0.0,
+    u: Any = None,
     spread: float | None = None,
     t: float = 0.0,
     inputs: Mapping[str, float] | None = None,
@@ -46,8 +46,8 @@ def check_model(
     model
         The model.
     q, u
-        A typical parameter (default the prior mean) and a typical state: numbers, functions of x,
-        or coefficients.
+        A typical parameter (default the prior mean) and a typical state (default the model's
+        initial one, or zero): numbers, functions of x, or coefficients.
     spread
         Size of the random variations of u; default a tenth of the largest |u|, or 1 if u = 0.
     t, inputs
@@ -115,12 +115,12 @@ class _Point:
         channels = {**dict.fromkeys(model.channels, 1.0), **(inputs or {})}
         moment = Moment(t, Inputs(channels))
         n, m = model.X.dim, model.Q.dim
-        centre = model.initial(u, moment)
+        start = model.initial_parameter(q)
+        centre = model.initial_state(start, moment) if u is None else model.initial(u, moment)
         width = spread or 0.1 * float(np.abs(centre).max()) or 1.0
         std = model.latent.deviations
         lower, upper = model.latent.bounds
-        prior = model.initial_parameter(q)
-        varied = np.clip(prior + std * rng.standard_normal(m), lower, upper) * model.Q.free
+        varied = np.clip(start + std * rng.standard_normal(m), lower, upper) * model.Q.free
         return cls(
             moment,
             varied,
