@@ -1,0 +1,175 @@
+"""Every ready-made equation and every kind of unknown passes the shipped checks: random draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import livepde as lp
+from livepde.fem import line, linear
+from livepde.models import EQUATIONS, Option
+
+REGIONS = {"inner": lambda x: x[0] < 0.5, "outer": lambda x: x[0] >= 0.5}
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Typical:
+    """Where an equation is checked, if not where all of them are.
+
+    Numbers are drawn from 0.3 to 3 unless a range is given; without dimension all is of size one,
+    so that terms balance. One of each group in `either` is given.
+    """
+
+    mesh: Callable[[], Any] = lambda: line([0.1, 0.3, 0.5, 0.8, 1.2])
+    ranges: Mapping[str, Range] = field(default_factory=dict)
+    either: tuple[tuple[str, ...], ...] = ()
+
+
+TYPICAL = {
+    "battery_particle": Typical(lambda: line([0.0, 0.3, 0.5, 0.8, 1.2])),
+    "grouted_borehole": Typical(
+        lambda: lp.interval(0.05, 2.0, 12, geometric=True),
+        {"r_p": (0.1, 0.2), "r_b": (0.4, 0.8), "share": (0.2, 0.8)},
+    ),
+    "groundwater": Typical(
+        lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4)),
+        {"radius": (0.4, 0.8), "x": (0.4, 0.6), "y": (0.4, 0.6)},
+    ),
+    "advection_diffusion": Typical(either=(("v", "K"),)),
+    "porous_fisher": Typical(ranges={"m": (1.0, 3.0)}),
+    "advection_dispersion": Typical(ranges={"R": (1.0, 3.0)}),
+    "mobile_immobile": Typical(ranges={"phi": (0.2, 0.8)}),
+}
+
+EVOLUTIONS = (lp.RandomWalk(0.1), lp.MeanReverting(2.0), lp.Periodic(3.0, harmonics=2))
+
+
+def number(name: str, typical: Typical) -> st.SearchStrategy[float]:
+    return st.floats(*typical.ranges.get(name, (0.3, 3.0)))
+
+
+@st.composite
+def unknown(draw: Any, name: str, text: str, mesh: Any, typical: Typical) -> Any:
+    """Draw an unknown of any kind that the equation says it takes, with any prior and evolution."""
+    low, high = typical.ranges.get(name, (0.0, 10.0))
+    prior = draw(number(name, typical))
+    options: dict[str, Any] = {"prior": prior, "transform": draw(st.sampled_from(["log", "logit"]))}
+    if name in typical.ranges or options["transform"] == "logit":
+        options |= {"transform": "logit", "bounds": (0.9 * low, 1.1 * high)}
+    # As they are, unknowns stay near their prior: nothing else keeps a divisor from zero.
+    if name not in typical.ranges and draw(st.booleans()):
+        options = {"prior": prior, "std": 0.05 * prior}
+        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS, lp.Scalar().evolution)))
+    else:
+        options["std"] = prior * draw(st.floats(0.05, 0.5))
+        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS[:2], lp.Scalar().evolution)))
+    kinds = ["number"] * ("initial" not in text)
+    kinds += ["field"] * ("field" in text)
+    kinds += ["regions"] * ("by layer" in text or "by region" in text)
+    kind = draw(st.sampled_from(kinds))
+    if kind == "field":
+        return lp.Field(mesh, linear(mesh), inner="H1", **options)
+    return lp.Piecewise(REGIONS, **options) if kind == "regions" else lp.Scalar(**options)
+
+
+@st.composite
+def option(draw: Any, name: str, known: Option, typical: Typical) -> Any:
+    if known.choices:
+        return draw(st.sampled_from(known.choices))
+    return draw(st.booleans() if known.kind is bool else number(name, typical))
+
+
+@st.composite
+def models(draw: Any, name: str) -> lp.Model:
+    equation, typical = EQUATIONS[name], TYPICAL.get(name, Typical())
+    mesh = typical.mesh()
+    optional = [key for key, known in equation.unknowns.items() if known.optional]
+    out = {key for key in optional if draw(st.booleans())}
+    for group in typical.either:
+        out = (out | set(group)) - {draw(st.sampled_from(group))}
+    unknowns = {
+        key: draw(unknown(key, known.text, mesh, typical))
+        for key, known in equation.unknowns.items()
+        if key not in out
+    }
+    options = {key: draw(option(key, item, typical)) for key, item in equation.options.items()}
+    return equation.build(mesh, unknowns, {}, **options)
+
+
+@pytest.mark.parametrize("name", EQUATIONS)
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data(), seed=st.integers(0, 2**31))
+def test_every_equation_passes_the_checks(name: str, data: Any, seed: int) -> None:
+    model = data.draw(models(name))
+    u = 0.7 if model.state_space.single else dict.fromkeys(model.state_space.blocks, 0.7)
+    inputs = {channel: data.draw(st.floats(-2.0, 2.0)) for channel in model.channels}
+    lp.check_model(model, u=u, t=0.5, inputs=inputs, seed=seed).raise_if_failed()
+
+
+# --- unknowns ------------------------------------------------------------------------------------
+
+MESH = line([0.0, 0.2, 0.5, 0.7, 1.0])
+KINDS: dict[str, Callable[..., Any]] = {
+    "number": lp.Scalar,
+    "by region": lambda **options: lp.Piecewise(REGIONS, **options),
+    "by name": lambda **options: lp.Scalars(("a", "b"), **options),
+    "field": lambda **options: lp.Field(MESH, linear(MESH), inner="H1", **options),
+}
+FORMS: dict[str, Callable[[Any, Any, Any, Any], Any]] = {
+    "linear": lambda k, u, v, x: k * lp.dot(lp.grad(u), lp.grad(v)),
+    "nonlinear": lambda k, u, v, x: k**2 * u**2 * v + lp.dot(lp.grad(u), lp.grad(v)) / (2 + k**2),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("transform", [None, "log", "logit"])
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=8, deadline=None)
+@given(
+    lower=st.floats(-2.0, 0.0),
+    width=st.floats(1.0, 5.0),
+    at=st.floats(0.2, 0.8),
+    share=st.floats(0.05, 0.5),
+    evolution=st.sampled_from(EVOLUTIONS),
+    seed=st.integers(0, 2**31),
+)
+def test_every_unknown_passes_the_checks_and_stays_inside(
+    form: str,
+    transform: str | None,
+    kind: str,
+    lower: float,
+    width: float,
+    at: float,
+    share: float,
+    evolution: Any,
+    seed: int,
+) -> None:
+    upper = np.inf if transform == "log" else lower + width
+    options: dict[str, Any] = {"prior": lower + at * width, "std": share * width}
+    if transform or kind != "field":
+        options |= {"transform": transform, "bounds": (lower, upper)}
+    if evolution.copies == 1:
+        options["evolution"] = evolution
+    elif transform is None:  # harmonics go without bounds
+        options = {**options, "bounds": (-np.inf, np.inf), "evolution": evolution}
+    term = FORMS[form]
+
+    def A(q: Any, u: Any, v: Any, x: Any) -> Any:
+        return term(q.k["a"] + q.k["b"] if kind == "by name" else q.k, u, v, x)
+
+    model = lp.Model(lp.Field(MESH, linear(MESH)), {"k": KINDS[kind](**options)}, A)
+    lp.check_model(model, u=0.7, seed=seed).raise_if_failed()
+    if transform:
+        latent = model.latent
+        a = 20.0 * np.random.default_rng(seed).standard_normal(latent.dim)
+        q = latent.value(a)
+        assert np.isfinite(q).all()
+        assert lower <= q.min()
+        assert q.max() <= upper
