@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from skfem import ElementLineHermite
 
 import livepde as lp
+from livepde.bench.cases import jobs_of, run_job
+from livepde.cases import load
 from livepde.diagnostics import check_model
 from livepde.models import EQUATIONS, allen_cahn, burgers, kdv, kuramoto_sivashinsky
 from livepde.stepping import Advance, Alexander2, simulate
@@ -190,3 +192,25 @@ def test_burgers_from_a_published_field(data_dir, noise, share, bound):
     found = identifier.run(zip(t[:51], z[:51], strict=True)).last.parameters
     assert abs(found["nu"][0] / 0.1 - 1) < bound
     assert abs(found["advection"][0] - 1) < bound
+
+
+CASES = ("burgers", "burgers_shock", "kdv", "kdv_pde_find", "allen_cahn")
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cases_are_short_and_fit_their_equations(name):
+    path = Path(__file__).parents[1] / "cases" / f"{name}.toml"
+    assert len(path.read_text().splitlines()) <= 60
+    assert len(load(path, allow_code=True).references) == 2
+    for job in jobs_of(path):
+        load(path, allow_code=True, settings=job.settings)
+
+
+def test_a_shock_from_few_noisy_points(data_dir, monkeypatch):
+    """The hardest variant of the case: 10 % noise on 2000 of the 25600 points."""
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+    *_, job = jobs_of(Path(__file__).parents[1] / "cases" / "burgers_shock.toml")
+    found = run_job(job)
+    assert not found.error
+    assert found.numbers["nu.error"] < 0.06391
+    assert found.numbers["advection.error"] < 0.02
