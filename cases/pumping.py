@@ -15,7 +15,8 @@ RATES = {"p05": 0.3, "p40": 0.1, "p42": 0.1, "p44": 0.1}  # m^3/s, by the name o
 
 def wells(folder: Path, rate: float, files: dict[str, str]) -> tuple[Array, Columns]:
     """Return drawdown by well, and Q = rate from time 0 on; files hold times and head changes."""
-    heads = {name: np.loadtxt(folder / "pumping_ttim" / file).T for name, file in files.items()}
+    texts = {name: (folder / "pumping_ttim" / file).read_text() for name, file in files.items()}
+    heads = {name: np.loadtxt(text.splitlines()).T for name, text in texts.items()}
     times = np.unique(np.concatenate([[0.0], *(time for time, _ in heads.values())]))
     columns = {"Q": np.full(len(times), rate)}
     for name, (time, head) in heads.items():
