@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -316,3 +317,63 @@ def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
     (row,), _ = preview(prepared, stream)
     (other,), _ = preview(prepared, warmer)
     assert other.posterior == pytest.approx(row.posterior, rel=1e-6)
+
+
+@pytest.mark.parametrize("name", EVOLUTIONS)
+def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: Any):
+    replayed, count = lp.SensitivityLaw._replayed, []
+
+    def counted(*arguments: Any) -> Any:
+        count.append(1)
+        return replayed(*arguments)
+
+    monkeypatch.setattr(lp.SensitivityLaw, "_replayed", counted)
+    law = lp.SensitivityLaw(modes=7, replay=lp.Replay(first=4, iterations=50))
+    identifier = lp.Identifier(linear_model(EVOLUTIONS[name]), sensors(), law)
+    for t, z in samples():
+        assert identifier.step(t, z).status.ok
+    assert 3 <= len(count) <= 15  # three doublings
+
+
+def test_replays_find_the_most_probable_parameter():
+    left = lambda x, t: np.sin(3 * t) + 0 * x[0]  # noqa: E731
+    state = lp.Field(mesh, ElementLineP1(), dirichlet={"left": left})
+    model = lp.Model(
+        state,
+        {
+            "a": lp.Scalar(0.2, 0.15, transform="log"),
+            "w": lp.Scalar(0.5, 0.5, transform="log"),
+            "off": lp.Scalars(("a", "b"), 0.0, 0.1),
+        },
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+        initial=lambda q, v, x: q.w * np.sin(np.pi * x[0]) * v,
+    )
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+    identifier = lp.Identifier(model, sensors(), law)
+    latent, forward, times = model.latent, ForwardStage(model), 0.02 * np.arange(64)
+
+    def seen(a: Array) -> Array:
+        u, rows = model.initial_state(a), []
+        for k, t in enumerate(times):
+            u = forward.solve(u, a, 0.02, lp.Moment(t)) if k else u
+            rows.append(identifier.observed.predict(u, latent.value(a), lp.Moment(t)))
+        return np.array(rows)
+
+    truth = {"a": 0.1, "w": 1.6, "off": [0.05, -0.08]}
+    rng, exact = np.random.default_rng(1), seen(model.initial_parameter(truth))
+    data = exact + NOISE * rng.standard_normal(exact.shape)
+    for t, z in zip(times, data, strict=True):
+        estimate = identifier.step(t, z)
+
+    def residual(x: Array) -> Array:
+        misfit = (data - seen(latent.prior + latent.deviations * x)) / NOISE
+        return np.append(misfit.ravel(), x)
+
+    found = least_squares(residual, np.zeros(latent.dim))
+    best = latent.prior + latent.deviations * found.x
+    root = np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+    std = root * latent.deviations * latent.slopes(best)
+    factor = estimate.belief.q_factor
+    assert factor is not None
+    np.testing.assert_allclose(np.linalg.norm(factor, axis=1), std, rtol=0.05)
+    assert np.abs(estimate.q - latent.value(best)).max() < 0.1 * std.min()

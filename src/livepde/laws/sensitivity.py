@@ -120,6 +120,8 @@ class SensitivityState:
         Samples used since the start of the window, and at how many the next replay is due.
     initial
         True while the window begins with the initial state that the model says (`Model.initial`).
+    reference
+        Latent parameter at the start of the window from which the reference of `now` comes.
     """
 
     now: Point
@@ -128,6 +130,12 @@ class SensitivityState:
     assimilated: int
     due: int
     initial: bool
+    reference: Array
+
+    @property
+    def span(self) -> float:
+        """Time since the start of the window."""
+        return float(self.samples.t[-1] - self.samples.t[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,6 +191,10 @@ class SensitivityWork:
         """True if an unknown moves by itself."""
         return any(motion.evolution.moves for motion in self.motions)
 
+    def transition(self, h: float) -> Array:
+        """Return the transition of all reduced coordinates in a time h, shape (k, k)."""
+        return np.asarray(block_diag(*(motion.transition(h) for motion in self.motions)))
+
     def moved(self, point: Point, h: float) -> Point:
         """Return a point whose unknowns have moved for a time h; those of its state have not.
 
@@ -190,7 +202,7 @@ class SensitivityWork:
         """
         if not self.moves or h == 0.0:
             return point
-        F = block_diag(*(motion.transition(h) for motion in self.motions))
+        F = self.transition(h)
         gained = np.sqrt(np.concatenate([motion.growth(h) for motion in self.motions]))
         new = np.diag(gained)[:, gained > 0.0]
         q = self.problem.model.latent.moved(point.q, h)
@@ -380,7 +392,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         )
         empty = Samples(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, len(channels))))
         due = self.replay.first if self.replay else 0
-        return SensitivityState(start, start, empty, 0, due, False)
+        return SensitivityState(start, start, empty, 0, due, False, q0)
 
     def start(
         self, work: SensitivityWork, q0: Array, u0: Array, moment: Moment
@@ -416,16 +428,16 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         state = self._store(work, state, point, interval)
         if state.assimilated >= state.due:
             for _ in range(self.replay.iterations):
-                replayed, status = self._replayed(work, state)
-                state = replace(state, now=replayed, due=2 * state.assimilated)
+                state, status = self._replayed(work, state)
+                state = replace(state, due=2 * state.assimilated)
                 if not status.ok:  # keep the linear estimate, say so, and try again when doubled
                     report = replace(report, notes={**report.notes, "replay_failed": 1.0})
-                if not status.ok or _converged(work, replayed):
+                if not status.ok or _converged(work, state):
                     break
         if len(state.samples.t) > self.replay.window:
             start = _recentre(work, state.now)
             empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
-            state = SensitivityState(start, start, empty, 0, self.replay.first, False)
+            state = SensitivityState(start, start, empty, 0, self.replay.first, False, start.q)
         return state, report
 
     def _store(
@@ -441,13 +453,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         used = state.assimilated + bool(interval.present.any())
         return replace(state, now=now, samples=samples, assimilated=used)
 
-    def _replayed(self, work: SensitivityWork, state: SensitivityState) -> tuple[Point, Status]:
+    def _replayed(
+        self, work: SensitivityWork, state: SensitivityState
+    ) -> tuple[SensitivityState, Status]:
         """Run the stored samples again about a reference at the estimate, or on the way to it."""
         start, samples, model = state.start, state.samples, work.problem.model
-        reference = state.now.q
-        step = work.reduced(work.bounded(work.latent(state.now)) - reference)
+        step = _missed(work, state)
         step = step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
-        q = work.traced(reference + work.Phi @ step, start.q, samples.t[-1] - samples.t[0])
+        q = state.reference + work.Phi @ step
         shift = work.reduced(q - start.q)
         channels = work.problem.channels
         named = [dict(zip(channels, row, strict=True)) for row in samples.inputs]
@@ -474,8 +487,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             )
             point, report = self._filter(work, point, interval)
             if not report.status.ok:
-                return state.now, report.status
-        return point, Status()
+                return state, report.status
+        return replace(state, now=point, reference=q), Status()
 
     def _filter(
         self, work: SensitivityWork, point: Point, interval: Interval
@@ -587,9 +600,15 @@ def _along(point: Point, shift: Array) -> Array:
     return along
 
 
-def _converged(work: SensitivityWork, point: Point) -> bool:
+def _missed(work: SensitivityWork, state: SensitivityState) -> Array:
+    """Return by how much the reference misses the estimate at the window's start, reduced (k,)."""
+    estimate = work.bounded(work.latent(state.now))
+    return work.reduced(work.traced(estimate, state.start.q, state.span) - state.reference)
+
+
+def _converged(work: SensitivityWork, state: SensitivityState) -> bool:
     """Return true if the estimate is within half a standard deviation of the reference."""
-    shift = work.reduced(work.bounded(work.latent(point)) - point.q)
+    point, shift = state.now, work.transition(state.span) @ _missed(work, state)
     deviations = np.linalg.lstsq(point.C, shift, rcond=None)[0]
     return bool(np.linalg.norm(deviations) <= CONVERGED * point.consistency.inflation)
 
