@@ -235,7 +235,7 @@ def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
     model = conductivity()
     sensors, samples = stream(model, 2.0, 0.1 * np.arange(12))
     ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=4)))
-    failing = lambda self, work, state: (state.now, lp.Status("not_converged", "no luck"))  # noqa: E731
+    failing = lambda self, work, state: (state, lp.Status("not_converged", "no luck"))  # noqa: E731
     monkeypatch.setattr(lp.SensitivityLaw, "_replayed", failing)
     estimates = [ident.step(*sample) for sample in samples]
     failed = [k for k, estimate in enumerate(estimates) if "replay_failed" in estimate.notes]
