@@ -173,7 +173,10 @@ def test_an_initial_state_may_read_channels():
     np.testing.assert_allclose(estimate.u, 3.0, rtol=1e-5)
 
 
-def test_replays_linearise_the_initial_state_anew():
+@pytest.mark.parametrize(
+    ("replay", "first"), [(None, True), (lp.Replay(first=2), True), (lp.Replay(first=2), False)]
+)
+def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
     unknown = lp.Scalar(1.0, 1.0, transform="log")
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
@@ -183,9 +186,10 @@ def test_replays_linearise_the_initial_state_anew():
     )
     truth = model.initial_parameter({"u0": 5.0})
     forward, u = ForwardStage(model), model.initial_state(truth)
-    law = lp.SensitivityLaw(replay=lp.Replay(first=2))
+    law = lp.SensitivityLaw(replay=replay)
     identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law)
-    identifier.step(0.0, identifier.observed.G @ u)
+    if first:
+        identifier.step(0.0, identifier.observed.G @ u)
     for k in range(1, 20):
         u = forward.solve(u, truth, 0.1, lp.Moment(0.1 * k))
         estimate = identifier.step(0.1 * k, identifier.observed.G @ u)

@@ -18,6 +18,7 @@ from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 __all__ = ["Replay", "SensitivityLaw", "SensitivityState"]
 
 CONVERGED = 0.5  # standard deviations between reference and estimate at which replays stop
+FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
 STRIDE = 1.0  # prior deviations that a replay moves its reference at most: a trust region
 
 
@@ -135,7 +136,7 @@ class SensitivityState:
     @property
     def span(self) -> float:
         """Time since the start of the window."""
-        return float(self.samples.t[-1] - self.samples.t[0])
+        return float(self.samples.t[-1] - self.samples.t[0]) if len(self.samples.t) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,12 +411,18 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
         if not work.output(point, interval.end).any():
             return state
-        new, _ = self._update(work, point, interval, work.predict(point, interval.end))
-        if not np.isfinite(new.da).all():
-            return state
+        form, begun = work.problem.model.form_initial, state
+        for _ in range(FIRST):
+            new, _ = self._update(work, point, interval, work.predict(point, interval.end))
+            if not np.isfinite(new.da).all():
+                return state
+            begun = replace(state, now=new, reference=point.q)
+            if form is None or form.linear_in_parameter or _converged(work, begun):
+                break
+            point = _placed(work, state, _next(work, begun), interval.end)
         if self.replay is None:
-            return replace(state, now=_recentre(work, new))
-        return self._store(work, state, new, interval)
+            return replace(begun, now=_recentre(work, new))
+        return self._store(work, begun, new, interval)
 
     def step(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
@@ -457,21 +464,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         self, work: SensitivityWork, state: SensitivityState
     ) -> tuple[SensitivityState, Status]:
         """Run the stored samples again about a reference at the estimate, or on the way to it."""
-        start, samples, model = state.start, state.samples, work.problem.model
-        step = _missed(work, state)
-        step = step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
-        q = state.reference + work.Phi @ step
-        shift = work.reduced(q - start.q)
+        samples, q = state.samples, _next(work, state)
         channels = work.problem.channels
         named = [dict(zip(channels, row, strict=True)) for row in samples.inputs]
         first = Moment(samples.t[0], Inputs(named[0]))
-        if state.initial:
-            U = model.initial_directions(q, work.Phi, first)
-            u, du = model.initial_state(q, first), -U @ shift
-            point = replace(start, q=q, u=u, du=du, da=-shift, U=U)
-        else:
-            along = _along(start, shift)
-            point = replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
+        point = _placed(work, state, q, first)
         if np.isfinite(samples.z[0]).any():
             z = samples.z[0]
             at = Interval(first.t, first.t, first.inputs, first.inputs, z, z)
@@ -604,6 +601,26 @@ def _missed(work: SensitivityWork, state: SensitivityState) -> Array:
     """Return by how much the reference misses the estimate at the window's start, reduced (k,)."""
     estimate = work.bounded(work.latent(state.now))
     return work.reduced(work.traced(estimate, state.start.q, state.span) - state.reference)
+
+
+def _next(work: SensitivityWork, state: SensitivityState) -> Array:
+    """Return the reference at the window's start that is next: towards the estimate, (m,)."""
+    step = _missed(work, state)
+    step = step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
+    q: Array = state.reference + work.Phi @ step
+    return q
+
+
+def _placed(work: SensitivityWork, state: SensitivityState, q: Array, first: Moment) -> Point:
+    """Return the filter at the start of the window, linear about q."""
+    start, model = state.start, work.problem.model
+    shift = work.reduced(q - start.q)
+    if state.initial:
+        U = model.initial_directions(q, work.Phi, first)
+        u, du = model.initial_state(q, first), -U @ shift
+        return replace(start, q=q, u=u, du=du, da=-shift, U=U)
+    along = _along(start, shift)
+    return replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
 
 
 def _converged(work: SensitivityWork, state: SensitivityState) -> bool:
