@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,7 @@ from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Pattern, analyse
-from livepde.stepping import ForwardStage, StepFailed, advance
+from livepde.stepping import ForwardStage, StepFailed, advance, simulate
 
 SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
 
@@ -259,9 +260,9 @@ def test_forward_stage_of_an_affine_model_is_one_factorisation():
     q = np.ones(model.Q.dim)
     u = np.random.default_rng(1).standard_normal(model.X.dim)
     first = forward.solve(u, q, 0.1, Moment(0.1))
-    kept = forward.system(q, 0.1)
+    kept = forward.system(q, 0.1, lp.Moment())
     assert forward.system(q.copy(), 0.1) is kept
-    assert forward.system(2 * q, 0.1) is not kept
+    assert forward.system(2 * q, 0.1, lp.Moment()) is not kept
     # What is kept never changes the numbers.
     np.testing.assert_array_equal(ForwardStage(model).solve(u, q, 0.1, Moment(0.1)), first)
     # And it solves the equation.
@@ -313,3 +314,49 @@ def test_a_simulation_that_blows_up_says_so():
     with pytest.raises(StepFailed) as caught:
         list(lp.simulate(model, np.zeros(7), 5.0, [0.0, 1.0], control))
     assert caught.value.code in {"not_converged", "not_finite", "singular"}
+
+
+def wells(terms, f=0.0):
+    mesh = lp.interval(0.0, 1.0, 12)
+    state = lp.Field(mesh, ElementLineP1(), dirichlet={"right": 0.0})
+    unknowns = {"k": lp.Scalar(0.3), "S": lp.Scalar(2.0)}
+    return lp.Model(state, unknowns, A=terms, f=f, inputs=["Q"])
+
+
+def conducts(q, u, v, x):
+    return q.k / q.S * lp.dot(lp.grad(u), lp.grad(v))
+
+
+def test_inputs_that_do_not_touch_the_state_keep_the_factor():
+    well = lp.On("left", lambda q, u, v, x: -x.inputs["Q"] / q.S * v)
+    apart = wells([conducts, well])
+    mixed = wells(
+        [conducts, lp.On("left", lambda q, u, v, x: -x.inputs["Q"] / q.S * v + 0 * u * v)]
+    )
+    assert apart.steady
+    assert not apart.constant
+    assert not mixed.steady
+    times, q = [0.0, 0.1, 0.2, 0.4], np.array([0.3, 2.0])
+    runs = [
+        [
+            u
+            for _, u in simulate(
+                model, q, 0.0, times, lp.Advance(lp.Alexander2()), lambda t: {"Q": 1 + t}
+            )
+        ]
+        for model in (apart, mixed)
+    ]
+    np.testing.assert_allclose(runs[0], runs[1], rtol=1e-9, atol=1e-12)
+    assert np.abs(runs[0][-1]).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    "term",
+    [
+        lambda q, u, v, x: (u if x.t > 5 else 0.0) * v,  # a branch that is taken later
+        lambda q, u, v, x: x.inputs["Q"] * (lambda: u)() * v,  # in a closure
+        functools.partial(lambda a, q, u, v, x: a * x.t * v, 1.0),  # no plain function
+    ],
+)
+def test_terms_that_may_touch_the_state_are_not_kept(term):
+    assert not wells([conducts, term]).steady

@@ -299,6 +299,11 @@ class Model:
         """True if A and B do not depend on time or inputs."""
         return self.form_A.constant and self.form_B.constant
 
+    @cached_property
+    def steady(self) -> bool:
+        """True if the derivatives of A and B in u do not depend on time or inputs."""
+        return self.form_A.steady and self.form_B.steady
+
     def A(self, u: Array, moment: Moment = START, q: Array | None = None) -> DualOperator:
         """Return A(u): Q -> X*, for coefficients u of shape (n,).
 

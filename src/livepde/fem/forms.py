@@ -21,7 +21,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dis import get_instructions
 from functools import cached_property
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -153,6 +155,7 @@ class Form(FormMatrices):
         self._tensors: dict[tuple[str, str], sp.csr_array | None] = {}
         self._patterns: dict[tuple[str, str], Pattern] = {}
         self._gathers: dict[tuple[str, str], list[sp.csr_array]] = {}
+        self._moving: list[bool] = []  # terms that read time or inputs, and the nonlinear argument
         self.uses: frozenset[str] = self._probe()
         self.parameter = parameter
         self.linear_in_parameter = parameter is None or self._linear(parameter)
@@ -186,12 +189,31 @@ class Form(FormMatrices):
                     "or a component index missing?"
                 )
             used |= place.used
+            self._moving.append(bool(place.used) and self._mentions_state(term.integrand))
         return frozenset(used)
 
     @property
     def constant(self) -> bool:
         """True if the form reads neither time nor inputs."""
         return not self.uses
+
+    def _mentions_state(self, integrand: Integrand) -> bool:
+        """Return false if a function never uses its nonlinear argument, whatever its branches."""
+        if self.nonlinear is None:
+            return False
+        position = list(self.spaces).index(self.nonlinear)
+        if not isinstance(integrand, FunctionType) or integrand.__code__.co_argcount <= position:
+            return True
+        code = integrand.__code__
+        name = code.co_varnames[position]
+        used = [item.argval for item in get_instructions(code) if item.opname.count("FAST")]
+        named = [name in item if isinstance(item, tuple) else item == name for item in used]
+        return any(named) or name in code.co_cellvars
+
+    @property
+    def steady(self) -> bool:
+        """True if the derivative in the nonlinear argument reads neither time nor inputs."""
+        return not any(self._moving)
 
     @cached_property
     def affine(self) -> bool:

@@ -228,6 +228,11 @@ class Composed(FormMatrices):
         return self.form.constant
 
     @property
+    def steady(self) -> bool:
+        """True if the derivative in u reads neither time nor inputs."""
+        return self.form.steady
+
+    @property
     def linear_in_parameter(self) -> bool:
         """True if the form is linear in the latent coefficients."""
         return self.latent.linear and self.form.linear_in_parameter

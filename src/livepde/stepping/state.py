@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
-from livepde.fem import START, Moment
+from livepde.fem import Moment
 from livepde.linalg import Array, Assembler, Factor, Pattern, Solver, analyse
 from livepde.model import Model
 from livepde.stepping.interval import Advance, Interval, advance
@@ -24,8 +24,9 @@ __all__ = ["ForwardStage", "simulate"]
 class ForwardStage:
     """Solves M (u - c)/h + B(u) + A(u) q = F(t) for u, with Dirichlet values imposed.
 
-    If B and A are affine in u and constant in time, the matrix is factorised once for each (h, q)
-    and a stage is one back-substitution. What is kept never changes the numbers.
+    If B and A are affine in u with derivatives that read neither time nor inputs, the matrix is
+    factorised once for each (h, q) and a stage is one back-substitution. What is kept never changes
+    the numbers.
     """
 
     def __init__(self, model: Model, newton: Newton | None = None) -> None:
@@ -74,22 +75,32 @@ class ForwardStage:
 
     @cached_property
     def _offset(self) -> tuple[Array, sp.csr_array | None]:
-        """B(0) of an affine model, and A(0) if it is linear in q."""
+        """B(0) of an affine, constant model, and A(0) if it is linear in q."""
         zero = np.zeros(self.model.X.dim)
         linear = self.model.form_A.linear_in_parameter
         return self.model.B(zero), self.model.A(zero).matrix if linear else None
 
-    def system(self, q: Array, h: float) -> _System:
-        """Return matrix and factor of an affine, constant model, kept for the last (q, h)."""
+    def _at_zero(self, q: Array, moment: Moment) -> Array:
+        """Return B(0) + A(0) q of an affine model."""
+        model, zero = self.model, np.zeros(self.model.X.dim)
+        if not model.constant:
+            return model.B(zero, moment) + model.form_A.vector("v", moment, q=q, u=zero)
+        offset, constant = self._offset
+        if constant is None:
+            return offset + model.form_A.vector("v", moment, q=q, u=zero)
+        return offset + constant @ q if constant.data.any() else offset
+
+    @property
+    def keeps(self) -> bool:
+        """True if the matrix of a stage depends on h and q only: it is kept for the last ones."""
+        return self.model.affine and self.model.steady
+
+    def system(self, q: Array, h: float, moment: Moment) -> _System:
+        """Return matrix and factor, and B(0) + A(0) q if it is constant, for the last (q, h)."""
         key = (h, q.tobytes())
         if self._kept is None or self._kept[0] != key:
-            data = self._data(np.zeros(self.model.X.dim), q, h, START)
-            offset, constant = self._offset
-            if constant is None:
-                zero = np.zeros(self.model.X.dim)
-                offset = offset + self.model.form_A.vector("v", q=q, u=zero)
-            elif constant.data.any():
-                offset = offset + constant @ q
+            data = self._data(np.zeros(self.model.X.dim), q, h, moment)
+            offset = self._at_zero(q, moment) if self.model.constant else None
             self._kept = (key, _System(self._rows[0].matrix(data), offset, self._factorise(data)))
         return self._kept[1]
 
@@ -97,24 +108,25 @@ class ForwardStage:
         """Return u of one stage; raises `StepFailed`."""
         model = self.model
         u = model.impose(c, moment)
-        if model.affine and model.constant:
-            system = self.system(q, h)
-            residual = system.matrix @ u - model.mass @ (c / h) + system.offset - model.F(moment)
+        if self.keeps:
+            system = self.system(q, h, moment)
+            offset = system.offset if system.offset is not None else self._at_zero(q, moment)
+            residual = system.matrix @ u - model.mass @ (c / h) + offset - model.F(moment)
             return u - system.factor.solve(residual * model.X.free)
         equation = _Equation(self, c, q, h, moment)
         return self.newton.solve(equation, u)
 
     def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised Jacobian at a solved stage, for sensitivities."""
-        if self.model.affine and self.model.constant:
-            return self.system(q, h).factor
+        if self.keeps:
+            return self.system(q, h, moment).factor
         return self.jacobian(u, q, h, moment)
 
 
 @dataclass(frozen=True, eq=False)
 class _System:
     matrix: sp.csr_array
-    offset: Array
+    offset: Array | None
     factor: Factor
 
 
