@@ -16,7 +16,7 @@ import livepde as lp
 from livepde import cases
 from livepde.cases.preview import preview
 from livepde.cases.template import write_template
-from livepde.diagnostics import check_law, theory_report
+from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
 from livepde.fem.evolution import Constant
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
@@ -381,3 +381,20 @@ def test_replays_find_the_most_probable_parameter():
     assert factor is not None
     np.testing.assert_allclose(np.linalg.norm(factor, axis=1), std, rtol=0.05)
     assert np.abs(estimate.q - latent.value(best)).max() < 0.1 * std.min()
+
+
+def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        lp.Scalar(2.0, 1.0, transform="log"),
+        A=lambda q, u, v, x: q * u * v,
+    )
+    full = lp.Full().bind(model.state_space, model.X, model.parameter_space)
+    excitation = Excitation(Spaces(model, full), window=0.5)
+    for q, slope in ((None, 2.0), (np.array([5.0]), 5.0)):
+        state = excitation.init()
+        for t in (0.0, 0.25, 0.5):
+            state = excitation.add(state, t, np.full(7, 3.0), q=q)
+        # 0.5 * 3 * dq/dtheta * deviation of theta, on an interval of length 1
+        strength = excitation.spectrum(state).strength
+        assert strength == pytest.approx([0.5 * 3.0 * slope * 0.5])

@@ -73,7 +73,7 @@ class ExcitationState:
     begun
         Where the open window begins.
     last
-        A(w) at t, dual vectors of X in columns, shape (n, m).
+        A(w) at t, of latent coefficients, dual vectors of X in columns, shape (n, m).
     integral
         Over the open window.
     latest
@@ -143,6 +143,7 @@ class Excitation:
         t: float,
         w: Array,
         inputs: Mapping[str, float] | None = None,
+        q: Array | None = None,
     ) -> ExcitationState:
         """Take the state estimate w at a time; return the new state.
 
@@ -152,9 +153,15 @@ class Excitation:
             u_alpha + P u, or the estimate u where they hardly differ; shape (n,).
         inputs
             Input channels at t.
+        q
+            Estimate of the parameter, shape (m,), by default the prior mean: at which A is taken
+            of a model that is not linear in what is estimated (a transform, say).
         """
-        moment = Moment(t, Inputs(inputs or {}))
-        now = self.spaces.model.A(w, moment).matrix
+        model, moment = self.spaces.model, Moment(t, Inputs(inputs or {}))
+        at = None
+        if q is not None and not model.form_A.linear_in_parameter:
+            at = model.latent.inverse(q)
+        now = model.A(w, moment, at).matrix
         if state.last is None or state.integral is None:
             empty = sp.csr_array(now.shape)
             return replace(state, t=t, begun=t, last=now, integral=empty)

@@ -178,7 +178,7 @@ class OnlineTracker:
         self.moments.append(_Moment(estimate.t, norms, theta, d))
         # Only a law with a damping rule works with u_alpha + P u.
         w = estimate.u if self.damping is None else estimate.u - r
-        self.excited = self.excitation.add(self.excited, estimate.t, w, self.inputs)
+        self.excited = self.excitation.add(self.excited, estimate.t, w, self.inputs, estimate.q)
         self.last = estimate
         if (len(self.moments) - 1) % self._every == 0:
             self.states.append(estimate.u)

@@ -37,7 +37,7 @@ class Manufactured(Model):
         super().__init__(**forms)
         self.h = h
         self._u_true = u_true
-        self._q = self.parameter_space.interpolate(q_true)
+        self._q = self.latent.inverse(self.parameter_space.interpolate(q_true))
 
     def exact(self, t: float) -> Array:
         """Return the coefficients U of the exact state."""
