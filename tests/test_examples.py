@@ -99,6 +99,11 @@ def test_the_case_of_a_new_pde_runs_as_the_page_shows_it(tmp_path):
     )
     rows = [",".join(map(str, (sample.t, 300.0, *sample.z))) for sample in stream]
     (tmp_path / "rod.csv").write_text("\n".join(["t,room,T_2,T_5,T_9", *rows]))
+    (tmp_path / "less.toml").write_text(re.sub(r"^a = .*\n", "", case, flags=re.MULTILINE))
+    with pytest.raises(lp.CaseError, match=r"channels\.a is missing: the equation reads it"):
+        CliRunner().invoke(
+            app, ["run", str(tmp_path / "less.toml"), "--allow-code"], catch_exceptions=False
+        )
     command = ["run", str(tmp_path / "rod.toml"), "--json", "--out", str(tmp_path / "run")]
     with pytest.raises(lp.CaseError, match="add --allow-code"):
         CliRunner().invoke(app, command, catch_exceptions=False)

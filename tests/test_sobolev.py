@@ -176,3 +176,23 @@ def test_bad_orders():
         lp.Sobolev(1.0).check_dimension(2)
     with pytest.raises(lp.SpaceError, match="not symmetric"):
         BorderedSpace(lp.HilbertSpace(CASES["line P1"].model().Q.gram).gram * np.nan, 13)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "s"),
+    [
+        (lp.interval(0.0, 1.0, 60), 1),
+        (lp.interval(0.0, 1.0, 60), 2),
+        (lp.rectangle((0.0, 1.0), (0.0, 1.0), (30, 30)), 2),
+    ],
+)
+def test_the_prior_deviation_is_that_at_a_point(mesh, s):
+    inner = lp.Sobolev(s, length=0.1).pointwise(len(mesh.p))
+    field = lp.Field(mesh, lp.linear(mesh), inner=inner, std=0.7)
+    model = lp.Model(lp.Field(mesh, lp.linear(mesh)), field, A=lambda q, u, v, x: q * u * v)
+    centre = np.argmin(np.abs(mesh.p - 0.5).sum(axis=0))
+    unit = np.zeros(model.Q.dim)
+    unit[centre] = 1.0
+    assert np.sqrt(model.Q.riesz(unit)[centre]) == pytest.approx(0.7, rel=0.05)
+    with pytest.raises(lp.SpaceError, match="take a larger s"):
+        lp.Sobolev(s).pointwise(2 * s)

@@ -22,8 +22,7 @@ from livepde.fem import (
     Piecewise,
     RandomWalk,
     Scalar,
-    dot,
-    grad,
+    Sobolev,
     grid,
     interval,
     line,
@@ -112,9 +111,10 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     unknowns = _unknowns(frame, mesh)
     model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
     for name in model.inputs:
-        if name not in inputs and name in frame.equation.inputs:
-            text = f"the {frame.equation.inputs[name].text}, with role = 'input'."
-            raise frame.missing(f"channels.{name}", text)
+        if name not in inputs:
+            known = frame.equation.inputs.get(name)
+            text = f"the {known.text}" if known else "the equation reads it"
+            raise frame.missing(f"channels.{name}", f"{text}, with role = 'input'.")
     own = unknowns_of(frame)
     if not own:
         return model
@@ -205,11 +205,9 @@ def _field(
         unit = frame.equation.length_unit
         length = frame.positive(spec.length, unit, f"unknowns.{name}.length")
 
-    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside; near a free end, within
-    # about one length, the deviation grows to sqrt(2) std.
-    def inner(u: Any, v: Any, x: Any) -> Any:
-        return 0.5 * (u * v / length + length * dot(grad(u), grad(v)))
-
+    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside.
+    dimension = len(mesh.p)
+    inner = Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
     # A transform acts on values at nodes.
     element = linear(mesh) if spec.transform else frame.equation.element(mesh)
     return Field(mesh, element, inner=inner, **given)

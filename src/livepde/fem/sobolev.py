@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import eigsh
+from scipy.special import gamma
 from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
 
 from livepde.errors import SpaceError
@@ -54,6 +55,8 @@ class Sobolev:
         Order.
     length
         Length over which q is correlated, in the unit of the mesh.
+    factor
+        Of the inner product; `pointwise` chooses it.
 
     >>> import livepde as lp
     >>> from skfem import ElementLineP1
@@ -62,6 +65,7 @@ class Sobolev:
 
     s: float
     length: float = 1.0
+    factor: float = 1.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.s) and self.s >= 0):
@@ -77,8 +81,41 @@ class Sobolev:
                 f"{d / 2:g} only (section 4.1); take a larger s."
             )
 
+    def pointwise(self, dimension: int) -> Sobolev:
+        """Return the inner product for which `std` of a field is its deviation at a point.
+
+        The prior covariance std^2 G^{-1} is then that of Whittle and Matern with variance std^2 in
+        the interior; within about a length of a free boundary the deviation grows, to sqrt(2) std
+        on it.
+
+        Parameters
+        ----------
+        dimension
+            Of the mesh.
+
+        Raises
+        ------
+        SpaceError
+            Unless s > dimension/2: values at points have no finite deviation.
+
+        >>> round(Sobolev(1, length=0.25).pointwise(1).factor, 12)  # 1/(2 length)
+        2.0
+        """
+        half = dimension / 2
+        if not self.s > half:
+            raise SpaceError(
+                f"Sobolev({self.s:g}).pointwise({dimension}): values at points have a finite "
+                f"deviation for s > {half:g} only; take a larger s."
+            )
+        volume = (4.0 * np.pi) ** half * self.length**dimension
+        return replace(self, factor=float(gamma(self.s - half) / gamma(self.s) / volume))
+
     def form(self, element: Any) -> Any:
         """Return the inner product as a weak form, or None if it has none on this element."""
+        form, factor = self._plain_form(element), self.factor
+        return form and (lambda u, v, x: factor * form(u, v, x))
+
+    def _plain_form(self, element: Any) -> Any:
         l2 = self.length**2
         if self.s == 0:
             return lambda u, v, x: u * v
@@ -106,7 +143,7 @@ class Sobolev:
         """
         mask, fixed = sp.diags_array(free), sp.diags_array(1.0 - free)
         M, K = (sp.csr_array(mask @ matrix @ mask + fixed) for matrix in (M, K))
-        return sp.csr_array(_border(float(self.s), M, K))
+        return sp.csr_array(self.factor * _border(float(self.s), M, K))
 
 
 def _border(s: float, M: Any, K: Any) -> Any:
