@@ -176,15 +176,60 @@ def test_the_equation_builds_it():
     assert built.channels == tuple(equation.inputs)
 
 
+def plane(far: float = 12.0, cells: int = 60, **more: float) -> lp.Model:
+    """The borehole on a mesh of radius and height, from its end to its middle."""
+    half = (KNOWN | more)["H"] / 2
+    r = np.geomspace(0.02, far, cells + 1)
+    z = np.concatenate([[0.0], np.geomspace(0.05, half, 14)])
+    return grouted_borehole(
+        lp.grid(r, z), **{name: unknown(name) for name in TRUTH}, **(KNOWN | more)
+    )
+
+
+def fluid(process: lp.Model, times: Any) -> float:
+    """Return the mean temperature of the fluid after a heating."""
+    heated = lambda t: {"Q": POWER}  # noqa: E731
+    start = process.initial_parameter(TRUTH)
+    *_, (_, u) = simulate(process, start, 10.0, times, Advance(Alexander2()), heated)
+    sensor = lp.Averages({"T": "left"}).bind(
+        process.state_space, process.X, process.parameter_space
+    )
+    moment = lp.Moment(float(times[-1]), heated(0.0))
+    return float(sensor.predict(u, process.latent.value(start), moment)[0])
+
+
+def test_forms_in_the_plane_pass_the_shipped_checks():
+    check_model(
+        plane(cells=30, C_c=1900.0), u=30.0, spread=5.0, inputs={"Q": POWER}
+    ).raise_if_failed()
+
+
+def test_the_ends_cool_the_borehole():
+    """With both ends at T0 the mean of a line source is lower, at the radius r, by
+
+        Q/(4 pi k H) 8 (sqrt(alpha t/pi) - r/2)/H
+
+    as long as the ends do not know of each other; about, for ours is no line.
+    """
+    times = np.concatenate([[0.0], np.geomspace(60.0, 100 * HOUR, 60)])
+    _, endless = final(model(60), times)
+    diffused = TRUTH["k"] / TRUTH["rho_c"] * times[-1]
+    reach = 8 * (np.sqrt(diffused / np.pi) - KNOWN["r_b"] / 2)
+    lower = POWER / KNOWN["H"] ** 2 / (4 * np.pi * TRUTH["k"]) * reach
+    assert endless[0] - fluid(plane(), times) == pytest.approx(lower, rel=0.1)
+    tall = KNOWN["H"] * 100  # the ends of a tall one do not matter
+    _, few = final(model(60, H=tall), times)
+    assert fluid(plane(H=tall), times) == pytest.approx(few[0], abs=1e-3)
+
+
 def test_the_sandbox_from_five_hours_on(data_dir, monkeypatch):
-    """k was measured independently; from about a day on the estimate agrees within 5 %."""
+    """k was measured independently; the interval covers it from the first sample on."""
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
     path = Path(__file__).resolve().parents[1] / "cases" / "thermal_response_grout.toml"
     prepared = cases.load(path).prepare()
     data = prepared.identifier.run(prepared.stream, fields_every=1000).to_xarray()
     hours, k, std = data["time"] / 3600.0, data["k"], data["k_std"]
     off = np.abs(k - 2.88)
-    assert (off[hours > 27.0] < 0.05 * 2.88).all()
-    assert (off < 1.96 * std)[hours > 14.0].all()
-    assert (off < 1.96 * std)[hours > 5.0].mean() > 0.93
+    assert (off[hours > 20.0] < 0.05 * 2.88).all()
+    assert (off < 1.96 * std)[hours > 5.0].all()
     assert std[-1] < 0.05 * 2.88

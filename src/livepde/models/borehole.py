@@ -33,17 +33,20 @@ def grouted_borehole(
     T0: float,
     C_c: float = 0.0,
 ) -> Model:
-    """Return radial conduction from the fluid of a heated borehole into the ground.
+    """Return conduction from the fluid of a heated borehole into the ground around it.
 
-    The pipes are one pipe of as large a cross-section, sqrt(2) times the radius for a U-tube,
+    The pipes of a U-tube are one pipe of an equivalent radius r_p,
 
         fluid    C_f T_t = Q/H - (T - T(r_p))/R_p                       R_p = share R_b
         grout    C_g r T_t = (k_g r T_r)_r,       r_p < r < r_b         ln(r_b/r_p)/(2 pi k_g) =
         ground   rho_c r T_t = (k r T_r)_r,       r_b < r                        (1 - share) R_b
 
     and T = T0 at the right end. The state at the left end of the mesh is the fluid: a sensor there
-    sees its mean temperature. All unknowns are positive: give them transform="log", and the share
-    "logit".
+    sees its temperature. On a mesh of a plane, radius times height, heat flows along the borehole,
+    too: the bottom is the plane of its end, where the ground is at T0, and the top that of its
+    middle. The power is spread evenly, and the mean over "left" is the temperature of the fluid.
+
+    All unknowns are positive: give them transform="log", and the share "logit".
 
     So that the capacity of the ground may be unknown, radii there are counted by the heat they
     hold: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x the capacity is
@@ -53,7 +56,8 @@ def grouted_borehole(
     ----------
     mesh
         Radius in m, best graded: `livepde.interval(0.9 * r_p, r_far, 60, geometric=True)`. It
-        begins a bit below r_p, the fluid; the nodes next to r_p and r_b are moved onto them.
+        begins a bit below r_p, the fluid; the nodes next to r_p and r_b are moved onto them. Or
+        radius and height in m, `livepde.grid(r, z)` with z from 0 to H/2, graded to 0.
     k
         Conductivity of the ground in W/(m K).
     rho_c
@@ -65,10 +69,11 @@ def grouted_borehole(
     H
         Length of the borehole in m.
     r_p, r_b
-        Outer radius of the pipes, as one, and radius of the borehole in m.
+        Radius of the pipes, as one, and of the borehole in m. Two pipes of diameter d, s apart from
+        axis to axis, are one of radius sqrt(d s/2) (Gu and O'Neal 1998).
     C_f, C_p, C_c
-        Heat capacities of the fluid, of the walls of the pipes, and of a casing at r_b, for each
-        metre of the borehole, in J/(m K).
+        Heat capacities of the fluid with what else is within r_p, of the walls of the pipes, and of
+        a casing at r_b, for each metre of the borehole, in J/(m K).
     C_g
         Volumetric heat capacity of the grout in J/(m^3 K).
     T0
@@ -84,20 +89,22 @@ def grouted_borehole(
     if not isinstance(rho_c, Scalar):
         raise ModelError("grouted_borehole: rho_c must be one number, a Scalar.")
     layered = _layered(mesh, r_p, r_b)
-    thickness, around, rho_0 = r_p - float(mesh.p.min()), log(r_b / r_p), rho_c.prior
+    thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), rho_c.prior
     # Of order four: the weight r and the elements of first order are integrated exactly.
-    state = Field(layered, linear(layered), dirichlet={"right": T0}, unit="degC", quadrature=4)
+    cold = {name: T0 for name in ("right", "end") if name in layered.boundaries}
+    state = Field(layered, linear(layered), dirichlet=cold, unit="degC", quadrature=4)
 
     def pipes(q: Any, u: Any, v: Any, x: Place) -> Any:
-        return thickness / (2 * pi * q.share * q.R_b) * dot(grad(u), grad(v))
+        return thickness / (2 * pi * q.share * q.R_b) * _outwards(u, v)
 
     def grout(q: Any, u: Any, v: Any, x: Place) -> Any:
         return around / (2 * pi * (1 - q.share) * q.R_b) * x[0] * dot(grad(u), grad(v))
 
     def ground(q: Any, u: Any, v: Any, x: Place) -> Any:
-        more = q.rho_c / rho_0
+        more, radial = q.rho_c / rho_0, _outwards(u, v)
         square = r_b**2 + (x[0] ** 2 - r_b**2) / more
-        return q.k * more * square / x[0] * dot(grad(u), grad(v))
+        along = dot(grad(u), grad(v)) - radial
+        return q.k * (more * square / x[0] * radial + x[0] / more * along)
 
     return Model(
         state,
@@ -116,31 +123,41 @@ def grouted_borehole(
     )
 
 
+def _outwards(u: Any, v: Any) -> Any:
+    """Return u_r v_r."""
+    return grad(u)[0] * grad(v)[0]
+
+
 def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
-    """Return the mesh with nodes at both radii, subdomains between them, and the facet "wall"."""
-    nodes = mesh.p.copy()
-    first, last = float(nodes.min()), float(nodes.max())
-    inner, wall = (int(np.abs(nodes[0] - r).argmin()) for r in (r_p, r_b))
-    if not first < r_p < r_b < last or inner == wall or {inner, wall} & set(_ends(nodes[0])):
+    """Return the mesh with nodes at both radii and names for what lies between them.
+
+    Subdomains "pipes", "grout" and "ground", the facets "wall" at r_b, and in a plane "end", the
+    bottom of the ground.
+    """
+    points = mesh.p.copy()
+    radii = points[0]
+    first, last = float(radii.min()), float(radii.max())
+    inner, wall = (float(radii[np.abs(radii - r).argmin()]) for r in (r_p, r_b))
+    if not first < r_p < r_b < last or not first < inner < wall < last:
         raise ModelError(
             f"grouted_borehole: the radii r_p = {r_p:g} m and r_b = {r_b:g} m must lie inside of "
             f"the mesh, {first:g} to {last:g} m, with cells of their own: let it begin a bit below "
             "r_p, and take more cells or geometric spacing."
         )
-    nodes[0, inner], nodes[0, wall] = r_p, r_b
-    moved = replace(mesh, doflocs=nodes)
-    facet = int(np.flatnonzero(np.isclose(moved.p[0, moved.facets[0]], r_b))[0])
-    return moved.with_boundaries({"wall": np.array([facet])}).with_subdomains(
+    points[0] = np.where(radii == inner, r_p, np.where(radii == wall, r_b, radii))
+    moved = replace(mesh, doflocs=points)
+    ends = moved.p[:, moved.facets]
+    boundaries = {"wall": np.flatnonzero(np.isclose(ends[0], r_b).all(axis=0))}
+    if len(points) > 1:
+        bottom = np.isclose(ends[1], points[1].min()).all(axis=0)
+        boundaries["end"] = np.flatnonzero(bottom & (ends[0].mean(axis=0) > r_b))
+    return moved.with_boundaries(boundaries).with_subdomains(
         {
             "pipes": lambda x: x[0] < r_p,
             "grout": lambda x: (x[0] > r_p) & (x[0] < r_b),
             "ground": lambda x: x[0] > r_b,
         }
     )
-
-
-def _ends(x: Any) -> tuple[int, int]:
-    return int(x.argmin()), int(x.argmax())
 
 
 def _build(
@@ -165,9 +182,9 @@ GROUTED_BOREHOLE = Equation(
     inputs={"Q": Variable("W", "power given to the fluid")},
     options={
         "H": Option("m", "length of the borehole"),
-        "r_p": Option("m", "outer radius of the pipes, as one pipe"),
+        "r_p": Option("m", "radius of the pipes, as one pipe"),
         "r_b": Option("m", "radius of the borehole"),
-        "C_f": Option("J/(m K)", "heat capacity of the fluid, for each metre"),
+        "C_f": Option("J/(m K)", "heat capacity of fluid and all else within r_p, for each metre"),
         "C_p": Option("J/(m K)", "heat capacity of the walls of the pipes, for each metre"),
         "C_c": Option("J/(m K)", "heat capacity of a casing, for each metre", 0.0),
         "C_g": Option("J/(m^3 K)", "volumetric heat capacity of the grout"),
