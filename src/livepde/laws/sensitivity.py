@@ -272,7 +272,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     It costs one step and one block of back-substitutions. For unknowns that stay as they are U is
     L C with the sensitivity L = du/da. One that moves (`evolution`, or `drift` for all) adds new
-    columns at each sample, independent of what the state remembers of older values; the factor is
+    columns at each substep, independent of what the state remembers of older values; the factor is
     then compressed to `rank` columns, so that nothing has to be forgotten by hand.
 
     Bounds of numbers hold for the reference about which the filter is linear, and for what is
