@@ -146,6 +146,8 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
         (lambda: lp.Scalar(1.0, 1.0, transform="sqrt"), "expected 'log' or 'logit'"),
         (lambda: lp.Scalar(1.0, 1.0, transform="logit"), "two finite bounds"),
         (lambda: lp.Scalar(1.0, 1.0, (0, 2), transform="log"), "no upper bound"),
+        (lambda: lp.Scalar(1.0, evolution="random-walk"), "expected RandomWalk"),
+        (lambda: lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Scalar()}), "by a penalty"),
         (lambda: lp.Scalars(("a", "a")), "names must be given and differ"),
         (lambda: lp.Scalars(()), "names must be given and differ"),
         (lambda: lp.RandomWalk(0.0), "rate must be a positive number"),

@@ -155,6 +155,11 @@ class _Prior:
 
     def _check(self) -> None:
         what = type(self).__name__
+        if not isinstance(self.evolution, Evolution):
+            raise SpaceError(
+                f"{what}: evolution={self.evolution!r}; expected RandomWalk(rate), "
+                "MeanReverting(time) or Periodic(period), or nothing."
+            )
         _check_prior(what, self.std, self.bounds, self.prior, self.transform)
         if self.evolution.copies > 1 and (self.transform or np.isfinite(self.bounds).any()):
             raise SpaceError(
@@ -210,10 +215,15 @@ class Field(_Prior):
                 "form (u, v, x)."
             )
         known = set(self.mesh.boundaries or {}) | {"boundary"}
-        for name in self.dirichlet:
+        for name, value in self.dirichlet.items():
             if name not in known:
                 raise SpaceError(
                     f"dirichlet: the mesh has no boundary '{name}'; it has {sorted(known)}."
+                )
+            if isinstance(value, _Prior):
+                raise SpaceError(
+                    f"dirichlet: the value on '{name}' is unknown; let it enter weakly, by a "
+                    f"penalty: On('{name}', lambda q, u, v, x: 100 * D / x.h * (u - q.value) * v)."
                 )
         for name in [name for pair in self.periodic for name in pair]:
             if name not in known - {"boundary"}:
