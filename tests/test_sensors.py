@@ -243,6 +243,13 @@ inside = st.floats(0.01, 0.99)
 anything = st.floats(-3.0, 3.0)
 
 
+EVERY_CLASS = {
+    item
+    for item in vars(lp).values()
+    if isinstance(item, type) and issubclass(item, lp.Observation) and item is not lp.Observation
+}
+
+
 @st.composite
 def sensors_of_any_kind(draw):
     """Every class of sensors, with random positions, weights, gains and powers."""
@@ -262,14 +269,17 @@ def sensors_of_any_kind(draw):
         ),
         lp.Moving({"m": "x", "n": "missing"}),
         lp.Transformed(lp.Points({"t": a}), lambda y: np.exp(c * y / 2)),
+        lp.Full(),
+        lp.Subdomain(lambda x: x[0] > 0.8 * a),
+        lp.Matrix(np.random.default_rng(power).standard_normal((3, 13)) + c),
     ]
-    kind = draw(st.integers(0, len(base) + 1))
-    if kind < len(base):
-        return base[kind]
     both = lp.Combined([base[k] for k in (1, 2, 3, 4, 5, 6)])
-    if kind == len(base):
-        return both
-    return lp.Calibrated(both, lambda y, q, x: q.gain * y + c * q.R * x.inputs["x"] * y[0] * y**2)
+    base += [
+        both,
+        lp.Calibrated(both, lambda y, q, x: q.gain * y + c * q.R * x.inputs["x"] * y[0] * y**2),
+    ]
+    assert {type(sensor) for sensor in base} == EVERY_CLASS
+    return draw(st.sampled_from(base))
 
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
