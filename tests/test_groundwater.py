@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ import livepde as lp
 from livepde.bench.cases import bench_cases
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
+from livepde.fem import grid
 from livepde.models import EQUATIONS, groundwater, pumping_test
 from livepde.stepping import Advance, Alexander2, simulate
 
@@ -188,6 +190,16 @@ def test_published_tests_are_found_again(name: str, data_dir: Any, monkeypatch: 
     assert len(runs) == 2
     assert len(outcome.checks) >= 4
     assert outcome.ok
+
+
+def test_the_tomography_of_horkheim_passes_the_checks():
+    place = spec_from_file_location("pumping", ROOT / "cases" / "pumping.py")
+    pumping = module_from_spec(place)
+    place.loader.exec_module(pumping)
+    mesh = grid([-600.0, -90.0, -12.0, -4.0, 4.0, 12.0, 90.0], [-700.0, -30.0, -6.0, 6.0, 700.0])
+    one = lp.Field(mesh, ElementQuad1(), prior=1.0, std=1.0, transform="log")
+    unknowns = {"T": positive(0.03), "S": positive(0.02), "Y": one, "Z": one}
+    check_model(pumping.four_tests(mesh, unknowns, {}, length=8.0), u=1.0).raise_if_failed()
 
 
 def test_the_page_runs():
