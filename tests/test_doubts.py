@@ -91,3 +91,10 @@ def test_the_gradient_law_has_no_innovations_to_judge():
     z = np.zeros(identifier.observed.size)
     assert doubts(identifier.run([(0.1, z), (0.2, z)]).to_xarray()) == []
     assert doubts(identifier.run([]).to_xarray()) == []
+
+
+def test_a_replay_that_did_not_converge_is_said():
+    far = rod(lp.Scalar(3.0, 3.0, transform="log"))
+    once = lp.Replay(first=300, iterations=1)
+    found = doubts(run(far, rod(lp.Scalar(0.2)), replay=once))
+    assert any("The last replay has not converged" in sentence for sentence in found)

@@ -417,7 +417,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not np.isfinite(new.da).all():
                 return state
             begun = replace(state, now=new, reference=point.q)
-            if form is None or form.linear_in_parameter or _converged(work, begun):
+            if form is None or form.linear_in_parameter or _left(work, begun) <= CONVERGED:
                 break
             point = _placed(work, state, _next(work, begun), interval.end)
         if self.replay is None:
@@ -437,9 +437,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             for _ in range(self.replay.iterations):
                 state, status = self._replayed(work, state)
                 state = replace(state, due=2 * state.assimilated)
+                left = _left(work, state)
+                notes = {**report.notes, "replay_left": left}
                 if not status.ok:  # keep the linear estimate, say so, and try again when doubled
-                    report = replace(report, notes={**report.notes, "replay_failed": 1.0})
-                if not status.ok or _converged(work, state):
+                    notes["replay_failed"] = 1.0
+                report = replace(report, notes=notes)
+                if not status.ok or left <= CONVERGED:
                     break
         if len(state.samples.t) > self.replay.window:
             start = _recentre(work, state.now)
@@ -623,11 +626,11 @@ def _placed(work: SensitivityWork, state: SensitivityState, q: Array, first: Mom
     return replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
 
 
-def _converged(work: SensitivityWork, state: SensitivityState) -> bool:
-    """Return true if the estimate is within half a standard deviation of the reference."""
+def _left(work: SensitivityWork, state: SensitivityState) -> float:
+    """Return the distance between estimate and reference, in standard deviations."""
     point, shift = state.now, work.transition(state.span) @ _missed(work, state)
     deviations = np.linalg.lstsq(point.C, shift, rcond=None)[0]
-    return bool(np.linalg.norm(deviations) <= CONVERGED * point.consistency.inflation)
+    return float(np.linalg.norm(deviations)) / point.consistency.inflation
 
 
 def _recentre(work: SensitivityWork, point: Point) -> Point:

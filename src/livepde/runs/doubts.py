@@ -15,6 +15,7 @@ __all__ = ["MODEL_ERROR", "doubts"]
 MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: twice as large
 OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
 SETTLED = 0.25  # share of a run after which means are taken
+LEFT = 1.0  # deviations between estimate and reference after the last replay
 HARDLY = 0.9  # of the prior deviation left: nothing was learned
 
 
@@ -23,11 +24,12 @@ def doubts(data: xr.Dataset) -> list[str]:
 
     The model does not explain the data if at the end the mean square of the innovations, over the
     last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
-    bound, or keeps more than 0.9 of its prior deviation: the data did not tell.
+    bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
+    ended more than one deviation away from where it has to end.
     """
     if not data.sizes["time"]:
         return []
-    return [*_model_error(data), *_unknowns(data)]
+    return [*_model_error(data), *_replays(data), *_unknowns(data)]
 
 
 def _model_error(data: xr.Dataset) -> list[str]:
@@ -63,6 +65,20 @@ def _model_error(data: xr.Dataset) -> list[str]:
             "(evolution) may be missing in the model; or the noise is larger than stated."
         )
     return found
+
+
+def _replays(data: xr.Dataset) -> list[str]:
+    if "replay_left" not in data:
+        return []
+    left = data["replay_left"].values
+    left = left[np.isfinite(left)]
+    if not len(left) or left[-1] <= LEFT:
+        return []
+    return [
+        f"The last replay has not converged: estimate and reference are {left[-1]:.1f} deviations "
+        "apart, so that the deviations do not hold. Give law.replay more iterations, let it begin "
+        "later (first), or start from a better prior."
+    ]
 
 
 def _unknowns(data: xr.Dataset) -> list[str]:
