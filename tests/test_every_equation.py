@@ -113,6 +113,22 @@ def test_every_equation_passes_the_checks(name: str, data: Any, seed: int) -> No
     lp.check_model(model, u=u, t=0.5, inputs=inputs, seed=seed).raise_if_failed()
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "battery_particle",
+        "borehole",
+        "grouted_borehole",
+        "pumping_test",
+        "advection_dispersion",
+        "kuramoto_sivashinsky",
+    ],
+)
+def test_equations_with_their_own_boundary_values_refuse_others(name: str) -> None:
+    with pytest.raises(lp.ModelError, match=rf"^{name} is .*: leave out the values on \['left'\]"):
+        EQUATIONS[name].build(line([0.0, 1.0]), {}, {"left": 1.0})
+
+
 # --- unknowns ------------------------------------------------------------------------------------
 
 MESH = line([0.0, 0.2, 0.5, 0.7, 1.0])

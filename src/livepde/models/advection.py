@@ -9,7 +9,7 @@ from livepde.errors import ModelError
 from livepde.fem import Field, Unknown, absolute, dot, grad, linear
 from livepde.fem.upwind import upwind
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, by_name
 
 __all__ = ["ADVECTION_DIFFUSION", "advection_diffusion"]
 
@@ -109,19 +109,6 @@ def advection_diffusion(
     )
 
 
-def _build(
-    mesh: Any,
-    unknowns: Mapping[str, Unknown],
-    dirichlet: Mapping[str, Any],
-    *,
-    L: float,
-    ratio: float,
-    stabilise: bool,
-) -> Model:
-    given: dict[str, Any] = {**unknowns, "L": L, "ratio": ratio, "stabilise": stabilise}
-    return advection_diffusion(mesh, dirichlet=dirichlet, **given)
-
-
 ADVECTION_DIFFUSION = Equation(
     name="advection_diffusion",
     summary="heat or a solute carried by a flow along a column: stream beds",
@@ -140,6 +127,6 @@ ADVECTION_DIFFUSION = Equation(
         "ratio": Option("", "velocity over flux: C of water over C of the wet bed", 1.0),
         "stabilise": Option("", "whether to add the diffusion that fast flows need", False),
     },
-    build=_build,
+    build=by_name(advection_diffusion),
     element=linear,
 )

@@ -7,7 +7,7 @@ from typing import Any
 
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
-from livepde.models.base import Equation, Variable
+from livepde.models.base import Equation, Variable, by_name
 from livepde.models.common import Coefficients, Number, beginning, state
 
 __all__ = ["ALLEN_CAHN", "allen_cahn"]
@@ -52,10 +52,6 @@ def allen_cahn(
     )
 
 
-def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
-    return allen_cahn(mesh, dirichlet=dirichlet or None, **unknowns)
-
-
 ALLEN_CAHN = Equation(
     name="allen_cahn",
     summary="two phases with a front between them, with unknown initial state",
@@ -66,7 +62,7 @@ ALLEN_CAHN = Equation(
         "r": Variable("", "rate of reaction"),
         "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
-    build=_build,
+    build=by_name(allen_cahn),
     element=hermite,
     length_unit="",
     time_unit="",

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from livepde.fem import Place
+from livepde.errors import ModelError
+from livepde.fem import Place, Unknown
 from livepde.model import Model
 
-__all__ = ["Equation", "Option", "Quantity", "Variable"]
+__all__ = ["Equation", "Option", "Quantity", "Variable", "by_name", "closed"]
 
 
 @dataclass(frozen=True)
@@ -92,3 +93,32 @@ class Equation:
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
     length_unit: str = "m"
     time_unit: str = "s"
+
+
+def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
+    """Return the `build` of a function that takes unknowns, `dirichlet` and options by name.
+
+    Without boundary values `dirichlet` is None: what the function takes by default.
+    """
+
+    def build(
+        mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
+    ) -> Model:
+        return function(mesh, dirichlet=dirichlet or None, **unknowns, **options)
+
+    return build
+
+
+def closed(function: Callable[..., Model], why: str) -> Callable[..., Model]:
+    """Return the same for a function that takes no boundary values, and says why: `ModelError`."""
+
+    def build(
+        mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
+    ) -> Model:
+        if dirichlet:
+            raise ModelError(
+                f"{function.__name__} {why}: leave out the values on {sorted(dirichlet)}."
+            )
+        return function(mesh, **unknowns, **options)
+
+    return build

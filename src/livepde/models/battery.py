@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from numpy import exp
@@ -10,7 +9,7 @@ from numpy import exp
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, closed
 
 __all__ = ["BATTERY_PARTICLE", "FARADAY", "battery_particle"]
 
@@ -93,17 +92,6 @@ def battery_particle(
     )
 
 
-def _build(
-    mesh: Any,
-    unknowns: Mapping[str, Unknown],
-    dirichlet: Mapping[str, Any],
-    *,
-    area: float,
-    c_max: float,
-) -> Model:
-    return battery_particle(mesh, unknowns["D"], unknowns.get("slope"), area=area, c_max=c_max)
-
-
 BATTERY_PARTICLE = Equation(
     name="battery_particle",
     summary="spherical diffusion of lithium in a particle of an electrode",
@@ -119,6 +107,6 @@ BATTERY_PARTICLE = Equation(
         "area": Option("m^2", "surface of all particles"),
         "c_max": Option("mol/m^3", "concentration of the full particle"),
     },
-    build=_build,
+    build=closed(battery_particle, "is fed by the input I"),
     element=linear,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from math import log, pi
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, closed
 
 __all__ = ["GROUTED_BOREHOLE", "grouted_borehole"]
 
@@ -160,13 +159,6 @@ def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
     )
 
 
-def _build(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: float
-) -> Model:
-    k, rho_c, R_b, share = (unknowns[name] for name in ("k", "rho_c", "R_b", "share"))
-    return grouted_borehole(mesh, k, rho_c, R_b, share, **options)
-
-
 GROUTED_BOREHOLE = Equation(
     name="grouted_borehole",
     summary="thermal response test with fluid, pipes, grout and ground",
@@ -190,6 +182,6 @@ GROUTED_BOREHOLE = Equation(
         "C_g": Option("J/(m^3 K)", "volumetric heat capacity of the grout"),
         "T0": Option("degC", "undisturbed temperature of the ground"),
     },
-    build=_build,
+    build=closed(grouted_borehole, "is heated by the input Q, with T0 far away"),
     element=linear,
 )

@@ -7,7 +7,7 @@ from typing import Any
 
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
-from livepde.models.base import Equation, Variable
+from livepde.models.base import Equation, Variable, by_name
 from livepde.models.common import Coefficients, Number, beginning, state
 
 __all__ = ["BURGERS", "burgers"]
@@ -54,10 +54,6 @@ def burgers(
     )
 
 
-def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
-    return burgers(mesh, dirichlet=dirichlet or None, **unknowns)
-
-
 BURGERS = Equation(
     name="burgers",
     summary="viscous Burgers, periodic or between given values, with unknown initial state",
@@ -68,7 +64,7 @@ BURGERS = Equation(
         "advection": Variable("", "coefficient a of the advection; else 1", optional=True),
         "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
-    build=_build,
+    build=by_name(burgers),
     element=hermite,
     length_unit="",
     time_unit="",

@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
-from livepde.errors import ModelError
 from livepde.fem import Field, Integrand, Unknown
 
-__all__ = ["Coefficients", "Number", "beginning", "ring", "state"]
+__all__ = ["Coefficients", "Number", "beginning", "state"]
 
 Number: TypeAlias = Unknown | float
 """A coefficient of an equation: unknown, or a known number."""
@@ -40,13 +39,6 @@ def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: st
         return Field(mesh, element, dirichlet=dict(dirichlet), unit=unit)
     pairs = [pair for pair in SIDES if set(pair) <= set(mesh.boundaries or {})]
     return Field(mesh, element, periodic=pairs, unit=unit)
-
-
-def ring(name: str, mesh: Any, dirichlet: Mapping[str, Any]) -> Any:
-    """Return the mesh of an equation that is periodic always; refuse boundary values."""
-    if dirichlet:
-        raise ModelError(f"{name} is periodic: leave out the values on {sorted(dirichlet)}.")
-    return mesh
 
 
 def beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:

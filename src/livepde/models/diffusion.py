@@ -8,7 +8,7 @@ from typing import Any
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, by_name
 
 __all__ = ["CONDUCTION", "HEAT", "conduction", "heat"]
 
@@ -164,18 +164,6 @@ def _free(name: str, mesh: Any, held: Mapping[str, Any]) -> list[str]:
     return free
 
 
-def _build_heat(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
-    given: dict[str, Any] = dict(unknowns)
-    return heat(mesh, dirichlet=dirichlet, **given)
-
-
-def _build_conduction(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, C: float
-) -> Model:
-    given: dict[str, Any] = dict(unknowns)
-    return conduction(mesh, dirichlet=dirichlet, C=C, **given)
-
-
 SURROUNDINGS = {
     AMBIENT: Variable("degC", "temperature of the surroundings, for loss and transfer", True)
 }
@@ -192,7 +180,7 @@ HEAT = Equation(
         "source": Variable("K/s", "heat gained over heat capacity", True),
     },
     inputs=SURROUNDINGS,
-    build=_build_heat,
+    build=by_name(heat),
     element=linear,
 )
 
@@ -209,6 +197,6 @@ CONDUCTION = Equation(
     },
     inputs=SURROUNDINGS,
     options={"C": Option("J/(m^3 K)", "volumetric heat capacity")},
-    build=_build_conduction,
+    build=by_name(conduction),
     element=linear,
 )

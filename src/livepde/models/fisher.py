@@ -10,7 +10,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, Unknown, dot, grad, linear, positive
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, by_name
 
 __all__ = ["FISHER_KPP", "POROUS_FISHER", "fisher_kpp", "porous_fisher"]
 
@@ -110,18 +110,6 @@ def _state(mesh: Any, dirichlet: Mapping[str, Any] | None, element: Any, unit: s
     return Field(mesh, element, dirichlet=dict(dirichlet or {}), unit=unit, quadrature=order)
 
 
-def _build_kpp(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, K: float
-) -> Model:
-    return fisher_kpp(mesh, unknowns["D"], unknowns["r"], dirichlet, K=K)
-
-
-def _build_porous(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, K: float, m: float
-) -> Model:
-    return porous_fisher(mesh, unknowns["D"], unknowns["r"], dirichlet, K=K, m=m)
-
-
 DENSITY = Variable("1/mm^2", "density of the population")
 CAPACITY = Option("1/mm^2", "carrying capacity: the density at which growth ends")
 RATE = Variable("1/d", "growth rate at low density")
@@ -133,7 +121,7 @@ FISHER_KPP = Equation(
     state=DENSITY,
     unknowns={"D": Variable("mm^2/d", "diffusivity: a number, by layer, or a field"), "r": RATE},
     options={"K": CAPACITY},
-    build=_build_kpp,
+    build=by_name(fisher_kpp),
     element=linear,
     length_unit="mm",
     time_unit="d",
@@ -150,7 +138,7 @@ POROUS_FISHER = Equation(
         "K": CAPACITY,
         "m": Option("", "exponent of the diffusivity, at least 1", 1.0),
     },
-    build=_build_porous,
+    build=by_name(porous_fisher),
     element=linear,
     length_unit="mm",
     time_unit="d",

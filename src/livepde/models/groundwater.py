@@ -12,7 +12,7 @@ from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, closed
 
 __all__ = ["GROUNDWATER", "PUMPING_TEST", "groundwater", "pumping_test", "well"]
 
@@ -173,12 +173,6 @@ def _place(mesh: Any, name: str, at: Sequence[float], radius: float) -> tuple[fl
     return place
 
 
-def _build_radial(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, b: float
-) -> Model:
-    return pumping_test(mesh, unknowns["k"], unknowns["Ss"], b=b)
-
-
 def _build_plane(
     mesh: Any,
     unknowns: Mapping[str, Unknown],
@@ -211,7 +205,7 @@ PUMPING_TEST = Equation(
     },
     inputs={"Q": Variable("m^3/s", "rate of the well, positive when water is taken out")},
     options={"b": Option("m", "thickness of the aquifer; with 1 m k is T and Ss is S")},
-    build=_build_radial,
+    build=closed(pumping_test, "is pumped by the input Q, with 0 far away"),
     element=linear,
 )
 

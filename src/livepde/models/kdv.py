@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
-from livepde.models.base import Equation, Variable
-from livepde.models.common import Coefficients, Number, beginning, ring, state
+from livepde.models.base import Equation, Variable, closed
+from livepde.models.common import Coefficients, Number, beginning, state
 
 __all__ = ["KDV", "kdv"]
 
@@ -42,10 +41,6 @@ def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = N
     )
 
 
-def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
-    return kdv(ring("kdv", mesh, dirichlet), **unknowns)
-
-
 KDV = Equation(
     name="kdv",
     summary="Korteweg-de Vries on a ring, with unknown initial state",
@@ -56,7 +51,7 @@ KDV = Equation(
         "dispersion": Variable("", "coefficient b of u_xxx"),
         "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
-    build=_build,
+    build=closed(kdv, "is periodic"),
     element=smooth,
     length_unit="",
     time_unit="",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
-from livepde.models.base import Equation, Variable
-from livepde.models.common import Coefficients, Number, beginning, ring, state
+from livepde.models.base import Equation, Variable, closed
+from livepde.models.common import Coefficients, Number, beginning, state
 
 __all__ = ["KURAMOTO_SIVASHINSKY", "kuramoto_sivashinsky"]
 
@@ -49,10 +48,6 @@ def kuramoto_sivashinsky(
     )
 
 
-def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
-    return kuramoto_sivashinsky(ring("kuramoto_sivashinsky", mesh, dirichlet), **unknowns)
-
-
 KURAMOTO_SIVASHINSKY = Equation(
     name="kuramoto_sivashinsky",
     summary="Kuramoto-Sivashinsky (chaotic) on a ring, with unknown initial state",
@@ -64,7 +59,7 @@ KURAMOTO_SIVASHINSKY = Equation(
         "damping": Variable("", "coefficient c of u_xxxx"),
         "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
     },
-    build=_build,
+    build=closed(kuramoto_sivashinsky, "is periodic"),
     element=smooth,
     length_unit="",
     time_unit="",

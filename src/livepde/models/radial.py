@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from math import pi
 from typing import Any
 
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Quantity, Variable
+from livepde.models.base import Equation, Option, Quantity, Variable, closed
 
 __all__ = ["BOREHOLE", "borehole", "fluid"]
 
@@ -57,18 +57,6 @@ def fluid(H: float) -> Callable[[Any, Place], Any]:
     return lambda q, x: q.R_b * x.inputs["Q"] / H
 
 
-def _build(
-    mesh: Any,
-    unknowns: Mapping[str, Unknown],
-    dirichlet: Mapping[str, Any],
-    *,
-    H: float,
-    rho_c: float,
-    T0: float,
-) -> Model:
-    return borehole(mesh, unknowns["k"], unknowns["R_b"], H=H, rho_c=rho_c, T0=T0)
-
-
 BOREHOLE = Equation(
     name="borehole",
     summary="thermal response test: radial conduction around a heated borehole",
@@ -91,6 +79,6 @@ BOREHOLE = Equation(
             direct=lambda options: fluid(options["H"]),
         )
     },
-    build=_build,
+    build=closed(borehole, "is heated by the input Q, with T0 far away"),
     element=linear,
 )

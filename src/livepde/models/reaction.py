@@ -7,7 +7,7 @@ from typing import Any
 
 from livepde.fem import Field, Unknown, dot, grad, hermite
 from livepde.model import Model, Source
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, by_name
 
 __all__ = ["REACTION_DIFFUSION", "reaction_diffusion"]
 
@@ -50,17 +50,6 @@ def reaction_diffusion(
     )
 
 
-def _build(
-    mesh: Any,
-    unknowns: Mapping[str, Unknown],
-    dirichlet: Mapping[str, Any],
-    *,
-    D: float,
-    f: float,
-) -> Model:
-    return reaction_diffusion(mesh, unknowns["q"], dirichlet or None, D=D, f=f)
-
-
 REACTION_DIFFUSION = Equation(
     name="reaction_diffusion",
     summary="the paper's example: unknown reaction coefficient, no units",
@@ -68,7 +57,7 @@ REACTION_DIFFUSION = Equation(
     state=Variable("", "state"),
     unknowns={"q": Variable("", "reaction coefficient")},
     options={"D": Option("", "diffusivity", 1.0), "f": Option("", "source density", 0.0)},
-    build=_build,
+    build=by_name(reaction_diffusion),
     element=hermite,
     length_unit="",
     time_unit="",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Channel, Field, On, Unknown, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable
+from livepde.models.base import Equation, Option, Variable, closed
 
 __all__ = [
     "ADVECTION_DISPERSION",
@@ -156,34 +155,12 @@ def _ends(velocity: Any, solute: Any, inlet: str) -> list[On]:
     return [out, into] if inlet == "flux" else [out]
 
 
-def _build_dispersion(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
-) -> Model:
-    _no_boundary("advection_dispersion", dirichlet)
-    return advection_dispersion(mesh, unknowns["D"], unknowns["v"], **options)
-
-
-def _no_boundary(name: str, dirichlet: Mapping[str, Any]) -> None:
-    if dirichlet:
-        raise ModelError(
-            f"{name}: boundary values on {sorted(dirichlet)}; the column is fed by the input "
-            "c_in: leave them out."
-        )
-
-
-def _build_immobile(
-    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], *, inlet: str
-) -> Model:
-    _no_boundary("mobile_immobile", dirichlet)
-    names = ("D", "v", "phi", "omega")
-    return mobile_immobile(mesh, *(unknowns[name] for name in names), inlet=inlet)
-
-
 COLUMN = {
     "D": Variable("cm^2/h", "coefficient of dispersion: a number, or by layer"),
     "v": Variable("cm/h", "mean pore velocity"),
 }
 INFLOW = {"c_in": Variable("", "concentration that flows in")}
+FED = "is fed by the input c_in"
 INLET = Option("", "what the inflow prescribes", "flux", INLETS)
 
 ADVECTION_DISPERSION = Equation(
@@ -198,7 +175,7 @@ ADVECTION_DISPERSION = Equation(
         "decay": Option("1/h", "rate of decay", 0.0),
         "inlet": INLET,
     },
-    build=_build_dispersion,
+    build=closed(advection_dispersion, FED),
     element=linear,
     length_unit="cm",
     time_unit="h",
@@ -217,7 +194,7 @@ MOBILE_IMMOBILE = Equation(
     },
     inputs=INFLOW,
     options={"inlet": INLET},
-    build=_build_immobile,
+    build=closed(mobile_immobile, FED),
     element=linear,
     length_unit="cm",
     time_unit="h",

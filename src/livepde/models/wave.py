@@ -8,7 +8,7 @@ from typing import Any
 from livepde.errors import ModelError
 from livepde.fem import Field, Unknown, dot, grad, linear
 from livepde.model import Model, Source
-from livepde.models.base import Equation, Variable
+from livepde.models.base import Equation, Variable, by_name
 
 __all__ = ["WAVE", "wave"]
 
@@ -88,10 +88,6 @@ def wave(
     )
 
 
-def _build(mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any]) -> Model:
-    return wave(mesh, unknowns["c2"], unknowns["d"], dirichlet)
-
-
 WAVE = Equation(
     name="wave",
     summary="waves with damping; unknown squared speed and damping",
@@ -101,6 +97,6 @@ WAVE = Equation(
         "c2": Variable("m^2/s^2", "squared speed: a number, by region, or a field"),
         "d": Variable("1/s", "damping"),
     },
-    build=_build,
+    build=by_name(wave),
     element=linear,
 )
