@@ -118,7 +118,6 @@ def test_engines_agree_with_dense_algebra(engine, seed):
         b = rng.standard_normal(shape)
         kept = b.copy()
         np.testing.assert_allclose(matrix @ factor.solve(b), b, atol=1e-12)
-        np.testing.assert_allclose(matrix.T @ factor.solve_transposed(b), b, atol=1e-12)
         np.testing.assert_array_equal(b, kept)  # right-hand sides are not written over
 
 

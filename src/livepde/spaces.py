@@ -139,10 +139,6 @@ class HilbertSpace:
         free = self.free if functional.ndim == 1 else self.free[:, None]
         return self.factor.solve(functional * free)
 
-    def scaled(self, factor: float) -> HilbertSpace:
-        """Return the same space with its inner product multiplied by `factor`."""
-        return HilbertSpace(sp.csr_array(self.gram * factor), self.name, self.fixed)
-
     def restricted(self, part: slice, fixed: IntArray) -> HilbertSpace:
         """Return the space of some of the coefficients, with its own fixed ones."""
         return HilbertSpace(sp.csr_array(self.gram[part, part]), self.name, fixed)
@@ -278,9 +274,6 @@ class BorderedSpace(HilbertSpace):
 
     def inner(self, x: Array, y: Array) -> float:
         return float(x @ self.dual(y))
-
-    def scaled(self, factor: float) -> HilbertSpace:
-        return BorderedSpace(sp.csr_array(self.border * factor), self.dim, self.name, self.fixed)
 
     def restricted(self, part: slice, fixed: IntArray) -> HilbertSpace:
         n = self.dim

@@ -400,16 +400,6 @@ class _Bordered:
             raise LinearAlgebraError("The damped system is singular: take less damping.")
         return x - self.column * (float(self.row @ x[:n]) / pivot)
 
-    def solve_transposed(self, b: Array) -> Array:
-        """Return the solution with the transpose."""
-        x = self.inner.solve_transposed(b)
-        n = len(self.row)
-        border = np.zeros_like(b)
-        border[:n] = self.row
-        border = self.inner.solve_transposed(border)
-        pivot = 1.0 + float(self.row @ self.column[:n])
-        return x - border * (float(self.column @ b) / pivot)
-
 
 def _stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
     """Return the data of a matrix in the order of a pattern, by default its own."""

@@ -28,22 +28,15 @@ class BandedFactor:
     order: IntArray
     inverse: IntArray
 
-    def _solve(self, b: Array, trans: int) -> Array:
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b."""
         x, info = lapack.dgbtrs(
-            self.lu, self.lower, self.upper, b[self.order], self.pivots, trans=trans, overwrite_b=1
+            self.lu, self.lower, self.upper, b[self.order], self.pivots, overwrite_b=1
         )
         if info != 0:
             raise LinearAlgebraError(f"LAPACK dgbtrs refused argument {-info}.")
         solution: Array = x[self.inverse]
         return solution
-
-    def solve(self, b: Array) -> Array:
-        """Return x with K x = b."""
-        return self._solve(b, 0)
-
-    def solve_transposed(self, b: Array) -> Array:
-        """Return x with K^T x = b."""
-        return self._solve(b, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,10 +32,6 @@ class Leading:
         """Return the leading unknowns for a right-hand side of the leading equations."""
         return self.factor.solve(self._padded(b))[: self.size]
 
-    def solve_transposed(self, b: Array) -> Array:
-        """Return the same with the transpose."""
-        return self.factor.solve_transposed(self._padded(b))[: self.size]
-
     def _padded(self, b: Array) -> Array:
         padded = np.zeros((self.total, *b.shape[1:]))
         padded[: self.size] = b

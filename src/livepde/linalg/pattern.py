@@ -87,26 +87,18 @@ class Pattern:
 
 
 class PatternOperator:
-    """Products with a matrix and its transpose, for data that change: nothing is built again."""
+    """Products with a matrix whose data change: nothing is built again."""
 
     def __init__(self, pattern: Pattern) -> None:
-        zeros = np.zeros(pattern.nnz)
-        self._matrix = pattern.matrix(zeros)
-        self._transpose = pattern.transposed(zeros)
+        self._matrix = pattern.matrix(np.zeros(pattern.nnz))
 
     def set(self, data: Array) -> None:
         """Use these values from now on."""
         self._matrix.data = data
-        self._transpose.data = data
 
     def apply(self, x: Array) -> Array:
         """Return the product with x."""
         product: Array = self._matrix @ x
-        return product
-
-    def apply_transposed(self, y: Array) -> Array:
-        """Return the product of the transpose with y."""
-        product: Array = self._transpose @ y
         return product
 
 

@@ -17,10 +17,6 @@ class Factor(Protocol):
         """Return x with K x = b; `b` has shape (n,) or, for several right-hand sides, (n, k)."""
         ...
 
-    def solve_transposed(self, b: Array) -> Array:
-        """Return x with K^T x = b; shapes as in `solve`."""
-        ...
-
 
 class Solver(Protocol):
     """An engine bound to one sparsity pattern."""

@@ -33,11 +33,6 @@ class SuperLUFactor:
         x: Array = self.lu.solve(b, trans="T")
         return x
 
-    def solve_transposed(self, b: Array) -> Array:
-        """Return x with K^T x = b."""
-        x: Array = self.lu.solve(b)
-        return x
-
 
 @dataclass(frozen=True, eq=False)
 class SuperLUSolver:
