@@ -326,9 +326,7 @@ def check(
     rows, count = _preview(prepared)
     if rows:
         columns = ("unknown", "prior deviation", "after", "left", "unit", "")
-        _print_table(
-            console, Table(f"What {count} samples can tell, at best", columns, rows), "dim"
-        )
+        _print_table(console, Table(f"What {count} samples can tell, at best", columns, rows))
     for note in loaded.notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
     if failed:
@@ -679,7 +677,7 @@ def _show(
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
 
 
-def _print_table(console: Console, table: Table, style: str = "") -> None:
+def _print_table(console: Console, table: Table) -> None:
     from rich.box import SIMPLE_HEAD
 
     grid = RichTable(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
@@ -29,7 +29,7 @@ from livepde.result import Result
 from livepde.runs import Check, Outcome, Table, measures
 from livepde.runs.directory import markdown
 from livepde.runs.outcome import Bound, Sense
-from livepde.runs.summary import digits
+from livepde.runs.summary import digits, shown
 from livepde.stepping import ForwardStage, Interval, advance
 
 __all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run_job"]
@@ -287,16 +287,11 @@ def _mean(runs: Sequence[Run]) -> Run:
     first = next((run for run in runs if run.error), runs[0])
     if first.error or len(runs) == 1:
         return first
-    names = first.numbers
-    return Run(
-        first.title,
-        first.source,
-        {name: float(np.mean([run.numbers[name] for run in runs])) for name in names},
-        first.unknowns,
-        first.expected,
-        first.samples,
-        float(np.mean([run.ratio for run in runs])),
-        float(np.mean([run.prior for run in runs])),
+    return replace(
+        first,
+        numbers={name: float(np.mean([r.numbers[name] for r in runs])) for name in first.numbers},
+        ratio=float(np.mean([run.ratio for run in runs])),
+        prior=float(np.mean([run.prior for run in runs])),
     )
 
 
@@ -319,22 +314,16 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
             continue
         numbers = run.numbers
         rmse, withheld = numbers["rmse"], numbers.get("rmse.withheld", math.nan)
-        shown = [_shown(value) for value in (rmse, withheld, run.prior)]
+        errors = [shown(value) for value in (rmse, withheld, run.prior)]
         steps = int(numbers["failed_steps"])
-        quality.append((job.label, *shown, run.samples, _shown(run.ratio, ".1f"), steps))
+        quality.append((job.label, *errors, run.samples, shown(run.ratio, ".1f"), steps))
         for label, (unit, reference) in run.unknowns.items():
             estimate = digits(numbers[label], numbers[f"{label}.std"])
-            error = 100 * numbers.get(f"{label}.error", math.nan)
-            ending = " %" if math.isfinite(error) else ""
-            compared = (_shown(reference, ".5g"), _shown(error, ".2g") + ending)
-            rows.append((job.label, label, *estimate, unit, *compared))
+            error = shown(100 * numbers.get(f"{label}.error", math.nan), ".2g", " %")
+            rows.append((job.label, label, *estimate, unit, shown(reference, ".5g"), error))
     columns = ("case", "unknown", "estimate", "± deviation", "unit", "reference", "error")
     more = ("case", "RMSE", "withheld", "prior", "samples", "time", "failed steps")
     return [Table("Estimates", columns, rows), Table("Runs", more, quality)]
-
-
-def _shown(value: float, form: str = ".3g") -> str:
-    return format(value, form) if math.isfinite(value) else "–"
 
 
 def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:

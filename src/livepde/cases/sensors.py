@@ -49,7 +49,7 @@ def observation_of(
     if not channels:
         return None
     how = _reconstruction(frame) if role == "sensor" else Pseudoinverse()
-    kinds: dict[tuple[Any, str], dict[str, ChannelSpec]] = {}
+    kinds: dict[tuple[str, str], dict[str, ChannelSpec]] = {}
     for name, channel in channels.items():
         kinds.setdefault((_kind(channel), channel.of or ""), {})[name] = channel
     names = [name for members in kinds.values() for name in members]
@@ -62,9 +62,9 @@ def observation_of(
     own = any(item.offset or item.gain or item.correlated for item in channels.values())
     common = {} if own or len(kinds) > 1 else outer
     parts = []
-    for (make, of), members in kinds.items():
+    for (kind, of), members in kinds.items():
         component = {"of": of} if of else {}
-        parts.append(make(frame, mesh, options, members, {**component, **common}))
+        parts.append(_part(frame, mesh, options, kind, members, {**component, **common}))
     if len(parts) > 1:
         whole: Observation = Combined(parts, **({} if own else outer))
     else:
@@ -72,23 +72,14 @@ def observation_of(
     return calibrated(frame, whole, names, **outer) if own else whole
 
 
-def _kind(channel: ChannelSpec) -> Any:
-    """Return what makes an observation of channels like this one."""
-    if channel.over is not None:
-        return _averages
-    if channel.along is not None:
-        return _lines
-    return _points if channel.follows is None else _moving
+def _kind(channel: ChannelSpec) -> str:
+    """Return the key that makes a channel a sensor of its kind."""
+    given = (key for key in ("over", "along", "follows") if getattr(channel, key) is not None)
+    return next(given, "at")
 
 
-def _averages(
-    frame: Frame,
-    mesh: Any,
-    options: Mapping[str, Any],
-    channels: Mapping[str, ChannelSpec],
-    common: Mapping[str, Any],
-) -> Observation:
-    """Return means over parts of the mesh."""
+def _regions(frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
+    """Return the parts of the mesh over which means are taken."""
     known = {**(mesh.boundaries or {}), **(mesh.subdomains or {})}
     regions: dict[str, Any] = {}
     for name, item in channels.items():
@@ -100,52 +91,22 @@ def _averages(
             regions[name] = item.over
         else:
             regions[name] = _inside(sides_of(frame, item.over, len(mesh.p), key))
-    return Averages(regions, **common)
+    return regions
 
 
-def _points(
-    frame: Frame,
-    mesh: Any,
-    options: Mapping[str, Any],
-    channels: Mapping[str, ChannelSpec],
-    common: Mapping[str, Any],
-) -> Observation:
-    """Return values at points, with what a quantity sees beside them."""
-    points, direct = {}, {}
-    for name, channel in channels.items():
-        points[name] = _position(frame, mesh, name, channel)
-        if channel.quantity is not None:
-            direct[name] = frame.equation.quantities[channel.quantity].direct(options)
-    return Points(points, direct, **common)
-
-
-def _lines(
-    frame: Frame,
-    mesh: Any,
-    options: Mapping[str, Any],
-    channels: Mapping[str, ChannelSpec],
-    common: Mapping[str, Any],
-) -> Observation:
-    """Return means along lines."""
-    ends = {name: item.along for name, item in channels.items() if item.along is not None}
-    lines = {
-        name: (
-            _inside_mesh(frame, mesh, start, f"channels.{name}.along"),
-            _inside_mesh(frame, mesh, end, f"channels.{name}.along"),
-        )
-        for name, (start, end) in ends.items()
+def _lines(frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
+    """Return the ends of lines along which means are taken."""
+    return {
+        name: tuple(_inside_mesh(frame, mesh, end, f"channels.{name}.along") for end in item.along)
+        for name, item in channels.items()
+        if item.along is not None
     }
-    return LineIntegrals(lines, mean=True, **common)
 
 
-def _moving(
-    frame: Frame,
-    mesh: Any,
-    options: Mapping[str, Any],
-    channels: Mapping[str, ChannelSpec],
-    common: Mapping[str, Any],
-) -> Observation:
-    """Return sensors whose positions are channels."""
+def _followed(
+    frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]
+) -> dict[str, tuple[str, ...]]:
+    """Return the channels of the positions of sensors that move."""
     positions: dict[str, tuple[str, ...]] = {}
     known = frame.roles("position")
     for name, item in channels.items():
@@ -158,7 +119,31 @@ def _moving(
             text = f"got {len(given)} channels; needs one for each of {len(mesh.p)} coordinates."
             raise frame.error(f"channels.{name}.follows", text)
         positions[name] = given
-    return Moving(positions, **common)
+    return positions
+
+
+def _part(
+    frame: Frame,
+    mesh: Any,
+    options: Mapping[str, Any],
+    kind: str,
+    channels: Mapping[str, ChannelSpec],
+    common: Mapping[str, Any],
+) -> Observation:
+    """Return what channels of one kind see."""
+    if kind == "over":
+        return Averages(_regions(frame, mesh, channels), **common)
+    if kind == "along":
+        return LineIntegrals(_lines(frame, mesh, channels), mean=True, **common)
+    if kind == "follows":
+        return Moving(_followed(frame, mesh, channels), **common)
+    points = {name: _position(frame, mesh, name, item) for name, item in channels.items()}
+    direct = {  # what a quantity sees beside the state
+        name: frame.equation.quantities[item.quantity].direct(options)
+        for name, item in channels.items()
+        if item.quantity is not None
+    }
+    return Points(points, direct, **common)
 
 
 def _reconstruction(frame: Frame) -> Reconstruction:

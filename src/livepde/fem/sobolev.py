@@ -73,14 +73,6 @@ class Sobolev:
         if not (np.isfinite(self.length) and self.length > 0):
             raise SpaceError(f"Sobolev: length must be a positive number; got {self.length}.")
 
-    def check_dimension(self, d: int) -> None:
-        """Raise `SpaceError` unless s > d/2, so that H^s is embedded in L^infinity."""
-        if not self.s > d / 2:
-            raise SpaceError(
-                f"Sobolev({self.s:g}) in {d} dimensions: A(u) q = q u is bounded for s > d/2 = "
-                f"{d / 2:g} only (section 4.1); take a larger s."
-            )
-
     def pointwise(self, dimension: int) -> Sobolev:
         """Return the inner product for which `std` of a field is its deviation at a point.
 

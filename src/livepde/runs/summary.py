@@ -11,7 +11,7 @@ import xarray as xr
 
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
-__all__ = ["checks_of", "digits", "measures", "scalars", "scored", "tables"]
+__all__ = ["checks_of", "digits", "measures", "scalars", "scored", "shown", "tables"]
 
 MOST_ROWS = 40
 CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
@@ -36,6 +36,15 @@ def digits(value: float, std: float) -> tuple[str, str]:
     places = max(0, 1 - math.floor(math.log10(std / scale)))
     exponent = f"e{power:+03d}" if power else ""
     return f"{value / scale:.{places}f}{exponent}", f"{std / scale:.{places}f}{exponent}"
+
+
+def shown(value: float, form: str = ".3g", unit: str = "") -> str:
+    """Return a number with its unit as text, a dash for one that is not finite.
+
+    >>> shown(2.5, ".2g", " %"), shown(float("nan"), ".2g", " %")
+    ('2.5 %', '–')
+    """
+    return format(value, form) + unit if math.isfinite(value) else "–"
 
 
 def scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
@@ -92,11 +101,11 @@ def _deviations(data: xr.Dataset, label: str) -> float:
 def measures(data: xr.Dataset) -> dict[str, float]:
     """Return every number of a run that a case may expect something of, by name.
 
-    Each scalar unknown by its label, with `.std` behind it its deviation and with `.error` the
-    relative error to a reference, with `.deviations` the distance from it in
-    deviations; `rmse` one-step, of all
-    sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`, `rmse.CHANNEL`;
-    `innovation_ratio` at the end, of squared innovations to what is expected; `failed_steps`.
+    Each scalar unknown by its label; behind it `.std`, its deviation, and where there is a
+    reference `.error`, relative to it, and `.deviations`, the distance from it in deviations;
+    `rmse` one-step, of all sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`,
+    `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to what is expected;
+    `failed_steps`.
     """
     found: dict[str, float] = {}
     if data.sizes["time"]:
@@ -141,9 +150,8 @@ def tables(data: xr.Dataset) -> list[Table]:
             value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
             cells = [*digits(value, std), data[label].attrs.get("units", "")]
             if compared:
-                error, attrs = _error(data, label), data[label].attrs
-                cells.append(f"{attrs['reference']:.5g}" if "reference" in attrs else "–")
-                cells.append(f"{100 * error:.2g} %" if math.isfinite(error) else "–")
+                cells.append(shown(float(data[label].attrs.get("reference", math.nan)), ".5g"))
+                cells.append(shown(100 * _error(data, label), ".2g", " %"))
             rows.append((label, *cells))
         columns: tuple[str, ...] = ("unknown", "value", "± deviation", "unit")
         title = "Estimates"
@@ -160,8 +168,8 @@ def tables(data: xr.Dataset) -> list[Table]:
             known = f"{name}_std" in data
             deviation = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
             numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
-            shown = f"{deviation:.2g}" if math.isfinite(deviation) else "–"
-            rows.append((name, *numbers, shown, data[name].attrs.get("units", "")))
+            unit = data[name].attrs.get("units", "")
+            rows.append((name, *numbers, shown(deviation, ".2g"), unit))
         columns = ("field", "least", "mean", "largest", "mean deviation", "unit")
         result.append(Table("Estimated fields", columns, rows))
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
@@ -170,7 +178,7 @@ def tables(data: xr.Dataset) -> list[Table]:
             name,
             role,
             f"{_rmse(errors):.4g}",
-            f"{errors.mean():+.3g}" if len(errors) else "–",
+            shown(float(errors.mean()) if len(errors) else math.nan, "+.3g"),
             len(errors),
             unit,
         )
