@@ -1,0 +1,318 @@
+"""A filter that is linear about a reference: state and reduced parameter with a joint factor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from livepde.errors import LawError
+from livepde.fem import Evolution, FieldBlock, Moment, RandomWalk
+from livepde.laws.base import Problem
+from livepde.laws.consistency import Consistency
+from livepde.linalg import Array
+from livepde.stepping import ForwardStage, Interval, StepFailed, advance
+
+__all__ = ["Filter", "Motion", "Point", "reduction"]
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A reference (u, q) and the linear filter about it.
+
+    Attributes
+    ----------
+    u, q
+        Reference state and parameter, shapes (n,) and (m,).
+    du, da
+        Estimated deviations of u and of the reduced parameter a, shapes (n,) and (k,).
+    U, C
+        Square root of the joint covariance of u and a, [U; C] [U; C]^T, shapes (n, r) and (k, r).
+        As long as nothing moves, r = k and U = L C with the sensitivity L = du/da.
+    consistency
+        Statistics of the innovations.
+    refused
+        How many values in a row of each sensor the gate has refused, shape (sensors,).
+    """
+
+    u: Array
+    q: Array
+    du: Array
+    da: Array
+    U: Array = field(metadata={"grows": 1})
+    C: Array = field(metadata={"grows": 1})
+    consistency: Consistency
+    refused: Array
+
+    def along(self, shift: Array) -> Array:
+        """Return by how much the state is expected to move with a shift of a, shape (n,)."""
+        if not shift.any():
+            return np.zeros(len(self.u))
+        weights = np.linalg.lstsq(self.C, shift, rcond=None)[0]
+        along: Array = self.U @ weights
+        return along
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How one unknown moves by itself, in reduced coordinates.
+
+    Attributes
+    ----------
+    part
+        Where its reduced coordinates stand: copies times modes.
+    evolution, std
+        Its model, and the prior deviation of its latent coefficients.
+    """
+
+    part: slice
+    evolution: Evolution
+    std: float
+
+    def transition(self, h: float) -> Array:
+        """Return the transition of its coordinates in a time h."""
+        F = self.evolution.transition(h)
+        return np.asarray(np.kron(F, np.eye((self.part.stop - self.part.start) // len(F))))
+
+    def growth(self, h: float) -> Array:
+        """Return the variance its coordinates gain in a time h."""
+        gained = self.evolution.growth(h, self.std)
+        return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
+
+    def backward(self, h: float) -> Array:
+        """Return what the coordinates are expected to have been a time h before: matrix on them."""
+        F = self.transition(h)
+        return np.asarray(np.linalg.solve(F @ F.T + np.diag(self.growth(h)), F).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Filter:
+    """A filter for a problem, linear about the reference of a `Point`.
+
+    Attributes
+    ----------
+    problem, forward
+        What is filtered, and the forward stage of its steps.
+    Phi, motions
+        The reduction a_latent = prior + Phi a, shape (m, k), and how its coordinates move.
+    noise
+        Standard deviation of each sensor, shape (sensors,).
+    scale, rank
+        A factor of more than `rank` columns is compressed; `scale`, shape (n,), weighs the
+        coefficients of the state then: the square root of the mass of each.
+    gate, patience
+        Innovations beyond `gate` expected deviations are refused, `patience` times in a row.
+    """
+
+    problem: Problem
+    forward: ForwardStage
+    Phi: Array
+    motions: tuple[Motion, ...]
+    noise: Array
+    scale: Array
+    rank: int
+    gate: float
+    patience: int
+
+    @cached_property
+    def moves(self) -> bool:
+        """True if an unknown moves by itself."""
+        return any(motion.evolution.moves for motion in self.motions)
+
+    def transition(self, h: float) -> Array:
+        """Return the transition of all reduced coordinates in a time h, shape (k, k)."""
+        return np.asarray(block_diag(*(motion.transition(h) for motion in self.motions)))
+
+    def moved(self, point: Point, h: float) -> Point:
+        """Return a point whose unknowns have moved for a time h; those of its state have not.
+
+        What they gain is in new columns of the factor, in the same order for every h.
+        """
+        if not self.moves or h == 0.0:
+            return point
+        F = self.transition(h)
+        gained = np.sqrt(np.concatenate([motion.growth(h) for motion in self.motions]))
+        new = np.diag(gained)[:, gained > 0.0]
+        q = self.problem.model.latent.moved(point.q, h)
+        U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
+        return replace(point, q=q, da=F @ point.da, U=U, C=np.hstack([F @ point.C, new]))
+
+    def traced(self, q: Array, start: Array, h: float) -> Array:
+        """Return the latent parameter that is expected to have become q in a time h.
+
+        Parameters
+        ----------
+        start
+            One at that time; what no mode sees is taken from it.
+        """
+        if not self.moves:
+            return q
+        prior = self.problem.model.latent.prior
+        back = block_diag(*(motion.backward(h) for motion in self.motions))
+        return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
+
+    def directions(self, point: Point) -> Array:
+        """Return the columns of the factor and da in latent coefficients, shape (m, r + 1)."""
+        directions: Array = self.Phi @ np.column_stack([point.C, point.da])
+        return directions
+
+    def latent(self, point: Point) -> Array:
+        """Return the estimated latent parameter, not yet bounded."""
+        q: Array = point.q + self.Phi @ point.da
+        return q
+
+    def predict(self, point: Point, moment: Moment) -> Array:
+        """Return what the sensors are expected to show."""
+        return self.problem.predict(point.u + point.du, self.latent(point), moment)
+
+    def output(self, point: Point, moment: Moment) -> Array:
+        """Return the derivative of the prediction along the columns of the factor, H [U; C]."""
+        problem, latent = self.problem, self.problem.model.latent
+        a = self.latent(point)
+        H_u, H_q = problem.observed.jacobian(point.u + point.du, latent.value(a), moment)
+        HC: Array = H_u @ point.U
+        return HC if H_q is None else HC + H_q @ latent.tangent(a, self.Phi @ point.C)
+
+    def reduced(self, dq: Array) -> Array:
+        """Return a with Phi a = dq: the columns of Phi are orthonormal in Q."""
+        a: Array = self.Phi.T @ self.problem.model.Q.dual(dq)
+        return a
+
+    def bounded(self, q: Array) -> Array:
+        """Return the latent parameter within its bounds."""
+        lower, upper = self.problem.model.latent.bounds
+        return np.clip(q, lower, upper)
+
+    def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
+        """Return the filter at the end of an interval, substeps, and why it failed or None."""
+        model, end = self.problem.model, self.moved(point, interval.t1 - interval.t0)
+        at_end = self.directions(end)
+
+        def stage(c: Array, t: float, h: float) -> Array:
+            moment, q, directions = interval.at(t), end.q, at_end
+            if self.moves and t != interval.t1:
+                now = self.moved(point, t - interval.t0)
+                q, directions = now.q, self.directions(now)
+            u = self.forward.solve(c[:, 0], q, h, moment)
+            factor = self.forward.tangent(u, q, h, moment)
+            forcing = model.form_A.product("v", "q", directions, moment, u=u, q=q)
+            rhs = (model.mass @ c[:, 1:]) / h - forcing
+            return np.column_stack([u, factor.solve(rhs * model.X.free[:, None])])
+
+        columns = np.column_stack([end.u, end.U, end.du])
+        y, steps, failure = advance(self.problem.control, stage, columns, interval)
+        if failure is not None or not np.isfinite(y).all():
+            return replace(end, u=y[:, 0], U=y[:, 1:-1], du=y[:, -1]), steps, failure
+        U, C = y[:, 1:-1], end.C
+        if C.shape[1] > self.rank:
+            U, C = _compressed(U, C, self.scale, self.rank)
+        return replace(end, u=y[:, 0], U=U, C=C, du=y[:, -1]), steps, None
+
+    def updated(self, point: Point, interval: Interval, predicted: Array) -> tuple[Point, int]:
+        """Return the filter after the sample, and how many values the gate refused."""
+        d = interval.z1 - predicted
+        present = np.isfinite(d)
+        if not present.any():
+            return point, 0
+        Y = self.output(point, interval.end) / self.noise[:, None]
+        e = d / (self.noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
+        used, count = present, 0
+        if np.isfinite(self.gate):
+            far = present & ~(np.abs(e) <= self.gate)
+            refused = np.where(far, point.refused + 1, np.where(present, 0, point.refused))
+            used = present & ~(far & (refused <= self.patience))
+            count = int(present.sum() - used.sum())
+            point = replace(point, refused=refused)
+            e = np.where(used, e, np.nan)
+        point = replace(point, consistency=point.consistency.add(e))
+        if not used.any():
+            return point, count
+        Y = Y[used]
+        # (I + Y^T Y)^-1 = W W^T with W = R^-1 from a QR factorisation of [I; Y].
+        root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(Y.shape[1]), Y]), mode="r"))
+        # SciPy's triangular solve would start threads for this small matrix; this one does not.
+        W: Array = np.asarray(np.linalg.inv(root), dtype=float)
+        half = W.T @ (Y.T @ (d / self.noise)[used])
+        U, C = point.U @ W, point.C @ W
+        new = replace(point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U)
+        return new, count
+
+    def recentred(self, point: Point) -> Point:
+        """Return the filter with its reference at the estimate, within the bounds.
+
+        Bounds hold for references and for what is reported, not for the linear filter: what lies
+        beyond them stays in da and du, so that nothing the data said is lost.
+        """
+        estimate = self.latent(point)
+        within = self.bounded(estimate)
+        if np.array_equal(within, estimate):
+            zero = np.zeros(len(point.da))
+            return replace(point, u=point.u + point.du, q=estimate, du=0.0 * point.du, da=zero)
+        shift = self.reduced(within - point.q)
+        beyond = point.along(point.da - shift)
+        return replace(
+            point,
+            u=point.u + point.du - beyond,
+            q=point.q + self.Phi @ shift,
+            du=beyond,
+            da=point.da - shift,
+        )
+
+
+def reduction(
+    problem: Problem, modes: int | dict[str, int], drift: float
+) -> tuple[Array, tuple[Motion, ...]]:
+    """Return Phi, shape (m, k), and how its coordinates move.
+
+    Parameters
+    ----------
+    modes, drift
+        As for `SensitivityLaw`.
+    """
+    model = problem.model
+    fields = model.parameter_space.fields
+    counts = modes if isinstance(modes, dict) else dict.fromkeys(fields, modes)
+    if set(counts) != set(fields):
+        raise LawError(
+            f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
+        )
+    blocks, motions, start = [], [], 0
+    for name, item in model.latent.parts.items():
+        first = slice(item.part.start, item.part.start + item.size)
+        if isinstance(item.block, FieldBlock):
+            part = model.parameter_space.part(name)
+            inner = model.Q.restricted(first, item.block.fixed)
+            count = min(counts[name], int(inner.free.sum()))
+            phi, _ = inner.modes(count, model.parameter_mass[part, part])
+        else:
+            phi = np.eye(item.size) * item.unknown.latent_std
+        evolution = item.evolution
+        if drift and not evolution.moves:
+            evolution = RandomWalk(np.sqrt(drift) * item.unknown.latent_std)
+        blocks.append(np.kron(np.eye(evolution.copies), phi))
+        stop = start + blocks[-1].shape[1]
+        motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std))
+        start = stop
+    Phi: Array = np.asarray(block_diag(*blocks))
+    return Phi, tuple(motions)
+
+
+def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:
+    """Return the factor with `rank` columns.
+
+    A rotation gathers all that is uncertain about the parameters, and the state with them, in the
+    first columns: they stay as they are. Of the rest, which is the state's alone, the leading
+    directions are kept, measured by `scale`.
+    """
+    k = len(C)
+    rotation, root = np.linalg.qr(C.T, mode="complete")
+    rotated = U @ rotation
+    alone = rotated[:, k:]
+    weighted = scale[:, None] * alone
+    _, vectors = np.linalg.eigh(weighted.T @ weighted)
+    kept = alone @ vectors[:, ::-1][:, : rank - k]
+    square: Array = np.zeros((k, rank))
+    square[:, :k] = root[:k].T
+    return np.hstack([rotated[:, :k], kept]), square
