@@ -37,6 +37,17 @@ __all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run
 WORKERS = 2
 WARM_UP = 2  # samples in which matrices are built that are built once
 
+GALLERY = """\
+# Gallery
+
+Every case on measurements or fields that others published, with its variants: what was estimated, the
+deviation that the law states, what others found, and the checks of the case. Written by
+`livepde bench cases --gallery FOLDER`; RMSE is one step ahead, with all learning in it, "prior" that of the
+model with its unknowns at their prior, and time that of a sample over that of a forward step of the same
+model. Figures show the first run of each case.
+
+"""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -338,5 +349,5 @@ def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
         text = markdown(run.title or path.stem, _tables(some), checks, source, figures)
         parts.append(text.replace("\n## ", "\n### ").replace("# ", "## ", 1))
     target = folder / "gallery.md"
-    target.write_text("# Gallery\n\n" + "\n".join(parts), encoding="utf-8")
+    target.write_text(GALLERY + "\n".join(parts), encoding="utf-8")
     return target
