@@ -34,9 +34,6 @@ from livepde.stepping import ForwardStage, Interval, advance
 
 __all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run_job"]
 
-WORKERS = 2
-WARM_UP = 2  # samples in which matrices are built that are built once
-
 GALLERY = """\
 # Gallery
 
@@ -47,6 +44,9 @@ model with its unknowns at their prior, and time that of a sample over that of a
 model. Figures show the first run of each case.
 
 """
+
+WORKERS = 2
+WARM_UP = 2  # samples in which matrices are built that are built once
 
 
 @dataclass(frozen=True)
