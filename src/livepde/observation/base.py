@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -25,6 +25,7 @@ from livepde.spaces import HilbertSpace
 __all__ = ["Observation", "Observed", "Split", "numbers"]
 
 Direct = Callable[[Any, Place], Any]
+STEP = 1e-30  # of the complex step
 DEPENDENT = 1e-12  # eigenvalues of G G* below this share of the largest count as zero
 ROUNDING = 1e-14  # entries of G below this share of the largest of their row count as zero
 LARGEST_MEMO = 64  # splits kept for different patterns of missing samples
@@ -70,6 +71,19 @@ class Observation:
         """Refuse `of` where it would say nothing."""
         if self.of:
             raise ObservationError(f"{type(self).__name__}: of='{self.of}' says nothing; {remedy}")
+
+    def _reads(self, channels: Iterable[str]) -> None:
+        """Put channels in front of `inputs`, each once."""
+        object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
+
+    def _shows(self, base: Observation) -> None:
+        """Take over the channels of a base whose readings are changed; refuse noise of its own."""
+        if base.noise is not None:
+            raise ObservationError(
+                f"{type(self).__name__}: give noise= to it and not to its base: it is that of the "
+                "readings."
+            )
+        self._reads(base.inputs)
 
     def names(self, count: int) -> tuple[str, ...]:
         """Return a name for each sensor."""

@@ -14,12 +14,10 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment, Place
 from livepde.linalg import Array
-from livepde.observation.base import Observation, Observed, numbers
+from livepde.observation.base import STEP, Observation, Observed, numbers
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Calibrated", "CalibratedObserved", "Combined", "CombinedObserved"]
-
-STEP = 1e-30  # of the complex step
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +44,7 @@ class Combined(Observation):
             raise ObservationError("Combined: give at least one observation.")
         if self.noise is not None and any(part.noise is not None for part in self.parts):
             raise ObservationError("Combined: give noise= to it or to its parts, not to both.")
-        channels = [name for part in self.parts for name in part.inputs]
-        object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
+        self._reads(name for part in self.parts for name in part.inputs)
 
     @property
     def optional(self) -> frozenset[str]:
@@ -157,12 +154,7 @@ class Calibrated(Observation):
 
     def __post_init__(self) -> None:
         self._sees_all("give of= to the observations it is made of.")
-        if self.base.noise is not None:
-            raise ObservationError(
-                "Calibrated: give noise= to it and not to its base: it is that of the readings."
-            )
-        channels = dict.fromkeys([*self.base.inputs, *self.inputs])
-        object.__setattr__(self, "inputs", tuple(channels))
+        self._shows(self.base)
 
     @property
     def optional(self) -> frozenset[str]:

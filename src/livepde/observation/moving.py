@@ -39,8 +39,7 @@ class Moving(Observation):
     def __post_init__(self) -> None:
         if not self.positions:
             raise ObservationError("Moving: give at least one sensor.")
-        channels = [name for names in self.channels for name in names]
-        object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
+        self._reads(name for names in self.channels for name in names)
 
     @property
     def channels(self) -> list[tuple[str, ...]]:

@@ -27,15 +27,13 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment
 from livepde.linalg import Array
-from livepde.observation.base import Direct, Observation, Observed
+from livepde.observation.base import STEP, Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Transformed", "TransformedObserved"]
 
 Reading = Callable[[Array], Array]
 """What each sensor shows for the value it sees: (sensors,) -> (sensors,), one by one."""
-
-STEP = 1e-30  # of the complex step
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,17 +73,13 @@ class Transformed(Observation):
 
     def __post_init__(self) -> None:
         self._sees_all("give of= to the observations it is made of.")
-        if self.base.noise is not None:
-            raise ObservationError(
-                "Transformed: give noise= to it and not to its base: it is that of the readings."
-            )
+        self._shows(self.base)
         if self.iterations < 1:
             raise ObservationError(
                 f"Transformed: iterations must be at least 1; got {self.iterations}."
             )
         if not self.reach > 0:
             raise ObservationError(f"Transformed: reach must be positive; got {self.reach}.")
-        object.__setattr__(self, "inputs", tuple(self.base.inputs))
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         return self.base.matrix(state)
