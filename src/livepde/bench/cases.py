@@ -37,11 +37,11 @@ __all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run
 GALLERY = """\
 # Gallery
 
-Every case on measurements or fields that others published, with its variants: what was estimated, the
-deviation that the law states, what others found, and the checks of the case. Written by
-`livepde bench cases --gallery FOLDER`; RMSE is one step ahead, with all learning in it, "prior" that of the
-model with its unknowns at their prior, and time that of a sample over that of a forward step of the same
-model. Figures show the first run of each case.
+Every case on measurements or fields that others published, with its variants: what was estimated,
+the deviation that the law states, what others found, and the checks of the case. Written by
+`livepde bench cases --gallery FOLDER`. RMSE is one step ahead, with all learning in it, "prior"
+that of the model with its unknowns at their prior, and time that of a sample over that of a forward
+step of the same model. Figures show the first run of each case.
 
 """
 
