@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -200,9 +199,3 @@ def test_the_tomography_of_horkheim_passes_the_checks():
     one = lp.Field(mesh, ElementQuad1(), prior=1.0, std=1.0, transform="log")
     unknowns = {"T": positive(0.03), "S": positive(0.02), "Y": one, "Z": one}
     check_model(pumping.four_tests(mesh, unknowns, {}, length=8.0), u=1.0).raise_if_failed()
-
-
-def test_the_page_runs():
-    page = (ROOT / "docs" / "models" / "groundwater.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    exec(compile(block, "groundwater.md", "exec"), {"__name__": "page"})

@@ -8,7 +8,7 @@ from typing import Any
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
 from livepde.models.base import Equation, Variable, by_name
-from livepde.models.common import Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
 
 __all__ = ["ALLEN_CAHN", "allen_cahn"]
 
@@ -60,7 +60,7 @@ ALLEN_CAHN = Equation(
     unknowns={
         "D": Variable("", "diffusivity"),
         "r": Variable("", "rate of reaction"),
-        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
+        "u0": INITIAL,
     },
     build=by_name(allen_cahn),
     element=hermite,

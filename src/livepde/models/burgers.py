@@ -8,7 +8,7 @@ from typing import Any
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
 from livepde.models.base import Equation, Variable, by_name
-from livepde.models.common import Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
 
 __all__ = ["BURGERS", "burgers"]
 
@@ -62,7 +62,7 @@ BURGERS = Equation(
     unknowns={
         "nu": Variable("", "viscosity"),
         "advection": Variable("", "coefficient a of the advection; else 1", optional=True),
-        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
+        "u0": INITIAL,
     },
     build=by_name(burgers),
     element=hermite,

@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from livepde.fem import Field, Integrand, Unknown
+from livepde.models.base import Variable
 
-__all__ = ["Coefficients", "Number", "beginning", "state"]
+__all__ = ["INITIAL", "Coefficients", "Number", "beginning", "state"]
 
 Number: TypeAlias = Unknown | float
 """A coefficient of an equation: unknown, or a known number."""
 
+INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)
 SIDES = (("left", "right"), ("bottom", "top"), ("front", "back"))
 
 

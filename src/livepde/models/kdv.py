@@ -7,7 +7,7 @@ from typing import Any
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
 from livepde.models.base import Equation, Variable, closed
-from livepde.models.common import Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
 
 __all__ = ["KDV", "kdv"]
 
@@ -49,7 +49,7 @@ KDV = Equation(
     unknowns={
         "advection": Variable("", "coefficient a of u u_x"),
         "dispersion": Variable("", "coefficient b of u_xxx"),
-        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
+        "u0": INITIAL,
     },
     build=closed(kdv, "is periodic"),
     element=smooth,

@@ -7,7 +7,7 @@ from typing import Any
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
 from livepde.models.base import Equation, Variable, closed
-from livepde.models.common import Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
 
 __all__ = ["KURAMOTO_SIVASHINSKY", "kuramoto_sivashinsky"]
 
@@ -57,7 +57,7 @@ KURAMOTO_SIVASHINSKY = Equation(
         "advection": Variable("", "coefficient a of u u_x"),
         "instability": Variable("", "coefficient b of u_xx"),
         "damping": Variable("", "coefficient c of u_xxxx"),
-        "u0": Variable("", "initial state, a field; else the case's `initial`", optional=True),
+        "u0": INITIAL,
     },
     build=closed(kuramoto_sivashinsky, "is periodic"),
     element=smooth,
