@@ -39,7 +39,7 @@ from livepde.linalg import Array, IntArray, Pattern, PatternOperator
 __all__ = ["Form", "FormMatrices"]
 
 STEP = 1e-30  # of the complex step: far below rounding, far above underflow
-SMALL = 1e-3  # share of the largest value of a component below which that is its scale
+SMALL = 1e-3  # share of a component's largest value or prior deviation: less is no scale
 SHIFT = 1e-3  # of a central difference of fourth order, relative: its errors are about 1e-13
 LARGEST_TENSOR = 20_000_000  # entries of a precomputed trilinear form; beyond it, quadrature
 
@@ -385,7 +385,7 @@ class Form(FormMatrices):
                     continue
                 value: Any = here[:, None, None]
                 if shifted in axes:
-                    value = value + shift * _scale(here) * local.units(axes[0], 2)
+                    value = value + shift * self._scale(key, local, here) * local.units(axes[0], 2)
                 if stepped in axes:
                     value = value + 1j * STEP * local.units(axes[-1], 2)
                 jets.append(local.jets(value))
@@ -403,8 +403,23 @@ class Form(FormMatrices):
         near = evaluate(SHIFT) - evaluate(-SHIFT)
         far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
         difference = (8.0 * near - far) / (12.0 * SHIFT)
-        scaled: Array = difference / np.swapaxes(_scale(here)[:, 0], 0, shifted)
+        scaled: Array = difference / np.swapaxes(self._scale(key, local, here)[:, 0], 0, shifted)
         return scaled
+
+    def _scale(self, key: str, local: LocalSpace, values: Array) -> Array:
+        """Return the size of each component at each point, not too small: (components, 1, 1, E, P).
+
+        For the parameter not far below its prior deviation: a value near zero has no size.
+        """
+        size = np.abs(values)
+        whole = size.max(axis=(1, 2), keepdims=True)
+        if key == self.parameter:
+            unknowns = local.space.unknowns.values()
+            counts = [len(item.phi) for item in local.locals]
+            std = np.repeat([float(item.std) for item in unknowns], counts)
+            whole = np.maximum(whole, std[:, None, None])
+        whole = np.where(whole > 0.0, whole, 1.0)
+        return np.where(size > SMALL * whole, size, whole)[:, None, None]
 
     def _constant(self, rows: str, cols: str) -> Array:
         """Return data(rows, cols) of an affine form at zero, computed once."""
@@ -458,11 +473,3 @@ class Form(FormMatrices):
         total.eliminate_zeros()
         self._tensors[rows, cols] = total
         return total
-
-
-def _scale(values: Array) -> Array:
-    """Return the size of each component at each point, not too small: (components, 1, 1, E, P)."""
-    size = np.abs(values)
-    whole = size.max(axis=(1, 2), keepdims=True)
-    whole = np.where(whole > 0.0, whole, 1.0)
-    return np.where(size > SMALL * whole, size, whole)[:, None, None]
