@@ -398,3 +398,16 @@ def test_reproduce_and_bench_for_people(fake, here):
     assert "step" in call("bench")[1]
     assert "did you mean 'seed'?" in bad("reproduce", "sed")
     assert "expected one of step" in bad("bench", "xyz")
+
+
+# The preview of the others takes long: they have hundreds of sensors or many unknowns.
+@pytest.mark.parametrize(
+    "name", ["thermal_response", "sioux", "streambed_047", "soil_column", "soil_layers"]
+)
+def test_check_understands_the_cases_of_the_project(name, data_dir, monkeypatch):
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+    case = Path(__file__).parent.parent / "cases" / f"{name}.toml"
+    result = CliRunner().invoke(cli.app, ["check", str(case), "--allow-code"])
+    assert result.exit_code == 0, result.output
+    assert "model: ok" in result.output
+    assert "observation: ok" in result.output

@@ -427,7 +427,7 @@ def _show_checks(console: Console, prepared: Prepared) -> bool:
     report = check_model(case.model, u=prepared.u0, t=first.t, inputs=inputs)
     observed, size = prepared.identifier.observed, prepared.typical(inputs)
     read = {name: values[name] for name in observed.observation.inputs}
-    reports = [report, check_observation(observed, at=size, inputs=read)]
+    reports = [report, check_observation(observed, at=size, inputs={**inputs, **read})]
     for item in reports:
         if item.ok:
             console.print(f"{item.name}: [green]ok[/] ({len(item.lines)} properties)")
