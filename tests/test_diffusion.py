@@ -123,3 +123,10 @@ def test_what_cannot_be_is_said():
         heat(mesh, number(1.0), {"left": 0.0, "right": 0.0}, transfer=number(1.0))
     with pytest.raises(ModelError, match="must be positive"):
         conduction(mesh, number(1.0), C=0.0)
+
+
+def test_the_surroundings_do_not_make_each_step_factorise_anew():
+    exchange = {"loss": lp.Scalar(0.1), "transfer": lp.Scalar(0.2)}
+    model = heat(lp.interval(0.0, 1.0, 4), lp.Scalar(1.0), {"left": 0.0}, **exchange)
+    assert model.steady
+    assert not model.constant

@@ -17,7 +17,7 @@ from livepde import cases
 from livepde.cases.preview import preview
 from livepde.cases.template import write_template
 from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
-from livepde.fem.evolution import Constant
+from livepde.fem.evolution import CONSTANT
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
 from livepde.streams import AbsoluteNoise, Twin
@@ -25,7 +25,7 @@ from livepde.streams import AbsoluteNoise, Twin
 NOISE = 0.02
 SENSORS = {"a": 0.3, "b": 0.55, "c": 0.8}
 EVOLUTIONS = {
-    "constant": Constant(),
+    "constant": CONSTANT,
     "walk": lp.RandomWalk(0.4),
     "reverting": lp.MeanReverting(0.8),
     "periodic": lp.Periodic(2.0, 2),

@@ -16,7 +16,7 @@ import livepde as lp
 from livepde.diagnostics import check_model
 from livepde.errors import ConfigurationError, LawError, SpaceError
 from livepde.fem import FunctionSpace, Latent
-from livepde.fem.evolution import Constant
+from livepde.fem.evolution import CONSTANT
 from livepde.fem.transforms import Log, Logit
 from livepde.stepping import ForwardStage
 
@@ -71,7 +71,7 @@ def test_transforms_have_their_inverse_and_derivatives(latent: float, lower: flo
 
 
 @pytest.mark.parametrize(
-    "evolution", [Constant(), lp.RandomWalk(0.3), lp.MeanReverting(2.0), lp.Periodic(5.0, 3)]
+    "evolution", [CONSTANT, lp.RandomWalk(0.3), lp.MeanReverting(2.0), lp.Periodic(5.0, 3)]
 )
 def test_transitions_are_exponentials_and_compose(evolution: Any):
     K = evolution.generator
@@ -247,7 +247,7 @@ def test_the_gradient_law_rotates_a_periodic_unknown():
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
     errors = {}
-    for name, evolution in (("periodic", lp.Periodic(10.0)), ("constant", Constant())):
+    for name, evolution in (("periodic", lp.Periodic(10.0)), ("constant", CONSTANT)):
         model = rod({"a": lp.Scalar(0.2, 0.2, evolution=evolution)})
         law = lp.GradientLaw(gain=10.0, damping=lp.ResidualDamping(10.0))
         identifier = lp.Identifier(model, lp.Full(), law)

@@ -14,7 +14,7 @@ import numpy as np
 from livepde.errors import SpaceError
 from livepde.linalg import Array
 
-__all__ = ["CONSTANT", "Constant", "Evolution", "MeanReverting", "Periodic", "RandomWalk"]
+__all__ = ["CONSTANT", "Evolution", "MeanReverting", "Periodic", "RandomWalk"]
 
 
 def _positive(what: str, value: float) -> None:
@@ -23,8 +23,8 @@ def _positive(what: str, value: float) -> None:
 
 
 @dataclass(frozen=True)
-class Constant:
-    """Does not move."""
+class Evolution:
+    """How an unknown moves; this one, `CONSTANT`, does not."""
 
     @property
     def copies(self) -> int:
@@ -44,7 +44,7 @@ class Constant:
     @property
     def moves(self) -> bool:
         """True unless it stays as it is."""
-        return type(self) is not Constant
+        return self != CONSTANT
 
     def transition(self, h: float) -> Array:
         """Return exp(K h), shape (copies, copies)."""
@@ -56,7 +56,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class RandomWalk(Constant):
+class RandomWalk(Evolution):
     """Drifts: a deviation of rate * sqrt(h) is gained in a time h.
 
     Parameters
@@ -76,7 +76,7 @@ class RandomWalk(Constant):
 
 
 @dataclass(frozen=True)
-class MeanReverting(Constant):
+class MeanReverting(Evolution):
     """Returns to the prior mean within `time`, with the prior deviation (Ornstein-Uhlenbeck)."""
 
     time: float
@@ -96,7 +96,7 @@ class MeanReverting(Constant):
 
 
 @dataclass(frozen=True)
-class Periodic(Constant):
+class Periodic(Evolution):
     """A constant and harmonics: q(t) = q_0 + sum over k of a_k cos(2 pi k t/period + phase_k).
 
     The prior mean belongs to the constant; each harmonic has the prior deviation. The parts rotate
@@ -139,5 +139,4 @@ class Periodic(Constant):
         return np.zeros(self.copies)
 
 
-Evolution = Constant
-CONSTANT = Constant()
+CONSTANT = Evolution()

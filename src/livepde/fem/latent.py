@@ -5,7 +5,7 @@ Without transforms and evolutions latent coefficients are those of q.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -150,9 +150,9 @@ class Latent:
             a[p.part.start : p.part.start + p.size] = inside
         return a
 
-    def _filled(self, values: Iterator[float]) -> Array:
-        lengths = [p.part.stop - p.part.start for p in self.parts.values()]
-        return np.repeat(np.array(list(values), dtype=float), lengths)
+    def _filled(self, values: Sequence[float]) -> Array:
+        """Return a number of each unknown for each of its latent coefficients."""
+        return np.repeat(values, [p.part.stop - p.part.start for p in self.parts.values()])
 
     @cached_property
     def prior(self) -> Array:
@@ -164,13 +164,13 @@ class Latent:
     @cached_property
     def deviations(self) -> Array:
         """Prior deviation that belongs to each latent coefficient, shape (dim,)."""
-        return self._filled(p.unknown.latent_std for p in self.parts.values())
+        return self._filled([p.unknown.latent_std for p in self.parts.values()])
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the latent coefficients, as laws have to respect them."""
-        pairs = [p.unknown.latent_bounds for p in self.parts.values()]
-        return self._filled(iter([p[0] for p in pairs])), self._filled(iter([p[1] for p in pairs]))
+        lower, upper = zip(*(p.unknown.latent_bounds for p in self.parts.values()), strict=True)
+        return self._filled(lower), self._filled(upper)
 
     @cached_property
     def limits(self) -> tuple[Array, Array]:

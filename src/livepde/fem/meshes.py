@@ -40,7 +40,7 @@ from livepde.errors import SpaceError
 from livepde.fem.fields import Predicate
 from livepde.linalg import Array
 
-__all__ = ["box", "hermite", "linear", "quadratic", "read_mesh", "rectangle", "smooth"]
+__all__ = ["box", "grid", "hermite", "linear", "quadratic", "read_mesh", "rectangle", "smooth"]
 
 LINEAR: dict[Any, Any] = {
     MeshLine: ElementLineP1,

@@ -133,12 +133,10 @@ def _model(
         lambda q, u, v, x: getattr(q, conductivity) * dot(grad(u), grad(v)),
     ]
     if "loss" in given:
-        terms.append(lambda q, u, v, x: q.loss * (u - x.inputs[AMBIENT]) * v)
+        terms += _exchange("loss")
     if "transfer" in given:
-        free = _free(name, mesh, held)
-        terms += [
-            On(side, lambda q, u, v, x: q.transfer * (u - x.inputs[AMBIENT]) * v) for side in free
-        ]
+        sides = _free(name, mesh, held)
+        terms += [On(side, term) for side in sides for term in _exchange("transfer")]
     if "source" in given:
         terms.append(lambda q, u, v, x: -q.source * v)
     return Model(
@@ -149,6 +147,14 @@ def _model(
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
         time_unit="s",
     )
+
+
+def _exchange(coefficient: str) -> list[Any]:
+    """Return coefficient (u - ambient) v, as two terms: what depends on u reads no input."""
+    return [
+        lambda q, u, v, x: getattr(q, coefficient) * u * v,
+        lambda q, u, v, x: -getattr(q, coefficient) * x.inputs[AMBIENT] * v,
+    ]
 
 
 def _free(name: str, mesh: Any, held: Mapping[str, Any]) -> list[str]:
