@@ -290,9 +290,6 @@ class FieldBlock(Block):
         if self.field.transform is not None:  # a projection need not stay within the bounds
             nodes = self.doflocs
             return np.asarray(value(nodes) + 0.0 * nodes[0])
-        if not self.field.periodic:
-            coefficients: Array = self.basis.project(lambda x: value(x) + 0.0 * x[0])
-            return coefficients
         mass = BilinearForm(lambda u, v, w: inner(u, v)).assemble(self.basis)
         rhs = LinearForm(lambda v, w: inner(value(w.x) + 0.0 * w.x[0], v)).assemble(self.basis)
         tie = self._spread
