@@ -257,7 +257,7 @@ class Identifier:
             steps=report.steps,
             notes=report.notes,
             held=held,
-            labels=self.model.parameter_space.labels,
+            space=self.model.parameter_space,
         )
 
     def estimate(self) -> Estimate:
