@@ -76,7 +76,7 @@ def test_fields_have_an_interval_for_each_coefficient():
     estimate, data = run(identifier(a=field))
     low, high = estimate.interval("a")
     assert low.shape == estimate.q.shape
-    assert (0 < low).all()
+    assert (low > 0).all()
     assert (low * high) == pytest.approx(estimate.q**2)
     assert data["a_low"].dims == data["a"].dims
     assert data["a_low"].values[-1] == pytest.approx(low)
