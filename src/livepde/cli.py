@@ -313,8 +313,6 @@ def check(
 
     Nothing is written. Example:  livepde check mycase/case.toml
     """
-    from livepde.runs import Table
-
     console = _console()
     loaded = _load(case, allow_code, settings)
     prepared = loaded.prepare(data)
@@ -323,11 +321,8 @@ def check(
     if data is None or not data.endswith((".jsonl", ".ndjson")):
         _show_data(console, loaded, prepared, samples)
     failed = _show_checks(console, prepared)
-    rows, count = _preview(prepared)
-    if rows:
-        columns = ("unknown", "prior deviation", "after", "left", "unit", "")
-        _print_table(console, Table(f"What {count} samples can tell, at best", columns, rows))
-    for note in loaded.notes:
+    notes = [*loaded.notes, *_show_preview(console, prepared)]
+    for note in notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
     if failed:
         raise typer.Exit(CHECK_FAILED)
@@ -341,11 +336,13 @@ def _load(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
     return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 
 
-def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
+def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
+    """Print what the sensors can tell; return sentences on it."""
     from livepde.cases.preview import preview
+    from livepde.runs import Table
 
-    found, count = preview(prepared, prepared.stream)
-    return [
+    found = preview(prepared, prepared.stream)
+    rows = [
         (
             item.name,
             f"{item.prior:.3g}",
@@ -354,8 +351,13 @@ def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
             item.unit,
             "hardly identified" if item.hardly else "",
         )
-        for item in found
-    ], count
+        for item in found.unknowns
+    ]
+    if rows:
+        columns = ("unknown", "prior deviation", "after", "left", "unit", "")
+        title = f"What {found.samples} samples can tell, at best"
+        _print_table(console, Table(title, columns, rows), "dim")
+    return found.sentences
 
 
 def _show_model(console: Console, prepared: Prepared) -> None:
@@ -489,6 +491,8 @@ def run(
     prepared.describe(dataset)
     checks = checks_of(loaded.expected, dataset)
     notes = [*loaded.notes, *doubts(dataset)]
+    if len(driven.result):
+        notes += _traded(prepared)
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
@@ -517,6 +521,17 @@ def run(
         raise typer.Exit(INTERRUPTED)
     if as_json and not all(item.ok for item in checks):
         raise typer.Exit(CHECK_FAILED)
+
+
+def _traded(prepared: Prepared) -> list[str]:
+    """Return what a run's data tell only together."""
+    from livepde.diagnostics import identifiability
+    from livepde.laws import SensitivityLaw
+
+    if not isinstance(prepared.case.law, SensitivityLaw):
+        return []
+    belief = prepared.identifier.latent_belief()
+    return identifiability(prepared.case.model, belief).sentences
 
 
 def _must_be_empty(folder: Path) -> None:

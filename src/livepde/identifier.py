@@ -228,10 +228,12 @@ class Identifier:
         belief, latent = self.latent_belief(), self.model.latent
         if latent.plain:
             return belief
-        factor = belief.q_factor
-        if factor is not None:
-            factor = latent.tangent(belief.q, factor)
-        return replace(belief, q=latent.value(belief.q), q_factor=factor)
+        factors = {
+            name: latent.tangent(belief.q, factor)
+            for name in ("q_factor", "prior_factor")
+            if (factor := getattr(belief, name)) is not None
+        }
+        return replace(belief, q=latent.value(belief.q), **factors)
 
     def _estimate(
         self,
