@@ -206,10 +206,14 @@ def bench(
         Path | None,
         typer.Option(help="With 'cases': folder for a page with tables and figures."),
     ] = None,
+    twins: Annotated[
+        int, typer.Option(min=1, help="With 'coverage': how many twins of each problem.")
+    ] = 200,
 ) -> None:
     """Measure what things cost, as ratios that hold on any machine, and what cases find.
 
     'cases' runs every case of the project with its variants, and the code that they name.
+    'coverage' counts how often the truth lies in the 68 % and 95 % intervals.
 
     Example:  livepde bench step
     Cases:    livepde bench cases --only soil_layers --json
@@ -217,13 +221,19 @@ def bench(
     from livepde.bench import BENCHMARKS
 
     if name == "list":
-        for key in (*BENCHMARKS, "cases"):
+        for key in (*BENCHMARKS, "cases", "coverage"):
             _console().print(key)
         return
     if name == "cases":
         _bench_cases(folder, only or [], gallery, as_json)
         return
-    outcome = _named(name, {**BENCHMARKS, "cases": None}, "benchmark")()
+    if name == "coverage":
+        from livepde.bench.coverage import coverage
+
+        command = ["livepde", "bench", name, "--twins", str(twins)]
+        _report_outcome(coverage(twins, progress=True), command, as_json)
+        return
+    outcome = _named(name, {**BENCHMARKS, "cases": None, "coverage": None}, "benchmark")()
     _report_outcome(outcome, ["livepde", "bench", name], as_json)
 
 

@@ -228,12 +228,13 @@ class Identifier:
         belief, latent = self.latent_belief(), self.model.latent
         if latent.plain:
             return belief
-        factors = {
-            name: latent.tangent(belief.q, factor)
-            for name in ("q_factor", "prior_factor")
-            if (factor := getattr(belief, name)) is not None
-        }
-        return replace(belief, q=latent.value(belief.q), **factors)
+        q_factor, prior_factor = (
+            None if factor is None else latent.tangent(belief.q, factor)
+            for factor in (belief.q_factor, belief.prior_factor)
+        )
+        return replace(
+            belief, q=latent.value(belief.q), q_factor=q_factor, prior_factor=prior_factor
+        )
 
     def _estimate(
         self,

@@ -86,14 +86,13 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
             count += bool(np.isfinite(estimate.innovation).any())
         if count >= MOST_SAMPLES:
             break
-    if not count:
-        return Preview()
     model = prepared.case.model
     # What was measured does not matter here, so what the innovations say does not either.
     belief = replace(identifier.latent_belief(), inflation=1.0)
-    assert belief.prior_factor is not None and belief.q_factor is not None
-    roots = (belief.prior_factor, belief.q_factor)
-    before, after = (model.latent.tangent(model.latent.prior, root) for root in roots)
+    prior, posterior = belief.prior_factor, belief.q_factor
+    if not count or prior is None or posterior is None:
+        return Preview()
+    before, after = (model.latent.tangent(model.latent.prior, f) for f in (prior, posterior))
     found = identifiability(model, belief)
     return Preview(tuple(_compare(prepared, before, after)), count, tuple(found.sentences))
 

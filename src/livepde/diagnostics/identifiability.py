@@ -1,8 +1,8 @@
 """What a belief knows more than the prior: what is pinned, flat, traded off, at a bound.
 
-Prior and posterior are compared in the reduced coordinates of the law, in which the prior is N(0, I):
-there the covariance itself is the posterior-to-prior ratio, its eigenvalues do not depend on units,
-and the root of one is the share of the prior deviation that is left.
+Prior and posterior are compared in the reduced coordinates of the law, in which the prior is
+N(0, I): there the covariance itself is the posterior-to-prior ratio, its eigenvalues do not depend
+on units, and the root of one is the share of the prior deviation that is left.
 """
 
 from __future__ import annotations
@@ -136,11 +136,9 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     >>> identifier = lp.Identifier(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), u0=1.0)
     >>> for t in (1.0, 2.0, 3.0):
     ...     _ = identifier.step(t, [1.0])
-    >>> [
-    ...     (a, b, round(r, 2))
-    ...     for a, b, r in identifiability(model, identifier.latent_belief()).pairs
-    ... ]
-    [('a', 'b', 1.0)]
+    >>> (found,) = identifiability(model, identifier.latent_belief()).pairs
+    >>> found[:2]
+    ('a', 'b')
     """
     prior, posterior = belief.prior_factor, belief.q_factor
     if prior is None or posterior is None:
