@@ -318,6 +318,10 @@ def check(
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
+    advise: Annotated[
+        bool,
+        typer.Option("--advise", help="Tell also where one more point sensor would help most."),
+    ] = False,
 ) -> None:
     """Check a case and its data, and tell what its sensors can identify.
 
@@ -332,6 +336,8 @@ def check(
         _show_data(console, loaded, prepared, samples)
     failed = _show_checks(console, prepared)
     notes = [*loaded.notes, *_show_preview(console, prepared)]
+    if advise:
+        _show_advice(console, prepared)
     for note in notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
     if failed:
@@ -368,6 +374,28 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
         title = f"What {found.samples} samples can tell, at best"
         _print_table(console, Table(title, columns, rows), "dim")
     return found.sentences
+
+
+def _show_advice(console: Console, prepared: Prepared) -> None:
+    """Print where one more sensor would help most."""
+    from livepde.cases.placement import advise
+    from livepde.runs import Table
+
+    found = advise(prepared, prepared.stream)
+    unit = prepared.case.frame.equation.length_unit
+    at = ", ".join(f"{x:.3g}" for x in found.position)
+    rows = [
+        (name, f"{100 * left:.2g} %", f"{100 * found.then[name]:.2g} %")
+        for name, left in found.now.items()
+    ]
+    title = f"One more sensor helps most at {at} {unit}".rstrip()
+    columns = ("unknown", "deviation left", "with the sensor")
+    _print_table(console, Table(title, columns, rows), "dim")
+    console.print(
+        f"Best of {found.candidates} vertices by the mean share of variance left, with the noise "
+        "of the other sensors.",
+        soft_wrap=True,
+    )
 
 
 def _show_model(console: Console, prepared: Prepared) -> None:
@@ -438,7 +466,8 @@ def _show_checks(console: Console, prepared: Prepared) -> bool:
     inputs = {name: values[name] for name in case.model.channels if values[name] == values[name]}
     report = check_model(case.model, u=prepared.u0, t=first.t, inputs=inputs)
     observed, size = prepared.identifier.observed, prepared.typical(inputs)
-    read = {name: values[name] for name in observed.observation.inputs}
+    # A sensor may see an input of the model, as in T(wall) + R_b Q/H.
+    read = inputs | {name: values[name] for name in observed.observation.inputs}
     reports = [report, check_observation(observed, at=size, inputs=read)]
     for item in reports:
         if item.ok:
