@@ -372,7 +372,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     if rows:
         columns = ("unknown", "prior deviation", "after", "left", "unit", "")
         title = f"What {found.samples} samples can tell, at best"
-        _print_table(console, Table(title, columns, rows), "dim")
+        _print_table(console, Table(title, columns, rows))
     return found.sentences
 
 
@@ -390,7 +390,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
     ]
     title = f"One more sensor helps most at {at} {unit}".rstrip()
     columns = ("unknown", "deviation left", "with the sensor")
-    _print_table(console, Table(title, columns, rows), "dim")
+    _print_table(console, Table(title, columns, rows))
     console.print(
         f"Best of {found.candidates} vertices by the mean share of variance left, with the noise "
         "of the other sensors.",
