@@ -15,9 +15,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from skfem import ElementLineP1
 
-from livepde.fem import Field, Inputs, Moment, RandomWalk, Scalar, dot, grad
+from livepde.fem import Field, Inputs, Moment, RandomWalk, Scalar, dot, grad, linear
 from livepde.fem import interval as line
 from livepde.identifier import Identifier
 from livepde.laws import Belief, Replay, SensitivityLaw
@@ -77,7 +76,7 @@ class Problem:
 
         ends: dict[str, Any] = {"left": lambda x, t: 5.0 * np.sin(t) + 0.0 * x[0], "right": 0.0}
         return Model(
-            Field(MESH, ElementLineP1(), dirichlet=ends),
+            Field(MESH, linear(MESH), dirichlet=ends),
             self.unknowns,
             A=flux,
             B=lambda u, v, x: loss * (u - 2.0) * v,
@@ -89,7 +88,7 @@ PROBLEMS: Mapping[str, Problem] = {
     "two numbers": Problem("diffusivity and heat loss", {"a": A, "b": Scalar(1.0, 0.4)}),
     "field": Problem(
         "diffusivity a(x), positive",
-        {"a": Field(MESH, ElementLineP1(), inner="H1", prior=0.3, std=0.1, transform="log")},
+        {"a": Field(MESH, linear(MESH), inner="H1", prior=0.3, std=0.1, transform="log")},
         SensitivityLaw(modes=15, replay=Replay()),
         sensors=5,
     ),
