@@ -20,7 +20,7 @@ from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
 from livepde.fem.evolution import Constant
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
-from livepde.streams import Twin
+from livepde.streams import AbsoluteNoise, Twin
 
 NOISE = 0.02
 SENSORS = {"a": 0.3, "b": 0.55, "c": 0.8}
@@ -398,3 +398,30 @@ def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
         # 0.5 * 3 * dq/dtheta * deviation of theta, on an interval of length 1
         strength = excitation.spectrum(state).strength
         assert strength == pytest.approx([0.5 * 3.0 * slope * 0.5])
+
+
+def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
+    """A logarithm that sensors see directly: the first samples overshot, and widened all."""
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"left": lambda x, t: np.sin(t) + 0 * x[0]}),
+        {"a": lp.Scalar(0.3, 0.1), "c": lp.Scalar(0.1, 0.05, transform="log")},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    points = lp.Points({"z": 0.5}, noise=NOISE, direct={"z": lambda q, x: 20.0 * q.c})
+    truth = {"a": 0.35, "c": 0.17}
+    noise = AbsoluteNoise(NOISE)
+    for seed in range(5):
+        twin = Twin(
+            model=model,
+            observation=points,
+            q_true=truth,
+            u0=0.0,
+            times=0.1 * np.arange(100),
+            noise=noise,
+            seed=seed,
+        )
+        law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+        estimate = lp.Identifier(model, points, law, u0=0.0).run(twin).last
+        assert estimate.belief.inflation < 1.3
+        for name, (value, std) in estimate.parameters.items():
+            assert abs(value - truth[name]) < 3.5 * std

@@ -164,16 +164,22 @@ class Filter:
         return q
 
     def predict(self, point: Point, moment: Moment) -> Array:
-        """Return what the sensors are expected to show."""
-        return self.problem.predict(point.u + point.du, self.latent(point), moment)
+        """Return what the sensors are expected to show, linear about the reference."""
+        predicted = self.problem.predict(point.u, point.q, moment)
+        if not (point.du.any() or point.da.any()):
+            return predicted
+        return predicted + self._seen(point, point.du[:, None], point.da[:, None], moment)[:, 0]
 
     def output(self, point: Point, moment: Moment) -> Array:
         """Return the derivative of the prediction along the columns of the factor, H [U; C]."""
-        problem, latent = self.problem, self.problem.model.latent
-        a = self.latent(point)
-        H_u, H_q = problem.observed.jacobian(point.u + point.du, latent.value(a), moment)
-        HC: Array = H_u @ point.U
-        return HC if H_q is None else HC + H_q @ latent.tangent(a, self.Phi @ point.C)
+        return self._seen(point, point.U, point.C, moment)
+
+    def _seen(self, point: Point, du: Array, da: Array, moment: Moment) -> Array:
+        """Return by how much the sensors see a change of state and reduced parameter."""
+        latent = self.problem.model.latent
+        H_u, H_q = self.problem.observed.jacobian(point.u, latent.value(point.q), moment)
+        seen: Array = H_u @ du
+        return seen if H_q is None else seen + H_q @ latent.tangent(point.q, self.Phi @ da)
 
     def reduced(self, dq: Array) -> Array:
         """Return a with Phi a = dq: the columns of Phi are orthonormal in Q."""
