@@ -12,7 +12,7 @@ import pytest
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.preview import preview
+from livepde.cases.preview import Preview, preview
 from livepde.cases.settings import parse, to_toml
 from livepde.cases.template import write_template
 from livepde.cases.units import convert
@@ -101,7 +101,8 @@ def test_template_runs_and_finds_the_truth(rod):
     assert data.sizes["time"] == 181
     assert int(np.isnan(data.innovation.sel(sensor="T_10")).sum()) == 2
     assert set(data.withheld.values) == {"T_20"}
-    rows, count = preview(prepared, prepared.stream)
+    found = preview(prepared, prepared.stream)
+    rows, count = found.unknowns, found.samples
     assert count == 181
     (row,) = rows
     assert row.left < 0.01
@@ -148,7 +149,7 @@ NO_REPLAY = ("replay = true ", "#")
 def test_layers(rod):
     prepared, data = result_of(rod(LAYERS))
     assert {"alpha[a]", "alpha[b]"} <= set(measures(data))
-    assert len(preview(prepared, prepared.stream)[0]) == 2
+    assert len(preview(prepared, prepared.stream).unknowns) == 2
 
 
 def test_layers_that_end_inside_of_a_cell_get_a_note(rod):
@@ -159,7 +160,7 @@ def test_layers_that_end_inside_of_a_cell_get_a_note(rod):
 def test_field(rod):
     prepared, data = result_of(rod(FIELD))
     assert data.attrs["fields"] == "alpha"
-    best, worst = preview(prepared, prepared.stream)[0]
+    best, worst = preview(prepared, prepared.stream).unknowns
     assert best.left < worst.left
     assert 3e-5 <= best.prior <= 1.01 * np.sqrt(2) * 3e-5  # std inside, more at free ends
 
@@ -171,7 +172,7 @@ def test_gradient_law_on_averages(rod):
     prepared, data = result_of(path)
     assert isinstance(prepared.case.law, lp.GradientLaw)
     assert not prepared.case.notes
-    assert preview(prepared, prepared.stream) == ([], 0)
+    assert preview(prepared, prepared.stream) == Preview()
     assert (data.status == 0).all()
 
 
@@ -586,14 +587,14 @@ def test_unknowns_that_move(rod, evolution, expected):
     assert type(unknown.evolution) is type(expected)
     assert vars(unknown.evolution) == pytest.approx(vars(expected))
     prepared = cases.load(path).prepare()
-    assert 0 < preview(prepared, prepared.stream)[0][0].left < 1
+    assert 0 < preview(prepared, prepared.stream).unknowns[0].left < 1
 
 
 def test_positive_unknowns(rod):
     path = rod(('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "log"'))
     prepared, data = result_of(path)
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
-    (row,) = preview(prepared, prepared.stream)[0]
+    (row,) = preview(prepared, prepared.stream).unknowns
     assert row.prior == pytest.approx(3e-5)
     assert row.left < 0.05
     case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))

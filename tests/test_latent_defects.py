@@ -318,8 +318,8 @@ def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
         if isinstance(item.z, dict)
     ]
     assert len(warmer) == len(stream)
-    (row,), _ = preview(prepared, stream)
-    (other,), _ = preview(prepared, warmer)
+    (row,) = preview(prepared, stream).unknowns
+    (other,) = preview(prepared, warmer).unknowns
     assert other.posterior == pytest.approx(row.posterior, rel=1e-6)
 
 

@@ -206,10 +206,14 @@ def bench(
         Path | None,
         typer.Option(help="With 'cases': folder for a page with tables and figures."),
     ] = None,
+    twins: Annotated[
+        int, typer.Option(min=1, help="With 'coverage': how many twins of each problem.")
+    ] = 200,
 ) -> None:
     """Measure what things cost, as ratios that hold on any machine, and what cases find.
 
     'cases' runs every case of the project with its variants, and the code that they name.
+    'coverage' counts how often the truth lies in the 68 % and 95 % intervals.
 
     Example:  livepde bench step
     Cases:    livepde bench cases --only soil_layers --json
@@ -217,13 +221,19 @@ def bench(
     from livepde.bench import BENCHMARKS
 
     if name == "list":
-        for key in (*BENCHMARKS, "cases"):
+        for key in (*BENCHMARKS, "cases", "coverage"):
             _console().print(key)
         return
     if name == "cases":
         _bench_cases(folder, only or [], gallery, as_json)
         return
-    outcome = _named(name, {**BENCHMARKS, "cases": None}, "benchmark")()
+    if name == "coverage":
+        from livepde.bench.coverage import coverage
+
+        command = ["livepde", "bench", name, "--twins", str(twins)]
+        _report_outcome(coverage(twins, progress=True), command, as_json)
+        return
+    outcome = _named(name, {**BENCHMARKS, "cases": None, "coverage": None}, "benchmark")()
     _report_outcome(outcome, ["livepde", "bench", name], as_json)
 
 
@@ -308,13 +318,15 @@ def check(
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
+    advise: Annotated[
+        bool,
+        typer.Option("--advise", help="Tell also where one more point sensor would help most."),
+    ] = False,
 ) -> None:
     """Check a case and its data, and tell what its sensors can identify.
 
     Nothing is written. Example:  livepde check mycase/case.toml
     """
-    from livepde.runs import Table
-
     console = _console()
     loaded = _load(case, allow_code, settings)
     prepared = loaded.prepare(data)
@@ -323,11 +335,10 @@ def check(
     if data is None or not data.endswith((".jsonl", ".ndjson")):
         _show_data(console, loaded, prepared, samples)
     failed = _show_checks(console, prepared)
-    rows, count = _preview(prepared)
-    if rows:
-        columns = ("unknown", "prior deviation", "after", "left", "unit", "")
-        _print_table(console, Table(f"What {count} samples can tell, at best", columns, rows))
-    for note in loaded.notes:
+    notes = [*loaded.notes, *_show_preview(console, prepared)]
+    if advise:
+        _show_advice(console, prepared)
+    for note in notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
     if failed:
         raise typer.Exit(CHECK_FAILED)
@@ -341,11 +352,13 @@ def _load(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
     return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 
 
-def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
+def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
+    """Print what the sensors can tell; return sentences on it."""
     from livepde.cases.preview import preview
+    from livepde.runs import Table
 
-    found, count = preview(prepared, prepared.stream)
-    return [
+    found = preview(prepared, prepared.stream)
+    rows = [
         (
             item.name,
             f"{item.prior:.3g}",
@@ -354,8 +367,35 @@ def _preview(prepared: Prepared) -> tuple[list[tuple[Any, ...]], int]:
             item.unit,
             "hardly identified" if item.hardly else "",
         )
-        for item in found
-    ], count
+        for item in found.unknowns
+    ]
+    if rows:
+        columns = ("unknown", "prior deviation", "after", "left", "unit", "")
+        title = f"What {found.samples} samples can tell, at best"
+        _print_table(console, Table(title, columns, rows))
+    return found.sentences
+
+
+def _show_advice(console: Console, prepared: Prepared) -> None:
+    """Print where one more sensor would help most."""
+    from livepde.cases.placement import advise
+    from livepde.runs import Table
+
+    found = advise(prepared, prepared.stream)
+    unit = prepared.case.frame.equation.length_unit
+    at = ", ".join(f"{x:.3g}" for x in found.position)
+    rows = [
+        (name, f"{100 * left:.2g} %", f"{100 * found.then[name]:.2g} %")
+        for name, left in found.now.items()
+    ]
+    title = f"One more sensor helps most at {at} {unit}".rstrip()
+    columns = ("unknown", "deviation left", "with the sensor")
+    _print_table(console, Table(title, columns, rows))
+    console.print(
+        f"Best of {found.candidates} vertices by the mean share of variance left, with the noise "
+        "of the other sensors.",
+        soft_wrap=True,
+    )
 
 
 def _show_model(console: Console, prepared: Prepared) -> None:
@@ -489,6 +529,8 @@ def run(
     prepared.describe(dataset)
     checks = checks_of(loaded.expected, dataset)
     notes = [*loaded.notes, *doubts(dataset)]
+    if len(driven.result):
+        notes += _traded(prepared)
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
@@ -517,6 +559,17 @@ def run(
         raise typer.Exit(INTERRUPTED)
     if as_json and not all(item.ok for item in checks):
         raise typer.Exit(CHECK_FAILED)
+
+
+def _traded(prepared: Prepared) -> list[str]:
+    """Return what a run's data tell only together."""
+    from livepde.diagnostics import identifiability
+    from livepde.laws import SensitivityLaw
+
+    if not isinstance(prepared.case.law, SensitivityLaw):
+        return []
+    belief = prepared.identifier.latent_belief()
+    return identifiability(prepared.case.model, belief).sentences
 
 
 def _must_be_empty(folder: Path) -> None:

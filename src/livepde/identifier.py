@@ -228,10 +228,13 @@ class Identifier:
         belief, latent = self.latent_belief(), self.model.latent
         if latent.plain:
             return belief
-        factor = belief.q_factor
-        if factor is not None:
-            factor = latent.tangent(belief.q, factor)
-        return replace(belief, q=latent.value(belief.q), q_factor=factor)
+        q_factor, prior_factor = (
+            None if factor is None else latent.tangent(belief.q, factor)
+            for factor in (belief.q_factor, belief.prior_factor)
+        )
+        return replace(
+            belief, q=latent.value(belief.q), q_factor=q_factor, prior_factor=prior_factor
+        )
 
     def _estimate(
         self,
@@ -257,7 +260,7 @@ class Identifier:
             steps=report.steps,
             notes=report.notes,
             held=held,
-            labels=self.model.parameter_space.labels,
+            space=self.model.parameter_space,
         )
 
     def estimate(self) -> Estimate:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["ensemble", "figure", "history", "overview", "profiles"]
+__all__ = ["ensemble", "figure", "history", "interval_95", "overview", "profiles"]
 
 # Okabe and Ito (2008): told apart with every common kind of colour blindness. Yellow is left out:
 # it cannot be seen on white.
@@ -33,6 +33,18 @@ MOST_LINES = 7  # in one panel; more sensors are drawn as one line with their ra
 MOST_POINTS = 20_000  # for which a free place for the legend is looked for
 PANEL = (5.4, 3.4)  # inches
 CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))  # span from which, factor, unit
+
+
+def interval_95(data: xr.Dataset, name: str) -> tuple[Array, Array]:
+    """Return the ends of the 95 % interval of a variable that has a deviation.
+
+    Those of the dataset, which are mapped through a transform and lie within bounds; where it has
+    none, the value and 1.96 deviations.
+    """
+    if f"{name}_low" in data:
+        return data[f"{name}_low"].values, data[f"{name}_high"].values
+    value, half = data[name].values, NORMAL_95 * data[f"{name}_std"].values
+    return value - half, value + half
 
 
 def _figure_class() -> type[Figure]:
@@ -186,13 +198,9 @@ def profiles(
             label=label,
             **style,  # type: ignore[arg-type]
         )
-    deviation = f"{name}_std"
-    if deviation in data:
-        half = NORMAL_95 * data[deviation].values[chosen[-1]]
-        last = data[name].values[chosen[-1]]
-        ax.fill_between(
-            x, last - half, last + half, color=shades[-1], alpha=0.25, linewidth=0, label="95 %"
-        )
+    if f"{name}_std" in data:
+        low, high = (end[chosen[-1]] for end in interval_95(data, name))
+        ax.fill_between(x, low, high, color=shades[-1], alpha=0.25, linewidth=0, label="95 %")
     if truth is not None and truth.ndim == 1:
         ax.plot(x, truth, color="black", linewidth=2.0, zorder=1.5, label="exact")
     elif truth is not None:
@@ -337,16 +345,20 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
     reach: list[Array] = []
     for k, label in enumerate(labels):
         value = data[label].values
-        half = NORMAL_95 * data[f"{label}_std"].values
+        low, high = interval_95(data, label)
         colour = PALETTE[k % len(PALETTE)]
         short = label[len(name) :].strip("[]") or name
-        known = bool(np.isfinite(half[-1]))
-        end = f"{short} = {value[-1]:.4g}" + (f" ± {half[-1]:.2g}" if known else "")
+        known = bool(np.isfinite(low[-1]))
+        end = f"{short} = {value[-1]:.4g}"
+        if f"{label}_low" in data:
+            end += f", {low[-1]:.3g} to {high[-1]:.3g}" if known else ""
+        elif known:
+            end += f" ± {high[-1] - value[-1]:.2g}"
         ax.plot(t, value, color=colour, label=end)
         reach.append(value)
         if known:
-            ax.fill_between(t, value - half, value + half, color=colour, alpha=0.2, linewidth=0)
-            reach += [(value - half)[late], (value + half)[late]]
+            ax.fill_between(t, low, high, color=colour, alpha=0.2, linewidth=0)
+            reach += [low[late], high[late]]
     finite = np.concatenate(reach)
     finite = finite[np.isfinite(finite)]
     if len(finite) and finite.max() > finite.min():

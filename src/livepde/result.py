@@ -10,7 +10,8 @@ import numpy as np
 import xarray as xr
 
 from livepde import plots
-from livepde.fem import FieldBlock
+from livepde.errors import ConfigurationError
+from livepde.fem import FieldBlock, FunctionSpace
 from livepde.laws import Belief, Status
 from livepde.linalg import Array
 from livepde.model import Model
@@ -45,6 +46,8 @@ class Estimate:
         Numbers of the law: norm of the residual, theta, innovation statistics.
     held
         Input channels whose last value was held because the sample had none.
+    space
+        The unknowns.
     """
 
     t: float
@@ -57,7 +60,7 @@ class Estimate:
     steps: int
     notes: Mapping[str, float]
     held: tuple[str, ...]
-    labels: Mapping[str, int]
+    space: FunctionSpace
 
     @property
     def q_std(self) -> Array | None:
@@ -75,8 +78,45 @@ class Estimate:
         std = self.q_std
         return {
             label: (float(self.q[k]), float(std[k]) if std is not None else np.nan)
-            for label, k in self.labels.items()
+            for label, k in self.space.labels.items()
         }
+
+    def interval(self, name: str, level: float = 0.95) -> tuple[Any, Any]:
+        """Return the ends of the central interval that holds an unknown with probability `level`.
+
+        Within its bounds, and not symmetric for one with a transform. NaN for a law without
+        covariance.
+
+        Parameters
+        ----------
+        name
+            Label of a scalar unknown, for which two numbers are returned; or name of a field, for
+            two arrays of coefficients.
+
+        Raises
+        ------
+        ConfigurationError
+            There is no such unknown.
+        """
+        space = self.space
+        std = self.q_std if self.q_std is not None else np.full_like(self.q, np.nan)
+        if name in space.labels:
+            k = space.labels[name]
+            low, high = _unknown(space, name).interval(self.q[k], std[k], level)
+            return float(low), float(high)
+        if name not in space.fields:
+            raise ConfigurationError(
+                f"interval: there is no unknown '{name}'; there are "
+                f"{[*space.labels, *space.fields]}."
+            )
+        part = space.part(name)
+        ends: tuple[Array, Array] = _unknown(space, name).interval(self.q[part], std[part], level)
+        return ends
+
+
+def _unknown(space: FunctionSpace, label: str) -> Any:
+    """Return the unknown that a label belongs to."""
+    return space.unknowns[label.split("[")[0]]
 
 
 class Result:
@@ -141,16 +181,19 @@ class Result:
             part = self.model.parameter_space.part(name)
             found[name] = field.at_vertices @ estimate.q[part]
             if belief.q_factor is not None:
-                found[f"{name}_std"] = belief.inflation * np.sqrt(
-                    ((field.at_vertices @ belief.q_factor[part]) ** 2).sum(axis=1)
-                )
+                squares = (field.at_vertices @ belief.q_factor[part]) ** 2
+                std = belief.inflation * np.sqrt(squares.sum(axis=1))
+                found[f"{name}_std"] = std
+                unknown = self.model.parameter_space.unknowns[name]
+                found |= _ends(name, unknown, found[name], std)
         return found
 
     def to_xarray(self) -> xr.Dataset:
         """Return a dataset with dimensions time, snapshot, vertex, sensor, withheld.
 
         Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
-        variables beside them; innovations over (`time`, `sensor`). Units are attributes.
+        variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
+        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes.
         """
         fields = list(self._fields)
         if self.last is not None and (not fields or fields[-1][0] != self.last.t):
@@ -171,16 +214,18 @@ class Result:
             }
         )
         units = self._units()
-        unknowns = self.model.parameter_space.unknowns
         for k, label in enumerate(self.model.parameter_space.labels):
-            unknown: Any = unknowns[label.split("[")[0]]
+            unknown = _unknown(self.model.parameter_space, label)
             values = np.array([row[k] for row in rows[1]], dtype=float)
             unit = {"units": unknown.unit}
             data[label] = ("time", values, {**unit, **_prior(unknown)})
-            data[f"{label}_std"] = ("time", np.array([row[k] for row in rows[2]]), unit)
+            std = np.array([row[k] for row in rows[2]], dtype=float)
+            data[f"{label}_std"] = ("time", std, unit)
+            for name, end in _ends(label, unknown, values, std).items():
+                data[name] = ("time", end, unit)
         for name in fields[0][1] if fields else ():
             values = np.array([profile[name][order] for _, profile in fields])
-            unit = {"units": units.get(name.removesuffix("_std"), "")}
+            unit = {"units": units.get(_bare(name), "")}
             data[name] = (("snapshot", "vertex"), values, unit)
         unit = {"units": self.observed.observation.unit}
         shape = (len(self._rows), self.observed.size)
@@ -234,6 +279,21 @@ def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[s
     names = _variables(name, block)
     rows = values.reshape(len(names), -1)
     return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
+
+
+def _ends(name: str, unknown: Any, values: Array, std: Array) -> dict[str, Array]:
+    """Return the variables with the ends of 95 % intervals, unless they are +- 1.96 deviations."""
+    if unknown.symmetric:
+        return {}
+    low, high = unknown.interval(values, std)
+    return {f"{name}_low": low, f"{name}_high": high}
+
+
+def _bare(name: str) -> str:
+    """Return what a variable beside an unknown belongs to."""
+    for end in ("_std", "_low", "_high"):
+        name = name.removesuffix(end)
+    return name
 
 
 def _prior(unknown: Any) -> dict[str, float]:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from livepde.cases.case import Prepared
+from livepde.diagnostics.identifiability import FLAT, identifiability
 from livepde.identifier import Sample
 from livepde.laws import Replay, SensitivityLaw
 from livepde.linalg import Array
 
-__all__ = ["HARDLY", "Identified", "preview"]
+__all__ = ["Identified", "Preview", "preview"]
 
-HARDLY = 0.9  # of the prior deviation left: the sensors have hardly told anything
 MOST_SAMPLES = 500
 NEVER = 1 << 60
 
@@ -44,11 +44,30 @@ class Identified:
     @property
     def hardly(self) -> bool:
         """True if the sensors have hardly told anything."""
-        return self.left > HARDLY
+        return self.left > FLAT
 
 
-def preview(prepared: Prepared, samples: Iterable[Sample]) -> tuple[list[Identified], int]:
-    """Return what the first samples would tell, linearised at the prior, and how many they are.
+@dataclass(frozen=True)
+class Preview:
+    """What the first samples of a case would tell.
+
+    Attributes
+    ----------
+    unknowns
+        One item for each number, two for each field.
+    samples
+        How many samples with a measurement it took.
+    sentences
+        What is traded off, and how many modes of each field are known.
+    """
+
+    unknowns: tuple[Identified, ...] = ()
+    samples: int = 0
+    sentences: tuple[str, ...] = ()
+
+
+def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
+    """Return what the first samples would tell, linearised at the prior.
 
     A filter that is linear about one reference has a covariance that does not depend on what is
     measured, only on when and with which inputs. So the law runs about the prior, never moves its
@@ -57,7 +76,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> tuple[list[Identif
     """
     law = prepared.case.law
     if not isinstance(law, SensitivityLaw):
-        return [], 0
+        return Preview()
     linear = SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
     identifier = prepared.identifier_with(linear)
     count = 0
@@ -67,13 +86,15 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> tuple[list[Identif
             count += bool(np.isfinite(estimate.innovation).any())
         if count >= MOST_SAMPLES:
             break
-    factor = identifier.latent_belief().q_factor if count else None
-    if factor is None:
-        return [], 0
-    latent = prepared.case.model.latent
-    Phi = linear.prepare(identifier.problem).Phi
-    before, after = (latent.tangent(latent.prior, root) for root in (Phi, factor))
-    return _compare(prepared, before, after), count
+    model = prepared.case.model
+    # What was measured does not matter here, so what the innovations say does not either.
+    belief = replace(identifier.latent_belief(), inflation=1.0)
+    prior, posterior = belief.prior_factor, belief.q_factor
+    if not count or prior is None or posterior is None:
+        return Preview()
+    before, after = (model.latent.tangent(model.latent.prior, f) for f in (prior, posterior))
+    found = identifiability(model, belief)
+    return Preview(tuple(_compare(prepared, before, after)), count, tuple(found.sentences))
 
 
 def _compare(prepared: Prepared, before: Array, after: Array) -> list[Identified]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from livepde.diagnostics.bounds import Errors, TwinTracker, bounds, conditions
 from livepde.diagnostics.constants import Part, Spaces, constants
 from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
+from livepde.diagnostics.identifiability import Identifiability, identifiability
 from livepde.diagnostics.law import check_law
 from livepde.diagnostics.links import Interpolation, Link, interpolation, link
 from livepde.diagnostics.model import check_model
@@ -26,6 +27,7 @@ __all__ = [
     "Errors",
     "Excitation",
     "ExcitationState",
+    "Identifiability",
     "Interpolation",
     "Link",
     "OnlineStopping",
@@ -44,6 +46,7 @@ __all__ = [
     "check_space",
     "conditions",
     "constants",
+    "identifiability",
     "interpolation",
     "link",
     "noise_size",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import NormalDist
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -152,6 +153,29 @@ class _Prior:
     def latent_bounds(self) -> tuple[float, float]:
         """Bounds of the latent coefficients: none where a transform keeps them."""
         return self.bounds if self.transform is None else (-np.inf, np.inf)
+
+    @property
+    def symmetric(self) -> bool:
+        """True if intervals are value +- deviations: neither a transform nor bounds."""
+        return self.transform is None and not np.isfinite(self.bounds).any()
+
+    def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
+        """Return the ends of the central interval that holds the unknown with probability `level`.
+
+        Quantiles of the Gaussian belief about the latent values, mapped through the transform and
+        cut off at the bounds.
+
+        Parameters
+        ----------
+        value, std
+            Estimates and their deviations, of any one shape.
+        """
+        if not 0.0 < level < 1.0:
+            raise SpaceError(f"interval: level must lie between 0 and 1; got {level}.")
+        z = NormalDist().inv_cdf(0.5 + 0.5 * level)
+        value, std = np.asarray(value, dtype=float), np.asarray(std, dtype=float)
+        low, high = (np.clip(self.map.shifted(value, std, s), *self.bounds) for s in (-z, z))
+        return low, high
 
     def _check(self) -> None:
         what = type(self).__name__

@@ -35,6 +35,22 @@ class Transform(ABC):
     def inverse(self, q: Array) -> Array:
         """Return the latent value of q; not finite where q lies outside of the range of T."""
 
+    def shifted(self, q: Array, std: Array, z: float) -> Array:
+        """Return q with its latent value moved by z deviations: a quantile of T(Gaussian).
+
+        Parameters
+        ----------
+        q, std
+            T of the latent mean, and T' times the latent deviation; NaN stays NaN. Where q has
+            reached the end of T's range to rounding, that deviation is not known any more, and the
+            end on the side of z is returned.
+        """
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            latent = self.inverse(q)
+            moved = latent + z * std / self.slope(latent)
+            moved = np.where(np.isfinite(moved), moved, np.copysign(np.inf, z))
+            return np.where(np.isnan(std), np.nan, self.value(moved))
+
 
 @dataclass(frozen=True)
 class Identity(Transform):

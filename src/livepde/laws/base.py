@@ -90,6 +90,9 @@ class Belief:
         a law that has no covariance.
     inflation
         Factor on all standard deviations for correlated or too large innovations, >= 1.
+    prior_factor
+        Square root of the covariance of q before the first sample, shape (m, k), its columns
+        orthonormal in Q.
     """
 
     q: Array
@@ -97,6 +100,7 @@ class Belief:
     q_factor: Array | None = None
     u_factor: Array | None = None
     inflation: float = 1.0
+    prior_factor: Array | None = None
 
     @property
     def q_std(self) -> Array | None:

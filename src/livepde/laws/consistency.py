@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ __all__ = ["Consistency"]
 WINDOW = 500  # samples: older innovations fade, so that a poor start is forgotten
 SLOW = 50  # samples over which innovations are averaged to find errors that hide below the noise
 LARGEST_CORRELATION = 0.999
+SIGNIFICANT = 1.645  # standard errors above 1 that a statistic has by chance in 5 of 100 cases
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,31 +23,35 @@ class Consistency:
 
     Attributes
     ----------
-    count, square
-        Sums of 1 and of e_k^2 over innovations, fading over `WINDOW` samples.
+    count, weight, square
+        Sums of 1, of squared weights, and of e_k^2 over innovations, fading over `WINDOW` samples.
     pairs, product
         Sums of 1 and of e_k e_(k-1).
-    slow_count, slow_square
-        Sums of 1 and of the squared `slow`.
+    slow_expected, slow_square
+        Sums of `slow_variance` and of the squared `slow`.
     last
         Last e of each sensor, shape (sensors,), NaN before its first.
-    slow
-        Exponential average of e over `SLOW` samples, shape (sensors,).
+    slow, slow_variance
+        Exponential average of e over `SLOW` samples, and its variance for white noise of size 1,
+        shapes (sensors,).
     """
 
     count: float
+    weight: float
     square: float
     pairs: float
     product: float
-    slow_count: float
+    slow_expected: float
     slow_square: float
     last: Array
     slow: Array
+    slow_variance: Array
 
     @classmethod
     def start(cls, sensors: int) -> Consistency:
         """Return the value before any innovation."""
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.full(sensors, np.nan), np.zeros(sensors))
+        never, zero = np.full(sensors, np.nan), np.zeros(sensors)
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, never, zero, zero)
 
     def add(self, e: Array) -> Consistency:
         """Return the value after one more vector of normalised innovations."""
@@ -53,16 +59,20 @@ class Consistency:
         both = np.isfinite(products)
         seen = np.isfinite(e)
         slow = np.where(seen, self.slow + (e - self.slow) / SLOW, self.slow)
+        kept = (1.0 - 1.0 / SLOW) ** 2 * self.slow_variance + 1.0 / SLOW**2
+        slow_variance = np.where(seen, kept, self.slow_variance)
         fade = 1.0 - 1.0 / WINDOW
         return Consistency(
             fade * self.count + float(seen.sum()),
+            fade**2 * self.weight + float(seen.sum()),
             fade * self.square + float(np.nansum(e**2)),
             fade * self.pairs + float(both.sum()),
             fade * self.product + float(products[both].sum()),
-            fade * self.slow_count + float(seen.sum()),
+            fade * self.slow_expected + float(slow_variance[seen].sum()),
             fade * self.slow_square + float((slow[seen] ** 2).sum()),
             np.where(seen, e, self.last),
             slow,
+            slow_variance,
         )
 
     @property
@@ -85,9 +95,7 @@ class Consistency:
         Model errors smaller than the noise hardly correlate one innovation with the next, and yet
         do not average out.
         """
-        if not self.slow_count:
-            return 1.0
-        return (2 * SLOW - 1) * self.slow_square / self.slow_count
+        return self.slow_square / self.slow_expected if self.slow_expected else 1.0
 
     @property
     def inflation(self) -> float:
@@ -96,6 +104,31 @@ class Consistency:
         By how much a mean of the innovations is less certain than one of white noise of the stated
         size. The larger of two variances: `persistence`, and ratio (1 + rho)/(1 - rho), of errors
         that follow a first-order autoregression.
+
+        Both scatter about 1 where the model is right, and the larger one lies above 1 more often
+        than not. So each counts by what it exceeds chance: see `_beyond_chance`. Their standard
+        errors are those for white noise: of N values the mean square has the variance 2/N, the
+        correlation 1/N; and `SLOW` values make one independent value of `slow`, of which each
+        sensor has one from the start.
         """
+        if not self.weight:
+            return 1.0
+        values = self.count**2 / self.weight
         rho = max(self.correlation, 0.0)
-        return float(np.sqrt(max(1.0, self.ratio * (1 + rho) / (1 - rho), self.persistence)))
+        following = self.ratio * (1 + rho) / (1 - rho)
+        averages = float(np.isfinite(self.last).sum()) + values / SLOW
+        variances = (
+            _beyond_chance(following, math.sqrt(6.0 / values)),
+            _beyond_chance(self.persistence, math.sqrt(2.0 / averages)),
+        )
+        return math.sqrt(max(variances))
+
+
+def _beyond_chance(variance: float, error: float) -> float:
+    """Return a variance, shrunk towards 1 as far as its standard error explains what it exceeds 1.
+
+    1 + x (1 - (c/x)^2) where the excess x is larger than c = `SIGNIFICANT` standard errors, else 1:
+    nothing is lost of what is far beyond chance.
+    """
+    excess, chance = variance - 1.0, SIGNIFICANT * error
+    return 1.0 + excess * (1.0 - (chance / excess) ** 2) if excess > chance else 1.0

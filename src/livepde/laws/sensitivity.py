@@ -346,6 +346,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             work.Phi @ now.C,
             now.U,
             now.consistency.inflation,
+            work.Phi,
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from livepde.plots import interval_95
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
 __all__ = ["checks_of", "digits", "measures", "scalars", "scored", "shown", "tables"]
@@ -85,6 +86,15 @@ def scalars(data: xr.Dataset) -> list[str]:
     return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
 
 
+def _interval(data: xr.Dataset, label: str) -> str:
+    """Return the last 95 % interval as text, its ends to the second digit of the deviation."""
+    std = float(data[f"{label}_std"][-1])
+    if not math.isfinite(std):
+        return "–"
+    low, high = (digits(float(end[-1]), std)[0] for end in interval_95(data, label))
+    return f"{low} to {high}"
+
+
 def _error(data: xr.Dataset, label: str) -> float:
     """Return the relative error of the last estimate to the reference, NaN without one."""
     reference = float(data[label].attrs.get("reference", math.nan))
@@ -148,12 +158,13 @@ def tables(data: xr.Dataset) -> list[Table]:
         compared = any("reference" in data[label].attrs for label in labels)
         for label in labels:
             value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
-            cells = [*digits(value, std), data[label].attrs.get("units", "")]
+            cells = [*digits(value, std), _interval(data, label)]
+            cells.append(data[label].attrs.get("units", ""))
             if compared:
                 cells.append(shown(float(data[label].attrs.get("reference", math.nan)), ".5g"))
                 cells.append(shown(100 * _error(data, label), ".2g", " %"))
             rows.append((label, *cells))
-        columns: tuple[str, ...] = ("unknown", "value", "± deviation", "unit")
+        columns: tuple[str, ...] = ("unknown", "value", "± deviation", "95 %", "unit")
         title = "Estimates"
         if compared:
             columns += ("reference", "error")

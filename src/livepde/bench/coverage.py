@@ -1,0 +1,256 @@
+"""Whether intervals hold what they promise: coverage over twins with true values from the prior.
+
+Each twin draws its unknowns from the prior, makes its data with the estimator's own scheme, adds
+noise, and asks whether the truth lies in the 68 % and 95 % intervals. If prior, model and noise are
+right, as many do as the level says. In the last problem the model is wrong: its data have a loss of
+heat, of a random size, that the model does not know. Then the interval has to be wide enough, or
+the run has to say that the model does not explain the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from livepde.fem import Field, Inputs, Moment, RandomWalk, Scalar, dot, grad, linear
+from livepde.fem import interval as line
+from livepde.identifier import Identifier
+from livepde.laws import Belief, Replay, SensitivityLaw
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Points
+from livepde.progress import watched
+from livepde.result import Estimate
+from livepde.runs import doubts
+from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import Advance, ForwardStage, ImplicitEuler, Interval, advance
+
+__all__ = ["PROBLEMS", "Problem", "Twin", "coverage", "twin"]
+
+LEVELS = (0.68, 0.95)
+WITHIN = {0.68: (0.60, 0.76), 0.95: (0.90, 0.98)}  # what the shares over 200 twins have to lie in
+HONEST = 0.9  # of the wrong models: wide enough, or doubted
+FALSE_ALARM = 0.05  # of the right models doubted, at most
+NOISE = 0.05
+MODEL_ERROR = "The model does not explain the data"
+MESH = line(0.0, 1.0, 20)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A rod, heated at its left end, with point sensors.
+
+    Attributes
+    ----------
+    title
+        What is unknown.
+    unknowns
+        What the estimator knows of them.
+    law
+        Of the estimator.
+    sensors
+        How many, equidistant.
+    loss
+        rng -> heat loss of the truth that the model does not know; None: the model is right.
+    samples
+        How many, 0.1 apart.
+    """
+
+    title: str
+    unknowns: Mapping[str, Any]
+    law: SensitivityLaw = field(default_factory=lambda: SensitivityLaw(replay=Replay()))
+    sensors: int = 3
+    loss: Callable[[np.random.Generator], float] | None = None
+    samples: int = 100
+
+    def model(self, loss: float = 0.0) -> Model:
+        """Return u_t - (a u_x)_x + (b + loss) (u - 2) = 0, with b among the unknowns or not."""
+
+        def flux(q: Any, u: Any, v: Any, x: Any) -> Any:
+            found = q.a * dot(grad(u), grad(v))
+            return found + q.b * (u - 2.0) * v if "b" in self.unknowns else found
+
+        ends: dict[str, Any] = {"left": lambda x, t: 5.0 * np.sin(t) + 0.0 * x[0], "right": 0.0}
+        return Model(
+            Field(MESH, linear(MESH), dirichlet=ends),
+            self.unknowns,
+            A=flux,
+            B=lambda u, v, x: loss * (u - 2.0) * v,
+        )
+
+
+A = Scalar(0.3, 0.06)
+PROBLEMS: Mapping[str, Problem] = {
+    "two numbers": Problem("diffusivity and heat loss", {"a": A, "b": Scalar(1.0, 0.4)}),
+    "field": Problem(
+        "diffusivity a(x), positive",
+        {"a": Field(MESH, linear(MESH), inner="H1", prior=0.3, std=0.1, transform="log")},
+        SensitivityLaw(modes=15, replay=Replay()),
+        sensors=5,
+    ),
+    "random walk": Problem(
+        "diffusivity that changes",
+        {"a": Scalar(0.3, 0.06, transform="log", evolution=RandomWalk(0.1))},
+        SensitivityLaw(),
+    ),
+    "wrong model": Problem(
+        "diffusivity; a heat loss is missing in the model",
+        {"a": A},
+        loss=lambda rng: float(np.exp(rng.uniform(np.log(0.003), np.log(1.0)))),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Twin:
+    """What one twin tells.
+
+    Attributes
+    ----------
+    inside
+        Level -> share of what is compared that lies in its interval: numbers at the end of the run,
+        a field at all vertices, a moving number at ten times.
+    error
+        Mean square of errors of latent values over their deviations.
+    inflation
+        Factor on the deviations at the end.
+    doubted
+        True if the run says that its model does not explain the data.
+    """
+
+    inside: Mapping[float, float]
+    error: float
+    inflation: float
+    doubted: bool
+
+
+def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
+    """Run all problems, each with so many twins."""
+    todo = [(name, seed) for name in PROBLEMS for seed in range(twins)]
+    found: dict[str, list[Twin]] = {name: [] for name in PROBLEMS}
+    for name, seed in watched(todo, len(todo), "twins") if progress else todo:
+        found[name].append(twin(PROBLEMS[name], seed))
+    rows, checks = [], []
+    for name, several in found.items():
+        inside = {level: _mean([one.inside[level] for one in several]) for level in LEVELS}
+        doubted = _mean([one.doubted for one in several])
+        honest = _mean([one.doubted or one.inside[0.95] == 1.0 for one in several])
+        rows.append(
+            (
+                name,
+                PROBLEMS[name].title,
+                *inside.values(),
+                float(np.sqrt(_mean([one.error for one in several]))),
+                _mean([one.inflation for one in several]),
+                doubted,
+            )
+        )
+        if PROBLEMS[name].loss is None:
+            checks += [
+                Check(f"{name}: in the {level:.0%} interval", inside[level], WITHIN[level], "in")
+                for level in LEVELS
+            ]
+            checks.append(Check(f"{name}: doubted", doubted, FALSE_ALARM, "<="))
+        else:
+            checks.append(Check(f"{name}: in the 95% interval, or doubted", honest, HONEST, ">="))
+    columns = ("problem", "unknown", "68 %", "95 %", "error / deviation", "inflation", "doubted")
+    note = (
+        f"True values are drawn from the prior, {twins} times; noise {NOISE:g}. Errors over "
+        "deviations are root mean squares, 1 if the deviations are right."
+    )
+    return Outcome([Table("Share of true values in the interval", columns, rows)], checks, [note])
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values))
+
+
+def twin(problem: Problem, seed: int) -> Twin:
+    """Run one twin; the same seed gives the same numbers."""
+    rng = np.random.default_rng(seed)
+    model = problem.model()
+    truth = model if problem.loss is None else problem.model(problem.loss(rng))
+    positions = (np.arange(problem.sensors) + 1.0) / (problem.sensors + 1)
+    points = Points(positions.tolist(), noise=NOISE)
+    identifier = Identifier(model, points, problem.law, u0=0.0)
+    times = np.linspace(0.0, 0.1 * problem.samples, problem.samples + 1)
+    path = _path(truth, times, rng)
+    G = points.matrix(truth.state_space)
+    compared = set(range(problem.samples, 0, -problem.samples // 20)[:10])
+    moving = model.latent.moves
+    samples, scores = [], []
+    for k, u in enumerate(_states(truth, path, times)):
+        z = G @ u + NOISE * rng.standard_normal(problem.sensors)
+        estimate = identifier.step(times[k], z)
+        samples.append(estimate)
+        if (moving and k in compared) or k == problem.samples:
+            scores.append(_score(model, estimate, identifier.latent_belief(), path[k]))
+    inside, errors = zip(*scores, strict=True)
+    result = identifier.run([])  # the estimates as a dataset, for what the run says of itself
+    for estimate in samples:
+        result.add(estimate)
+    return Twin(
+        {level: _mean([one[level] for one in inside]) for level in LEVELS},
+        _mean(errors),
+        samples[-1].belief.inflation,
+        any(sentence.startswith(MODEL_ERROR) for sentence in doubts(result.to_xarray())),
+    )
+
+
+def _path(model: Model, times: Array, rng: np.random.Generator) -> Array:
+    """Return latent coefficients from the prior at each time, as they move, (times, m)."""
+    latent = model.latent
+    gram = model.Q.gram.toarray()
+    # q ~ N(prior, G^{-1}): with G = L L^T it is prior + L^{-T} times white noise.
+    root = np.linalg.inv(np.linalg.cholesky(gram)).T
+    a = latent.prior + root @ rng.standard_normal(latent.dim)
+    path = [a]
+    for t0, t1 in pairwise(times):
+        a = latent.moved(a, t1 - t0)
+        for item in latent.parts.values():
+            grown = np.repeat(item.evolution.growth(t1 - t0, item.unknown.latent_std), item.size)
+            if grown.any():
+                noise = root[item.part, item.part] @ rng.standard_normal(len(grown))
+                a = a.copy()
+                a[item.part] += np.sqrt(grown) * noise
+        path.append(a)
+    return np.array(path)
+
+
+def _states(model: Model, path: Array, times: Array) -> Iterator[Array]:
+    """Yield the states of the truth, whose parameter may change from sample to sample."""
+    forward, control = ForwardStage(model), Advance(ImplicitEuler())
+    nothing, none = Inputs({}), np.zeros(0)
+    u = model.initial(0.0, Moment(times[0], nothing))
+    yield u
+    for q, (t0, t1) in zip(path[1:], pairwise(times), strict=True):
+        interval = Interval(t0, t1, nothing, nothing, none, none)
+
+        def stage(c: Array, t: float, h: float, q: Array = q, at: Any = interval.at) -> Array:
+            return forward.solve(c, q, h, at(t))
+
+        u, _, failure = advance(control, stage, u, interval)
+        if failure is not None:
+            raise failure
+        yield u
+
+
+def _score(
+    model: Model, estimate: Estimate, belief: Belief, truth: Array
+) -> tuple[dict[float, float], float]:
+    """Return the shares inside the intervals, and the mean square of normalised errors."""
+    space, exact = model.parameter_space, model.latent.value(truth)
+    inside = {}
+    for level in LEVELS:
+        hits = []
+        for name in (*space.labels, *space.fields):
+            part = space.labels[name] if name in space.labels else space.part(name)
+            low, high = estimate.interval(name, level)
+            hits.append(np.mean((low <= exact[part]) & (exact[part] <= high)))
+        inside[level] = _mean(hits)
+    errors = (belief.q - truth) / np.asarray(belief.q_std, dtype=float)
+    return inside, float(np.mean(errors**2))

@@ -1,0 +1,220 @@
+"""What a belief knows more than the prior: what is pinned, flat, traded off, at a bound.
+
+Prior and posterior are compared in the reduced coordinates of the law, in which the prior is
+N(0, I): there the covariance itself is the posterior-to-prior ratio, its eigenvalues do not depend
+on units, and the root of one is the share of the prior deviation that is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.errors import ConfigurationError
+from livepde.laws import Belief
+from livepde.linalg import Array
+from livepde.model import Model
+
+__all__ = ["FLAT", "Direction", "Identifiability", "Known", "identifiability"]
+
+PINNED = 0.1  # of the prior deviation left, at most
+FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly anything
+TRADED = 0.9  # correlation from which two unknowns are one
+WEIGHT = 0.3  # least weight in a combination of length one that is named
+
+
+@dataclass(frozen=True)
+class Known:
+    """How well one unknown is known.
+
+    Attributes
+    ----------
+    name
+        Label of a number, or name of a field.
+    left
+        Share of its prior deviation that is left; of a field root mean square over its modes.
+    modes
+        Of a field how many combinations of its modes are pinned, and flat, and how many modes it
+        has; of a number nothing.
+    bound
+        The bound at which a number lies, NaN for none.
+    moves
+        True if it changes by itself: then it is never known for good.
+    """
+
+    name: str
+    left: float
+    modes: tuple[int, int, int] | None = None
+    bound: float = np.nan
+    moves: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """In one word: "at its bound", "pinned", "flat" or "partly"."""
+        if np.isfinite(self.bound):
+            return "at its bound"
+        if self.left <= PINNED:
+            return "pinned"
+        return "flat" if self.left > FLAT and not self.moves else "partly"
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of numbers, in prior deviations, and the share of its deviation left."""
+
+    weights: Mapping[str, float]
+    left: float
+
+    def __str__(self) -> str:
+        terms = [f"{'-' if w < 0 else '+'} {abs(w):.2g} {name}" for name, w in self.weights.items()]
+        return " ".join(terms).removeprefix("+ ")
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a belief knows more than the prior.
+
+    Attributes
+    ----------
+    unknowns
+        One item for each number and field.
+    pairs
+        Two names and their correlation, if beyond 0.9: only a combination of both is known. Of a
+        number and a field its multiple correlation with the modes.
+    directions
+        Leading combinations of three or more numbers that are pinned while none of them is.
+    """
+
+    unknowns: tuple[Known, ...]
+    pairs: tuple[tuple[str, str, float], ...]
+    directions: tuple[Direction, ...]
+
+    @property
+    def sentences(self) -> list[str]:
+        """What is traded off, and how many modes of each field are known."""
+        found = [
+            f"{a} and {b} are traded off against each other (correlation {r:+.2f}): the data tell "
+            "a combination of them, not each alone."
+            for a, b, r in self.pairs
+        ]
+        found += [
+            f"Of {', '.join(d.weights)} the data pin the combination {d} (in prior deviations; "
+            f"{d.left:.0%} left), and none of them alone."
+            for d in self.directions
+        ]
+        found += [
+            f"{item.name}: of {item.modes[2]} modes the data pin {item.modes[0]}; "
+            f"{item.modes[1]} are as the prior left them."
+            for item in self.unknowns
+            if item.modes is not None
+        ]
+        return found
+
+
+def identifiability(model: Model, belief: Belief) -> Identifiability:
+    """Compare a belief with its prior.
+
+    Parameters
+    ----------
+    belief
+        In latent coefficients: `Identifier.latent_belief()`.
+
+    Raises
+    ------
+    ConfigurationError
+        The law has no covariance.
+
+    >>> import livepde as lp, numpy as np
+    >>> from skfem import ElementLineP1
+    >>> model = lp.Model(
+    ...     lp.Field(lp.interval(0, 1, 4), ElementLineP1()),
+    ...     {"a": lp.Scalar(), "b": lp.Scalar()},
+    ...     A=lambda q, u, v, x: (q.a - q.b) * u * v,
+    ... )
+    >>> identifier = lp.Identifier(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), u0=1.0)
+    >>> for t in (1.0, 2.0, 3.0):
+    ...     _ = identifier.step(t, [1.0])
+    >>> (found,) = identifiability(model, identifier.latent_belief()).pairs
+    >>> found[:2]
+    ('a', 'b')
+    """
+    prior, posterior = belief.prior_factor, belief.q_factor
+    if prior is None or posterior is None:
+        raise ConfigurationError(
+            "identifiability needs a belief with a covariance: run the SensitivityLaw."
+        )
+    latent, space = model.latent, model.parameter_space
+    labels = list(space.labels)
+    rows = list(space.labels.values())
+    before = np.linalg.norm(latent.tangent(belief.q, prior)[rows], axis=1)
+    numbers = latent.tangent(belief.q, posterior)[rows] / before[:, None]
+    unknowns = [
+        Known(
+            label,
+            belief.inflation * float(np.linalg.norm(row)),
+            bound=_bound(model, belief, label),
+            moves=space.unknowns[label.split("[")[0]].evolution.moves,
+        )
+        for label, row in zip(labels, numbers, strict=True)
+    ]
+    pairs = _pairs(labels, numbers)
+    reduced = prior.T @ model.Q.dual(posterior)
+    for name in space.fields:
+        item = latent.parts[name]
+        block = reduced[np.abs(prior[item.part]).max(axis=0) > 0.0]
+        left = belief.inflation * np.linalg.svd(block, compute_uv=False)
+        counts = (int((left <= PINNED).sum()), int((left > FLAT).sum()), len(block))
+        rms = float(np.sqrt((left**2).sum() / len(block)))
+        unknowns.append(Known(name, rms, counts, moves=item.evolution.moves))
+        pairs += [
+            (label, name, r)
+            for label, row in zip(labels, numbers, strict=True)
+            if (r := _explained(row, block)) > TRADED
+        ]
+    return Identifiability(
+        tuple(unknowns), tuple(pairs), tuple(_directions(unknowns, labels, numbers, belief))
+    )
+
+
+def _bound(model: Model, belief: Belief, label: str) -> float:
+    """Return the bound at which a number lies, NaN for none."""
+    k = model.parameter_space.labels[label]
+    value = model.latent.value(belief.q)[k]
+    ends = [end[k] for end in model.latent.limits if end[k] == value]
+    return float(ends[0]) if ends else np.nan
+
+
+def _pairs(labels: list[str], factor: Array) -> list[tuple[str, str, float]]:
+    """Return pairs of numbers that are correlated beyond `TRADED`."""
+    unit = factor / np.linalg.norm(factor, axis=1)[:, None]
+    r = unit @ unit.T
+    found = np.argwhere(np.triu(np.abs(r) > TRADED, 1))
+    return [(labels[i], labels[j], float(r[i, j])) for i, j in found]
+
+
+def _explained(row: Array, block: Array) -> float:
+    """Return the multiple correlation of a number with the modes of a field."""
+    fit = np.linalg.lstsq(block.T, row, rcond=1e-10)[0]
+    return float(np.linalg.norm(fit @ block) / np.linalg.norm(row))
+
+
+def _directions(
+    unknowns: list[Known], labels: list[str], factor: Array, belief: Belief
+) -> list[Direction]:
+    """Return pinned combinations of three or more numbers that are not pinned themselves."""
+    vectors, sizes, _ = np.linalg.svd(factor, full_matrices=False)
+    known = dict(zip(labels, unknowns, strict=False))
+    found = []
+    for vector, size in zip(vectors.T, sizes, strict=True):
+        left = belief.inflation * float(size)
+        members = {
+            name: float(weight)
+            for name, weight in zip(labels, vector, strict=True)
+            if abs(weight) >= WEIGHT
+        }
+        open_ = all(known[name].left > PINNED for name in members)
+        if left <= PINNED and len(members) > 2 and open_:
+            found.append(Direction(members, left))
+    return found

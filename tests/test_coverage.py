@@ -1,0 +1,61 @@
+"""The benchmark that counts how often the truth lies in the interval."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from livepde.bench import coverage
+from livepde.bench.coverage import PROBLEMS, twin
+from livepde.cli import app
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_twin_is_the_same_for_the_same_seed(name: str):
+    first, again, other = (twin(PROBLEMS[name], seed) for seed in (1, 1, 2))
+    assert first == again
+    assert first.error != other.error
+    assert set(first.inside) == {0.68, 0.95}
+
+
+def test_true_values_are_drawn_from_the_prior_and_move_as_it_says():
+    problem, times = PROBLEMS["random walk"], np.linspace(0.0, 4.0, 41)
+    model, rng = problem.model(), np.random.default_rng(0)
+    paths = np.array([coverage._path(model, times, rng)[:, 0] for _ in range(400)])
+    latent = problem.unknowns["a"].latent_std
+    assert paths[:, 0].mean() == pytest.approx(np.log(0.3), abs=0.04)
+    assert paths[:, 0].std() == pytest.approx(latent, rel=0.1)
+    assert (paths[:, -1] - paths[:, 0]).std() == pytest.approx(0.1 * np.sqrt(4.0), rel=0.1)
+    field = PROBLEMS["field"].model()
+    draws = np.array([coverage._path(field, times[:2], rng)[0] for _ in range(400)])
+    expected = np.sqrt(np.diag(np.linalg.inv(field.Q.gram.toarray())))
+    assert draws.std(axis=0) == pytest.approx(expected, rel=0.2)
+
+
+def test_intervals_hold_what_they_promise():
+    several = [twin(PROBLEMS["two numbers"], seed) for seed in range(40)]
+    assert np.mean([one.inside[0.95] for one in several]) > 0.87
+    assert 0.5 < np.mean([one.inside[0.68] for one in several]) < 0.85
+    assert not any(one.doubted for one in several)
+
+
+def test_a_wrong_model_is_doubted_or_its_interval_is_wide_enough():
+    large = replace(PROBLEMS["wrong model"], loss=lambda rng: 1.0)
+    assert twin(large, 0).doubted
+    several = [twin(PROBLEMS["wrong model"], seed) for seed in range(12)]
+    assert np.mean([one.doubted or one.inside[0.95] == 1.0 for one in several]) > 0.8
+
+
+def test_the_command_prints_checks(monkeypatch: pytest.MonkeyPatch):
+    short = {name: replace(item, samples=20) for name, item in PROBLEMS.items()}
+    monkeypatch.setattr(coverage, "PROBLEMS", short)
+    done = CliRunner().invoke(app, ["bench", "coverage", "--twins", "2", "--json"])
+    found = json.loads(done.stdout)
+    assert done.exit_code == (0 if all(item["ok"] for item in found["checks"]) else 1)
+    assert len(found["tables"][0]["rows"]) == len(PROBLEMS)
+    bounds = {item["name"]: item["bound"] for item in found["checks"]}
+    assert bounds["two numbers: in the 95% interval"] == [0.9, 0.98]

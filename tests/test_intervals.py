@@ -1,0 +1,100 @@
+"""Intervals of unknowns: quantiles that go through a transform and stay within bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde import plots
+from livepde.runs import tables
+
+MESH = lp.interval(0.0, 1.0, 8)
+TIMES = 0.1 * np.arange(1, 11)
+
+
+def identifier(law: lp.AnyLaw | None = None, **unknowns: Any) -> lp.Identifier:
+    model = lp.Model(
+        lp.Field(MESH, ElementLineP1(), dirichlet={"boundary": 0.0}),
+        unknowns,
+        A=lambda q, u, v, x: next(iter(vars(q).values())) * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    law = law or lp.SensitivityLaw(noise=0.1)
+    observation = lp.Points([0.5]) if isinstance(law, lp.SensitivityLaw) else lp.Full()
+    return lp.Identifier(model, observation, law, u0=lambda x: np.sin(np.pi * x[0]))
+
+
+def run(ident: lp.Identifier) -> tuple[Any, Any]:
+    """Return the last estimate and the dataset."""
+    size = ident.observed.size
+    result = ident.run([(t, np.full(size, np.exp(-3 * t))) for t in TIMES])
+    return result.last, result.to_xarray()
+
+
+def test_a_plain_number_has_value_and_deviations():
+    estimate, data = run(identifier(a=lp.Scalar(0.3, 0.1)))
+    value, std = estimate.parameters["a"]
+    assert estimate.interval("a") == pytest.approx((value - 1.959964 * std, value + 1.959964 * std))
+    assert estimate.interval("a", 0.6826895) == pytest.approx((value - std, value + std))
+    assert "a_low" not in data
+
+
+def test_a_logarithm_has_quantiles_of_a_log_normal_number():
+    estimate, data = run(identifier(a=lp.Scalar(0.3, 0.3, transform="log")))
+    value, std = estimate.parameters["a"]
+    low, high = estimate.interval("a")
+    assert low > 0
+    assert low * high == pytest.approx(value**2)
+    assert np.log(high / value) == pytest.approx(1.959964 * std / value)
+    assert (data["a_low"][-1], data["a_high"][-1]) == (low, high)
+    (ends,) = (row[3] for row in tables(data)[0].rows)
+    assert ends.split(" to ")[0].startswith(f"{low:.2g}")
+
+
+def test_bounds_cut_an_interval_off():
+    estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1, bounds=(0.28, 0.33))))
+    low, high = estimate.interval("a", 0.9999)
+    assert (low, high) == (0.28, 0.33)
+    inside = identifier(a=lp.Scalar(0.3, 0.1, bounds=(0.1, 0.6), transform="logit"))
+    low, high = run(inside)[0].interval("a", 0.999999)
+    assert 0.1 < low < high < 0.6
+
+
+def test_where_rounding_hides_the_latent_value_the_interval_is_open():
+    unknown = lp.Scalar(0.3, 0.1, bounds=(0.0, 1.0), transform="logit")
+    assert unknown.interval(1.0, 0.0) == (0.0, 1.0)
+    positive = lp.Scalar(0.3, 0.1, transform="log")
+    assert positive.interval(0.0, 0.0) == (0.0, np.inf)
+
+
+def test_fields_have_an_interval_for_each_coefficient():
+    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=0.3, std=0.2, transform="log")
+    estimate, data = run(identifier(a=field))
+    low, high = estimate.interval("a")
+    assert low.shape == estimate.q.shape
+    assert (low > 0).all()
+    assert (low * high) == pytest.approx(estimate.q**2)
+    assert data["a_low"].dims == data["a"].dims
+    assert data["a_low"].values[-1] == pytest.approx(low)
+    drawn = plots.profiles(data, "a").collections[0].get_paths()[0].vertices[:, 1]
+    assert (drawn.min(), drawn.max()) == pytest.approx((low.min(), high.max()))
+
+
+def test_without_covariance_there_is_no_interval():
+    estimate, data = run(identifier(lp.GradientLaw(), a=lp.Scalar(0.3, 0.1, bounds=(0.0, 1.0))))
+    assert np.isnan(estimate.interval("a")).all()
+    assert tables(data)[0].rows[0][3] == "–"
+
+
+def test_bad_questions():
+    estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1)))
+    with pytest.raises(lp.ConfigurationError, match=r"no unknown 'b'; there are \['a'\]"):
+        estimate.interval("b")
+    with pytest.raises(lp.SpaceError, match="level must lie between 0 and 1"):
+        estimate.interval("a", 95)
+    replaced = replace(estimate, belief=replace(estimate.belief, inflation=2.0))
+    assert np.diff(replaced.interval("a")) == pytest.approx(2 * np.diff(estimate.interval("a")))
