@@ -12,6 +12,7 @@ from livepde.errors import LawError
 from livepde.fem import Evolution, FieldBlock, Inputs, Moment, RandomWalk
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
+from livepde.laws.jumps import Jumps, Watch
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
@@ -123,6 +124,8 @@ class SensitivityState:
         True while the window begins with the initial state that the model says (`Model.initial`).
     reference
         Latent parameter at the start of the window from which the reference of `now` comes.
+    watch
+        Innovations of the last samples, for `Jumps`.
     """
 
     now: Point
@@ -132,6 +135,7 @@ class SensitivityState:
     due: int
     initial: bool
     reference: Array
+    watch: Watch
 
     @property
     def span(self) -> float:
@@ -299,6 +303,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Innovations of more than this many expected deviations are not used; default all are.
     gate_patience
         After so many refusals in a row a sensor is believed again: something has really changed.
+    jumps
+        Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
     """
 
     modes: int | dict[str, int] = 12
@@ -309,6 +315,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     rank: int | None = None
     gate: float = np.inf
     gate_patience: int = 10
+    jumps: Jumps | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.drift) and self.drift >= 0):
@@ -338,6 +345,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             )
         Phi, motions = self._modes(problem)
         moving = sum(m.part.stop - m.part.start for m in motions if m.growth(1.0).any())
+        moving = Phi.shape[1] if self.jumps is not None else moving
         rank = self.rank if self.rank is not None else Phi.shape[1] + 5 * moving
         if rank < Phi.shape[1]:
             raise LawError(
@@ -393,7 +401,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         )
         empty = Samples(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, len(channels))))
         due = self.replay.first if self.replay else 0
-        return SensitivityState(start, start, empty, 0, due, False, q0)
+        watch = (self.jumps or Jumps()).start()
+        return SensitivityState(start, start, empty, 0, due, False, q0, watch)
 
     def start(
         self, work: SensitivityWork, q0: Array, u0: Array, moment: Moment
@@ -430,8 +439,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         point, report = self._filter(work, state.now, interval)
         if not report.status.ok:
             return state, report
+        state, point, report, alarm = self._watched(work, state, point, report)
         if self.replay is None:
             return replace(state, now=_recentre(work, point)), report
+        if alarm:  # what was measured before does not belong to the unknowns of now
+            return self._renewed(_recentre(work, point), state), report
         state = self._store(work, state, point, interval)
         if state.assimilated >= state.due:
             for _ in range(self.replay.iterations):
@@ -445,10 +457,27 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 if not status.ok or left <= CONVERGED:
                     break
         if len(state.samples.t) > self.replay.window:
-            start = _recentre(work, state.now)
-            empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
-            state = SensitivityState(start, start, empty, 0, self.replay.first, False, start.q)
+            state = self._renewed(_recentre(work, state.now), state)
         return state, report
+
+    def _renewed(self, start: Point, state: SensitivityState) -> SensitivityState:
+        """Return a state whose window begins here."""
+        empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
+        first = self.replay.first if self.replay else 0
+        return SensitivityState(start, start, empty, 0, first, False, start.q, state.watch)
+
+    def _watched(
+        self, work: SensitivityWork, state: SensitivityState, point: Point, report: Report
+    ) -> tuple[SensitivityState, Point, Report, bool]:
+        """Return state, filter and report after the test for a jump, and whether there is one."""
+        if self.jumps is None:
+            return state, point, report, False
+        usual = state.now.consistency
+        watch, alarm = self.jumps.add(state.watch, point.consistency.newest, usual)
+        report = replace(report, notes={**report.notes, "jump": float(alarm)})
+        if alarm:
+            point = _loosened(work, point, self.jumps.size)
+        return replace(state, watch=watch), point, report, alarm
 
     def _store(
         self, work: SensitivityWork, state: SensitivityState, now: Point, interval: Interval
@@ -653,6 +682,19 @@ def _recentre(work: SensitivityWork, point: Point) -> Point:
         du=beyond,
         da=point.da - shift,
     )
+
+
+def _loosened(work: SensitivityWork, point: Point, size: float) -> Point:
+    """Return the filter with `size` prior deviations added to what is uncertain of every unknown.
+
+    Independent of what the state remembers: the state is as well known as before.
+    """
+    k = len(point.da)
+    C = np.hstack([point.C, size * np.eye(k)])
+    U = np.hstack([point.U, np.zeros((len(point.u), k))])
+    if C.shape[1] > work.rank:
+        U, C = _compressed(U, C, work.scale, work.rank)
+    return replace(point, U=U, C=C)
 
 
 def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:
