@@ -13,6 +13,7 @@ from livepde.fem import Evolution, FieldBlock, Inputs, Moment, RandomWalk
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
 from livepde.laws.jumps import Jumps, Watch
+from livepde.laws.level import NoiseLevel
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
@@ -74,6 +75,10 @@ class Point:
         Statistics of the innovations.
     refused
         How many values in a row of each sensor the gate has refused, shape (sensors,).
+    level
+        Estimated noise as a multiple of the stated one; 1 unless the law finds it.
+    evidence
+        Logarithm of the likelihood of all samples so far, each given those before.
     """
 
     u: Array
@@ -84,6 +89,8 @@ class Point:
     C: Array = field(metadata={"grows": 1})
     consistency: Consistency
     refused: Array
+    level: NoiseLevel
+    evidence: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +294,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     modes
         Number of modes for each field: one number, or name -> number.
     noise
-        Standard deviation of the measurement noise; default what the observation says.
+        Standard deviation of the measurement noise; default what the observation says. "auto": what
+        the observation says is a first guess, and the level is found from the samples, the same
+        multiple for all sensors.
     drift
         Variance of a gained per unit of time, relative to the prior, by every unknown without an
         evolution of its own: > 0 follows parameters that change.
@@ -308,7 +317,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     """
 
     modes: int | dict[str, int] = 12
-    noise: float | None = None
+    noise: float | str | None = None
     drift: float = 0.0
     memory: float = np.inf
     replay: Replay | None = None
@@ -326,8 +335,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             raise LawError(
                 "SensitivityLaw: replay keeps all of the past, memory fades it; choose one."
             )
-        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
-            raise LawError(f"SensitivityLaw: noise must be a positive number; got {self.noise}.")
+        number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
+        if not (self.noise in (None, "auto") or number):
+            raise LawError(
+                f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
+            )
         if not self.gate > 0:
             raise LawError(f"SensitivityLaw: gate must be positive; got {self.gate}.")
         if self.gate_patience < 1:
@@ -336,8 +348,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
         noise = observed.noise
-        if self.noise is not None:
-            noise = np.full(observed.size, self.noise)
+        if isinstance(self.noise, int | float):
+            noise = np.full(observed.size, float(self.noise))
         if noise is None:
             raise LawError(
                 "SensitivityLaw needs the noise level of the sensors: give noise= to the "
@@ -398,6 +410,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             np.eye(k),
             Consistency.start(sensors),
             np.zeros(sensors, dtype=np.int64),
+            NoiseLevel(),
+            0.0,
         )
         empty = Samples(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, len(channels))))
         due = self.replay.first if self.replay else 0
@@ -546,6 +560,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             "innovation_ratio": new.consistency.ratio,
             "innovation_correlation": new.consistency.correlation,
         }
+        if self.noise == "auto":
+            notes["noise_level"] = new.level.scale
         if np.isfinite(self.gate):
             notes["refused"] = float(refused)
         return new, Report(Status(), predicted, steps, notes)
@@ -558,8 +574,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         present = np.isfinite(d)
         if not present.any():
             return point, 0
-        Y = work.output(point, interval.end) / work.noise[:, None]
-        e = d / (work.noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
+        noise = point.level.scale * work.noise
+        Y = work.output(point, interval.end) / noise[:, None]
+        e = d / (noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
         used, count = present, 0
         if np.isfinite(self.gate):
             far = present & ~(np.abs(e) <= self.gate)
@@ -576,9 +593,19 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(Y.shape[1]), Y]), mode="r"))
         # SciPy's triangular solve would start threads for this small matrix; this one does not.
         W: Array = np.asarray(np.linalg.inv(root), dtype=float)
-        half = W.T @ (Y.T @ (d / work.noise)[used])
+        d = (d / noise)[used]
+        half = W.T @ (Y.T @ d)
         U, C = point.U @ W, point.C @ W
-        new = replace(point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U)
+        spread = float(np.log(np.abs(np.diag(root))).sum() + np.log(noise[used]).sum())
+        evidence = point.evidence - 0.5 * float(d @ d - half @ half) - spread
+        new = replace(
+            point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U, evidence=evidence
+        )
+        if self.noise == "auto":
+            # What the update leaves of the sample, and what is left of its variance.
+            seen = Y @ W
+            left = float(((d - seen @ half) ** 2).mean() + (seen**2).sum(axis=1).mean())
+            new = replace(new, level=point.level.add(left))
         return new, count
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
@@ -645,7 +672,7 @@ def _next(work: SensitivityWork, state: SensitivityState) -> Array:
 
 def _placed(work: SensitivityWork, state: SensitivityState, q: Array, first: Moment) -> Point:
     """Return the filter at the start of the window, linear about q."""
-    start, model = state.start, work.problem.model
+    start, model = replace(state.start, level=state.now.level), work.problem.model
     shift = work.reduced(q - start.q)
     if state.initial:
         U = model.initial_directions(q, work.Phi, first)
