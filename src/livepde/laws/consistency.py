@@ -29,6 +29,8 @@ class Consistency:
         Sums of 1 and of the squared `slow`.
     last
         Last e of each sensor, shape (sensors,), NaN before its first.
+    newest
+        e of the last sample, shape (sensors,), NaN where missing.
     slow
         Exponential average of e over `SLOW` samples, shape (sensors,).
     """
@@ -40,12 +42,14 @@ class Consistency:
     slow_count: float
     slow_square: float
     last: Array
+    newest: Array
     slow: Array
 
     @classmethod
     def start(cls, sensors: int) -> Consistency:
         """Return the value before any innovation."""
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.full(sensors, np.nan), np.zeros(sensors))
+        nothing = np.full(sensors, np.nan)
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, nothing, nothing, np.zeros(sensors))
 
     def add(self, e: Array) -> Consistency:
         """Return the value after one more vector of normalised innovations."""
@@ -62,6 +66,7 @@ class Consistency:
             fade * self.slow_count + float(seen.sum()),
             fade * self.slow_square + float((slow[seen] ** 2).sum()),
             np.where(seen, e, self.last),
+            e,
             slow,
         )
 
