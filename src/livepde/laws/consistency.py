@@ -31,6 +31,8 @@ class Consistency:
         Sums of `slow_variance` and of the squared `slow`.
     last
         Last e of each sensor, shape (sensors,), NaN before its first.
+    newest
+        e of the last sample, shape (sensors,), NaN where missing.
     slow, slow_variance
         Exponential average of e over `SLOW` samples, and its variance for white noise of size 1,
         shapes (sensors,).
@@ -44,6 +46,7 @@ class Consistency:
     slow_expected: float
     slow_square: float
     last: Array
+    newest: Array
     slow: Array
     slow_variance: Array
 
@@ -51,7 +54,7 @@ class Consistency:
     def start(cls, sensors: int) -> Consistency:
         """Return the value before any innovation."""
         never, zero = np.full(sensors, np.nan), np.zeros(sensors)
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, never, zero, zero)
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, never, never, zero, zero)
 
     def add(self, e: Array) -> Consistency:
         """Return the value after one more vector of normalised innovations."""
@@ -71,6 +74,7 @@ class Consistency:
             fade * self.slow_expected + float(slow_variance[seen].sum()),
             fade * self.slow_square + float((slow[seen] ** 2).sum()),
             np.where(seen, e, self.last),
+            e,
             slow,
             slow_variance,
         )

@@ -12,6 +12,7 @@ from livepde.errors import LawError
 from livepde.fem import Evolution, FieldBlock, Moment, RandomWalk
 from livepde.laws.base import Problem
 from livepde.laws.consistency import Consistency
+from livepde.laws.level import NoiseLevel
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
@@ -35,6 +36,10 @@ class Point:
         Statistics of the innovations.
     refused
         How many values in a row of each sensor the gate has refused, shape (sensors,).
+    level
+        Estimated noise as a multiple of the stated one; 1 unless the law finds it.
+    evidence
+        Logarithm of the likelihood of all samples so far, each given those before.
     """
 
     u: Array
@@ -45,6 +50,8 @@ class Point:
     C: Array = field(metadata={"grows": 1})
     consistency: Consistency
     refused: Array
+    level: NoiseLevel
+    evidence: float
 
     def along(self, shift: Array) -> Array:
         """Return by how much the state is expected to move with a shift of a, shape (n,)."""
@@ -104,6 +111,8 @@ class Filter:
         coefficients of the state then: the square root of the mass of each.
     gate, patience
         Innovations beyond `gate` expected deviations are refused, `patience` times in a row.
+    adaptive
+        True if the noise is a first guess whose multiple is found from the samples.
     """
 
     problem: Problem
@@ -115,6 +124,7 @@ class Filter:
     rank: int
     gate: float
     patience: int
+    adaptive: bool
 
     @cached_property
     def moves(self) -> bool:
@@ -222,8 +232,9 @@ class Filter:
         present = np.isfinite(d)
         if not present.any():
             return point, 0
-        Y = self.output(point, interval.end) / self.noise[:, None]
-        e = d / (self.noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
+        noise = point.level.scale * self.noise
+        Y = self.output(point, interval.end) / noise[:, None]
+        e = d / (noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
         used, count = present, 0
         if np.isfinite(self.gate):
             far = present & ~(np.abs(e) <= self.gate)
@@ -240,10 +251,32 @@ class Filter:
         root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(Y.shape[1]), Y]), mode="r"))
         # SciPy's triangular solve would start threads for this small matrix; this one does not.
         W: Array = np.asarray(np.linalg.inv(root), dtype=float)
-        half = W.T @ (Y.T @ (d / self.noise)[used])
+        d = (d / noise)[used]
+        half = W.T @ (Y.T @ d)
         U, C = point.U @ W, point.C @ W
-        new = replace(point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U)
+        spread = float(np.log(np.abs(np.diag(root))).sum() + np.log(noise[used]).sum())
+        evidence = point.evidence - 0.5 * float(d @ d - half @ half) - spread
+        new = replace(
+            point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U, evidence=evidence
+        )
+        if self.adaptive:
+            # What the update leaves of the sample, and what is left of its variance.
+            seen = Y @ W
+            left = float(((d - seen @ half) ** 2).mean() + (seen**2).sum(axis=1).mean())
+            new = replace(new, level=point.level.add(left))
         return new, count
+
+    def loosened(self, point: Point, size: float) -> Point:
+        """Return the filter with `size` prior deviations added to the uncertainty of each unknown.
+
+        Independent of what the state remembers: the state is as well known as before.
+        """
+        k = len(point.da)
+        C = np.hstack([point.C, size * np.eye(k)])
+        U = np.hstack([point.U, np.zeros((len(point.u), k))])
+        if C.shape[1] > self.rank:
+            U, C = _compressed(U, C, self.scale, self.rank)
+        return replace(point, U=U, C=C)
 
     def recentred(self, point: Point) -> Point:
         """Return the filter with its reference at the estimate, within the bounds.

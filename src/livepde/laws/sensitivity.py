@@ -11,6 +11,8 @@ from livepde.fem import Inputs, Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
 from livepde.laws.filter import Filter, Point, reduction
+from livepde.laws.jumps import Jumps, Watch
+from livepde.laws.level import NoiseLevel
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage, Interval
 
@@ -93,6 +95,8 @@ class SensitivityState:
         True while the window begins with the initial state that the model says (`Model.initial`).
     reference
         Latent parameter at the start of the window from which the reference of `now` comes.
+    watch
+        Innovations of the last samples, for `Jumps`.
     """
 
     now: Point
@@ -102,6 +106,7 @@ class SensitivityState:
     due: int
     initial: bool
     reference: Array
+    watch: Watch
 
     @property
     def span(self) -> float:
@@ -135,7 +140,9 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
     modes
         Number of modes for each field: one number, or name -> number.
     noise
-        Standard deviation of the measurement noise; default what the observation says.
+        Standard deviation of the measurement noise; default what the observation says. "auto": what
+        the observation says is a first guess, and the level is found from the samples, the same
+        multiple for all sensors.
     drift
         Variance of a gained per unit of time, relative to the prior, by every unknown without an
         evolution of its own: > 0 follows parameters that change.
@@ -151,16 +158,19 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         Innovations of more than this many expected deviations are not used; default all are.
     gate_patience
         After so many refusals in a row a sensor is believed again: something has really changed.
+    jumps
+        Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
     """
 
     modes: int | dict[str, int] = 12
-    noise: float | None = None
+    noise: float | str | None = None
     drift: float = 0.0
     memory: float = np.inf
     replay: Replay | None = None
     rank: int | None = None
     gate: float = np.inf
     gate_patience: int = 10
+    jumps: Jumps | None = None
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.drift) and self.drift >= 0):
@@ -171,8 +181,11 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             raise LawError(
                 "SensitivityLaw: replay keeps all of the past, memory fades it; choose one."
             )
-        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
-            raise LawError(f"SensitivityLaw: noise must be a positive number; got {self.noise}.")
+        number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
+        if not (self.noise in (None, "auto") or number):
+            raise LawError(
+                f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
+            )
         if not self.gate > 0:
             raise LawError(f"SensitivityLaw: gate must be positive; got {self.gate}.")
         if self.gate_patience < 1:
@@ -181,8 +194,8 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
     def prepare(self, problem: Problem) -> Filter:
         observed, model = problem.observed, problem.model
         noise = observed.noise
-        if self.noise is not None:
-            noise = np.full(observed.size, self.noise)
+        if isinstance(self.noise, int | float):
+            noise = np.full(observed.size, float(self.noise))
         if noise is None:
             raise LawError(
                 "SensitivityLaw needs the noise level of the sensors: give noise= to the "
@@ -190,6 +203,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             )
         Phi, motions = reduction(problem, self.modes, self.drift)
         moving = sum(m.part.stop - m.part.start for m in motions if m.growth(1.0).any())
+        moving = Phi.shape[1] if self.jumps is not None else moving
         rank = self.rank if self.rank is not None else Phi.shape[1] + 5 * moving
         if rank < Phi.shape[1]:
             raise LawError(
@@ -200,7 +214,16 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         scale = np.sqrt(mass / mass.sum())
         forward = ForwardStage(model)
         return Filter(
-            problem, forward, Phi, motions, noise, scale, rank, self.gate, self.gate_patience
+            problem,
+            forward,
+            Phi,
+            motions,
+            noise,
+            scale,
+            rank,
+            self.gate,
+            self.gate_patience,
+            self.noise == "auto",
         )
 
     def init(self, work: Filter, q0: Array, u0: Array) -> SensitivityState:
@@ -215,10 +238,13 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             np.eye(k),
             Consistency.start(sensors),
             np.zeros(sensors, dtype=np.int64),
+            NoiseLevel(),
+            0.0,
         )
         empty = Samples(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, len(channels))))
         due = self.replay.first if self.replay else 0
-        return SensitivityState(start, start, empty, 0, due, False, q0)
+        watch = (self.jumps or Jumps()).start()
+        return SensitivityState(start, start, empty, 0, due, False, q0, watch)
 
     def start(self, work: Filter, q0: Array, u0: Array, moment: Moment) -> SensitivityState:
         state, model = self.init(work, q0, u0), work.problem.model
@@ -251,8 +277,11 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         point, report = self._filter(work, state.now, interval)
         if not report.status.ok:
             return state, report
+        state, point, report, alarm = self._watched(work, state, point, report)
         if self.replay is None:
             return replace(state, now=work.recentred(point)), report
+        if alarm:  # what was measured before does not belong to the unknowns of now
+            return self._renewed(work.recentred(point), state), report
         state = self._store(work, state, point, interval)
         if state.assimilated >= state.due:
             for _ in range(self.replay.iterations):
@@ -266,10 +295,27 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
                 if not status.ok or left <= CONVERGED:
                     break
         if len(state.samples.t) > self.replay.window:
-            start = work.recentred(state.now)
-            empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
-            state = SensitivityState(start, start, empty, 0, self.replay.first, False, start.q)
+            state = self._renewed(work.recentred(state.now), state)
         return state, report
+
+    def _renewed(self, start: Point, state: SensitivityState) -> SensitivityState:
+        """Return a state whose window begins here."""
+        empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
+        first = self.replay.first if self.replay else 0
+        return SensitivityState(start, start, empty, 0, first, False, start.q, state.watch)
+
+    def _watched(
+        self, work: Filter, state: SensitivityState, point: Point, report: Report
+    ) -> tuple[SensitivityState, Point, Report, bool]:
+        """Return state, filter and report after the test for a jump, and whether there is one."""
+        if self.jumps is None:
+            return state, point, report, False
+        usual = state.now.consistency
+        watch, alarm = self.jumps.add(state.watch, point.consistency.newest, usual)
+        report = replace(report, notes={**report.notes, "jump": float(alarm)})
+        if alarm:
+            point = work.loosened(point, self.jumps.size)
+        return replace(state, watch=watch), point, report, alarm
 
     def _store(
         self, work: Filter, state: SensitivityState, now: Point, interval: Interval
@@ -334,6 +380,8 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             "innovation_ratio": new.consistency.ratio,
             "innovation_correlation": new.consistency.correlation,
         }
+        if self.noise == "auto":
+            notes["noise_level"] = new.level.scale
         if np.isfinite(self.gate):
             notes["refused"] = float(refused)
         return new, Report(Status(), predicted, steps, notes)
@@ -366,7 +414,7 @@ def _next(work: Filter, state: SensitivityState) -> Array:
 
 def _placed(work: Filter, state: SensitivityState, q: Array, first: Moment) -> Point:
     """Return the filter at the start of the window, linear about q."""
-    start, model = state.start, work.problem.model
+    start, model = replace(state.start, level=state.now.level), work.problem.model
     shift = work.reduced(q - start.q)
     if state.initial:
         U = model.initial_directions(q, work.Phi, first)

@@ -1,0 +1,95 @@
+"""Has the process changed? A test on the innovations, with a stated rate of false alarms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import gammaincc
+
+from livepde.errors import LawError
+from livepde.laws.consistency import Consistency
+from livepde.linalg import Array
+
+__all__ = ["Jumps", "Watch"]
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """Innovations of the last samples.
+
+    Attributes
+    ----------
+    squares, counts
+        Sum of e^2 and number of innovations e of each of the last samples, newest first.
+    seen
+        Samples since the start or the last alarm.
+    """
+
+    squares: Array
+    counts: Array
+    seen: int
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Watch for sudden changes of the unknowns, and let them move when there is one.
+
+    The innovations of the last 1, 2, 4, ... samples, normalised by what is expected of them and by
+    their usual size and correlation, are compared with the chi-square distribution. An alarm adds
+    `size` prior deviations to the uncertainty of every unknown, so that the law learns again
+    without a restart; what is known of the state is kept.
+
+    Parameters
+    ----------
+    probability
+        Of a false alarm, in each sample.
+    window
+        Longest number of samples, a power of two.
+    size
+        What an alarm adds, in prior deviations.
+    settle
+        No alarm in so many samples after the start, and after an alarm.
+    """
+
+    probability: float = 1e-5
+    window: int = 32
+    size: float = 1.0
+    settle: int = 50
+
+    def __post_init__(self) -> None:
+        if not 0 < self.probability < 1:
+            raise LawError(f"Jumps: probability must lie between 0 and 1; got {self.probability}.")
+        if self.window < 1 or self.window & (self.window - 1):
+            raise LawError(f"Jumps: window must be a power of two; got {self.window}.")
+        if not (np.isfinite(self.size) and self.size > 0):
+            raise LawError(f"Jumps: size must be a positive number; got {self.size}.")
+        if self.settle < 0:
+            raise LawError(f"Jumps: settle must be at least 0; got {self.settle}.")
+
+    def start(self) -> Watch:
+        """Return the value before any innovation."""
+        return Watch(np.zeros(self.window), np.zeros(self.window), 0)
+
+    def add(self, watch: Watch, e: Array, usual: Consistency) -> tuple[Watch, bool]:
+        """Return the value after a sample, and whether there is an alarm.
+
+        Parameters
+        ----------
+        e
+            Normalised innovations, shape (sensors,), NaN where missing.
+        usual
+            Their statistics before this sample.
+        """
+        seen = np.isfinite(e)
+        squares = np.concatenate([[float((e[seen] ** 2).sum())], watch.squares[:-1]])
+        counts = np.concatenate([[float(seen.sum())], watch.counts[:-1]])
+        new = Watch(squares, counts, watch.seen + 1)
+        if new.seen <= self.settle or not seen.any():
+            return new, False
+        lengths = 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
+        sums, freedom = np.cumsum(squares)[lengths], np.cumsum(counts)[lengths]
+        chance = gammaincc(0.5 * freedom, 0.5 * sums / usual.inflation**2)
+        if float(chance.min()) * len(lengths) >= self.probability:
+            return new, False
+        return self.start(), True

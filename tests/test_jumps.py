@@ -1,0 +1,108 @@
+"""Sudden changes are flagged soon, hardly ever without cause, and learned without a restart."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde.laws.consistency import Consistency
+from livepde.laws.jumps import Jumps
+from livepde.laws.level import NoiseLevel
+from livepde.stepping import ForwardStage
+
+MESH = lp.interval(0.0, 1.0, 16)
+POINTS = [0.25, 0.5, 0.75]
+NOISE = 0.01
+
+
+def rod() -> lp.Model:
+    ends = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
+    state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
+    unknown = {"a": lp.Scalar(0.2, 0.2)}
+    return lp.Model(state, unknown, A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
+
+
+def samples(a: Any, count: int, seed: int, noise: float = NOISE) -> list[tuple[float, Any]]:
+    model, rng = rod(), np.random.default_rng(seed)
+    observed = lp.Points(POINTS).bind(model.state_space, model.X, model.parameter_space)
+    forward, u, found = ForwardStage(model), model.initial(0.0), []
+    for t0, t1 in pairwise((0.05 * np.arange(count + 1)).tolist()):
+        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
+        found.append((t1, observed.G @ u + noise * rng.standard_normal(len(POINTS))))
+    return found
+
+
+def run(law: lp.SensitivityLaw, stream: Any, guess: float = NOISE) -> list[lp.Estimate]:
+    identifier = lp.Identifier(rod(), lp.Points(POINTS, noise=guess), law, u0=0.0)
+    found = [identifier.step(t, z) for t, z in stream]
+    assert all(estimate.status.ok for estimate in found)
+    return found
+
+
+@pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.parametrize("change", [0.8, 1.2])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, seed: int):
+    def a(t: float) -> float:
+        return 0.3 if t < 15.0 else 0.3 * change
+
+    law = lp.SensitivityLaw(jumps=Jumps(), replay=replay)
+    found = run(law, samples(a, 500, seed))
+    alarms = [k for k, estimate in enumerate(found) if estimate.notes["jump"]]
+    late = [k for k in alarms if k >= 299]
+    assert late
+    assert late[0] - 299 <= 30
+    value, std = found[-1].parameters["a"]
+    assert abs(value - 0.3 * change) < 5 * std < 0.02
+
+
+def test_white_innovations_raise_no_alarm():
+    rng, jumps = np.random.default_rng(0), Jumps(probability=1e-5)
+    watch, usual, alarms = jumps.start(), Consistency.start(3), 0
+    for _ in range(20_000):
+        e = rng.standard_normal(3)
+        e[rng.random(3) < 0.1] = np.nan
+        watch, alarm = jumps.add(watch, e, usual)
+        usual, alarms = usual.add(e), alarms + alarm
+    assert alarms <= 1
+
+
+def test_the_rate_of_false_alarms_is_about_the_stated_one():
+    rng, jumps = np.random.default_rng(1), Jumps(probability=2e-3, settle=0)
+    watch, usual, alarms = jumps.start(), Consistency.start(2), 0
+    for _ in range(20_000):
+        watch, alarm = jumps.add(watch, rng.standard_normal(2), usual)
+        alarms += alarm
+    assert 4 <= alarms <= 40  # of each sample; windows overlap, so fewer than stated
+
+
+@pytest.mark.parametrize("options", [{"probability": 0.0}, {"window": 3}, {"size": 0.0}])
+def test_settings_that_cannot_be_meant_are_refused(options: Any):
+    with pytest.raises(lp.LawError, match=next(iter(options))):
+        Jumps(**options)
+
+
+@pytest.mark.parametrize("guess", [1e-3, 1e-2, 1e-1, 1.0])
+def test_the_noise_is_found_from_any_first_guess(guess: float):
+    law = lp.SensitivityLaw(noise="auto", replay=lp.Replay(first=16))
+    found = run(law, samples(lambda t: 0.3, 400, 0), guess)
+    assert found[-1].notes["noise_level"] * guess == pytest.approx(NOISE, rel=0.2)
+    value, std = found[-1].parameters["a"]
+    assert abs(value - 0.3) < 4 * std < 0.01
+
+
+def test_the_level_of_white_residuals_is_their_size():
+    rng, level = np.random.default_rng(0), NoiseLevel()
+    for z in 3.0 * rng.standard_normal((2000, 4)):
+        level = level.add(float((z**2).mean()) / level.square)
+    assert level.scale == pytest.approx(3.0, rel=0.05)
+
+
+def test_what_noise_cannot_be_is_one_sentence():
+    with pytest.raises(lp.LawError, match="a positive number or 'auto'; got 'white'"):
+        lp.SensitivityLaw(noise="white")
