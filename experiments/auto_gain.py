@@ -5,7 +5,9 @@ space by Tikhonov in the V~ norm with the discrepancy principle, nothing in time
 law that tunes itself against the smallest error of a grid of constant gains and c_1, chosen for
 each level and seed by the truth.
 
-    python experiments/auto_gain.py 100 101      # seeds of the noise
+    python experiments/auto_gain.py 100 101
+
+runs it for these seeds of the noise.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from livepde.reproduce import noisy, seed, seed_excited
 from livepde.streams import Twin
 
 LEVELS = (0.0, 0.01, 0.05, 0.10)
-GAINS = (10.0, 100.0, 1e3, 1e4, 1e5)
+GAINS = (10.0, 100.0, 1e3, 1e4)
 C1 = (1.0, 10.0, 100.0, 1e3)
 TARGET = 1.3
 

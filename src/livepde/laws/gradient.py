@@ -194,11 +194,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
         learning, length = work.learning, interval.t1 - interval.t0
         metric, spread = None, 0.0
         if learning is not None and isinstance(state, LearningState):
-            spread = learning.spread(
-                state.learned,
-                learning.coupling(coupled.split, state.u, state.q, interval.end),
-                length,
-            )
+            observed_now = reconstruct(interval.t1).u
+            w = observed_now + coupled.split.P @ state.u
+            seen = learning.coupling(coupled.split, w, state.q, interval.end)
+            spread = learning.spread(state.learned, seen, length)
             metric = learning.metric(state.learned, spread, state.q, length)
 
         def stage(c: Array, t: float, h: float) -> Array:

@@ -37,6 +37,9 @@ G_Q^{-1} J)/RESOLUTION: exact data would leave the equation for q singular.
 Every number above is a ratio of quantities with the same units: scaling u, q (with `std`), x or t
 scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
 itself.
+
+What S does not know is a bias: a reconstruction G_alpha that smooths too much leaves an equation
+error that moves with w, as a wrong q does, and q takes it up.
 """
 
 from __future__ import annotations
@@ -57,7 +60,7 @@ __all__ = ["Learned", "Learning"]
 PROBES = 8  # random vectors for the trace
 FORGETS = 2.0  # power of time that weighs a sample in the mean of S
 FADES = 1.0  # power of time that weighs a sample in J
-RESOLUTION = 1e6  # largest ratio of information to prior: deviations of a thousandth
+RESOLUTION = 1e7  # largest ratio of information to prior: deviations of 1 in 3000
 _RHO = 1.0 / (1.0 + PULL)
 _FILTER = (1.0 + _RHO) / (_RHO**2 * (3.0 - _RHO))
 
