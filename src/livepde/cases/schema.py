@@ -280,7 +280,7 @@ class GradientSpec(Spec):
     """The paper's law, for observed subdomains and averages."""
 
     kind: Literal["gradient"]
-    gain: float = 1.0
+    gain: float | Literal["auto"] = 1.0
     c1: float | None = None
     mu: float | None = None
     nu: float = 0.0
@@ -291,6 +291,8 @@ class GradientSpec(Spec):
     def _one_damping(self) -> GradientSpec:
         if self.c1 is not None and self.mu is not None:
             raise ValueError("c1 and mu are two damping rules: keep one")
+        if self.gain == "auto" and not (self.c1 is None and self.mu is None and self.sigma == 0.0):
+            raise ValueError("gain = 'auto' chooses c1, mu and sigma itself: leave them out")
         return self
 
 

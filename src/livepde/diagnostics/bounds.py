@@ -116,11 +116,16 @@ class TwinTracker:
         self,
         twin: Twin,
         spaces: Spaces,
-        gain: float = 1.0,
+        gain: float | Literal["auto"] = 1.0,
         damping: Damping | None = None,
         reconstruct: Callable[[Array], Array] | None = None,
     ) -> None:
         model = twin.model
+        if gain == "auto":
+            raise ConfigurationError(
+                "TwinTracker: the paper's bounds are those of a constant gain; with gain='auto' "
+                "the inner product of Q changes with every sample."
+            )
         if model.latent.moves or not model.form_A.linear_in_parameter:
             raise ConfigurationError(
                 "TwinTracker: the paper's errors are those of a constant parameter in which the "

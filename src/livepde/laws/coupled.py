@@ -18,7 +18,9 @@ from livepde.stepping import Newton
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
-__all__ = ["CoupledStage", "Gains"]
+PULL = 10.0  # theta h where the law tunes itself: r forgets within a step
+
+__all__ = ["PULL", "CoupledStage", "Gains", "Metric"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,30 @@ class Gains:
     at_estimate: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """What stands in the place of G_Q/gain where the law tunes itself (`livepde.laws.memory`).
+
+    The second line of the stage becomes
+
+        (spread G_Q + J) (q - c_q)/PULL + h shift/PULL - A(w)^T r = 0,    theta = PULL/h.
+
+    Attributes
+    ----------
+    spread
+        S, the spectral density of the equation error.
+    information
+        J, shape (m, m), and its data in the pattern given to the stage.
+    shift
+        The pull of a prior that has become heavier or lighter, per unit of time, shape (m,).
+    """
+
+    spread: float
+    information: sp.csr_array
+    data: Array
+    shift: Array
+
+
 class CoupledStage:
     """One implicit Euler stage of (est_exact_q), (est_exact_u), or (noisy_q), (noisy_u), coupled.
 
@@ -62,9 +88,17 @@ class CoupledStage:
     unknown that moves by itself adds -G_Q K (q - prior)/gain there.
     """
 
-    def __init__(self, model: Model, split: Split, gains: Gains, newton: Newton) -> None:
+    def __init__(
+        self,
+        model: Model,
+        split: Split,
+        gains: Gains,
+        newton: Newton,
+        memory: Pattern | None = None,
+    ) -> None:
         self.model = model
         self.split = split
+        self.memory = memory  # pattern of `Metric.information`
         self.gains = gains
         self.newton = newton
         self.n = model.X.dim
@@ -107,6 +141,8 @@ class CoupledStage:
             whole.add("Aqq", A.pattern("q", "q"), minus, free_q, at=(n, n))
         free_g = sp.diags_array(np.concatenate([self.free_q, 1.0 - rest]))
         whole.add("G", Pattern.of(self.gram), free_g, free_g, at=(n, n))
+        if self.memory is not None:
+            whole.add("J", self.memory, free_q, free_q, at=(n, n))
         if model.latent.generator.nnz:
             K = sp.block_diag([model.latent.generator, sp.csr_array((len(rest), len(rest)))])
             whole.add("K", Pattern.of(self.gram), -free_g, sp.csr_array(K @ free_g), at=(n, n))
@@ -126,19 +162,24 @@ class CoupledStage:
         return self._assembled[1]
 
     @cached_property
+    def gram_data(self) -> Array:
+        """Data of `gram`, in the order of its pattern."""
+        return stored(self.gram)
+
+    @cached_property
     def constant_data(self) -> dict[str, Array]:
         """Data of the coupled matrix that never change: with 1/h, with theta, and the rest."""
         maps, model, g = self.maps, self.model, self.gains
-        gram = maps["G"] @ _stored(self.gram) / g.gain
-        rest = maps["PNP"] @ (g.nu * _stored(self.PNP)) + g.sigma * gram
+        gram = maps["G"] @ self.gram_data / g.gain
+        rest = maps["PNP"] @ (g.nu * stored(self.PNP)) + g.sigma * gram
         rest += maps["fixed"] @ np.ones(self.size + self.auxiliary)
         if "K" in maps:
-            rest += maps["K"] @ _stored(self.gram) / g.gain
+            rest += maps["K"] @ stored(self.gram) / g.gain
         if self.constant_B:
             rest += maps["B"] @ model.form_B.data("v", "u", u=np.zeros(self.n))
         return {
             "rate": maps["M"] @ model.mass.data + gram,
-            "pull": maps["RMR"] @ _stored(self.RMR),
+            "pull": maps["RMR"] @ stored(self.RMR),
             "rest": rest,
         }
 
@@ -180,7 +221,15 @@ class CoupledStage:
             row += self.RMR.T @ ((2.0 * dV) * self.model.X.riesz(Mr))
         return row
 
-    def solve(self, c: Array, h: float, moment: Moment, u_alpha: Array, start: Array) -> Array:
+    def solve(
+        self,
+        c: Array,
+        h: float,
+        moment: Moment,
+        u_alpha: Array,
+        start: Array,
+        metric: Metric | None = None,
+    ) -> Array:
         """Return y = (u, q) of one stage; raises `StepFailed`.
 
         Parameters
@@ -191,12 +240,15 @@ class CoupledStage:
             G^+ z at the stage's time, shape (n,).
         start
             Where the iteration starts, shape (n + m,); it does not change the result.
+        metric
+            In the place of G_Q/gain (with gain = inf) and of the damping rule.
         """
         start[: self.n] = self.model.impose(start[: self.n], moment)
         if self._bilinear is not None:
             equation: _Equation = _BilinearEquation(self._bilinear, self, c, h, moment, u_alpha)
         else:
             equation = _Equation(self, c, h, moment, u_alpha)
+        equation.metric = metric
         return self.newton.solve(equation, start, self.blocks, floors=self.floors, lagged=True)
 
 
@@ -216,6 +268,7 @@ class _Equation:
         self.moment = moment
         self.u_alpha = u_alpha
         self.source = stage.model.F(moment)
+        self.metric: Metric | None = None
 
     def residual(self, y: Array) -> Array:
         """Return the residual at y = (u, q)."""
@@ -233,11 +286,24 @@ class _Equation:
             drive -= model.latent.generator @ (q - model.latent.prior) / g.gain
         out = np.empty_like(y)
         out[:n] = (model.mass @ rate + flux) * model.X.free + self.pull()
-        out[n:] = (model.Q.dual(drive) - A.T @ r) * stage.free_q
+        out[n:] = (model.Q.dual(drive) - A.T @ r + self.learned(y)) * stage.free_q
         return out
+
+    def learned(self, y: Array) -> Array | float:
+        """Return what the metric adds to the second line; 0 without one."""
+        metric = self.metric
+        if metric is None:
+            return 0.0
+        change = y[self.stage.n :] - self.c[self.stage.n :]
+        force = metric.spread * self.stage.model.Q.dual(change) + metric.information @ change
+        learned: Array = (force + self.h * metric.shift) / PULL
+        return learned
 
     def pull(self) -> Array:
         """Return theta R^T M_op r."""
+        if self.metric is not None:
+            self.theta = PULL / self.h
+            return self.theta * self.Mr
         self.norms = self.stage.norms(self.r, self.Mr, self.mass_r)
         self.theta = self.stage.gains.damping.theta(self.norms)
         return self.theta * self.Mr
@@ -269,10 +335,14 @@ class _Equation:
         data = self.changing(y, sweep)
         data += stage.constant(self.h)
         data += self.theta * stage.constant_data["pull"]
+        metric = self.metric
+        if metric is not None:
+            data += stage.maps["G"] @ ((metric.spread / PULL) * stage.gram_data)
+            data += stage.maps["J"] @ (metric.data / PULL)
         factor: Factor = stage.solver.factorise(data)
         if stage.auxiliary:
             factor = Leading(factor, stage.size, stage.size + stage.auxiliary)
-        if sweep:
+        if sweep or metric is not None:
             return factor
         row = stage.slope(self.norms, self.Mr, self.mass_r)
         if not row.any():
@@ -317,7 +387,8 @@ class _Bilinear:
         zero = np.zeros(n)
         B = model.form_B.matrix("v", "u", u=zero)
         self.offset = model.B(zero) * model.X.free
-        gram = free_q @ stage.gram / g.gain
+        gram = sp.csr_array(free_q @ stage.gram / g.gain)
+        gram.eliminate_zeros()  # all of it if a metric stands in its place
         moving = sp.block_diag([free @ model.mass, gram])
         state = free @ (B @ W + g.nu * stage.PNP)
         mass = stage.RT @ model.mass
@@ -325,8 +396,8 @@ class _Bilinear:
         rest = sp.block_array([[sp.block_diag([state, g.sigma * gram])], [_widened(observed, m)]])
         rate = sp.vstack([moving, sp.csr_array((observed.shape[0], n + m))])
         self._pattern = Pattern.of(abs(rate) + abs(rest))
-        self._rate_data = _stored(rate, self._pattern)
-        self._rest_data = _stored(rest, self._pattern)
+        self._rate_data = stored(rate, self._pattern)
+        self._rest_data = stored(rest, self._pattern)
         self._linear: tuple[float, sp.csr_array] | None = None
         fed = sp.csr_array((n, n)) if g.at_estimate else -(free @ B)  # what u_alpha adds to B(w)
         data = sp.vstack([fed, sp.csr_array((m, n)), sp.eye_array(n), stage.RM, mass])
@@ -367,6 +438,7 @@ class _BilinearEquation(_Equation):
         coupling.set(self.products.coupling @ w)
         out: Array = stack[:size] + coupling.apply(np.concatenate([r, y[n:]]))
         out[:n] += self.pull()
+        out[n:] += self.learned(y) * self.stage.free_q
         return out
 
     def changing(self, y: Array, sweep: bool) -> Array:
@@ -401,7 +473,7 @@ class _Bordered:
         return x - self.column * (float(self.row @ x[:n]) / pivot)
 
 
-def _stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
+def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
     """Return the data of a matrix in the order of a pattern, by default its own."""
     coo = sp.coo_array(matrix)
     data: Array = (pattern or Pattern.of(matrix)).gather(coo.row, coo.col) @ coo.data

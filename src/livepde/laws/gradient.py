@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
-from livepde.laws.coupled import CoupledStage, Gains
+from livepde.laws.coupled import PULL, CoupledStage, Gains
 from livepde.laws.damping import Damping, ResidualDamping
+from livepde.laws.memory import Learned, Learning
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.observation import Reconstructed, Split
@@ -33,13 +34,23 @@ class GradientState:
     rate: Array
 
 
+@dataclass(frozen=True, eq=False)
+class LearningState(GradientState):
+    """The same of a law that tunes itself, with what the data have taught."""
+
+    learned: Learned
+
+
 class GradientWork:
     """The problem with its operators M_op and N_op and a stage for each set of present sensors."""
 
-    def __init__(self, problem: Problem, gains: Gains, newton: Newton) -> None:
+    def __init__(
+        self, problem: Problem, gains: Gains, newton: Newton, learning: Learning | None = None
+    ) -> None:
         self.problem = problem
         self.gains = gains
         self.newton = newton
+        self.learning = learning
         self._stages: dict[Split, CoupledStage] = {}
 
     def stage(self, present: Array) -> CoupledStage:
@@ -48,7 +59,10 @@ class GradientWork:
         if split not in self._stages:
             if len(self._stages) >= 8:
                 self._stages.clear()
-            self._stages[split] = CoupledStage(self.problem.model, split, self.gains, self.newton)
+            memory = None if self.learning is None else self.learning.pattern
+            self._stages[split] = CoupledStage(
+                self.problem.model, split, self.gains, self.newton, memory
+            )
         return self._stages[split]
 
 
@@ -71,6 +85,15 @@ class GradientLaw(Law[GradientWork, GradientState]):
     gain
         Scale of the inner product of Q, > 0. The theory holds for every value; it sets how fast q
         learns. Stable for every value, because u and q are solved together.
+
+        "auto": the law tunes itself, from r, the excitation and the prior (`std` of the unknowns)
+        alone. The inverse of the information that the data have given so far takes the place of
+        gain G_Q^{-1}, weighed against the prior by a noise level that is estimated as well
+        (`livepde.laws.memory` derives it); M_op is the mass and theta h = 10, so `damping`, `M_op`
+        and `sigma` are not to be given. For constant unknowns. What early data taught stays when
+        the excitation dies out. The notes of each report hold gain, the scale of the inner product
+        before any information, and information, the trace of J G_Q^{-1}/S: beyond 1 the data say
+        more than the prior.
     damping
         Rule for theta = mu / ||r||_V~.
     nu
@@ -85,7 +108,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         The nonlinear iteration.
     """
 
-    gain: float = 1.0
+    gain: float | Literal["auto"] = 1.0
     damping: Damping = field(default_factory=ResidualDamping)
     nu: float = 0.0
     sigma: float = 0.0
@@ -94,8 +117,15 @@ class GradientLaw(Law[GradientWork, GradientState]):
     newton: Newton = field(default_factory=Newton)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.gain) and self.gain > 0):
-            raise LawError(f"GradientLaw: gain must be a positive number; got {self.gain}.")
+        gain: Any = self.gain
+        if gain == "auto":
+            if (self.damping, self.M_op, self.sigma) != (ResidualDamping(), h1_form, 0.0):
+                raise LawError(
+                    "GradientLaw: gain='auto' chooses damping, M_op and sigma itself: leave them "
+                    "out, or give a number for gain."
+                )
+        elif isinstance(gain, str) or not (np.isfinite(gain) and gain > 0):
+            raise LawError(f"GradientLaw: gain must be a positive number or 'auto'; got {gain!r}.")
         for name in ("nu", "sigma"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
@@ -108,13 +138,30 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 "parameter directly: use SensitivityLaw."
             )
         model = problem.model
+        if self.gain == "auto":
+            return self._tuned(problem)
         M_op = model.bilinear(self.M_op)
         N_op = M_op if self.N_op is self.M_op else model.bilinear(self.N_op)
         gains = Gains(self.gain, self.damping, self.nu, self.sigma, M_op, N_op)
         return GradientWork(problem, gains, self.newton)
 
+    def _tuned(self, problem: Problem) -> GradientWork:
+        model = problem.model
+        if model.latent.moves:
+            raise LawError(
+                "GradientLaw: gain='auto' accumulates what is known of constant unknowns, and here "
+                "one moves (evolution=): give a number for gain, or use SensitivityLaw."
+            )
+        N_op = model.bilinear(self.N_op)
+        gains = Gains(np.inf, self.damping, self.nu, 0.0, model.mass, N_op)
+        learning = Learning(model, problem.observed.observation.nodal)
+        return GradientWork(problem, gains, self.newton, learning)
+
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
-        return GradientState(u0, q0, np.zeros(len(u0) + len(q0)))
+        rate = np.zeros(len(u0) + len(q0))
+        if work.learning is not None:
+            return LearningState(u0, q0, rate, work.learning.init(q0))
+        return GradientState(u0, q0, rate)
 
     def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
         form = work.problem.model.form_initial
@@ -144,6 +191,14 @@ class GradientLaw(Law[GradientWork, GradientState]):
             return Reconstructed(coupled.split.reconstruct(interval.z(t), boundary), 0.0, 0.0, None)
 
         found = Reconstructed(zero, 0.0, 0.0, None)
+        learning, length = work.learning, interval.t1 - interval.t0
+        metric, spread = None, 0.0
+        if learning is not None and isinstance(state, LearningState):
+            observed_now = reconstruct(interval.t1).u
+            w = observed_now + coupled.split.P @ state.u
+            seen = learning.coupling(coupled.split, w, state.q, interval.end)
+            spread = learning.spread(state.learned, seen, length)
+            metric = learning.metric(state.learned, spread, state.q, length)
 
         def stage(c: Array, t: float, h: float) -> Array:
             nonlocal found
@@ -156,7 +211,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 start[: model.X.dim] += (
                     coupled.split.inverse @ interval.change(t - h, t)[interval.present]
                 )
-            return coupled.solve(c, h, interval.at(t), found.u, start)
+            return coupled.solve(c, h, interval.at(t), found.u, start, metric)
 
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stage, y, interval)
@@ -169,12 +224,18 @@ class GradientLaw(Law[GradientWork, GradientState]):
         observed_u = coupled.split.R @ u
         rate = end - y
         rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
-        rate /= interval.t1 - interval.t0
+        rate /= length
         notes = {"residual": model.X.norm(observed_u - found.u)}
         if regularises:
             notes |= {"alpha": found.alpha, "misfit": found.misfit}
         predicted = work.problem.predict(u, q, interval.end)
-        return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
+        if learning is None or not isinstance(state, LearningState):
+            return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
+        r = observed_u - found.u
+        seen = learning.coupling(coupled.split, u - r, q, interval.end)
+        learned = learning.learn(state.learned, spread, seen, r, length)
+        notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
+        return LearningState(u, q, rate, learned), Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

@@ -1,0 +1,178 @@
+"""What the data have taught so far: how `GradientLaw(gain="auto")` tunes itself.
+
+The first line of the method says, on the observed part, that q* leaves the equation error
+
+    eps(q) = M u_alpha' + B(w) + A(w) q - F,        eps(q) - eps(q*) = A(w) (q - q*),
+
+for which r, drawn in by theta, is a filter: M r/h + theta M r = M r_before/h - eps. With M_op = M
+and theta = PULL/h all of r comes from the step itself, r = -h M^{-1} eps/(1 + PULL). Let eps(q*) be
+noise, white in time and in X with spectral density S, and q - q0 ~ N(0, G_Q^{-1}) the prior (G_Q
+is divided by the square of `std`). Then the best q given all data so far minimises
+
+    S ||q - q0||_Q^2 + int ||R^T eps(q)||^2_{M^{-1}} dt,
+
+and its recursion is the method's second line in the metric of the information,
+
+    H q' = theta A(w)^T r,       H = S G_Q + J,       J = int A^T R M^{-1} R^T A dt,
+
+recursive least squares for a field: the gain H^{-1} falls like 1/t where the data excite q, stays
+that of the prior where they do not, and what early data taught stays when the excitation dies out.
+For M^{-1} stands D^{-1} with a diagonal D >= M (Gershgorin), so J is as sparse as A^T A, and never
+larger than what the data have taught: the gain errs to the large side, where the coupled step is
+stable and only noise is lost.
+
+S is estimated online. The equation error of a wrong q moves with the excitation, noise jumps from
+sample to sample: so S is read from second differences of r, as far as q can see them,
+
+    S = mean of c/(2 h) ||A^T D2 r||^2_{Q*} / trace(G_Q^{-1} A^T R D^{-1} R^T A),
+    c = (1 + rho)/(rho^2 (3 - rho)),     rho = 1/(1 + PULL),
+
+where c undoes the filter; the trace is that of a few fixed random probes. The mean weighs a sample
+at time t by t^2: it forgets the start, and no time constant is asked for. J weighs it by t: the
+first samples were taken with a wrong q and a wrong P u in w, and count less and less; of noise this
+costs 15 % (the root of 4/3), and q itself is not moved by it. When S changes, H changes by dS G_Q
+for all of the past; the minimiser follows by the term dS G_Q (q - q0). S is not taken below trace(
+G_Q^{-1} J)/RESOLUTION: exact data would leave the equation for q singular.
+
+Every number above is a ratio of quantities with the same units: scaling u, q (with `std`), x or t
+scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
+itself.
+
+What S does not know is a bias: a reconstruction G_alpha that smooths too much leaves an equation
+error that moves with w, as a wrong q does, and q takes it up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.fem import Moment
+from livepde.laws.coupled import PULL, Metric, stored
+from livepde.linalg import Array, Pattern
+from livepde.model import Model
+from livepde.observation import Split
+
+__all__ = ["Learned", "Learning"]
+
+PROBES = 8  # random vectors for the trace
+FORGETS = 2.0  # power of time that weighs a sample in the mean of S
+FADES = 1.0  # power of time that weighs a sample in J
+RESOLUTION = 1e7  # largest ratio of information to prior: deviations of 1 in 3000
+_RHO = 1.0 / (1.0 + PULL)
+_FILTER = (1.0 + _RHO) / (_RHO**2 * (3.0 - _RHO))
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What is known after some samples.
+
+    Attributes
+    ----------
+    origin
+        q0, shape (m,).
+    information
+        Data of J, in its pattern.
+    spread
+        S of the last step.
+    noise, seen
+        The two means of which S is the quotient.
+    total
+        trace(G_Q^{-1} J).
+    elapsed, samples
+        Time and number of samples.
+    last, before
+        The last two r, shape (n,).
+    """
+
+    origin: Array
+    information: Array
+    spread: float
+    noise: float
+    seen: float
+    total: float
+    elapsed: float
+    samples: int
+    last: Array
+    before: Array
+
+
+class Learning:
+    """The algebra of J and S for a model; J is sparse if sensors select coefficients."""
+
+    def __init__(self, model: Model, selects: bool) -> None:
+        self.model = model
+        diagonal = model.mass.diagonal()
+        held = diagonal > 0.0
+        root = np.sqrt(np.where(held, diagonal, 1.0))
+        scale = sp.diags_array(1.0 / root)
+        rows = abs(scale @ model.mass @ scale).sum(axis=1)
+        self.weights = np.where(held, model.X.free / (root**2 * np.maximum(rows, 1.0)), 0.0)
+        signs = np.random.default_rng(0).integers(0, 2, (model.X.dim, PROBES))
+        self.probes = np.sqrt(self.weights)[:, None] * (2.0 * signs - 1.0)
+        if selects:
+            A = model.form_A.pattern("v", "q")
+            ones = A.matrix(np.ones(A.nnz))
+            self.pattern = Pattern.of(sp.csr_array(ones.T @ ones))
+        else:
+            self.pattern = Pattern.of(sp.csr_array(np.ones((model.Q.dim, model.Q.dim))))
+
+    def init(self, q0: Array) -> Learned:
+        """Return what is known before the first sample: nothing."""
+        r = np.zeros(self.model.X.dim)
+        return Learned(q0, np.zeros(self.pattern.nnz), 0.0, 0.0, 0.0, 0.0, 0.0, 0, r, r)
+
+    def coupling(self, split: Split, w: Array, q: Array, moment: Moment) -> sp.csr_array:
+        """Return R^T A(w), on free coefficients, shape (n, m)."""
+        A = self.model.form_A.matrix("v", "q", moment, u=w, q=q)
+        free, free_q = sp.diags_array(self.model.X.free), sp.diags_array(self.model.Q.free)
+        return sp.csr_array(split.R.T @ (free @ A @ free_q))
+
+    def spread(self, learned: Learned, coupling: sp.csr_array, h: float) -> float:
+        """Return S for the next step: that of the prior itself before anything is known."""
+        if learned.seen > 0.0:
+            return max(learned.noise / learned.seen, learned.total / RESOLUTION)
+        force = coupling.T @ self.probes
+        moved = self.model.Q.riesz(force)
+        size = float((force * moved).sum())
+        if size <= 0.0:
+            return 1.0  # nothing is excited: any value keeps q where it is
+        image = np.sqrt(self.weights)[:, None] * (coupling @ moved)
+        return h * float((image**2).sum()) / size
+
+    def metric(self, learned: Learned, spread: float, q: Array, h: float) -> Metric:
+        """Return the metric of a step of length h that starts at q."""
+        before = learned.spread if learned.samples else spread
+        shift = (spread - before) * self.model.Q.dual(q - learned.origin) / h
+        information = self.pattern.matrix(learned.information)
+        return Metric(spread, information, learned.information, shift)
+
+    def learn(
+        self, learned: Learned, spread: float, coupling: sp.csr_array, r: Array, h: float
+    ) -> Learned:
+        """Return what is known after a step of length h that ended with A(w) and r."""
+        force = coupling.T @ self.probes
+        trace = float((force * self.model.Q.riesz(force)).sum()) / PROBES
+        # Differences of the first samples have one or two terms: variance 1, 2, 6.
+        jump = (r, r - learned.last, r - 2.0 * learned.last + learned.before)
+        order = min(learned.samples, 2)
+        sight = coupling.T @ jump[order]
+        noise = _FILTER * float(sight @ self.model.Q.riesz(sight)) / (2.0 * h)
+        elapsed = learned.elapsed + h
+        kept = max(0.0, 1.0 - FORGETS * h / elapsed)
+        faded = max(0.0, 1.0 - FADES * h / elapsed)
+        gained = sp.csr_array(coupling.T @ sp.diags_array(h * self.weights) @ coupling)
+        return replace(
+            learned,
+            information=faded * learned.information + stored(gained, self.pattern),
+            spread=spread,
+            noise=kept * learned.noise + h * noise,
+            seen=kept * learned.seen + h * trace,
+            total=faded * learned.total + h * trace,
+            elapsed=elapsed,
+            samples=learned.samples + 1,
+            last=r,
+            before=learned.last,
+        )

@@ -1,0 +1,226 @@
+"""GradientLaw(gain="auto"): the law tunes itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1, ElementLineP2
+
+import livepde as lp
+from livepde.errors import LawError
+from livepde.reproduce import seed, seed_excited
+from livepde.streams import Twin
+
+AUTO = lp.GradientLaw(gain="auto")
+
+
+def rod(
+    q: float = 1.0,
+    u: float = 1.0,
+    x: float = 1.0,
+    t: float = 1.0,
+    cells: int = 20,
+    element=ElementLineP1,
+    **options,
+) -> tuple[lp.Model, Twin]:
+    """u_t - D u_xx + q u = f in units given by their sizes, two modes, P1."""
+    D = x**2 / t
+    mesh = lp.interval(0, x, cells)
+    model = lp.Model(
+        lp.Field(mesh, element(), dirichlet={"boundary": 0.0}),
+        lp.Field(
+            mesh,
+            element(),
+            inner=lambda p, v, at: (p * v + 0.1 * x**2 * lp.dot(lp.grad(p), lp.grad(v))) / x,
+            std=q,
+        ),
+        lambda p, w, v, at: p / (q * t) * w * v,
+        lambda w, v, at: D * lp.dot(lp.grad(w), lp.grad(v)),
+        f=lambda at, s: (
+            u / t * (10 + 5 * np.sin(s / t)) * np.sin(np.pi * at[0] / x)
+            + u / t * 30 * np.cos(0.7 * s / t) * np.sin(2 * np.pi * at[0] / x)
+        ),
+    )
+    dt = options.pop("dt", 0.1)
+    times = t * dt * np.arange(round(10 / dt) + 1)
+    return model, Twin(
+        model=model,
+        observation=options.pop("observation", lp.Full()),
+        q_true=lambda at: q * (1 + np.sin(np.pi * at[0] / x) ** 2),
+        u0=0.0,
+        times=times,
+        **options,
+    )
+
+
+def run(model: lp.Model, twin: Twin, noise: float = 0.0) -> tuple[float, np.ndarray, dict]:
+    """Return the error at the end, the estimate, and the last notes; noise is smoothed in space."""
+    rng = np.random.default_rng(3)
+    smooth = lp.Full(reconstruction=lp.Tikhonov("V", lp.Discrepancy(level=noise or 1.0)))
+    observation = smooth if noise else twin.observation
+    identifier = lp.Identifier(model, observation, AUTO, q0=0.0, u0=0.0)
+    for sample in twin:
+        size = noise * np.sqrt((sample.z**2).mean())
+        z = sample.z + size * rng.standard_normal(len(sample.z))
+        estimate = identifier.step(sample.t, z)
+        assert estimate.status.ok
+    return twin.error(estimate.q), np.asarray(estimate.q), estimate.notes
+
+
+def test_seed_reaches_its_floor_without_a_gain() -> None:
+    model, omega = seed.build()
+    twin = Twin(
+        model=model,
+        observation=omega,
+        times=seed.TIMES,
+        q_true=seed.q_true,
+        u_true=seed.u_true,
+    )
+    identifier = lp.Identifier(model, omega, AUTO, q0=0.0, u0=lambda x: seed.u_true(x, 0.0))
+    errors = [twin.error(identifier.step(s.t, s.z).q) for s in twin]
+    assert errors[-1] <= 0.06  # what is left lies outside of omega
+    assert errors[20] <= 0.06  # and it was there at t = 12: kept while the excitation dies
+
+
+def test_excited_twin_with_exact_data() -> None:
+    model, full = seed_excited.build()
+    twin = Twin(
+        model=model,
+        observation=full,
+        times=seed_excited.TIMES[:201],
+        q_true=seed_excited.q_true,
+        u_true=seed_excited.u_true,
+    )
+    identifier = lp.Identifier(model, full, AUTO, q0=0.0, u0=lambda x: seed_excited.u_true(x, 0.0))
+    for s in twin:
+        estimate = identifier.step(s.t, s.z)
+    assert twin.error(estimate.q) <= 0.005
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize(
+    "units", [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
+)
+def test_units_scale_out(units: dict[str, float], noise: float) -> None:
+    _, plain, _ = run(*rod(), noise=noise)
+    _, scaled, notes = run(*rod(**units), noise=noise)
+    size = units.get("q", 1.0)
+    assert np.abs(scaled / size - plain).max() <= 1e-6 * np.abs(plain).max()
+    assert notes["information"] > 1.0
+
+
+def test_sampling_rate_and_mesh_do_not_matter_without_noise() -> None:
+    errors = [run(*rod(**case))[0] for case in ({}, {"dt": 0.05}, {"dt": 0.025}, {"cells": 40})]
+    assert max(errors) <= 0.01
+
+
+def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:
+    # Noise of one spectral density: a deviation that grows with the root of the rate.
+    notes = [run(*rod(dt=dt), noise=0.02 * np.sqrt(0.1 / dt))[2] for dt in (0.1, 0.05, 0.025)]
+    information = [one["information"] for one in notes]
+    assert max(information) <= 2 * min(information)
+
+
+def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
+    # Noise of each node by itself: twice the nodes are twice the data.
+    information = [run(*rod(cells=n), noise=0.02)[2]["information"] / n for n in (20, 40, 80)]
+    assert max(information) <= 1.5 * min(information)
+
+
+def test_more_noise_less_weight_on_the_data() -> None:
+    found = [run(*rod(), noise=noise)[2]["information"] for noise in (0.0, 0.01, 0.03, 0.1)]
+    assert found == sorted(found, reverse=True)
+
+
+def test_what_was_learned_stays_without_excitation() -> None:
+    mesh = lp.interval(0, 1, 20)
+    rest = {"boundary": 0.0}
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet=rest),
+        lp.Field(mesh, ElementLineP1(), inner="H1"),
+        lambda q, u, v, x: q * u * v,
+        lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    twin = Twin(
+        model=model,
+        observation=lp.Full(),
+        q_true=lambda x: 1 + x[0],
+        u_true=None,
+        u0=lambda x: np.sin(np.pi * x[0]) + 0.5 * np.sin(2 * np.pi * x[0]),
+        times=0.05 * np.arange(401),
+    )
+    identifier = lp.Identifier(model, lp.Full(), AUTO, q0=0.0, u0=twin.u0)
+    rng = np.random.default_rng(0)
+    errors = []
+    for s in twin:
+        z = s.z + 1e-6 * rng.standard_normal(len(s.z))
+        errors.append(twin.error(identifier.step(s.t, z).q))
+    assert errors[40] <= 0.2  # at t = 2; u falls by e every 0.4
+    assert errors[-1] <= 1.5 * errors[40]  # at t = 20 there is nothing but noise
+
+
+def test_a_gap_and_partial_sensors() -> None:
+    model, twin = rod(observation=lp.Subdomain(lambda x: x[0] > 0.4))
+    identifier = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
+    for k, s in enumerate(twin):
+        z = s.z.copy()
+        z[: 3 if k % 2 else 0] = np.nan
+        estimate = identifier.step(s.t, z)
+        assert estimate.status.ok
+    assert twin.error(estimate.q) <= 0.6
+
+
+def test_averages_and_a_number() -> None:
+    mesh = lp.interval(0, 1, 20)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP2(), dirichlet={"left": 0.0}),
+        lp.Scalar(prior=1.0, std=1.0),
+        lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        f=lambda x, t: np.sin(t) + 0 * x[0],
+    )
+    sensors = lp.Averages({"a": lambda x: x[0] < 0.5, "b": lambda x: x[0] > 0.5})
+    twin = Twin(model=model, observation=sensors, q_true=1.5, u0=0.0, times=0.1 * np.arange(101))
+    identifier = lp.Identifier(model, sensors, AUTO, u0=0.0)
+    for s in twin:
+        estimate = identifier.step(s.t, s.z)
+    assert abs(estimate.q - 1.5) <= 0.3
+
+
+def test_a_run_can_be_saved_and_continued(tmp_path) -> None:
+    model, twin = rod()
+    samples = list(twin)
+    whole = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
+    for s in samples[:40]:
+        whole.step(s.t, s.z)
+    whole.save(tmp_path / "state.npz")
+    other = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
+    other.load(tmp_path / "state.npz")
+    for s in samples[40:60]:
+        one, two = whole.step(s.t, s.z), other.step(s.t, s.z)
+    assert np.array_equal(one.q, two.q)
+
+
+def test_divided_steps_learn_the_same() -> None:
+    errors = []
+    for dt_max in (np.inf, 0.05):
+        model, twin = rod(dt_max=dt_max)
+        identifier = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0, dt_max=dt_max)
+        for s in twin:
+            estimate = identifier.step(s.t, s.z)
+        errors.append(twin.error(estimate.q))
+    assert max(errors) <= 0.02
+
+
+def test_what_cannot_be_is_one_sentence() -> None:
+    with pytest.raises(LawError, match="leave them out"):
+        lp.GradientLaw(gain="auto", damping=lp.ResidualDamping(2.0))
+    with pytest.raises(LawError, match="'auto'"):
+        lp.GradientLaw(gain="best")  # type: ignore[arg-type]
+    mesh = lp.interval(0, 1, 4)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        lp.Scalar(prior=1.0, evolution=lp.RandomWalk(0.1)),
+        lambda q, u, v, x: q * u * v,
+    )
+    with pytest.raises(LawError, match="moves"):
+        lp.Identifier(model, lp.Full(), AUTO, u0=0.0)
