@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from time import process_time
 
 import numpy as np
@@ -100,9 +101,9 @@ class Trajectory:
         D = np.zeros((len(self.Phi), self.size))
         k, m = self.Phi.shape[1], len(self.moving)
         D[:, :k] = self.Phi
-        D[:, k : k + at * m] = (
-            self.Phi[:, None, self.moving] * self.growth[None, :at]
-        ).reshape(len(self.Phi), at * m)
+        D[:, k : k + at * m] = (self.Phi[:, None, self.moving] * self.growth[None, :at]).reshape(
+            len(self.Phi), at * m
+        )
         return D
 
     def latent(self, a: Array, at: int) -> Array:
@@ -132,7 +133,7 @@ class Trajectory:
         y = np.zeros((model.X.dim, 1 + width))
         at = Interval(times[0], times[0], self._inputs(0), self._inputs(0), none, none)
         y[:, 0] = model.initial(process.u0, at.end)
-        for k, (t0, t1) in enumerate(zip(times[:-1], times[1:], strict=True), start=1):
+        for k, (t0, t1) in enumerate(pairwise(times), start=1):
             q = self.latent(a, k)
             # Later increments of a walk do not act yet.
             live = min(width, self.Phi.shape[1] + k * len(self.moving))
