@@ -190,13 +190,22 @@ def reproduce(
     _report_outcome(outcome, command, as_json)
 
 
+SUITES = ("cases", "coverage", "accuracy", "peers")  # benchmarks with options of their own
+
+
 @app.command()
 def bench(
     name: Annotated[str, typer.Argument(help="Name of the benchmark; 'list' shows them.")] = "list",
     as_json: JsonOption = False,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="With 'cases': only the case of this name. Repeat it for more."),
+        typer.Option(help="With 'cases', 'accuracy', 'peers': only this one. Repeat it for more."),
+    ] = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="With 'accuracy', 'peers': data sets for each noise level. Default: 3, 1."
+        ),
     ] = None,
     folder: Annotated[
         Path | None,
@@ -214,27 +223,42 @@ def bench(
 
     'cases' runs every case of the project with its variants, and the code that they name.
     'coverage' counts how often the truth lies in the 68 % and 95 % intervals.
+    'accuracy' holds our laws against what all data together can tell, at several noise levels;
+    'peers' against other packages, where they are installed.
 
     Example:  livepde bench step
+    Accuracy: livepde bench accuracy --only wall --seeds 5
     Cases:    livepde bench cases --only soil_layers --json
     """
     from livepde.bench import BENCHMARKS
 
     if name == "list":
-        for key in (*BENCHMARKS, "cases", "coverage"):
+        for key in (*BENCHMARKS, *SUITES):
             _console().print(key)
         return
     if name == "cases":
         _bench_cases(folder, only or [], gallery, as_json)
         return
-    if name == "coverage":
-        from livepde.bench.coverage import coverage
-
-        command = ["livepde", "bench", name, "--twins", str(twins)]
-        _report_outcome(coverage(twins, progress=True), command, as_json)
-        return
-    outcome = _named(name, {**BENCHMARKS, "cases": None, "coverage": None}, "benchmark")()
+    if name in SUITES:
+        outcome = _bench_suite(name, only or [], seeds, twins)
+    else:
+        outcome = _named(name, {**BENCHMARKS, **dict.fromkeys(SUITES)}, "benchmark")()
     _report_outcome(outcome, ["livepde", "bench", name], as_json)
+
+
+def _bench_suite(name: str, only: Sequence[str], seeds: int | None, twins: int) -> Outcome:
+    from livepde.bench.accuracy import accuracy
+    from livepde.bench.coverage import coverage
+    from livepde.bench.peers import peers
+    from livepde.bench.problems import PROBLEMS
+
+    if name == "coverage":
+        return coverage(twins, progress=True)
+    for problem in only:
+        _named(problem, PROBLEMS, "problem")
+    if name == "peers":
+        return peers(only, seeds or 1, progress=True)
+    return accuracy(only, seeds or 3, progress=True)
 
 
 def _bench_cases(

@@ -48,14 +48,14 @@ def f(x: Any, t: float) -> Any:
     return (D * np.pi**2 - 1 / (1 + t) + q_true(x)) * u_true(x, t)
 
 
-def build() -> tuple[Model, Subdomain]:
-    """Return the paper's model and observation."""
+def build(std: float = 1.0) -> tuple[Model, Subdomain]:
+    """Return the paper's model, with a prior deviation of q, and observation."""
     mesh = interval(0, 1, N - 1)
     element = hermite(mesh)
     zero = {"boundary": 0.0}
     model = Model(
         state=Field(mesh, element, dirichlet=zero),
-        parameter=Field(mesh, element, inner="H1", dirichlet=zero),
+        parameter=Field(mesh, element, inner="H1", dirichlet=zero, std=std),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: D * dot(grad(u), grad(v)),
         f=f,

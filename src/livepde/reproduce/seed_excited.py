@@ -53,13 +53,13 @@ def f(x: Any, t: float) -> Any:
     return rate + D * np.pi**2 * curvature + q_true(x) * u_true(x, t)
 
 
-def build() -> tuple[Model, Full]:
-    """Return model and observation."""
+def build(std: float = 1.0) -> tuple[Model, Full]:
+    """Return model, with a prior deviation of q, and observation."""
     mesh = interval(0, 1, N - 1)
     element = hermite(mesh)
     model = Model(
         state=Field(mesh, element, dirichlet={"boundary": 0.0}),
-        parameter=Field(mesh, element, inner="H1"),
+        parameter=Field(mesh, element, inner="H1", std=std),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: D * dot(grad(u), grad(v)),
         f=f,

@@ -1,0 +1,456 @@
+"""The same data and the same model in the packages that users take today.
+
+Each peer is given the reduced coordinates, the prior, the noise level and the initial state that
+our laws are given, and steps of our forward model. Where it has a knob, the setting that does best
+*with the truth* on the very data set is reported, which favours it. A package that is not installed
+is a row that says so: `pip install livepde[peers]`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from livepde.bench.accuracy import (
+    LAWS,
+    WARM_UP,
+    Contender,
+    Judge,
+    Score,
+    contenders,
+    forward_seconds,
+    scored,
+    table_of,
+)
+from livepde.bench.offline import Trajectory
+from livepde.bench.problems import PROBLEMS, Data, Problem
+from livepde.errors import LivepdeError
+from livepde.fem import Moment
+from livepde.linalg import Array
+from livepde.progress import watched
+from livepde.runs.outcome import Outcome
+from livepde.stepping import ForwardStage, Interval, advance
+
+__all__ = ["PEERS", "Peer", "peers"]
+
+INFLATIONS = (1.0, 1.02)  # of the ensemble, after each update
+NUGGETS = (1e-6, 1e-4)  # process noise of the state in the unscented filter, relative to the data
+ALPHAS = (0.1, 1.0)  # spread of its sigma points
+ARRIVALS = (1.0, 10.0, 100.0)  # weight of the parameters' last estimate in the moving horizon
+HORIZON = 10
+LARGEST = 100  # coordinates of state and parameters that the unscented filter is asked to carry
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another package's estimator.
+
+    Attributes
+    ----------
+    packages
+        What has to be installed: names to import.
+    run
+        (problem, data, processor time of a forward step) -> score, or None where it does not apply.
+    """
+
+    packages: tuple[str, ...]
+    run: Callable[[Problem, Data, float], Score | None]
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Packages that are not installed."""
+        return tuple(name for name in self.packages if find_spec(name) is None)
+
+
+class Augmented:
+    """Our forward model as peers want it: x = (free coefficients of u, reduced coordinates a)."""
+
+    def __init__(self, problem: Problem, data: Data) -> None:
+        self.data = data
+        self.judge = Judge(problem, data)
+        self.trajectory = Trajectory(data, problem.modes)
+        self.model = self.trajectory.model
+        self.forward = ForwardStage(self.model)
+        self.free = np.flatnonzero(self.model.X.free)
+        self.n, self.k = len(self.free), self.trajectory.Phi.shape[1]
+        self.times = data.process.times.tolist()
+
+    @cached_property
+    def moments(self) -> list[Moment]:
+        """Time and inputs of each sample."""
+        return [Moment(t, self.trajectory._inputs(k)) for k, t in enumerate(self.times)]
+
+    @cached_property
+    def start(self) -> Array:
+        """The known initial state, free coefficients."""
+        start: Array = self.model.initial(self.data.process.u0, self.moments[0])[self.free]
+        return start
+
+    def latent(self, a: Array) -> Array:
+        """Return the latent coefficients."""
+        q: Array = self.model.latent.prior + self.trajectory.Phi @ a
+        return q
+
+    def full(self, x: Array, at: int) -> Array:
+        """Return all coefficients of the state at a time."""
+        u = np.zeros(self.model.X.dim)
+        u[self.free] = x[: self.n]
+        return self.model.impose(u, self.moments[at])
+
+    def forecast(self, x: Array, at: int) -> Array:
+        """Return x at the sample with this number from that at the one before."""
+        q, none = self.latent(x[self.n :]), np.zeros(0)
+        before, now = self.moments[at - 1], self.moments[at]
+        interval = Interval(before.t, now.t, before.inputs, now.inputs, none, none)
+
+        def stage(c: Array, t: float, h: float) -> Array:
+            return self.forward.solve(c, q, h, interval.at(t))
+
+        u, _, failure = advance(self.trajectory.control, stage, self.full(x, at - 1), interval)
+        if failure is not None:
+            raise failure
+        return np.concatenate([u[self.free], x[self.n :]])
+
+    def output(self, x: Array, at: int) -> Array:
+        """Return what the sensors show."""
+        q = self.model.latent.value(self.latent(x[self.n :]))
+        return self.data.observed.predict(self.full(x, at), q, self.moments[at])
+
+    def growth(self, at: int) -> Array:
+        """Return the deviation that each reduced coordinate gains up to this sample, (k,)."""
+        gained = np.zeros(self.k)
+        gained[self.trajectory.moving] = self.trajectory.growth[at - 1]
+        return gained
+
+    def judged(
+        self, step: Callable[[int], tuple[Array, Array]], forward: float, note: str
+    ) -> Score:
+        """Take all steps: number of the sample -> mean of a and a square root of its covariance."""
+        seconds, found = 0.0, []
+        for at in range(1, len(self.times)):
+            start = process_time()
+            mean, root = step(at)
+            seconds += process_time() - start
+            if at == WARM_UP:
+                seconds = 0.0
+            if not np.isfinite(mean).all():
+                return Score(note=f"{note}; diverged at sample {at}")
+            if at in self.judge.scored:
+                found.append((at, self.latent(mean), self.trajectory.Phi @ root))
+        error, covered = self.judge.judged(found)
+        steps = len(self.times) - 1 - WARM_UP
+        return Score(error, covered, seconds / steps / forward, note=note)
+
+
+def _best(scores: Sequence[Score]) -> Score:
+    """Return the score with the least error."""
+    return min(scores, key=lambda score: math.inf if math.isnan(score.error) else score.error)
+
+
+# --- ensemble Kalman filter ----------------------------------------------------------------------
+
+
+def _ensemble(members: int, problem: Problem, data: Data, forward: float) -> Score:
+    """Run DAPPER's square-root filter on the augmented state."""
+    augmented = Augmented(problem, data)
+    return _best([_ensemble_run(augmented, members, infl, forward) for infl in INFLATIONS])
+
+
+def _ensemble_run(augmented: Augmented, members: int, inflation: float, forward: float) -> Score:
+    from dapper.da_methods.ensemble import EnKF_analysis, post_process
+    from dapper.tools.randvars import GaussRV
+
+    n, k, data = augmented.n, augmented.k, augmented.data
+    rng = np.random.default_rng(members)
+    drawn = rng.standard_normal((members, k))
+    E = np.hstack([np.tile(augmented.start, (members, 1)), drawn - drawn.mean(axis=0)])
+    noise = GaussRV(mu=np.zeros(len(data.noise)), C=data.noise**2)
+
+    def step(at: int) -> tuple[Array, Array]:
+        nonlocal E
+        E = np.array([augmented.forecast(x, at) for x in E])
+        E[:, n:] += augmented.growth(at) * rng.standard_normal((members, k))
+        seen = np.array([augmented.output(x, at) for x in E])
+        E = post_process(EnKF_analysis(E, seen, noise, data.z[at], "Sqrt"), inflation, False)
+        a = E[:, n:]
+        return a.mean(axis=0), (a - a.mean(axis=0)).T / np.sqrt(members - 1)
+
+    return augmented.judged(step, forward, f"inflation {inflation:g}")
+
+
+# --- unscented filter ----------------------------------------------------------------------------
+
+
+def _unscented(problem: Problem, data: Data, forward: float) -> Score:
+    """Run filterpy's unscented filter on the augmented state."""
+    augmented = Augmented(problem, data)
+    size = augmented.n + augmented.k
+    if size > LARGEST:
+        return Score(note=f"not run: {2 * size + 1} forward steps for each sample")
+
+    def tried(alpha: float, nugget: float) -> Score | None:
+        def contender(problem: Problem, data: Data) -> Score:
+            return _unscented_run(augmented, alpha, nugget, forward)
+
+        return scored(contender, problem, data)
+
+    runs = [tried(alpha, nugget) for alpha in ALPHAS for nugget in NUGGETS]
+    return _best([score for score in runs if score is not None])
+
+
+def _unscented_run(augmented: Augmented, alpha: float, nugget: float, forward: float) -> Score:
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+    n, k, data = augmented.n, augmented.k, augmented.data
+    points = MerweScaledSigmaPoints(n + k, alpha=alpha, beta=2.0, kappa=0.0)
+    kalman = UnscentedKalmanFilter(
+        n + k,
+        data.z.shape[1],
+        dt=1.0,
+        hx=lambda x, at: augmented.output(x, at),
+        fx=lambda x, dt, at: augmented.forecast(x, at),
+        points=points,
+    )
+    small = (nugget * np.sqrt(np.mean(data.z**2))) ** 2
+    kalman.x = np.concatenate([augmented.start, np.zeros(k)])
+    kalman.P = np.diag(np.concatenate([np.full(n, small), np.ones(k)]))
+    kalman.R = np.diag(data.noise**2)
+
+    def step(at: int) -> tuple[Array, Array]:
+        kalman.Q = np.diag(np.concatenate([np.full(n, small), augmented.growth(at) ** 2]))
+        kalman.predict(at=at)
+        kalman.update(data.z[at], at=at)
+        return kalman.x[n:], np.linalg.cholesky(kalman.P[n:, n:])
+
+    return augmented.judged(step, forward, f"alpha {alpha:g}, process noise {nugget:g}")
+
+
+# --- moving horizon ------------------------------------------------------------------------------
+
+
+def _moving_horizon(problem: Problem, data: Data, forward: float) -> Score | None:
+    """Run do-mpc's moving-horizon estimator; on the paper's example only."""
+    if problem.name != "seed":
+        return None
+    augmented = Augmented(problem, data)
+    return _best([_horizon_run(augmented, weight, forward) for weight in ARRIVALS])
+
+
+def _horizon_run(augmented: Augmented, arrival: float, forward: float) -> Score:
+    import casadi
+    import do_mpc
+
+    model, data, free = augmented.model, augmented.data, augmented.free
+    n, k, times = augmented.n, augmented.k, augmented.times
+    # Coefficients of unit mass and measurements of unit noise: Ipopt fails on values and slopes as
+    # they are.
+    scale = 1.0 / np.sqrt(model.mass.diagonal()[free])
+    eye = np.eye(model.X.dim)[:, free] * scale
+    M = scale[:, None] * model.mass[free][:, free].toarray() * scale
+    K = scale[:, None] * np.column_stack([model.B(e) for e in eye.T])[free]
+    # A(u) q is bilinear: one sparse matrix for each mode.
+    A = np.array([model.A(e).matrix @ augmented.trajectory.Phi for e in eye.T])[:, free]
+    A *= scale[:, None]
+    H = data.observed.G[:, free].toarray() * scale / data.noise[:, None]
+    F = np.array([scale * model.F(moment)[free] for moment in augmented.moments])
+
+    process = do_mpc.model.Model("continuous")
+    u = process.set_variable("_x", "u", (n, 1))
+    rate = process.set_variable("_z", "rate", (n, 1))
+    a = process.set_variable("_p", "a", (k, 1))
+    source = process.set_variable("_tvp", "source", (n, 1))
+    process.set_meas("z", casadi.DM(H) @ u, meas_noise=True)
+    process.set_rhs("u", rate)
+    flux = casadi.DM(K) @ u
+    for mode in range(k):
+        matrix = A[:, :, mode].T
+        matrix[np.abs(matrix) < 1e-14 * np.abs(matrix).max()] = 0.0
+        flux += a[mode] * (casadi.sparsify(casadi.DM(matrix)) @ u)
+    process.set_alg("balance", casadi.sparsify(casadi.DM(M)) @ rate + flux - source)
+    process.setup()
+
+    horizon = do_mpc.estimator.MHE(process, ["a"])
+    horizon.set_param(
+        n_horizon=HORIZON,
+        t_step=times[1] - times[0],
+        meas_from_data=False,
+        store_full_solution=False,
+        state_discretization="collocation",
+        collocation_type="radau",  # of degree 1: implicit Euler, as the data
+        collocation_deg=1,
+        collocation_ni=1,
+        nlpsol_opts={
+            "ipopt.max_iter": 100,
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "print_time": 0,
+        },
+    )
+    sources, measured = horizon.get_tvp_template(), horizon.get_y_template()
+    now = 0
+
+    def window(template: Any, name: str, rows: Array) -> Any:
+        # Measurements and sources at the ends of the intervals, the last of them now.
+        for j in range(HORIZON):
+            template[name, j] = rows[now - HORIZON + 1 + j]
+        return template
+
+    horizon.set_tvp_fun(lambda _: window(sources, "_tvp", F))
+    horizon.set_y_fun(lambda _: window(measured, "y_meas", data.z / data.noise))
+    horizon.set_default_objective(
+        P_x=casadi.DM(np.diag((scale / data.noise.min()) ** 2)),
+        P_v=casadi.DM(np.eye(len(data.noise))),
+        P_p=casadi.DM(np.eye(k) * arrival),
+    )
+    p_template = horizon.get_p_template()
+    horizon.set_p_fun(lambda now: p_template)
+    horizon.setup()
+    horizon.x0 = augmented.start / scale
+    horizon.p_est0 = np.zeros(k)
+    horizon.set_initial_guess()
+    none = np.full((k, 0), np.nan)
+
+    def step(at: int) -> tuple[Array, Array]:
+        nonlocal now
+        now = at
+        if at >= HORIZON:  # before, it would take the first sample for older ones
+            horizon.make_step((data.z[at] / data.noise).reshape(-1, 1))
+        return np.asarray(horizon.p_est0.cat).ravel(), none
+
+    score = augmented.judged(step, forward, f"horizon {HORIZON}, arrival weight {arrival:g}")
+    return replace(score, covered=math.nan)  # it has no intervals
+
+
+PEERS: dict[str, Peer] = {
+    **{
+        f"DAPPER: EnKF, {members} members": Peer(("dapper",), partial(_ensemble, members))
+        for members in (20, 50, 100)
+    },
+    "filterpy: unscented filter": Peer(("filterpy",), _unscented),
+    "do-mpc: moving horizon": Peer(("do_mpc", "casadi"), _moving_horizon),
+}
+"""Row -> peer."""
+
+OURS = ("prior", "sensitivity", "sensitivity, replay", "offline fit of all data")
+LEVEL = 0.01
+
+
+# --- the table -----------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what packages print and warn of at import to themselves."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _peak(reset: bool = False) -> float:
+    """Return the largest memory of this process so far in MB, or since a reset; NaN if unknown."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return math.nan
+    return next((int(row.split()[1]) / 1024 for row in lines if row.startswith("VmHWM")), math.nan)
+
+
+def run_row(problem: Problem, level: float | None, seed: int, row: str) -> Score | None:
+    """Run one row on one data set, in the process that calls."""
+    peer = PEERS.get(row)
+    if peer is not None and peer.missing:
+        return Score(note=f"not installed: {', '.join(peer.missing)}")
+    data = problem.data(level, seed)
+    forward = forward_seconds(data)
+    contender: Contender
+    if peer is None:
+        contender = contenders(LAWS, forward)[row]
+    else:
+        run = peer.run
+
+        def contender(problem: Problem, data: Data) -> Score | None:
+            return run(problem, data, forward)
+
+    with _quiet():
+        for package in peer.packages if peer is not None else ():
+            __import__(package)
+        before = _peak(reset=True)
+        score = scored(contender, problem, data)
+    return None if score is None else replace(score, megabytes=_peak() - before)
+
+
+def _job(name: str, level: float | None, seed: int, row: str) -> Score | None:
+    return run_row(PROBLEMS[name], level, seed, row)
+
+
+def peers(
+    only: Sequence[str] = (),
+    seeds: int = 1,
+    *,
+    levels: Sequence[float] = (LEVEL,),
+    rows: Sequence[str] = (*OURS, *PEERS),
+    progress: bool = False,
+) -> Outcome:
+    """Run our sensitivity law and the peers on the same data, each row in a fresh process.
+
+    Parameters
+    ----------
+    only
+        Names of problems; default all that have a known truth.
+    seeds
+        Data sets for each noise level.
+    levels
+        Noise levels.
+    rows
+        Names of `PEERS`, and of rows of `accuracy`.
+    progress
+        Show a bar on standard error.
+    """
+    names = list(only) or [name for name, item in PROBLEMS.items() if None not in item.levels]
+    jobs = [
+        (name, level, seed, row)
+        for name in names
+        for level in (levels if None not in PROBLEMS[name].levels else (None,))
+        for seed in range(seeds)
+        for row in rows
+    ]
+    found: dict[tuple[str, float | None, str], list[Score]] = {}
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
+        waiting = [pool.submit(_job, *job) for job in jobs]
+        pairs = list(zip(jobs, waiting, strict=True))
+        for (name, level, _, row), future in (
+            watched(pairs, len(pairs), "runs") if progress else pairs
+        ):
+            try:
+                score = future.result()
+            except (LivepdeError, ArithmeticError, RuntimeError, ValueError) as error:
+                score = Score(note=f"{type(error).__name__}: {error}")
+            if score is not None:
+                found.setdefault((name, level, row), []).append(score)
+    return Outcome(tables=table_of(found, seeds, memory=True), notes=NOTES)
+
+
+NOTES = (
+    "Same model, samples, prior, reduced coordinates and noise level for all; knobs of peers are "
+    "set to the best of those tried, with the truth of the very data set (see note).",
+    "step: processor time of a step over that of a forward step with the matrix kept, at the best "
+    "setting. MB: memory needed on top of what data and imported packages take.",
+    "The ensemble filters use DAPPER's analysis in a plain loop, without its statistics.",
+)

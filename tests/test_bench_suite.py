@@ -1,0 +1,142 @@
+"""The benchmark suite on a tiny problem: truth, offline fit, scores, rows that cannot run."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde.bench import accuracy as suite
+from livepde.bench import peers as other
+from livepde.bench.offline import Trajectory, fit
+from livepde.bench.problems import PROBLEMS, Data, Problem, Process
+
+TIMES = np.linspace(0.0, 1.0, 21)
+
+
+def rod(seed: int, evolution: lp.RandomWalk | None = None) -> Process:
+    mesh = lp.interval(0.0, 1.0, 12)
+    ends = {"left": lambda x, t: np.sin(4 * t) + 0.0 * x[0], "right": 0.0}
+    moves = {} if evolution is None else {"evolution": evolution}
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
+        {"a": lp.Scalar(0.3, 0.1, transform="log", **moves)},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    points = lp.Points([0.3, 0.6])
+    q = np.array([0.3 * np.exp(np.random.default_rng(seed).normal() / 3)])
+    G = points.matrix(model.state_space)
+    run = lp.simulate(model, np.log(q), 0.0, TIMES.tolist(), lp.Advance(lp.ImplicitEuler()))
+    exact = np.array([G @ u for _, u in run])
+    q_true = np.tile(q, (len(TIMES), 1))
+    return Process(model=model, observation=points, times=TIMES, exact=exact, q_true=q_true, u0=0.0)
+
+
+ROD = Problem(name="rod", summary="one number", make=rod)
+WALK = Problem(
+    name="walk", summary="it may move", make=lambda s: rod(s, lp.RandomWalk(0.2)), varying=True
+)
+
+
+@pytest.fixture(scope="module")
+def data() -> Data:
+    return ROD.data(0.01, 0)
+
+
+@pytest.mark.parametrize("problem", [ROD, WALK])
+def test_sensitivities_of_the_offline_fit_are_exact(problem):
+    trajectory = Trajectory(problem.data(0.01, 0), modes=1)
+    rng = np.random.default_rng(0)
+    a, d = 0.3 * rng.standard_normal((2, trajectory.size))
+    J, h = trajectory.jacobian(a) @ d, 1e-5
+    difference = (trajectory.residual(a + h * d) - trajectory.residual(a - h * d)) / (2 * h)
+    np.testing.assert_allclose(J, difference, rtol=1e-5, atol=1e-5 * np.abs(J).max())
+
+
+def test_offline_fit_finds_the_parameter_within_its_deviation(data):
+    found = fit(data, modes=1)
+    assert found.converged
+    true, std = np.log(data.process.q_true[0, 0]), abs(found.factor(-1)[0, 0])
+    assert std < 0.1
+    assert abs(found.q[-1, 0] - true) < 3 * std
+
+
+def test_same_seed_same_data_and_noise_has_its_level(data):
+    again = ROD.data(0.01, 0)
+    np.testing.assert_array_equal(data.z, again.z)
+    assert not np.array_equal(data.z, ROD.data(0.01, 1).z)
+    noise = (data.z - data.process.exact) / data.noise
+    assert 0.7 < noise.std() < 1.3
+
+
+def test_every_row_is_scored(data):
+    outcome = suite.accuracy(seeds=1, levels=[0.01], problems={"rod": ROD})
+    rows = {row[1]: row for row in outcome.tables[0].rows}
+    assert list(rows) == ["prior", "sensitivity", "sensitivity, replay", "offline fit of all data"]
+    assert rows["sensitivity"][2] < rows["prior"][2]
+    assert rows["offline fit of all data"][5] == 1.0
+    assert all(row[8] == 0 and row[9] == "" for row in rows.values())
+
+
+def test_a_parameter_that_moves_is_scored_over_the_second_half():
+    judge = suite.Judge(WALK, WALK.data(0.01, 0))
+    assert list(judge.scored) == list(range(10, 21))
+
+
+def test_coverage_counts_intervals_that_hold_the_truth(data):
+    judge = suite.Judge(ROD, data)
+    true, std = np.log(data.process.q_true[-1]), np.array([[0.1]])
+    assert judge.covered(true + 0.19, std, -1) == 1.0
+    assert judge.covered(true + 0.2, std, -1) == 0.0
+    assert math.isnan(judge.covered(true, None, -1))
+
+
+def test_a_contender_that_fails_is_a_row(data):
+    def broken(problem, data):
+        raise lp.LawError("no")
+
+    score = suite.scored(broken, ROD, data)
+    assert score is not None
+    assert math.isnan(score.error)
+    assert score.note == "LawError: no"
+
+
+def test_a_peer_that_is_not_installed_is_a_row(monkeypatch):
+    absent = other.Peer(("no_such_package",), lambda *_: None)
+    monkeypatch.setitem(other.PEERS, "absent", absent)
+    score = other.run_row(ROD, 0.01, 0, "absent")
+    assert score is not None
+    assert score.note == "not installed: no_such_package"
+
+
+def test_peers_are_given_our_forward_model(data):
+    augmented = other.Augmented(ROD, data)
+    a = np.log(data.process.q_true[0] / 0.3) * 3.0
+    x = np.concatenate([augmented.start, a])
+    for at in range(1, len(TIMES)):
+        x = augmented.forecast(x, at)
+        np.testing.assert_allclose(augmented.output(x, at), data.process.exact[at], atol=1e-12)
+
+
+@pytest.mark.parametrize("row", [name for name in other.PEERS if "do-mpc" not in name])
+def test_peers_that_are_installed_find_the_parameter(row):
+    if other.PEERS[row].missing:
+        pytest.skip(f"not installed: {other.PEERS[row].missing}")
+    score = other.run_row(ROD, 0.01, 0, row)
+    assert score is not None
+    assert score.error < 0.2
+
+
+@pytest.mark.parametrize("name", [n for n, p in PROBLEMS.items() if None not in p.levels])
+def test_the_estimators_model_explains_the_exact_data_to_the_stated_floor(name):
+    problem = PROBLEMS[name]
+    data = problem.data(0.0, 0)
+    process, trajectory = data.process, Trajectory(data, problem.modes)
+    latent = process.model.latent
+    trajectory.latent = lambda a, at: latent.inverse(process.q_true[at])
+    shown, _, _ = trajectory.run(np.zeros(trajectory.size), sensitivities=False)
+    missed = ((shown - process.exact) / process.size)[2:]
+    assert np.sqrt(np.mean(missed**2)) <= 2 * problem.floor
