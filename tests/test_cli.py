@@ -97,7 +97,7 @@ def test_main_returns_codes(monkeypatch, capsys):
         def close(self):
             self.closed = True
 
-    monkeypatch.setattr(cli, "app", broken)
+    monkeypatch.setattr("livepde.cli.program.app", broken)
     monkeypatch.setattr(sys, "stderr", Stream())
     assert cli.main() == 0
 
@@ -352,12 +352,13 @@ class Fake:
 
 @pytest.fixture
 def fake(monkeypatch):
-    from livepde import bench, reproduce
+    from livepde import reproduce
+    from livepde.bench import step
 
     def install(value: float) -> Fake:
         one = Fake(value)
         monkeypatch.setattr(reproduce, "EXPERIMENTS", {"seed": one})
-        monkeypatch.setattr(bench, "BENCHMARKS", {"step": lambda: outcome(value)})
+        monkeypatch.setattr(step, "step", lambda: outcome(value))
         return one
 
     return install
@@ -395,9 +396,11 @@ def test_reproduce_and_bench_for_people(fake, here):
     assert (here / "kept" / "parameter.png").is_file()
     assert call("bench", "step")[0] == 0
     assert "the first experiment" in call("reproduce", "list")[1]
-    assert "step" in call("bench")[1]
+    assert "coverage" in call("bench", "--help")[1]
     assert "did you mean 'seed'?" in bad("reproduce", "sed")
-    assert "expected one of step" in bad("bench", "xyz")
+    code, output = call("bench", "xyz")
+    assert code == 2
+    assert "No such command 'xyz'" in output
 
 
 # The preview of the others takes long: they have hundreds of sensors or many unknowns.

@@ -1,0 +1,5 @@
+"""The command line. Exit codes: 0 all well, 1 a check failed, 2 bad input, 130 interrupted."""
+
+from livepde.cli.program import app, main
+
+__all__ = ["app", "main"]

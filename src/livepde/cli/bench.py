@@ -1,0 +1,129 @@
+"""Benchmarks: each a command with its own options."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from livepde.cli.options import JsonOption
+from livepde.cli.printing import can_draw, named, report_outcome, terminal
+
+__all__ = ["bench"]
+
+ProblemsOption = Annotated[
+    list[str] | None, typer.Option("--only", help="Only this problem. Repeat it for more.")
+]
+
+bench = typer.Typer(
+    name="bench",
+    help="""Measure what things cost, as ratios that hold on any machine, and what they find.
+
+    Example:  livepde bench step""",
+    no_args_is_help=True,
+)
+
+
+@bench.command()
+def step(as_json: JsonOption = False) -> None:
+    """Time a step of each law against one forward step of the same model.
+
+    Example:  livepde bench step --json
+    """
+    from livepde.bench.step import step as benchmark
+
+    report_outcome(benchmark(), ["livepde", "bench", "step"], as_json)
+
+
+@bench.command()
+def cases(
+    only: Annotated[
+        list[str] | None, typer.Option(help="Only this case. Repeat it for more.")
+    ] = None,
+    folder: Annotated[
+        Path | None, typer.Option(help="Where the cases are. Default: the next folder 'cases'.")
+    ] = None,
+    gallery: Annotated[
+        Path | None, typer.Option(help="Folder for a page with tables and figures.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run every case of the project with its variants, and the code that they name.
+
+    Example:  livepde bench cases --only soil_layers --json
+    """
+    from livepde.bench import cases as benchmark
+
+    known = {path.stem: path for path in benchmark.find_cases(folder)}
+    paths = [named(name, known, "case") for name in only or ()] or list(known.values())
+    pictures = None
+    if gallery is not None:
+        gallery.mkdir(parents=True, exist_ok=True)
+        pictures = gallery if can_draw(terminal(err=True)) else None
+    outcome, runs = benchmark.bench_cases(paths, progress=True, pictures=pictures)
+    if gallery is not None:
+        page = benchmark.gallery(runs, gallery)
+        terminal(err=True).print(f"Gallery: {page}", soft_wrap=True)
+    report_outcome(outcome, ["livepde", "bench", "cases"], as_json)
+
+
+@bench.command()
+def coverage(
+    twins: Annotated[int, typer.Option(min=1, help="How many twins of each problem.")] = 200,
+    as_json: JsonOption = False,
+) -> None:
+    """Count how often the truth lies in the intervals that are reported.
+
+    Example:  livepde bench coverage --twins 20
+    """
+    from livepde.bench.coverage import coverage as benchmark
+
+    command = ["livepde", "bench", "coverage", "--twins", str(twins)]
+    report_outcome(benchmark(twins, progress=True), command, as_json)
+
+
+@bench.command()
+def accuracy(
+    only: ProblemsOption = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 3,
+    as_json: JsonOption = False,
+) -> None:
+    """Hold our laws against what all data together can tell, at several noise levels.
+
+    Example:  livepde bench accuracy --only wall --seeds 5
+    """
+    from livepde.bench.accuracy import accuracy as benchmark
+
+    outcome = benchmark(_problems(only), seeds, progress=True)
+    report_outcome(outcome, _command("accuracy", only, seeds), as_json)
+
+
+@bench.command()
+def peers(
+    only: ProblemsOption = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Data sets of each problem.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Hold our sensitivity law against other packages, where they are installed.
+
+    Example:  livepde bench peers --only seed
+    """
+    from livepde.bench.peers import peers as benchmark
+
+    outcome = benchmark(_problems(only), seeds, progress=True)
+    report_outcome(outcome, _command("peers", only, seeds), as_json)
+
+
+def _problems(only: Sequence[str] | None) -> list[str]:
+    from livepde.bench.problems import PROBLEMS
+
+    for name in only or ():
+        named(name, PROBLEMS, "problem")
+    return list(only or ())
+
+
+def _command(name: str, only: Sequence[str] | None, seeds: int) -> list[str]:
+    chosen = [word for problem in only or () for word in ("--only", problem)]
+    return ["livepde", "bench", name, *chosen, "--seeds", str(seeds)]

@@ -1,0 +1,66 @@
+"""To begin with: a case to start from, and the ready-made equations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from livepde.cli.printing import (
+    named,
+    print_table,
+    terminal,
+)
+
+__all__ = ["equations", "init"]
+
+
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
+) -> None:
+    """Write a commented case to start from, with made-up data that it runs on.
+
+    Example:  livepde init mycase
+    """
+    from livepde.cases.template import write_template
+
+    case, data = write_template(folder)
+    console = terminal()
+    console.print(f"Wrote {case} and {data}. Next:", soft_wrap=True)
+    console.print(f"  livepde check {case}\n  livepde run {case}", soft_wrap=True)
+
+
+def equations(
+    name: Annotated[str, typer.Argument(help="Name of an equation; 'list' shows them.")] = "list",
+) -> None:
+    """Show the ready-made equations, and what a case says about one of them.
+
+    Example:  livepde equations heat
+    """
+    from livepde.models import EQUATIONS
+    from livepde.runs import Table
+
+    console = terminal()
+    if name == "list":
+        for item in EQUATIONS.values():
+            console.print(f"[bold]{item.name}[/]  {escape(item.summary)}", soft_wrap=True)
+        return
+    found = named(name, EQUATIONS, "equation")
+    console.print(f"[bold]{found.name}[/]  {escape(found.summary)}", soft_wrap=True)
+    console.print(escape(found.formula), soft_wrap=True)
+    rows = [("state", "u", found.state.text, found.state.unit, "")]
+    for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):
+        rows += [(table, key, item.text, item.unit, "") for key, item in known.items()]
+    for key, option in found.options.items():
+        default = "needed" if option.default is None else str(option.default)
+        choices = f" ({', '.join(option.choices)})" if option.choices else ""
+        rows.append(("[options]", key, option.text + choices, option.unit, default))
+    unit = found.state.unit
+    rows += [
+        ("[channels], quantity", key, item.text, unit, "") for key, item in found.quantities.items()
+    ]
+    columns = ("where", "name", "what", "unit", "default")
+    print_table(console, Table("What a case says about it", columns, rows))
+    console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")

@@ -1,0 +1,189 @@
+"""Look at a case before it runs: model, data, and what its sensors can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from livepde.cli.options import (
+    CaseArgument,
+    CodeOption,
+    SetOption,
+    load_case,
+)
+from livepde.cli.printing import (
+    CHECK_FAILED,
+    print_table,
+    terminal,
+)
+
+if TYPE_CHECKING:
+    from livepde.cases import Case, Prepared
+    from livepde.streams import Table as Samples
+
+__all__ = ["check"]
+
+MOST_CHANNELS = 40  # rows of the table of channels
+
+
+def check(
+    case: CaseArgument,
+    data: Annotated[
+        str | None,
+        typer.Option(help="Other data than the case names (.csv, .jsonl).", show_default=False),
+    ] = None,
+    allow_code: CodeOption = False,
+    settings: SetOption = None,
+    advise: Annotated[
+        bool,
+        typer.Option("--advise", help="Tell also where one more point sensor would help most."),
+    ] = False,
+) -> None:
+    """Check a case and its data, and tell what its sensors can identify.
+
+    Nothing is written. Example:  livepde check mycase/case.toml
+    """
+    console = terminal()
+    loaded = load_case(case, allow_code, settings)
+    prepared = loaded.prepare(data)
+    _show_model(console, prepared)
+    samples: Samples = prepared.stream  # type: ignore[assignment]
+    if data is None or not data.endswith((".jsonl", ".ndjson")):
+        _show_data(console, loaded, prepared, samples)
+    failed = _show_checks(console, prepared)
+    notes = [*loaded.notes, *_show_preview(console, prepared)]
+    if advise:
+        _show_advice(console, prepared)
+    for note in notes:
+        console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
+    if failed:
+        raise typer.Exit(CHECK_FAILED)
+    console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
+
+
+def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
+    """Print what the sensors can tell; return sentences on it."""
+    from livepde.cases.preview import preview
+    from livepde.runs import Table
+
+    found = preview(prepared, prepared.stream)
+    rows = [
+        (
+            item.name,
+            f"{item.prior:.3g}",
+            f"{item.posterior:.3g}",
+            f"{100 * item.left:.2g} %",
+            item.unit,
+            "hardly identified" if item.hardly else "",
+        )
+        for item in found.unknowns
+    ]
+    if rows:
+        columns = ("unknown", "prior deviation", "after", "left", "unit", "")
+        title = f"What {found.samples} samples can tell, at best"
+        print_table(console, Table(title, columns, rows))
+    return found.sentences
+
+
+def _show_advice(console: Console, prepared: Prepared) -> None:
+    """Print where one more sensor would help most."""
+    from livepde.cases.placement import advise
+    from livepde.runs import Table
+
+    found = advise(prepared, prepared.stream)
+    unit = prepared.case.frame.equation.length_unit
+    at = ", ".join(f"{x:.3g}" for x in found.position)
+    rows = [
+        (name, f"{100 * left:.2g} %", f"{100 * found.then[name]:.2g} %")
+        for name, left in found.now.items()
+    ]
+    title = f"One more sensor helps most at {at} {unit}".rstrip()
+    columns = ("unknown", "deviation left", "with the sensor")
+    print_table(console, Table(title, columns, rows))
+    console.print(
+        f"Best of {found.candidates} vertices by the mean share of variance left, with the noise "
+        "of the other sensors.",
+        soft_wrap=True,
+    )
+
+
+def _show_model(console: Console, prepared: Prepared) -> None:
+    case, model = prepared.case, prepared.case.model
+    console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.frame.equation.formula)}")
+    from livepde.linalg import analyse
+
+    engine = type(analyse(model.form_M.pattern("v", "u"))).__name__.removesuffix("Solver")
+    console.print(
+        f"State: {model.X.dim} coefficients; parameter: {model.Q.dim}; "
+        f"law: {type(case.law).__name__}; scheme: {type(case.scheme).__name__}; "
+        f"engine: {engine}."
+    )
+
+
+def _show_data(console: Console, case: Case, prepared: Prepared, samples: Samples) -> None:
+    import numpy as np
+
+    from livepde.runs import Table
+
+    steps = np.diff(samples.t)
+    unit = case.frame.equation.time_unit
+    begin = f" from {prepared.origin}" if prepared.origin else ""
+    text = f"Data: {len(samples)} samples{begin}, t = {samples.t[0]:g} to {samples.t[-1]:g} {unit}"
+    if len(steps):
+        text += f"; step {np.median(steps):g} {unit}, longest {steps.max():g} {unit}"
+    console.print(text + ".", soft_wrap=True)
+    rows: list[tuple[Any, ...]] = []
+    many = len(samples.names) > MOST_CHANNELS
+    for name, values in zip(samples.names, samples.values.T, strict=True):
+        if many and len(rows) == MOST_CHANNELS:
+            more = len(samples.names) - MOST_CHANNELS
+            rows.append((f"and {more} more", "", "", "", "", "", ""))
+            break
+        present = values[np.isfinite(values)]
+        least, largest = (
+            (f"{present.min():.4g}", f"{present.max():.4g}") if len(present) else ("–", "–")
+        )
+        rows.append(
+            (
+                name,
+                case.frame.spec.channels[name].role,
+                least,
+                largest,
+                case.frame.unit(name),
+                len(values) - len(present),
+                _longest_gap(np.isfinite(values)),
+            )
+        )
+    columns = ("channel", "role", "least", "largest", "unit", "missing", "longest gap")
+    print_table(console, Table("Channels", columns, rows))
+
+
+def _longest_gap(present: Any) -> int:
+    longest = here = 0
+    for value in present.tolist():
+        here = 0 if value else here + 1
+        longest = max(longest, here)
+    return longest
+
+
+def _show_checks(console: Console, prepared: Prepared) -> bool:
+    """Run the library's own checks on the case's model; True if one failed."""
+    from livepde.diagnostics import check_model, check_observation
+
+    case, first = prepared.case, prepared.first
+    values = first.z if isinstance(first.z, Mapping) else {}
+    inputs = {name: values[name] for name in case.model.channels if values[name] == values[name]}
+    report = check_model(case.model, u=prepared.u0, t=first.t, inputs=inputs)
+    observed, size = prepared.identifier.observed, prepared.typical(inputs)
+    read = {name: values[name] for name in observed.observation.inputs}
+    reports = [report, check_observation(observed, at=size, inputs={**inputs, **read})]
+    for item in reports:
+        if item.ok:
+            console.print(f"{item.name}: [green]ok[/] ({len(item.lines)} properties)")
+        else:
+            console.print(escape(str(item)), soft_wrap=True)
+    return not all(item.ok for item in reports)

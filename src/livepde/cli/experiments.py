@@ -1,0 +1,114 @@
+"""Published experiments: the demo, and what the paper shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from livepde import __version__
+from livepde.cli.options import (
+    JsonOption,
+    OutOption,
+)
+from livepde.cli.printing import (
+    can_draw,
+    named,
+    report_outcome,
+    show,
+    terminal,
+)
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["demo", "reproduce"]
+
+
+def demo(out: OutOption = None) -> None:
+    """Watch the paper's method find q(x) and u(t, x) online.
+
+    Runs the first experiment of Boiger and Kaltenbacher (2016), prints how close it came, and
+    leaves a run directory with the figures of the paper.
+
+    Example:  livepde demo
+    """
+    from livepde.reproduce import EXPERIMENTS
+    from livepde.runs import RunWriter, free_path
+
+    console = terminal()
+    console.print(
+        "\n[bold]Which reaction q(x) explains what is seen?[/]\n\n"
+        "  u_t - (D u_x)_x + q u = f  on (0, 1), u is seen on (0.3, 0.87), one sample at a time.\n"
+        "  The state u and the parameter q are estimated together while the samples come.\n",
+        soft_wrap=True,
+    )
+    folder = out or free_path(Path("runs") / "demo")
+    experiment = EXPERIMENTS["seed"]
+    command = ["livepde", "demo"]
+    writer = RunWriter.create(
+        folder, version=__version__, command=command, title="Demo: " + experiment.summary
+    )
+    outcome = experiment.run(None, progress=True)
+    show(console, outcome.tables, outcome.checks, outcome.notes)
+    figures = outcome.figures if can_draw(console) else {}
+    writer.finish(
+        status="finished",
+        dataset=outcome.dataset,
+        shown=outcome.tables,
+        checks=outcome.checks,
+        notes=outcome.notes,
+        figures=figures,
+    )
+    for name in figures:
+        console.print(f"Figure: {folder / name}.png", soft_wrap=True)
+    console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+
+
+def reproduce(
+    name: Annotated[str, typer.Argument(help="Name of the experiment; 'list' shows them.")],
+    truth: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the data come from: discrete (the same scheme), fine (a finer grid), "
+            "analytic (a formula).",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Keep dataset and figures in a new run directory.", show_default=False),
+    ] = None,
+) -> None:
+    """Run a published or stated experiment and compare it with its expected numbers.
+
+    Example:  livepde reproduce seed --json
+    """
+    from livepde.reproduce import EXPERIMENTS
+    from livepde.runs import RunWriter
+
+    if name == "list":
+        for item in EXPERIMENTS.values():
+            terminal().print(f"[bold]{item.name}[/]  {escape(item.summary)}")
+        return
+    experiment = named(name, EXPERIMENTS, "experiment")
+    command = ["livepde", "reproduce", name, *(["--truth", truth] if truth else [])]
+    writer = None
+    if out is not None:
+        writer = RunWriter.create(
+            out, version=__version__, command=command, title=experiment.summary
+        )
+    outcome = experiment.run(truth, progress=not as_json)
+    if writer is not None:
+        writer.finish(
+            status="finished",
+            dataset=outcome.dataset,
+            shown=outcome.tables,
+            checks=outcome.checks,
+            notes=outcome.notes,
+            figures=outcome.figures if can_draw(terminal(err=True)) else {},
+        )
+    report_outcome(outcome, command, as_json)

@@ -1,0 +1,151 @@
+"""What commands print: tables, checks and notes for people, one JSON object for programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from livepde import __version__
+from livepde.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from livepde.runs import Check, Outcome, Table
+
+__all__ = [
+    "BAD_INPUT",
+    "CHECK_FAILED",
+    "INTERRUPTED",
+    "can_draw",
+    "figures_of",
+    "named",
+    "print_json",
+    "print_table",
+    "report_outcome",
+    "show",
+    "terminal",
+]
+
+CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
+FIGURES_MISSING = "No figures: they need Matplotlib, pip install 'livepde[plots]'."
+
+
+def terminal(*, err: bool = False) -> Console:
+    """Return where to print: standard output, or standard error."""
+    return Console(stderr=err, highlight=False)
+
+
+def named(name: str, known: Mapping[str, Any], what: str) -> Any:
+    """Return an item by name; one sentence with the closest name if there is none."""
+    if name not in known:
+        import difflib
+
+        close = difflib.get_close_matches(name, known, n=1)
+        hint = f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known)}."
+        raise ConfigurationError(f"there is no {what} '{name}'; {hint}")
+    return known[name]
+
+
+def can_draw(console: Console) -> bool:
+    """Return whether figures can be drawn; say why not."""
+    import importlib.util
+
+    found = importlib.util.find_spec("matplotlib") is not None
+    if not found:
+        console.print(escape(FIGURES_MISSING))
+    return found
+
+
+def figures_of(dataset: Any, title: str) -> dict[str, Any]:
+    """Return the figures of a run: name -> function that draws."""
+    from livepde import plots
+
+    if not dataset.sizes["time"]:
+        return {}
+    return {"overview": lambda: plots.overview(dataset, title=title)}
+
+
+def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:
+    """Print an outcome; with `as_json` a failed check ends the command with exit code 1."""
+    if as_json:
+        print_json(outcome.tables, outcome.checks, outcome.notes, command=" ".join(command))
+    else:
+        show(terminal(), outcome.tables, outcome.checks, outcome.notes)
+    if as_json and not outcome.ok:
+        raise typer.Exit(CHECK_FAILED)
+
+
+def print_json(
+    shown: Iterable[Table],
+    checks: Iterable[Check],
+    notes: Iterable[str],
+    *,
+    dataset: Any = None,
+    **more: Any,
+) -> None:
+    """Print one JSON object; `dataset`: with the measures of a run."""
+    from livepde.runs import measures
+    from livepde.runs.directory import plain
+
+    content: dict[str, Any] = {"livepde": __version__, **more}
+    content["checks"] = [item.to_dict() for item in checks]
+    if dataset is not None:
+        content["measures"] = measures(dataset)
+    content["tables"] = [item.to_dict() for item in shown]
+    content["notes"] = list(notes)
+    sys.stdout.write(json.dumps(plain(content), ensure_ascii=False) + "\n")
+
+
+def show(
+    console: Console, shown: Iterable[Table], checks: Iterable[Check], notes: Iterable[str]
+) -> None:
+    """Print tables, checks and notes."""
+    for table in shown:
+        print_table(console, table)
+    _print_checks(console, list(checks))
+    for note in notes:
+        console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Print a table."""
+    from rich.box import SIMPLE_HEAD
+
+    grid = RichTable(
+        title=escape(table.title), title_justify="left", box=SIMPLE_HEAD, title_style="bold"
+    )
+    for k, column in enumerate(table.columns):
+        numbers = k > 0 and all(_numeric(row[k]) for row in table.rows)
+        grid.add_column(escape(column), justify="right" if numbers else "left")
+    for row in table.rows:
+        grid.add_row(*(escape(_cell(value)) for value in row))
+    console.print(grid)
+
+
+def _numeric(value: Any) -> bool:
+    if isinstance(value, int | float):
+        return True
+    text = str(value).removesuffix(" %")
+    return text == "–" or text.lstrip("+-").replace(".", "").replace("e", "").isdigit()
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _print_checks(console: Console, checks: Sequence[Check]) -> None:
+    from livepde.runs.directory import bound_text
+
+    if not checks:
+        return
+    grid = RichTable.grid(padding=(0, 2))
+    for item in checks:
+        mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
+        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, bound_text(item))
+    console.print(grid)

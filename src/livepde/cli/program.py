@@ -1,0 +1,66 @@
+"""The program: its commands, and how it ends."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from threadpoolctl import threadpool_limits
+
+from livepde import __version__
+from livepde.cli.bench import bench
+from livepde.cli.cases import equations, init
+from livepde.cli.check import check
+from livepde.cli.experiments import demo, reproduce
+from livepde.cli.printing import BAD_INPUT, terminal
+from livepde.cli.report import report
+from livepde.cli.run import run
+from livepde.errors import LivepdeError
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="livepde",
+    help="""Identify the unknown parameters of a process that a PDE describes, while it runs.
+
+    Start with:  livepde demo,  then  livepde init mycase,  livepde run mycase/case.toml""",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for command in (demo, init, check, run, report, equations, reproduce):
+    app.command()(command)
+app.add_typer(bench)
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    try:
+        # The dense matrices of a step are small: threads for them cost more than they save.
+        with threadpool_limits(1):
+            app(standalone_mode=True)
+    except LivepdeError as error:
+        terminal(err=True).print(f"[bold red]Error:[/] {escape(str(error))}", soft_wrap=True)
+        return BAD_INPUT
+    except BrokenPipeError:  # the reader of a pipe has seen enough
+        sys.stderr.close()
+    return 0
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        terminal().print(f"livepde {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass

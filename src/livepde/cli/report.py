@@ -1,0 +1,109 @@
+"""Look at what a run found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from livepde.cli.options import (
+    CodeOption,
+    JsonOption,
+    load_case,
+)
+from livepde.cli.printing import (
+    CHECK_FAILED,
+    can_draw,
+    figures_of,
+    print_json,
+    show,
+    terminal,
+)
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["report"]
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")],
+    theory: Annotated[
+        bool,
+        typer.Option(
+            "--theory",
+            help="What the paper's theory says about the run: constants, excitation, conditions, "
+            "T*. Takes the samples again; writes theory.md.",
+        ),
+    ] = False,
+    data: Annotated[
+        str | None,
+        typer.Option(help="With --theory: the run's data, if its case was moved."),
+    ] = None,
+    as_json: JsonOption = False,
+    allow_code: CodeOption = False,
+) -> None:
+    """Show what a run found: tables, and figures into the run directory.
+
+    Example:  livepde report runs/mycase
+    Theory:   livepde report runs/mycase --theory
+    """
+    from livepde import runs
+
+    if theory:
+        _report_theory(runs.open(folder), data, as_json, allow_code)
+        return
+    from livepde.runs.directory import markdown
+
+    opened = runs.open(folder)
+    shown = opened.summary()
+    checks = opened.checks
+    console = terminal(err=as_json)
+    drawn = []
+    if can_draw(console):
+        for name, draw in figures_of(opened.dataset, opened.title).items():
+            draw().savefig(folder / f"{name}.png", dpi=120)
+            drawn.append(f"{name}.png")
+    notes = opened.notes
+    text = markdown(opened.title, shown, checks, notes, drawn)
+    (folder / "report.md").write_text(text, encoding="utf-8")
+    if as_json:
+        print_json(
+            shown, checks, notes, run=str(folder), status=opened.status, dataset=opened.dataset
+        )
+        if not all(item.ok for item in checks):
+            raise typer.Exit(CHECK_FAILED)
+        return
+    console.print(f"[bold]{escape(opened.title)}[/]  {opened.status}")
+    show(console, shown, checks, notes)
+    for name in drawn:
+        console.print(f"Figure: {folder / name}", soft_wrap=True)
+
+
+def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
+    """Take a run's samples again, and print and write what the theory says."""
+    from livepde.diagnostics import theory_report
+    from livepde.errors import CaseError, RunError
+    from livepde.runs import Table
+
+    case = opened.case_file()
+    try:
+        prepared = load_case(case, allow_code, opened.settings).prepare(data or opened.data_file)
+    except CaseError as error:
+        if case.parent != opened.path:
+            raise
+        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
+        raise RunError(f"{error} {moved}") from error
+    found = theory_report(prepared.identifier, prepared.stream)
+    target = opened.path / "theory.md"
+    target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")
+    shown = [Table(table.title, table.columns, table.rows) for table in found.tables]
+    if as_json:
+        print_json(shown, [], found.notes, run=str(opened.path), theory=str(target))
+        return
+    console = terminal()
+    console.print(f"[bold]{escape(opened.title)}[/]  theory")
+    show(console, shown, [], found.notes)
+    console.print(f"Page: {escape(str(target))}", soft_wrap=True)
