@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import zipfile
@@ -15,7 +16,7 @@ import numpy as np
 from livepde.errors import RunError
 from livepde.linalg import Array
 
-__all__ = ["flatten", "read", "rebuild", "write"]
+__all__ = ["flatten", "packed", "read", "rebuild", "unpacked", "write"]
 
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
@@ -60,15 +61,33 @@ def _others(array: Array, axis: int) -> list[int]:
     return [length for k, length in enumerate(array.shape) if k != axis]
 
 
-def write(
-    path: str | os.PathLike[str], header: Mapping[str, Any], leaves: Mapping[str, Any]
-) -> None:
-    """Write header and leaves; the file appears whole or not at all."""
+def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
+    """Return header and leaves as one archive."""
+    archive = io.BytesIO()
+    np.savez(archive, header=json.dumps(dict(header)), **leaves)
+    return archive.getvalue()
+
+
+def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Array]]:
+    """Return header and leaves of an archive; `where` names it in messages."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            leaves = {name: archive[name] for name in archive.files}
+        header: dict[str, Any] = json.loads(str(leaves.pop("header")))
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise RunError(
+            f"{where} is not a checkpoint of livepde, or it is damaged: {error}."
+        ) from error
+    return header, leaves
+
+
+def write(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write an archive; the file appears whole or not at all."""
     target = Path(path)
     partial = target.with_name(target.name + ".partial")
     try:
         with partial.open("wb") as file:
-            np.savez(file, header=json.dumps(dict(header)), **leaves)
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         partial.replace(target)
@@ -78,14 +97,9 @@ def write(
         ) from error
 
 
-def read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return header and leaves of a checkpoint."""
+def read(path: str | os.PathLike[str]) -> bytes:
+    """Return the archive in a file."""
     try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            leaves = {name: archive[name] for name in archive.files}
-        header: dict[str, Any] = json.loads(str(leaves.pop("header")))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise RunError(
-            f"{path} is not a checkpoint of livepde, or it is damaged: {error}."
-        ) from error
-    return header, leaves
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise RunError(f"Cannot read the checkpoint {path}: {error.strerror or error}.") from error

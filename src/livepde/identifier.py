@@ -363,6 +363,10 @@ class Identifier:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to a file, from which `load` continues with bit-identical numbers."""
+        checkpoint.write(path, self.dump())
+
+    def dump(self) -> bytes:
+        """Return the state as `save` writes it."""
         header = {**self._fingerprint(), "begun": self._state is not None}
         leaves = {
             "t": self._t,
@@ -372,7 +376,7 @@ class Identifier:
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
-        checkpoint.write(path, header, leaves)
+        return checkpoint.packed(header, leaves)
 
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continue from a saved state; the identifier must be built as the one that was saved.
@@ -382,12 +386,16 @@ class Identifier:
         RunError
             The file is damaged, or of another model, law or set of sensors.
         """
-        header, leaves = checkpoint.read(path)
+        self.restore(checkpoint.read(path), str(path))
+
+    def restore(self, content: bytes, where: str = "the checkpoint") -> None:
+        """Continue from what `dump` returned; `where` names it in messages. Raises as `load`."""
+        header, leaves = checkpoint.unpacked(content, where)
         mine = self._fingerprint()
         for key, value in mine.items():
             if header.get(key) != value:
                 raise RunError(
-                    f"{path} was saved with {key} = {header.get(key)!r}; this identifier has "
+                    f"{where} was saved with {key} = {header.get(key)!r}; this identifier has "
                     f"{value!r}. Build it as it was when it was saved."
                 )
         state = None
@@ -400,7 +408,7 @@ class Identifier:
                 state = checkpoint.rebuild(template, leaves)
         except (KeyError, ValueError) as error:
             raise RunError(
-                f"{path} does not fit this identifier ({error}): build it with the law's options "
+                f"{where} does not fit this identifier ({error}): build it with the law's options "
                 "as they were when it was saved."
             ) from error
         self._t, self._samples, self._z, self._inputs = t, samples, z, inputs

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import xarray as xr
@@ -17,7 +17,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 
-__all__ = ["Estimate", "Result"]
+__all__ = ["Estimate", "Record", "Records", "Result"]
 
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular")
 
@@ -119,23 +119,71 @@ def _unknown(space: FunctionSpace, label: str) -> Any:
     return space.unknowns[label.split("[")[0]]
 
 
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What is kept of an estimate.
+
+    Attributes
+    ----------
+    t, steps, notes, innovation, withheld_error
+        Of the estimate.
+    values, stds
+        Scalar unknowns and their standard deviations, in the order of their labels.
+    status
+        Index of the status code.
+    profiles
+        Fields and their deviations at the vertices of the mesh; None where none are kept.
+    """
+
+    t: float
+    values: Array
+    stds: Array
+    innovation: Array
+    withheld_error: Array
+    status: int
+    steps: int
+    notes: Mapping[str, float]
+    profiles: Mapping[str, Array] | None = None
+
+
+class Records(Protocol):
+    """Where records are kept: a list, or the journal of a run."""
+
+    def append(self, record: Record, /) -> None:
+        """Keep one more."""
+
+    def __iter__(self) -> Iterator[Record]: ...
+
+    def __len__(self) -> int: ...
+
+
 class Result:
     """Estimates of a run, as they are added.
 
     Scalars, innovations and status are kept for every sample; fields, evaluated at the vertices of
     the mesh, for every `fields_every`-th and the last.
+
+    Parameters
+    ----------
+    records
+        Where to keep them; default a new list.
     """
 
     def __init__(
-        self, model: Model, observed: Observed, withheld: Observed | None, fields_every: int
+        self,
+        model: Model,
+        observed: Observed,
+        withheld: Observed | None,
+        fields_every: int,
+        records: Records | None = None,
     ) -> None:
         self.model = model
         self.observed = observed
         self.withheld = withheld
         self.fields_every = fields_every
         self.last: Estimate | None = None
-        self._rows: list[tuple[Any, ...]] = []
-        self._fields: list[tuple[float, dict[str, Array]]] = []
+        self.records: Records = [] if records is None else records
+        self._count = len(self.records)
 
     @classmethod
     def empty(
@@ -145,25 +193,26 @@ class Result:
         return cls(model, observed, withheld, fields_every)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return self._count
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
         values = estimate.parameters
-        self._rows.append(
-            (
+        keeps = self._count % self.fields_every == 0
+        self.records.append(
+            Record(
                 estimate.t,
-                [values[k][0] for k in values],
-                [values[k][1] for k in values],
+                np.array([value for value, _ in values.values()]),
+                np.array([std for _, std in values.values()]),
                 estimate.innovation,
                 estimate.withheld_error,
                 STATUS_CODES.index(estimate.status.code),
-                estimate.notes,
                 estimate.steps,
+                estimate.notes,
+                self._profiles(estimate) if keeps else None,
             )
         )
-        if (len(self._rows) - 1) % self.fields_every == 0:
-            self._fields.append((estimate.t, self._profiles(estimate)))
+        self._count += 1
         self.last = estimate
 
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
@@ -195,15 +244,16 @@ class Result:
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
         with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes.
         """
-        fields = list(self._fields)
+        rows = list(self.records)
+        fields = [(row.t, row.profiles) for row in rows if row.profiles is not None]
         if self.last is not None and (not fields or fields[-1][0] != self.last.t):
             fields.append((self.last.t, self._profiles(self.last)))
-        rows = list(zip(*self._rows, strict=True)) or [()] * 8
+        times = np.array([row.t for row in rows], dtype=float)
         points = self.model.mesh.p
         order = np.argsort(points[0]) if len(points) == 1 else np.arange(points.shape[1])
         data = xr.Dataset(
             coords={
-                "time": ("time", np.array(rows[0], dtype=float), {"units": self.model.time_unit}),
+                "time": ("time", times, {"units": self.model.time_unit}),
                 "snapshot": np.array([t for t, _ in fields]),
                 "sensor": list(self.observed.names),
                 "withheld": list(self.withheld.names if self.withheld else ()),
@@ -216,10 +266,10 @@ class Result:
         units = self._units()
         for k, label in enumerate(self.model.parameter_space.labels):
             unknown = _unknown(self.model.parameter_space, label)
-            values = np.array([row[k] for row in rows[1]], dtype=float)
+            values = np.array([row.values[k] for row in rows], dtype=float)
             unit = {"units": unknown.unit}
             data[label] = ("time", values, {**unit, **_prior(unknown)})
-            std = np.array([row[k] for row in rows[2]], dtype=float)
+            std = np.array([row.stds[k] for row in rows], dtype=float)
             data[f"{label}_std"] = ("time", std, unit)
             for name, end in _ends(label, unknown, values, std).items():
                 data[name] = ("time", end, unit)
@@ -228,20 +278,24 @@ class Result:
             unit = {"units": units.get(_bare(name), "")}
             data[name] = (("snapshot", "vertex"), values, unit)
         unit = {"units": self.observed.observation.unit}
-        shape = (len(self._rows), self.observed.size)
-        data["innovation"] = (("time", "sensor"), np.reshape(rows[3], shape), unit)
+        shape = (len(rows), self.observed.size)
+        innovations = np.reshape([row.innovation for row in rows], shape)
+        data["innovation"] = (("time", "sensor"), innovations, unit)
         if self.withheld is not None:
-            shape = (len(self._rows), self.withheld.size)
-            data["withheld_error"] = (("time", "withheld"), np.reshape(rows[4], shape), unit)
+            errors = np.reshape(
+                [row.withheld_error for row in rows], (len(rows), self.withheld.size)
+            )
+            data["withheld_error"] = (("time", "withheld"), errors, unit)
         flags = {
             "flag_values": list(range(len(STATUS_CODES))),
             "flag_meanings": " ".join(STATUS_CODES),
         }
-        data["status"] = ("time", np.array(rows[5], dtype=np.int32), flags)
-        data["steps"] = ("time", np.array(rows[7], dtype=np.int32), {"long_name": "substeps taken"})
-        for name in dict.fromkeys(key for notes in rows[6] for key in notes):
+        data["status"] = ("time", np.array([row.status for row in rows], dtype=np.int32), flags)
+        steps = np.array([row.steps for row in rows], dtype=np.int32)
+        data["steps"] = ("time", steps, {"long_name": "substeps taken"})
+        for name in dict.fromkeys(key for row in rows for key in row.notes):
             key = f"note_{name}" if name in data else name  # an unknown may have the same name
-            data[key] = ("time", np.array([notes.get(name, np.nan) for notes in rows[6]]))
+            data[key] = ("time", np.array([row.notes.get(name, np.nan) for row in rows]))
         data.attrs["fields"] = " ".join(self.model.parameter_space.fields)
         data.attrs["scalars"] = "\n".join(self.model.parameter_space.labels)
         components = self.model.state_space.fields.items()

@@ -6,7 +6,7 @@ import csv
 import difflib
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -18,7 +18,17 @@ from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.identifier import Sample
 from livepde.linalg import Array
 
-__all__ = ["Clock", "Column", "JsonLines", "Table", "read_csv", "read_json_lines", "tabulated"]
+__all__ = [
+    "Clock",
+    "Column",
+    "JsonLines",
+    "Table",
+    "channel_value",
+    "read_csv",
+    "read_json_lines",
+    "row_time",
+    "tabulated",
+]
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "#n/a"})
 Instant: TypeAlias = float | str | date | datetime
@@ -303,16 +313,7 @@ class JsonLines:
                 continue
             where = f"{self._where}, line {number}"
             row = _object(line, where)
-            if clock.name not in row:
-                raise SampleError(
-                    f"{where}: there is no '{clock.name}'{_hint(clock.name, list(row))}"
-                )
-
-            def here(_: int, where: str = where) -> str:
-                return f"{where},"
-
-            times, dates = _times([row[clock.name]], clock, here)
-            t = float(times[0])
+            t, dates = row_time(row, clock, where)
             low, high = clock.bounds(dates, self._where)
             if t > high:
                 return
@@ -330,17 +331,29 @@ class JsonLines:
                     stamp = datetime.fromtimestamp(t / clock.second, UTC)
                     self.origin = stamp.replace(tzinfo=None)
             values = {
-                channel: self._value(column, row, where)
+                channel: channel_value(column, row, self._missing, where)
                 for channel, column in self._columns.items()
             }
             yield Sample(t - zero, values)
 
-    def _value(self, column: Column, row: Mapping[str, Any], where: str) -> float:
-        numbers = []
-        for name in column.names:
-            value = _number(row.get(name), f"{where}, '{name}'")
-            numbers.append(math.nan if value in self._missing else value)
-        return column.factor * sum(numbers) / len(numbers) + column.offset
+
+def row_time(row: Mapping[str, Any], clock: Clock, where: str = "row") -> tuple[float, bool]:
+    """Return the time of a row in the model's unit, and whether it is a date (then since 1970)."""
+    if clock.name not in row:
+        raise SampleError(f"{where}: there is no '{clock.name}'{_hint(clock.name, list(row))}")
+    times, dates = _times([row[clock.name]], clock, lambda _: f"{where},")
+    return float(times[0]), dates
+
+
+def channel_value(
+    column: Column, row: Mapping[str, Any], missing: Collection[float], where: str = "row"
+) -> float:
+    """Return the value of a channel in a row, NaN if it is missing."""
+    numbers = []
+    for name in column.names:
+        value = _number(row.get(name), f"{where}, '{name}'")
+        numbers.append(math.nan if value in missing else value)
+    return column.factor * sum(numbers) / len(numbers) + column.offset
 
 
 def _check_columns(where: str, needed: Iterable[str], known: list[str]) -> None:

@@ -1,0 +1,270 @@
+"""Where rows come from while a process runs: a growing file, standard input, any iterator."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import queue
+import threading
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from livepde.errors import DataError
+
+__all__ = ["Follow", "Lines", "Row", "Rows", "Source", "json_row"]
+
+LONGEST = 1_000_000  # characters of a line or message; longer ones are refused unread
+BATCH = 1000  # rows that a poll brings at most
+NAP = 0.05  # seconds between looks at a file that does not grow
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a source.
+
+    Attributes
+    ----------
+    values
+        Column -> value.
+    token
+        By which the source knows it again.
+    broken
+        Why there are no values; '' if there are.
+    """
+
+    values: Mapping[str, Any]
+    token: Any = None
+    broken: str = ""
+
+
+class Source(Protocol):
+    """Brings rows as they come; used from one thread."""
+
+    @property
+    def done(self) -> bool:
+        """True if nothing more will come."""
+
+    def poll(self, wait: float) -> Sequence[Row]:
+        """Return the rows that are there, or after at most `wait` seconds none."""
+
+    def position(self, waiting: Iterable[Any]) -> str:
+        """Return from where to go on, if the rows with these tokens are still to be taken.
+
+        A source that is made with it brings those rows and all that follow; '' if the source itself
+        remembers, or cannot go back.
+        """
+
+    def acknowledge(self, tokens: Iterable[Any]) -> None:
+        """Hear which rows have been taken for good."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+def json_row(text: str | bytes, token: Any = None) -> Row:
+    """Return the row in a line of JSON: an object, column -> value."""
+    if len(text) > LONGEST:
+        return Row({}, token, f"longer than {LONGEST} characters")
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        return Row({}, token, f"not JSON ({type(error).__name__})")
+    if not isinstance(found, dict):
+        return Row({}, token, "not an object, column -> value")
+    return Row(found, token)
+
+
+class Follow:
+    """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
+
+    A line counts when it is ended. A file that has become shorter or was replaced is read from its
+    start: samples that are known are late then.
+
+    Parameters
+    ----------
+    path
+        The file; it need not exist yet if `follow`.
+    separator
+        Of a CSV file.
+    follow
+        Wait for more at the end of the file.
+    position
+        As `accepted` returned it.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        separator: str = ",",
+        follow: bool = False,
+        position: str = "",
+    ) -> None:
+        self.path = Path(path)
+        self.follow = follow
+        self._separator = separator
+        self._json = self.path.suffix in (".jsonl", ".ndjson")
+        self._header: list[str] | None = None
+        self._offset = 0
+        self._start = int(position) if position else 0
+        self._identity: tuple[int, int] | None = None
+        self._ended = False
+        if not follow and not self.path.is_file():
+            raise DataError(f"there is no file {self.path}.")
+
+    @property
+    def done(self) -> bool:
+        """True at the end of a file that is not followed."""
+        return self._ended
+
+    def poll(self, wait: float) -> Sequence[Row]:
+        """Return the complete lines that are there."""
+        until = time.monotonic() + wait
+        while True:
+            rows = self._read()
+            if rows or self._ended:
+                return rows
+            if not self.follow:
+                self._ended = True
+                return rows
+            if time.monotonic() >= until:
+                return rows
+            time.sleep(min(NAP, wait))
+
+    def position(self, waiting: Iterable[Any]) -> str:
+        """Return the place of the first line that still waits, or of the next one."""
+        return str(min((start for start, _ in waiting), default=self._offset))
+
+    def acknowledge(self, tokens: Iterable[Any]) -> None:
+        """A file does not need to hear it."""
+
+    def close(self) -> None:
+        """Nothing is held open between polls."""
+
+    def _read(self) -> list[Row]:
+        try:
+            with self.path.open("rb") as file:
+                status = os.fstat(file.fileno())
+                identity = (status.st_dev, status.st_ino)
+                if self._identity not in (None, identity) or status.st_size < self._offset:
+                    self._header, self._offset, self._start = None, 0, 0
+                self._identity = identity
+                return self._lines(file)
+        except FileNotFoundError:
+            return []
+        except OSError as error:
+            raise DataError(f"{self.path} cannot be read: {error.strerror or error}.") from error
+
+    def _lines(self, file: io.BufferedReader) -> list[Row]:
+        rows: list[Row] = []
+        file.seek(self._offset)
+        while len(rows) < BATCH:
+            start = file.tell()
+            line = file.readline()
+            if not line.endswith(b"\n") and (self.follow or not line):
+                break
+            self._offset = file.tell()
+            row = self._row(line, (start, self._offset))
+            if row is not None and start >= self._start:
+                rows.append(row)
+            elif start < self._start and self._header is not None:
+                file.seek(self._start)  # what was accepted before
+                self._offset = self._start
+        return rows
+
+    def _row(self, line: bytes, token: Any) -> Row | None:
+        if not line.strip():
+            return None
+        if self._json:
+            return json_row(line, token)
+        try:
+            text = line.decode("utf-8-sig")
+            cells = next(csv.reader([text], delimiter=self._separator, skipinitialspace=True), [])
+        except (UnicodeDecodeError, csv.Error) as error:
+            return Row({}, token, f"not a line of a CSV file ({type(error).__name__})")
+        if self._header is None:
+            self._header = [cell.strip() for cell in cells]
+            return None
+        if len(cells) > len(self._header):
+            text = f"{len(cells)} fields, the header has {len(self._header)}"
+            return Row({}, token, text)
+        return Row(dict(zip(self._header, cells, strict=False)), token)
+
+
+class Lines:
+    """JSON lines from standard input, or whatever gives lines; read in a thread of its own."""
+
+    def __init__(self, lines: Iterable[str]) -> None:
+        self._queue: queue.Queue[str | None] = queue.Queue(BATCH)
+        self._ended = False
+        threading.Thread(target=self._pump, args=(lines,), daemon=True).start()
+
+    def _pump(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            if line.strip():
+                self._queue.put(line)
+        self._queue.put(None)
+
+    @property
+    def done(self) -> bool:
+        """True when the lines have ended."""
+        return self._ended
+
+    def poll(self, wait: float) -> Sequence[Row]:
+        """Return the lines that have come."""
+        rows: list[Row] = []
+        while len(rows) < BATCH and not self._ended:
+            try:
+                line = self._queue.get(timeout=wait) if not rows else self._queue.get_nowait()
+            except queue.Empty:
+                break
+            if line is None:
+                self._ended = True
+            else:
+                rows.append(json_row(line))
+        return rows
+
+    def position(self, waiting: Iterable[Any]) -> str:
+        """Nothing can be asked for again."""
+        return ""
+
+    def acknowledge(self, tokens: Iterable[Any]) -> None:
+        """Nothing waits to hear it."""
+
+    def close(self) -> None:
+        """The thread ends with its lines."""
+
+
+class Rows:
+    """Rows from a Python iterator of mappings, column -> value."""
+
+    def __init__(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        self._rows = iter(rows)
+        self._ended = False
+
+    @property
+    def done(self) -> bool:
+        """True when the iterator has ended."""
+        return self._ended
+
+    def poll(self, wait: float) -> Sequence[Row]:
+        """Return the next row."""
+        for values in self._rows:
+            return [Row(values)]
+        self._ended = True
+        return []
+
+    def position(self, waiting: Iterable[Any]) -> str:
+        """Nothing can be asked for again."""
+        return ""
+
+    def acknowledge(self, tokens: Iterable[Any]) -> None:
+        """Nothing waits to hear it."""
+
+    def close(self) -> None:
+        """Nothing is held."""

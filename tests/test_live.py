@@ -1,0 +1,223 @@
+"""Runs beside a process: journal, resume after a kill, rows out of order."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.runs.journal import Event, Journal
+from livepde.runs.live import Backlog, Live
+from livepde.streams.intake import Intake, Policy
+from livepde.streams.sources import Follow, Rows, json_row
+from livepde.streams.table import Clock, Column
+
+COLUMNS = {name: Column((name,)) for name in ("a", "b", "left")}
+CLOCK = Clock("t")
+
+
+def identifier() -> lp.Identifier:
+    mesh = lp.interval(0.0, 1.0, 10)
+    model = lp.Model(
+        state=lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("left"), "right": 0.0}),
+        parameter={"k": lp.Scalar(0.05, std=0.03)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
+    return lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=8)))
+
+
+def rows(count: int):
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        t = 0.1 * k
+        left = 1.0 + math.sin(t)
+        a, b = (left * f + 0.01 * rng.standard_normal() for f in (0.7, 0.4))
+        yield {"t": t, "a": a, "b": b, "left": left}
+
+
+def journal(path: Path) -> Journal:
+    return Journal.create(path, ("a", "b", "left"), (1, 2, 0))
+
+
+def live(folder: Path, source=None, **options) -> Live:
+    path = folder / "journal.sqlite"
+    kept = Journal.open(path, write=True) if path.exists() else journal(path)
+    if source is None:
+        source = Follow(folder / "data.csv", position=kept.position)
+    intake = Intake(COLUMNS, CLOCK, origin=0.0, last=kept.last)
+    return Live(identifier(), source, intake, kept, fields_every=10, **options)
+
+
+def write(folder: Path, count: int) -> None:
+    lines = ["t,a,b,left", *(",".join(map(repr, row.values())) for row in rows(count))]
+    (folder / "data.csv").write_text("\n".join(lines) + "\n")
+
+
+def same(one: Journal, other: Journal) -> None:
+    mine, yours = list(one), list(other)
+    assert len(mine) == len(yours) > 0
+    for a, b in zip(mine, yours, strict=True):
+        for name in ("t", "values", "stds", "innovation", "status", "steps"):
+            assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+        assert (a.profiles is None) == (b.profiles is None)
+        for name in a.profiles or ():
+            assert np.array_equal(a.profiles[name], b.profiles[name])
+
+
+def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
+    write(tmp_path, 50)
+    run = live(tmp_path)
+    run.run()
+    result = identifier().run(
+        [(row["t"], {k: row[k] for k in ("a", "b", "left")}) for row in rows(50)]
+    )
+    found = run.result.to_xarray()
+    assert np.array_equal(found["k"], result.to_xarray()["k"])
+    assert np.array_equal(found["innovation"], result.to_xarray()["innovation"], equal_nan=True)
+    assert found.sizes["snapshot"] == 6
+
+
+CHILD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_live import live
+run = live(Path(sys.argv[1]))
+run.resume()
+run.run()
+run.journal.close()
+"""
+
+
+def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    for folder in (whole, killed):
+        folder.mkdir()
+        write(folder, 700)
+    undisturbed = live(whole)
+    undisturbed.run()
+    here = str(Path(__file__).parent)
+    rng, kills = np.random.default_rng(1), 0
+    for _ in range(20):
+        child = subprocess.Popen([sys.executable, "-c", CHILD, str(killed), here])
+        path = killed / "journal.sqlite"
+        seen = path.stat().st_size if path.exists() else 0
+        while child.poll() is None and (not path.exists() or path.stat().st_size == seen):
+            time.sleep(0.01)
+        time.sleep(float(rng.uniform(0.0, 0.3)))
+        if child.poll() is None:
+            os.kill(child.pid, signal.SIGKILL)
+            kills += 1
+        if child.wait() == 0:
+            break
+    rest = live(killed)
+    rest.resume()
+    rest.run()
+    assert kills >= 2
+    same(rest.journal, undisturbed.journal)
+    assert rest.journal.accepted == 700
+
+
+def test_one_writer_many_readers(tmp_path):
+    write(tmp_path, 20)
+    run = live(tmp_path)
+    run.run()
+    with pytest.raises(lp.RunError, match="written by another process"):
+        Journal.open(tmp_path / "journal.sqlite", write=True)
+    with Journal.open(tmp_path / "journal.sqlite") as reader:
+        assert len(reader) == 20
+        with pytest.raises(lp.RunError, match="readonly"):
+            reader.note(Event(0.0, "x", "", ""))
+    run.journal.close()
+    Journal.open(tmp_path / "journal.sqlite", write=True).close()
+
+
+def test_rows_out_of_order_are_put_in_order_within_the_wait():
+    intake = Intake(COLUMNS, CLOCK, Policy(wait=1.0))
+    order = [0.0, 0.4, 0.2, 0.6, 2.0, 0.5, 3.5]
+    found = []
+    for t in order:
+        ready, _ = intake.take({"t": t, "a": t, "b": 0, "left": 0})
+        found += [sample.t for sample in ready]
+    found += [sample.t for sample in intake.flush()]
+    assert found == [0.0, 0.2, 0.4, 0.6, 2.0, 3.5]
+    assert intake.counts == {("late", name): 1 for name in COLUMNS}
+
+
+def test_channels_that_come_one_by_one_make_one_sample():
+    intake = Intake(COLUMNS, CLOCK, Policy(tolerance=0.05))
+    taken = []
+    for k in range(3):
+        for shift, name in ((0.0, "a"), (0.01, "b"), (0.02, "left")):
+            ready, refused = intake.take({"t": k + shift, name: float(k)})
+            taken += ready
+            assert not refused
+    assert [(s.t, len(s.values)) for s in taken] == [(0.0, 3), (1.0, 3), (2.0, 3)]
+
+
+@pytest.mark.parametrize(("repeated", "value"), [("first", 1.0), ("last", 2.0)])
+def test_a_second_value_is_counted(repeated, value):
+    intake = Intake(COLUMNS, CLOCK, Policy(repeated=repeated))
+    intake.take({"t": 0.0, "a": 1.0})
+    _, (refused,) = intake.take({"t": 0.0, "a": 2.0})
+    assert refused.kind == "repeated"
+    (sample,) = intake.flush()
+    assert sample.values == {"a": value}
+
+
+def test_a_clock_that_leaps_does_not_make_the_rest_late():
+    intake = Intake(COLUMNS, CLOCK, Policy(leap=10.0))
+    kinds = []
+    for t in (0.0, 1.0, 1e9, 2.0, 500.0, 501.0, 502.0):
+        kinds += [r.kind for r in intake.take({"t": t, "a": 0.0, "b": 0.0, "left": 0.0})[1]]
+    assert kinds == ["leap", "leap"]
+    assert intake.take({"t": 503.0, "a": 0.0, "b": 0.0, "left": 0.0})[0][0].t == 503.0
+
+
+@pytest.mark.parametrize("overflow", ["merge", "drop"])
+def test_what_comes_too_fast_is_merged_or_dropped_and_counted(tmp_path, overflow):
+    write(tmp_path, 100)
+    run = live(tmp_path, backlog=Backlog(overflow, 10))
+    run.run()
+    assert run.journal.counts[(overflow, "")] == 90
+    assert len(run.journal) == 10
+
+
+def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
+    good = list(rows(200))
+    mixed = []
+    for k, row in enumerate(good):
+        mixed.append(row)
+        mixed.append([{"t": "x"}, {"a": 1.0}, {"t": math.inf}, {"t": row["t"], "a": "?"}][k % 4])
+    run = live(tmp_path, Rows(mixed))
+    run.run()
+    assert len(run.journal) == 200
+    assert sum(run.journal.counts.values()) == 200
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", "nan", "1" * 2_000_000, "[" * 100_000])
+def test_lines_that_are_no_rows(text):
+    assert json_row(text).broken
+
+
+def test_silence_is_noticed(tmp_path):
+    class Silent(Rows):
+        def poll(self, wait):
+            now[0] += 1.0
+            if now[0] > 20.0:
+                run.stopping.set()
+            return super().poll(wait) if now[0] in (1.0, 12.0) else []
+
+    now = [0.0]
+    run = live(tmp_path, Silent(rows(2)), silence=5.0, clock=lambda: now[0])
+    run.run()
+    assert [event.kind for event in run.journal.events] == ["silent", "heard", "silent"]
