@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from livepde.errors import DataError
 from livepde.identifier import Identifier
 from livepde.result import Estimate, Result
 from livepde.runs.journal import Event, Journal, Taken
-from livepde.streams.intake import Intake, Ready
-from livepde.streams.sources import Source
+from livepde.streams.intake import Intake, Ready, Refused
+from livepde.streams.sources import Row, Source
 
 __all__ = ["Backlog", "Live", "Sink"]
 
@@ -50,15 +50,15 @@ class Backlog:
     overflow: Literal["queue", "merge", "drop"] = "queue"
     length: int = 1000
 
-    def relieved(self, waiting: deque[Ready]) -> int:
-        """Shorten what waits, and return how many samples were merged or dropped."""
+    def relieved(self, waiting: deque[Ready]) -> list[Ready]:
+        """Shorten what waits, and return the samples that were merged with others or dropped."""
         excess = len(waiting) - self.length
         if self.overflow == "queue" or excess <= 0:
-            return 0
+            return []
         oldest = [waiting.popleft() for _ in range(excess)]
         if self.overflow == "merge":
             waiting.appendleft(_merged([*oldest, waiting.popleft()]))
-        return excess
+        return oldest
 
 
 def _merged(samples: Sequence[Ready]) -> Ready:
@@ -142,28 +142,38 @@ class Live:
             rows = self.source.poll(0.0 if self._waiting else LOOK)
             self._watch(bool(rows))
             for row in rows:
-                if row.broken:
-                    self.intake.counts[("malformed", "")] += 1
-                    self.journal.count("malformed")
-                    continue
-                ready, refused = self.intake.take(row.values, row.token)
-                for item in refused:
-                    self.journal.count(item.kind, item.channel)
-                self._waiting.extend(ready)
+                self._hear(row)
             if self.source.done:
                 self._waiting.extend(self.intake.flush())
             relieved = self.backlog.relieved(self._waiting)
             if relieved:
-                self.journal.count(self.backlog.overflow, "", relieved)
+                self.journal.count(self.backlog.overflow, "", len(relieved))
+            if self.backlog.overflow == "drop":
+                self.source.acknowledge(token for ready in relieved for token in ready.tokens)
             if self._waiting:
                 self._take(self._waiting.popleft())
             elif self.source.done:
                 break
         self.journal.checkpoint(self.identifier.dump())
 
+    def _hear(self, row: Row) -> None:
+        if row.broken:
+            ready: list[Ready] = []
+            refused = [Refused("malformed", "", row.broken)]
+        else:
+            ready, refused = self.intake.take(row.values, row.token)
+        for item in refused:
+            self.journal.count(item.kind, item.channel)
+        self._waiting.extend(ready)
+        if refused and row.token not in self._tokens():
+            self.source.acknowledge([row.token])  # it is not needed again
+
+    def _tokens(self) -> list[Any]:
+        """Return the tokens of all rows that are not taken for good yet."""
+        return [*self.intake.waiting, *(t for ready in self._waiting for t in ready.tokens)]
+
     def _take(self, ready: Ready) -> None:
-        waiting = [token for item in self._waiting for token in item.tokens]
-        position = self.source.position([*waiting, *self.intake.waiting])
+        position = self.source.position(self._tokens())
         taken = self.journal.accept(ready.t, ready.values, position)
         self.source.acknowledge(ready.tokens)
         self._step(taken)

@@ -19,7 +19,7 @@ from livepde.errors import DataError
 __all__ = ["Follow", "Lines", "Row", "Rows", "Source", "json_row"]
 
 LONGEST = 1_000_000  # characters of a line or message; longer ones are refused unread
-BATCH = 1000  # rows that a poll brings at most
+BATCH = 100  # rows that a poll brings at most
 NAP = 0.05  # seconds between looks at a file that does not grow
 
 
