@@ -7,6 +7,7 @@ import math
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -203,18 +204,27 @@ class MqttSink:
 
     def __init__(self, broker: Broker, topic: str) -> None:
         self._topic = topic.rstrip("/")
+        self._sent: deque[Any] = deque()
         self._client = broker.client("-out")
         broker.connect(self._client)
 
     def put(self, estimate: Estimate) -> None:
         """Publish an estimate."""
         row = numbers(estimate)
-        self._client.publish(self._topic, json.dumps(row), qos=1)
+        while self._sent and self._sent[0].is_published():
+            self._sent.popleft()
+        self._publish(self._topic, row)
         for label in estimate.parameters:
-            self._client.publish(f"{self._topic}/{label}", json.dumps(row[label]), 1, retain=True)
+            self._publish(f"{self._topic}/{label}", row[label], retain=True)
+
+    def _publish(self, topic: str, content: Any, retain: bool = False) -> None:
+        self._sent.append(self._client.publish(topic, json.dumps(content), qos=1, retain=retain))
 
     def close(self) -> None:
-        """Disconnect when all is sent."""
+        """Disconnect when all is sent, or the broker has not answered for some time."""
+        until = time.monotonic() + PATIENCE
+        for message in self._sent:
+            message.wait_for_publish(max(until - time.monotonic(), 0.0))
         self._client.disconnect()
         self._client.loop_stop()
 
