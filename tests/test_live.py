@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +19,7 @@ import pytest
 import livepde as lp
 from livepde.runs.journal import Event, Journal
 from livepde.runs.live import Backlog, Live
+from livepde.runs.monitor import Metrics, Monitor
 from livepde.streams.intake import Intake, Policy
 from livepde.streams.sources import Follow, Rows, json_row
 from livepde.streams.table import Clock, Column
@@ -221,3 +225,32 @@ def test_silence_is_noticed(tmp_path):
     run = live(tmp_path, Silent(rows(2)), silence=5.0, clock=lambda: now[0])
     run.run()
     assert [event.kind for event in run.journal.events] == ["silent", "heard", "silent"]
+
+
+def test_health_and_metrics(tmp_path):
+    def ask(path):
+        with urllib.request.urlopen(f"http://127.0.0.1:{monitor.port}{path}", timeout=10) as answer:
+            return answer.read().decode()
+
+    metrics = Metrics(["a", "b"])
+    run = live(tmp_path, Rows(rows(5)), sinks=[metrics])
+    monitor = Monitor("127.0.0.1", 0, lambda: run.health, metrics)
+    run.run()
+    assert json.loads(ask("/health")) == {
+        "ok": True,
+        "t": 0.4,
+        "samples": 5,
+        "waiting": 0,
+        "silent": False,
+        "status": "ok",
+    }
+    value = run.result.last.parameters["k"][0]
+    assert f'livepde_estimate{{unknown="k"}} {value!r}' in ask("/metrics")
+    run.silent = True
+    with pytest.raises(urllib.error.HTTPError, match="503"):
+        ask("/health")
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        ask("/")
+    with pytest.raises(lp.RunError, match="choose another port"):
+        Monitor("127.0.0.1", monitor.port, dict, metrics)
+    monitor.close()

@@ -156,6 +156,20 @@ class Live:
                 break
         self.journal.checkpoint(self.identifier.dump())
 
+    @property
+    def health(self) -> dict[str, Any]:
+        """What a watchdog should know: ok, unless the source is silent or steps fail."""
+        last = self.result.last
+        failed = last is not None and not last.status.ok
+        return {
+            "ok": not (self.silent or failed),
+            "t": self.identifier.t,
+            "samples": len(self.result),
+            "waiting": len(self._waiting),
+            "silent": self.silent,
+            "status": "" if last is None else last.status.code,
+        }
+
     def _hear(self, row: Row) -> None:
         if row.broken:
             ready: list[Ready] = []

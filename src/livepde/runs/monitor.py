@@ -1,0 +1,130 @@
+"""A small HTTP endpoint beside a run: /health for watchdogs, /metrics for Prometheus."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+
+from livepde.errors import RunError
+from livepde.result import Estimate
+
+if TYPE_CHECKING:
+    from wsgiref.types import StartResponse, WSGIEnvironment
+
+__all__ = ["Metrics", "Monitor"]
+
+
+class Metrics:
+    """Estimates as Prometheus metrics; a sink of a run.
+
+    `livepde_estimate{unknown}`, `livepde_deviation{unknown}`, `livepde_innovation{sensor}`,
+    `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`.
+
+    Parameters
+    ----------
+    sensors
+        Names of the sensors.
+    """
+
+    def __init__(self, sensors: Iterable[str]) -> None:
+        try:
+            from prometheus_client import CollectorRegistry, Counter, Gauge
+        except ImportError:
+            raise RunError(
+                "Metrics need prometheus-client: pip install 'livepde[service]'."
+            ) from None
+        self.registry = CollectorRegistry()
+        self._sensors = tuple(sensors)
+        self._estimate = Gauge(
+            "livepde_estimate", "Estimated unknown", ["unknown"], registry=self.registry
+        )
+        self._deviation = Gauge(
+            "livepde_deviation", "Standard deviation", ["unknown"], registry=self.registry
+        )
+        self._innovation = Gauge(
+            "livepde_innovation",
+            "Measured minus expected of the last sample",
+            ["sensor"],
+            registry=self.registry,
+        )
+        self._time = Gauge("livepde_time", "Time of the last sample", registry=self.registry)
+        self._samples = Counter("livepde_samples", "Samples taken", registry=self.registry)
+        self._failed = Counter("livepde_failed_steps", "Steps that failed", registry=self.registry)
+
+    def put(self, estimate: Estimate) -> None:
+        """Take one estimate."""
+        for label, (value, std) in estimate.parameters.items():
+            self._estimate.labels(label).set(value)
+            self._deviation.labels(label).set(std)
+        for name, value in zip(self._sensors, estimate.innovation.tolist(), strict=True):
+            self._innovation.labels(name).set(value)
+        self._time.set(estimate.t)
+        self._samples.inc()
+        if not estimate.status.ok:
+            self._failed.inc()
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class _Quiet(WSGIRequestHandler):
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing of each request."""
+
+
+class Monitor:
+    """Serves /health and /metrics from a thread.
+
+    Parameters
+    ----------
+    host, port
+        Where to listen; port 0: a free one, then in `port`.
+    health
+        Returns what /health says as JSON; "ok" in it decides between the codes 200 and 503.
+    metrics
+        What /metrics says.
+
+    Raises
+    ------
+    RunError
+        The port is taken.
+    """
+
+    def __init__(
+        self, host: str, port: int, health: Callable[[], Mapping[str, Any]], metrics: Metrics
+    ) -> None:
+        from prometheus_client import make_wsgi_app
+
+        self._health = health
+        self._metrics = make_wsgi_app(metrics.registry)
+        try:
+            self._server = make_server(host, port, self._answer, WSGIServer, _Quiet)
+        except OSError as error:
+            raise RunError(
+                f"Cannot listen on {host}:{port}: {error.strerror or error}; choose another port."
+            ) from error
+        self.port = int(self._server.server_port)
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def _answer(self, environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:
+        path = environ.get("PATH_INFO", "/")
+        if path == "/metrics":
+            answer: Iterable[bytes] = self._metrics(environ, start)
+            return answer
+        if path == "/health":
+            found = dict(self._health())
+            start(
+                "200 OK" if found.get("ok") else "503 Service Unavailable",
+                [("Content-Type", "application/json")],
+            )
+            return [json.dumps(found).encode()]
+        start("404 Not Found", [("Content-Type", "text/plain")])
+        return [b"There are /health and /metrics.\n"]
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._server.shutdown()
+        self._server.server_close()
