@@ -1,8 +1,8 @@
 """Scratch assays fitted with hindsight: what the choice of start, weights and equation does.
 
 Least squares over all samples with livepde's forward model (`batch.py`), no prior: from the first
-sample as it is; the same with the published weights, and without their outlier on the left; and
-with the density that every position starts from unknown as well.
+sample as it is; the same with the published weights, u^-0.2 (so that what is left is smaller), and
+without their outlier on the left; with the density that every position starts from unknown as well.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main() -> None:
 
         fits = {"as measured": fit(lambda p, z=z: (z - known(p))[1:], guess)}
         if equation == "fisher_kpp":
-            fits["weighted"] = fit(weighted, guess)  # what is left: in u^0.2
+            fits["weighted"] = fit(weighted, guess)
             fits["fitted, too"] = fit(free, [*guess, *np.maximum(z[0], 1.0)])
         for title, (p, left) in fits.items():
             print(f"{density} 000  {equation + ', ' + title:34}{p[0]:8.4f}{p[1]:9.2f}{left:15.1f}")
