@@ -24,7 +24,7 @@ CASES = Path(__file__).parents[1] / "cases"
 
 
 class Forward:
-    """A case with its data: what it predicts, and by how much that misses."""
+    """A case with its data, z: what it predicts for given numbers."""
 
     def __init__(self, name: str, settings: Mapping[str, Any]) -> None:
         self.case = case = load(CASES / f"{name}.toml", allow_code=True, settings=settings)
@@ -45,16 +45,17 @@ class Forward:
         return np.array([self.observed.predict(u, known, lp.fem.Moment(t)) for t, u in states])
 
 
-def fit(residual: Callable[[Any], Any], start: Any, high: Any = np.inf) -> tuple[Any, float]:
-    """Return positive numbers and the root mean square that is left; what is missing counts 0."""
-    start = np.asarray(start, dtype=float)
+def fit(
+    residual: Callable[[Any], Any], start: Any, high: Any = np.inf, low: float = 1e-6
+) -> tuple[Any, float]:
+    """Return numbers between bounds, and the root mean square of what is left."""
 
-    def finite(p: Any) -> Any:
+    def finite(p: Any) -> Any:  # without missing samples
         misses = np.ravel(residual(p))
         return misses[np.isfinite(misses)]
 
-    low = 1e-4 * start.min()
-    found = least_squares(finite, start, bounds=(low, high), x_scale=start, diff_step=1e-5)
+    scale = np.abs(start)
+    found = least_squares(finite, start, bounds=(low, high), x_scale=scale, diff_step=1e-5)
     return found.x, float(np.sqrt(np.mean(found.fun**2)))
 
 
@@ -76,11 +77,12 @@ def column() -> None:
 
 def streambed() -> None:
     forward = Forward("streambed_035_uniform", {})
-    p, left = fit(
-        lambda p: (forward.z - forward({"kappa": 1e-6 * p[0], "K": 1e-5 * (p[1] - 10)}))[1:],
-        [0.8, 10.0],
-    )
-    print(f"kappa {1e-6 * p[0]:.3g} m^2/s, K {1e-5 * (p[1] - 10):.3g} m/s, left {left:.3f} K")
+
+    def misses(p: Any) -> Any:
+        return (forward.z - forward({"kappa": 1e-6 * p[0], "K": 1e-5 * p[1]}))[1:]
+
+    p, left = fit(misses, [0.8, -1.0], low=-np.inf)
+    print(f"kappa {1e-6 * p[0]:.3g} m^2/s, K {1e-5 * p[1]:.3g} m/s, left {left:.3f} K")
 
 
 def borehole() -> None:
