@@ -232,8 +232,15 @@ class Identifier:
             None if factor is None else latent.tangent(belief.q, factor)
             for factor in (belief.q_factor, belief.prior_factor)
         )
+        rest = belief.rest
+        if rest is not None:  # parts of an unknown are independent
+            rest = np.sqrt(latent.V**2 @ (latent.slopes(belief.q) * rest) ** 2)
         return replace(
-            belief, q=latent.value(belief.q), q_factor=q_factor, prior_factor=prior_factor
+            belief,
+            q=latent.value(belief.q),
+            q_factor=q_factor,
+            prior_factor=prior_factor,
+            rest=rest,
         )
 
     def _estimate(

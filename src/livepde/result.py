@@ -180,9 +180,8 @@ class Result:
         for name, field in self.model.parameter_space.fields.items():
             part = self.model.parameter_space.part(name)
             found[name] = field.at_vertices @ estimate.q[part]
-            if belief.q_factor is not None:
-                squares = (field.at_vertices @ belief.q_factor[part]) ** 2
-                std = belief.inflation * np.sqrt(squares.sum(axis=1))
+            std = belief.deviation(field.at_vertices, part)
+            if std is not None:
                 found[f"{name}_std"] = std
                 unknown = self.model.parameter_space.unknowns[name]
                 found |= _ends(name, unknown, found[name], std)

@@ -93,6 +93,9 @@ class Belief:
     prior_factor
         Square root of the covariance of q before the first sample, shape (m, k), its columns
         orthonormal in Q.
+    rest
+        Standard deviation of each coefficient of q in the modes that the law leaves out, which stay
+        as the prior has them: independent of q_factor, and not inflated, shape (m,). None: 0.
     """
 
     q: Array
@@ -101,21 +104,33 @@ class Belief:
     u_factor: Array | None = None
     inflation: float = 1.0
     prior_factor: Array | None = None
+    rest: Array | None = None
 
     @property
     def q_std(self) -> Array | None:
         """Standard deviation of each coefficient of q."""
-        return _deviation(self.q_factor, self.inflation)
+        if self.q_factor is None:
+            return None
+        std = _deviation(self.q_factor, self.inflation)
+        return std if self.rest is None else np.hypot(std, self.rest)
 
     @property
     def u_std(self) -> Array | None:
         """Standard deviation of each coefficient of u."""
-        return _deviation(self.u_factor, self.inflation)
+        return None if self.u_factor is None else _deviation(self.u_factor, self.inflation)
+
+    def deviation(self, rows: Any, part: slice) -> Array | None:
+        """Return the standard deviation of rows @ q[part] for a matrix, that of point values, say.
+
+        Where a row has several entries the rest counts as if it were fully correlated.
+        """
+        if self.q_factor is None:
+            return None
+        std = _deviation(rows @ self.q_factor[part], self.inflation)
+        return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
 
 
-def _deviation(factor: Array | None, inflation: float) -> Array | None:
-    if factor is None:
-        return None
+def _deviation(factor: Array, inflation: float) -> Array:
     std: Array = inflation * np.sqrt((factor**2).sum(axis=1))
     return std
 

@@ -18,6 +18,8 @@ from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
 __all__ = ["Filter", "Motion", "Point", "reduction"]
 
+ROUNDING = 1e-9  # share of a variance that is none
+
 
 @dataclass(frozen=True, eq=False)
 class Point:
@@ -40,6 +42,8 @@ class Point:
         Estimated noise as a multiple of the stated one; 1 unless the law finds it.
     evidence
         Logarithm of the likelihood of all samples so far, each given those before.
+    age
+        Time for which the unknowns have moved.
     """
 
     u: Array
@@ -52,6 +56,7 @@ class Point:
     refused: Array
     level: NoiseLevel
     evidence: float
+    age: float = 0.0
 
     def along(self, shift: Array) -> Array:
         """Return by how much the state is expected to move with a shift of a, shape (n,)."""
@@ -147,7 +152,39 @@ class Filter:
         new = np.diag(gained)[:, gained > 0.0]
         q = self.problem.model.latent.moved(point.q, h)
         U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
-        return replace(point, q=q, da=F @ point.da, U=U, C=np.hstack([F @ point.C, new]))
+        C, age = np.hstack([F @ point.C, new]), point.age + h
+        return replace(point, q=q, da=F @ point.da, U=U, C=C, age=age)
+
+    @cached_property
+    def _left_out(self) -> Array:
+        """Prior variance of each latent coefficient in the modes that are left out, shape (m,)."""
+        model = self.problem.model
+        variance = np.zeros(len(self.Phi))
+        for item in model.latent.parts.values():
+            if isinstance(item.block, FieldBlock):
+                first = slice(item.part.start, item.part.start + item.size)
+                whole = model.Q.restricted(first, item.block.fixed).variance
+                variance[item.part] = np.tile(whole, item.evolution.copies)
+        left = variance - (self.Phi**2).sum(axis=1)
+        return np.where(left > ROUNDING * variance, left, 0.0)
+
+    def rest(self, age: float) -> Array:
+        """Return the deviation of each latent coefficient in the modes that are left out, (m,).
+
+        They are as the prior has them, and have moved for a time `age`.
+        """
+        if not self.moves or not self._left_out.any():
+            return np.sqrt(self._left_out)
+        F = self.transition(age)
+        grown = (F**2).sum(axis=1) + np.concatenate([m.growth(age) for m in self.motions])
+        variance = self._left_out.copy()
+        for motion, item in zip(
+            self.motions, self.problem.model.latent.parts.values(), strict=True
+        ):
+            copies = item.evolution.copies
+            modes = (motion.part.stop - motion.part.start) // copies
+            variance[item.part] *= np.repeat(grown[motion.part][::modes], item.size)
+        return np.sqrt(variance)
 
     def traced(self, q: Array, start: Array, h: float) -> Array:
         """Return the latent parameter that is expected to have become q in a time h.

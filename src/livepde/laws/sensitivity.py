@@ -395,6 +395,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             now.U,
             now.consistency.inflation,
             work.Phi,
+            work.rest(now.age),
         )
 
 
