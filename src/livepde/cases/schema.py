@@ -252,7 +252,7 @@ class ReplaySpec(Spec):
     """Options of the replay."""
 
     window: PositiveInt = 4096
-    first: PositiveInt = 32
+    first: PositiveInt = 8
     iterations: PositiveInt = 4
 
 
@@ -261,7 +261,7 @@ class SensitivitySpec(Spec):
 
     kind: Literal["sensitivity"]
     noise: Quantity | None = None
-    modes: PositiveInt = 12
+    modes: PositiveInt | Literal["auto"] = 12
     drift: Quantity = 0.0
     memory: Quantity | None = None
     replay: bool | ReplaySpec = False

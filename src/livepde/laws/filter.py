@@ -19,6 +19,8 @@ from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 __all__ = ["Filter", "Motion", "Point", "reduction"]
 
 ROUNDING = 1e-9  # share of a variance that is none
+LEFT_OUT = 0.01  # share of the prior variance of a field that modes="auto" leaves out
+MOST_MODES = 40  # of a field with modes="auto": a step costs about as much as with one mode
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +340,7 @@ class Filter:
 
 
 def reduction(
-    problem: Problem, modes: int | dict[str, int], drift: float
+    problem: Problem, modes: int | str | dict[str, int], drift: float
 ) -> tuple[Array, tuple[Motion, ...]]:
     """Return Phi, shape (m, k), and how its coordinates move.
 
@@ -349,7 +351,13 @@ def reduction(
     """
     model = problem.model
     fields = model.parameter_space.fields
-    counts = modes if isinstance(modes, dict) else dict.fromkeys(fields, modes)
+    if isinstance(modes, str) and modes != "auto":
+        raise LawError(
+            f"SensitivityLaw: modes must be a number, 'auto', or a number for each field; got "
+            f"{modes!r}."
+        )
+    most = MOST_MODES if isinstance(modes, str) else modes
+    counts = most if isinstance(most, dict) else dict.fromkeys(fields, most)
     if set(counts) != set(fields):
         raise LawError(
             f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
@@ -361,7 +369,10 @@ def reduction(
             part = model.parameter_space.part(name)
             inner = model.Q.restricted(first, item.block.fixed)
             count = min(counts[name], int(inner.free.sum()))
-            phi, _ = inner.modes(count, model.parameter_mass[part, part])
+            mass = model.parameter_mass[part, part]
+            phi, _ = inner.modes(count, mass)
+            if modes == "auto":
+                phi = phi[:, : _enough(phi, inner.variance, mass.diagonal())]
         else:
             phi = np.eye(item.size) * item.unknown.latent_std
         evolution = item.evolution
@@ -373,6 +384,13 @@ def reduction(
         start = stop
     Phi: Array = np.asarray(block_diag(*blocks))
     return Phi, tuple(motions)
+
+
+def _enough(phi: Array, variance: Array, mass: Array) -> int:
+    """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
+    held = np.cumsum(mass @ phi**2)
+    short = int((held < (1.0 - LEFT_OUT) * (mass @ variance)).sum())
+    return min(short + 1, len(held))
 
 
 def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:
