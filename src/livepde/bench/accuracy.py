@@ -138,7 +138,7 @@ class Judge:
 
     @cached_property
     def rest(self) -> Array:
-        """Deviation of what `probe` evaluates, in the modes that no estimator has, shape (rows,)."""
+        """Deviation of what `probe` evaluates in the modes that no estimator has, (rows,)."""
         rest: Array = np.abs(self.probe) @ Trajectory(self.data, self.problem.modes).rest
         return rest
 

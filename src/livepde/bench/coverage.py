@@ -2,7 +2,7 @@
 
 Each twin draws its unknowns from the prior, makes its data with the estimator's own scheme, adds
 noise, and asks whether the truth lies in the 68 % and 95 % intervals. If prior, model and noise are
-right, as many do as the level says, and the normalised innovations are white: of the twins 95 % have
+right, as many do as the level says, and the normalised innovations are white: of 100 twins 95 have
 a mean square within 1.96 standard errors of 1, and a correlation of successive ones within as many
 of 0. In the last problems the model is wrong: its data have a loss of heat, or a second layer, of a
 random size, that the model does not know. Then the interval has to be wide enough, or the run has

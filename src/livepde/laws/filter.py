@@ -19,7 +19,7 @@ from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 __all__ = ["Filter", "Motion", "Point", "reduction"]
 
 ROUNDING = 1e-9  # share of a variance that is none
-LEFT_OUT = 0.01  # share of the prior variance of a field that modes="auto" leaves out
+LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
 MOST_MODES = 40  # of a field with modes="auto": a step costs about as much as with one mode
 
 

@@ -139,7 +139,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
     ----------
     modes
         Number of modes for each field: one number, or name -> number. "auto": so many that they
-        hold 99 % of the prior variance, at most 40.
+        hold 99.99 % of the prior variance, at most 40.
     noise
         Standard deviation of the measurement noise; default what the observation says. "auto": what
         the observation says is a first guess, and the level is found from the samples, the same
