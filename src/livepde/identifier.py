@@ -232,9 +232,7 @@ class Identifier:
             None if factor is None else latent.tangent(belief.q, factor)
             for factor in (belief.q_factor, belief.prior_factor)
         )
-        rest = belief.rest
-        if rest is not None:  # parts of an unknown are independent
-            rest = np.sqrt(latent.V**2 @ (latent.slopes(belief.q) * rest) ** 2)
+        rest = None if belief.rest is None else latent.deviation(belief.q, belief.rest)
         return replace(
             belief,
             q=latent.value(belief.q),

@@ -261,7 +261,7 @@ class SensitivitySpec(Spec):
 
     kind: Literal["sensitivity"]
     noise: Quantity | None = None
-    modes: PositiveInt | Literal["auto"] = 12
+    modes: PositiveInt | Literal["auto"] = "auto"
     drift: Quantity = 0.0
     memory: Quantity | None = None
     replay: bool | ReplaySpec = False

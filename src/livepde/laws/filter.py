@@ -20,7 +20,7 @@ __all__ = ["Filter", "Motion", "Point", "reduction"]
 
 ROUNDING = 1e-9  # share of a variance that is none
 LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
-MOST_MODES = 40  # of a field with modes="auto": a step costs about as much as with one mode
+MOST_MODES = 60  # of a field with modes="auto"
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,18 +175,16 @@ class Filter:
 
         They are as the prior has them, and have moved for a time `age`.
         """
-        if not self.moves or not self._left_out.any():
-            return np.sqrt(self._left_out)
-        F = self.transition(age)
-        grown = (F**2).sum(axis=1) + np.concatenate([m.growth(age) for m in self.motions])
-        variance = self._left_out.copy()
-        for motion, item in zip(
-            self.motions, self.problem.model.latent.parts.values(), strict=True
-        ):
-            copies = item.evolution.copies
-            modes = (motion.part.stop - motion.part.start) // copies
-            variance[item.part] *= np.repeat(grown[motion.part][::modes], item.size)
-        return np.sqrt(variance)
+        parts = self.problem.model.latent.parts.values()
+        grown = [
+            np.repeat(
+                (motion.evolution.transition(age) ** 2).sum(axis=1)
+                + motion.evolution.growth(age, motion.std),
+                item.size,
+            )
+            for motion, item in zip(self.motions, parts, strict=True)
+        ]
+        return np.asarray(np.sqrt(self._left_out * np.concatenate(grown)))
 
     def traced(self, q: Array, start: Array, h: float) -> Array:
         """Return the latent parameter that is expected to have become q in a time h.

@@ -139,7 +139,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
     ----------
     modes
         Number of modes for each field: one number, or name -> number. "auto": so many that they
-        hold 99.99 % of the prior variance, at most 40.
+        hold 99.99 % of the prior variance, at most 60.
     noise
         Standard deviation of the measurement noise; default what the observation says. "auto": what
         the observation says is a first guess, and the level is found from the samples, the same
@@ -163,7 +163,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
     """
 
-    modes: int | str | dict[str, int] = 12
+    modes: int | str | dict[str, int] = "auto"
     noise: float | str | None = None
     drift: float = 0.0
     memory: float = np.inf
