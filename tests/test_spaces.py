@@ -199,8 +199,8 @@ def test_prior_variances_are_the_diagonal_of_the_inverse():
 
 
 def test_prior_variances_of_large_fields_are_interpolated(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(spaces, "SOLVED", 60)
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (12, 12))
+    monkeypatch.setattr(spaces, "SOLVED", 250)
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (24, 24))
     for inner in (lp.Sobolev(2.0, 0.3), lp.Sobolev(1.5, 0.3)):
         unknown = {"q": lp.Field(mesh, lp.linear(mesh), inner=inner, dirichlet={"left": 0.0})}
         model = lp.Model(lp.Field(mesh, lp.linear(mesh)), unknown, A=lambda q, u, v, x: q.q * u * v)
@@ -209,7 +209,7 @@ def test_prior_variances_of_large_fields_are_interpolated(monkeypatch: pytest.Mo
         exact[free] = np.diag(np.linalg.inv(model.Q.gram.toarray()[np.ix_(free, free)]))
         found = model.Q.variance
         missed = np.abs(found - exact) / exact.max()
-        assert missed.max() < 0.4  # at corners, where the variance has its peaks
-        assert 0.0 < missed.mean() < 0.05
+        assert missed.max() < 0.35  # at corners, where the variance has its peaks
+        assert 0.0 < missed.mean() < 0.03
         assert abs(found.sum() / exact.sum() - 1.0) < 0.03
         assert (found[model.Q.fixed] == 0.0).all()

@@ -153,8 +153,8 @@ class HilbertSpace:
     def variance(self) -> Array:
         """Prior variance of each coefficient: the diagonal of G^{-1}, shape (n,); 0 where fixed.
 
-        Solved for at most 1000 coefficients, evenly chosen. In between, v_i G_ii is harmonic on the
-        graph of G: the mean of its neighbours.
+        Solved for at most 1000 coefficients, evenly chosen. In between v_i G_ii, or v_i where G is
+        not written out, is harmonic on the graph of G: the mean of its neighbours.
         """
         variance, free = np.zeros(self.dim), np.flatnonzero(self.free)
         solved = free[np.unique(np.linspace(0, len(free) - 1, SOLVED).astype(int))]
@@ -165,8 +165,8 @@ class HilbertSpace:
             variance[at] = self.factor.solve(unit)[at, np.arange(len(at))]
         rest = np.setdiff1d(free, solved)
         if len(rest):
-            scale, links = self.augmented.diagonal()[: self.dim], self._links
-            scale = np.where(scale > 0.0, scale, 1.0)
+            whole, links = self.augmented, self._links
+            scale = whole.diagonal() if whole.shape[0] == self.dim else np.ones(self.dim)
             graph = sp.csr_array(sp.diags_array(links.sum(axis=1)) - links)
             inner = sp.csr_array(graph[rest][:, rest])
             pattern = Pattern.of(inner)
