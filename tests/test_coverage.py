@@ -58,9 +58,8 @@ def test_a_wrong_model_is_doubted_or_its_interval_is_wide_enough(name: str, flaw
 
 def test_innovations_are_white_if_the_model_is_right():
     right = PROBLEMS["short run"]
-    square, correlation = np.mean([twin(right, seed).white for seed in range(100, 140)], axis=0)
-    assert square > 0.85
-    assert correlation > 0.85
+    square, correlation = np.mean([twin(right, seed).white for seed in range(40)], axis=0)
+    assert min(square, correlation) > 0.8  # 0.95 less four standard errors
     lossy = replace(right, unknowns={"a": right.unknowns["a"]}, loss=lambda rng: 9.0)
     assert twin(lossy, 0).white == (False, False)
 
