@@ -78,14 +78,14 @@ class Process:
     u0: Any
     draw: Callable[[np.random.Generator], Array]
     law: SensitivityLaw = field(default_factory=lambda: SensitivityLaw(jumps=Jumps()))
-    where: Any = slice(None)
+    where: Any = field(default_factory=lambda: slice(None))
 
     def data(self, at: int, count: int, change: float, rng: np.random.Generator) -> Data:
         """Return `count` samples; the coefficient changes after sample `at`, relative by `change`.
 
         A change of zero is no jump.
         """
-        q, times = self.draw(rng), STEP * np.arange(count + 1)
+        q, times = self.draw(rng), _times(count)
         states = _states(self.model, q, self.u0, times[: at + 1])
         if at < count:
             states += _states(self.model, (1.0 + change) * q, states[-1], times[at:])[1:]
@@ -126,6 +126,11 @@ def _seen(
     noise = NOISE * float(np.sqrt((exact**2).mean()))
     z = exact + noise * rng.standard_normal(exact.shape)
     return Data(times, z, q, replace(observation, noise=noise))
+
+
+def _times(count: int) -> Array:
+    times: Array = STEP * np.arange(count + 1.0)
+    return times
 
 
 def _states(model: Model, q: Array, u0: Any, times: Array) -> list[Array]:
@@ -311,7 +316,7 @@ def _rod(a: Any, loss: float = 0.0, source: float = 0.0) -> Model:
 
 def _suspects() -> dict[str, Suspect]:
     number = Scalar(0.3, 0.1, transform="log")
-    halves = {"left": "left half", "right": lambda x: x[0] >= 0.5}
+    halves: dict[str, Any] = {"left": "left half", "right": lambda x: x[0] >= 0.5}
     layers = Piecewise(halves, prior=0.3, std=0.1, transform="log")
     plain = _rod(number)
 
@@ -334,7 +339,7 @@ def _suspects() -> dict[str, Suspect]:
 SUSPECTS: Mapping[str, Suspect] = _suspects()
 """Name -> what is wrong."""
 
-CASES = (
+CASES: tuple[tuple[str, str, dict[str, Any], bool], ...] = (
     ("soil, uniform", "soil_uniform", {"law.noise": "0.1 K"}, True),
     ("soil, layers with offsets", "soil_offsets", {}, False),
     ("stream bed, uniform", "streambed_035_uniform", {}, True),
@@ -346,7 +351,7 @@ CASES = (
 def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
     """Return whether the right and the wrong model are doubted on the same data."""
     rng = np.random.default_rng(seed)
-    q, times = suspect.draw(rng), STEP * np.arange(WATCHED + 1)
+    q, times = suspect.draw(rng), _times(WATCHED)
     states = _states(suspect.right, q, 0.0, times)
     data = _seen(suspect.right, Points(POINTS), states, times, q, rng)
     told = []
@@ -408,8 +413,8 @@ def alarms(seeds: int = 10, calm: int = 4, twins: int = 20, *, progress: bool = 
 
 
 NOTES = (
-    f"Jump of {JUMP:.0%} up or down, noise {NOISE:.0%} of the data, samples {STEP:g} apart; data of "
-    f"the estimator's scheme. Error, and share in the 95 % interval, {AFTER} samples after the jump.",
+    f"Jump of {JUMP:.0%} up or down, noise {NOISE:.0%} of the data, samples {STEP:g} apart; data "
+    f"of the estimator's scheme. Error and share in the 95 % interval: {AFTER} samples later.",
 )
 
 
@@ -481,7 +486,7 @@ def _models(
     return Table("Does the run say that its model does not explain the data?", columns, rows)
 
 
-def _percent(values: Array) -> str:
+def _percent(values: Any) -> str:
     return f"{100 * float(np.mean(values)):.3g} %"
 
 

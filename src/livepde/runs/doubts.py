@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from livepde.runs.summary import scalars, scored
+from livepde.runs.summary import digits, jumps, scalars, scored
 
 __all__ = ["MODEL_ERROR", "doubts"]
 
@@ -16,6 +16,7 @@ MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: 
 OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
 SETTLED = 0.25  # share of a run after which means are taken
 LEFT = 1.0  # deviations between estimate and reference after the last replay
+MOST_JUMPS = 5  # that get a sentence of their own
 HARDLY = 0.9  # of the prior deviation left: nothing was learned
 
 
@@ -25,11 +26,11 @@ def doubts(data: xr.Dataset) -> list[str]:
     The model does not explain the data if at the end the mean square of the innovations, over the
     last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
     bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
-    ended more than one deviation away from where it has to end.
+    ended more than one deviation away from where it has to end. Something jumped.
     """
     if not data.sizes["time"]:
         return []
-    return [*_model_error(data), *_replays(data), *_unknowns(data)]
+    return [*_model_error(data), *_replays(data), *_unknowns(data), *_jumps(data)]
 
 
 def _model_error(data: xr.Dataset) -> list[str]:
@@ -97,4 +98,32 @@ def _unknowns(data: xr.Dataset) -> list[str]:
                 f"{label}: the data have told hardly anything; its deviation is still about "
                 "that of the prior."
             )
+    return found
+
+
+def _jumps(data: xr.Dataset) -> list[str]:
+    unit, found = data["time"].attrs.get("units", ""), []
+    alarms = jumps(data)
+    for jump in alarms[:MOST_JUMPS]:
+        at = f"t = {jump.t:.6g} {unit}".rstrip()
+        went = [
+            f"{label} from {digits(before, std)[0]} to {' ± '.join(digits(after, std))}"
+            for label, (before, after, std) in jump.moved.items()
+        ]
+        if went:
+            found.append(
+                f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
+                f"allowed to move; since then {', '.join(went)}."
+            )
+        else:
+            found.append(
+                f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
+                "allowed to move, but no number has changed for good: a passing disturbance, or "
+                "a change that the model does not know."
+            )
+    if len(alarms) > MOST_JUMPS:
+        found.append(
+            f"{len(alarms) - MOST_JUMPS} more jumps: the unknowns may rather move all the time "
+            "(evolution), or a process is missing in the model."
+        )
     return found
