@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from livepde.runs.summary import digits, jumps, scalars, scored
+from livepde.runs.summary import digits, jumps, scalars, scored, when
 
 __all__ = ["MODEL_ERROR", "doubts"]
 
@@ -102,10 +102,9 @@ def _unknowns(data: xr.Dataset) -> list[str]:
 
 
 def _jumps(data: xr.Dataset) -> list[str]:
-    unit, found = data["time"].attrs.get("units", ""), []
-    alarms = jumps(data)
+    alarms, found = jumps(data), []
     for jump in alarms[:MOST_JUMPS]:
-        at = f"t = {jump.t:.6g} {unit}".rstrip()
+        at = when(data, jump.t)
         went = [
             f"{label} from {digits(before, std)[0]} to {' ± '.join(digits(after, std))}"
             for label, (before, after, std) in jump.moved.items()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,11 @@ __all__ = [
     "scored",
     "shown",
     "tables",
+    "when",
 ]
 
 MOST_ROWS = 40
+SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0}
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
 JUMP = "jump"  # what the law notes of each sample
 CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
@@ -122,7 +125,7 @@ def jumps(data: xr.Dataset) -> list[Jump]:
     if JUMP not in data or data[JUMP].dims != ("time",):
         return []
     at = np.flatnonzero(data[JUMP].values > 0.0)
-    ends = [*(at[1:] - 1), data.sizes["time"] - 1]
+    ends = np.append(at, data.sizes["time"])[1:] - 1
     found = []
     for k, end in zip(at, ends, strict=True):
         moved = {}
@@ -134,6 +137,15 @@ def jumps(data: xr.Dataset) -> list[Jump]:
                 moved[label] = float(values[before]), float(values[end]), float(std[end])
         found.append(Jump(float(data["time"].values[k]), moved))
     return found
+
+
+def when(data: xr.Dataset, t: float) -> str:
+    """Return a time of a run as text: a date if it has one."""
+    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
+    if origin is None or unit not in SECONDS:
+        return f"t = {t:.6g} {unit}".rstrip()
+    date = datetime.fromisoformat(str(origin)) + timedelta(seconds=t * SECONDS[unit])
+    return date.isoformat(sep=" ", timespec="seconds")
 
 
 def _interval(data: xr.Dataset, label: str) -> str:
@@ -272,15 +284,19 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
         others = _traded(data, label)
         if others:
             state += f", traded off with {', '.join(others)}"
-        rows.append((label, f"{100 * share:.2g} %", state))
+        rows.append((label, _share(share), state))
     for name in str(data.attrs.get("fields", "")).split():
         if f"{name}_modes" not in data:
             continue
         modes = data[f"{name}_modes"]
         count, told = int(modes.attrs["of"]), float(modes[-1])
         share = math.sqrt(max(1.0 - told / count, 0.0)) if count else math.nan
-        rows.append((name, f"{100 * share:.2g} %", f"{told:.1f} of {count} modes told"))
+        rows.append((name, _share(share), f"{told:.1f} of {count} modes told"))
     return Table("What the data have told", ("unknown", "prior deviation left", "state"), rows)
+
+
+def _share(left: float) -> str:
+    return f"{100 * left:.0f} %" if left >= 1.0 else f"{100 * left:.2g} %"
 
 
 def _traded(data: xr.Dataset, label: str) -> list[str]:
@@ -296,11 +312,9 @@ def _jumped(data: xr.Dataset) -> Table:
     """Return when something jumped, and what moved then."""
     rows: list[tuple[Any, ...]] = []
     for jump in jumps(data):
-        at = f"{jump.t:.6g}"
+        at = when(data, jump.t)
         rows += [
             (at, label, digits(before, std)[0], " ± ".join(digits(after, std)))
             for label, (before, after, std) in jump.moved.items()
         ] or [(at, "–", "–", "–")]
-    unit = data["time"].attrs.get("units", "")
-    columns = (f"t [{unit}]" if unit else "t", "unknown", "before", "since then")
-    return Table("Jumps", columns, rows)
+    return Table("Jumps", ("when", "unknown", "before", "since then"), rows)
