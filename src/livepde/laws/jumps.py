@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaincc
@@ -49,7 +49,7 @@ class Jumps:
     size
         What an alarm adds, in prior deviations.
     settle
-        No alarm in so many samples after the start, and after an alarm.
+        So many samples after the start, and after an alarm, are not looked at.
     """
 
     probability: float = 1e-5
@@ -81,15 +81,17 @@ class Jumps:
         usual
             Their statistics before this sample.
         """
+        if watch.seen < self.settle:  # the first linearisations are poor: what they miss is no jump
+            return replace(watch, seen=watch.seen + 1), False
         seen = np.isfinite(e)
         squares = np.concatenate([[float((e[seen] ** 2).sum())], watch.squares[:-1]])
         counts = np.concatenate([[float(seen.sum())], watch.counts[:-1]])
         new = Watch(squares, counts, watch.seen + 1)
-        if new.seen <= self.settle or not seen.any():
+        if not seen.any():
             return new, False
         lengths = 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
         sums, freedom = np.cumsum(squares)[lengths], np.cumsum(counts)[lengths]
-        chance = gammaincc(0.5 * freedom, 0.5 * sums / usual.inflation**2)
+        chance = gammaincc(0.5 * freedom, 0.5 * sums / usual.scatter**2)
         if float(chance.min()) * len(lengths) >= self.probability:
             return new, False
         return self.start(), True
