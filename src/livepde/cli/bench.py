@@ -86,7 +86,7 @@ def coverage(
 
 @bench.command()
 def alarms(
-    seeds: Annotated[int, typer.Option(min=1, help="Jumps up, and as many down, of each.")] = 10,
+    seeds: Annotated[int, typer.Option(min=1, help="Jumps up, and as many down, of each.")] = 5,
     as_json: JsonOption = False,
 ) -> None:
     """Measure how soon jumps are flagged, how seldom without cause, and which models are doubted.

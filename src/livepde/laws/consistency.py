@@ -123,7 +123,7 @@ class Consistency:
 
     @property
     def scatter(self) -> float:
-        """The part of `inflation` that is in the size of innovations and how they follow each other.
+        """The part of `inflation` that comes from the size of innovations and their correlation.
 
         Errors that hide below the noise are not: they hardly make the innovations larger.
         """
