@@ -44,7 +44,7 @@ AFTER = 300  # samples after it
 CALM = 3000  # samples of a run without a jump
 SOON = 30  # samples within which a jump has to be flagged
 SELDOM = 1.0  # false alarms in 10 000 samples, at most
-FOUND = 0.03  # relative error after the jump, at most: the jump itself is 0.2
+FOUND = JUMP / 3  # relative error after the jump, at most
 WATCHED = 300  # samples of a run whose model is in question
 
 POINTS = (0.25, 0.5, 0.75)
