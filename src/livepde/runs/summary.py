@@ -216,7 +216,7 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run.
 
-    Estimates with references, what the data have told of them, jumps, and errors of each channel.
+    Estimates with references, errors of each channel, what the data have told, and jumps.
     """
     result: list[Table] = []
     labels = scalars(data) if data.sizes["time"] else []
@@ -250,7 +250,6 @@ def tables(data: xr.Dataset) -> list[Table]:
             rows.append((name, *numbers, shown(deviation, ".2g"), unit))
         columns = ("field", "least", "mean", "largest", "mean deviation", "unit")
         result.append(Table("Estimated fields", columns, rows))
-    result += [table for table in (_told(data, labels), _jumped(data)) if table.rows]
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
         (
@@ -265,7 +264,7 @@ def tables(data: xr.Dataset) -> list[Table]:
     ]
     columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))
-    return result
+    return result + [table for table in (_told(data, labels), _jumped(data)) if table.rows]
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
@@ -282,7 +281,7 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
         )
         state = "moves" if known.moves and known.verdict == "partly" else known.verdict
         others = _traded(data, label)
-        if others:
+        if others and known.verdict != "pinned":
             state += f", traded off with {', '.join(others)}"
         rows.append((label, _share(share), state))
     for name in str(data.attrs.get("fields", "")).split():
