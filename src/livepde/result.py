@@ -203,7 +203,10 @@ class Result:
 
         Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
-        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes.
+        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
+        law with covariance also `_left`, the share of the prior deviation of a number that is left;
+        `_modes`, of how many modes of a field the data have told, over `snapshot`; and
+        `correlation` of the last numbers, over (`unknown`, `other`).
         """
         fields = list(self._fields)
         if self.last is not None and (not fields or fields[-1][0] != self.last.t):
