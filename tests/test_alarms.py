@@ -19,6 +19,7 @@ from livepde.bench import alarms
 from livepde.cases.template import NOISE, TRUE_ALPHA, write_template
 from livepde.cli import app
 from livepde.diagnostics import identifiability
+from livepde.laws.consistency import Consistency
 from livepde.models import heat
 from livepde.runs import doubts, measures, tables
 
@@ -138,6 +139,32 @@ def test_many_jumps_are_counted_and_dates_are_dates():
     told = said(data)
     assert told[0].startswith("Jump at 2025-04-01 12:00:03: ")
     assert told[-1].startswith("2 more jumps")
+
+
+def test_what_settles_is_not_looked_at():
+    rng, jumps = np.random.default_rng(0), lp.Jumps(settle=50)
+    watch = jumps.start()
+    for k in range(200):
+        e = (10.0 if k < 50 else 1.0) * rng.standard_normal(2)
+        watch, alarm = jumps.add(watch, e, Consistency.start(2))
+        assert not alarm
+    _, alarm = jumps.add(watch, np.full(2, 10.0), Consistency.start(2))
+    assert alarm
+
+
+def test_slow_errors_below_the_noise_hide_no_jump():
+    rng, usual = np.random.default_rng(0), Consistency.start(2)
+    for k in range(2000):
+        usual = usual.add(rng.standard_normal(2) + 0.3 * np.sin(0.01 * k))
+    assert usual.inflation > 1.5
+    assert usual.scatter < 1.25
+    jumps = lp.Jumps(settle=0)
+    watch, alarm = jumps.start(), False
+    for k in range(30):
+        watch, alarm = jumps.add(watch, rng.standard_normal(2) + 2.0 * np.sin(k), usual)
+        if alarm:
+            break
+    assert alarm
 
 
 MESH = lp.interval(0.0, 1.0, 12)
