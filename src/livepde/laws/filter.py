@@ -278,6 +278,14 @@ class Filter:
             U, C = _compressed(U, C, self.scale, self.rank)
         return replace(point, U=U, C=C)
 
+    def fresh(self, point: Point) -> Point:
+        """Return the filter with the prior of the unknowns, and the state as it is estimated."""
+        k = len(point.da)
+        prior = self.problem.model.latent.prior
+        state, U = point.u + point.du, np.zeros((len(point.u), k))
+        zero = np.zeros(k)
+        return replace(point, u=state, q=prior, du=0.0 * point.du, da=zero, U=U, C=np.eye(k))
+
     def recentred(self, point: Point) -> Point:
         """Return the filter with its reference at the estimate, within the bounds.
 
