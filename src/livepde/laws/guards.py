@@ -28,8 +28,8 @@ class Guards:
 
     *Runaway.* A step that fails, or a prediction that misses the data by more than `runaway` times
     all that the sensor has ever varied: the law goes back to before the last samples, adds one
-    prior deviation to what is uncertain there, and takes these samples again; if that does not
-    help it begins there with the prior. Note: "restarted". If nothing helps a failed step is
+    prior deviation to what is uncertain there, and carries the state on without those samples; if
+    that fails as well, with the prior. Note: "restarted". If nothing helps a failed step is
     reported as such and changes nothing; "runaway" notes a prediction that stays away.
 
     Parameters
@@ -48,8 +48,8 @@ class Guards:
     """
 
     reach: float = 1.0
-    iterations: int = 20
-    temperings: int = 3
+    iterations: int = 10
+    temperings: int = 2
     runaway: float = 10.0
     past: int = 32
 

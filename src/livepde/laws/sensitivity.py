@@ -265,10 +265,10 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         self, work: Filter, state: SensitivityState, interval: Interval
     ) -> tuple[SensitivityState, Report]:
         new, report = self._assimilated(work, state, interval)
-        if self.guards is not None:
-            new, report = self._rescued(work, state, interval, new, report)
-        if report.status.ok and self.jumps is not None:
-            new, report = self._watched(work, state, interval, new, report)
+        if (guards := self.guards) is not None:
+            new, report = self._rescued(work, guards, state, interval, new, report)
+        if report.status.ok and (jumps := self.jumps) is not None:
+            new, report = self._watched(work, jumps, state, interval, new, report)
         return new, report
 
     def _assimilated(
@@ -279,9 +279,9 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         if not report.status.ok:
             return state, report
         if self.replay is None:
-            if self.guards is not None:
-                point, notes = self._iterated(work, state, interval, point)
-                report = replace(report, notes={**report.notes, **notes})
+            if (guards := self.guards) is not None:
+                point, notes = self._iterated(work, guards, state, interval, point)
+                report = replace(report, notes={**report.notes, **_consistent(point), **notes})
             return self._remember(work, replace(state, now=work.recentred(point)), interval), report
         state = self._store(work, state, point, interval)
         if state.assimilated >= state.due:
@@ -328,66 +328,66 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         )
 
     def _iterated(
-        self, work: Filter, state: SensitivityState, interval: Interval, point: Point
+        self,
+        work: Filter,
+        guards: Guards,
+        state: SensitivityState,
+        interval: Interval,
+        point: Point,
     ) -> tuple[Point, dict[str, float]]:
         """Return the filter after a sample that may have moved it too far, and notes.
 
-        A replay of this one sample from where the interval began.
+        Too far is cured by a replay of this one sample from where the interval began.
         """
-        assert self.guards is not None
-        level, noise = state.now.level, 1.0
-        for temper in range(self.guards.temperings + 1):
-            begin = replace(state.now, level=level.times(noise))
-            window = self._renewed(begin, state)
+        level = state.now.level
+        for temper in range(guards.temperings + 1):
+            tempered = {"tempered": 1.0} if temper else {}
+            begin = replace(state.now, level=level.times(TEMPER**temper))
             if temper:
-                point, report = self._filter(work, begin, interval)
-                if not report.status.ok:
-                    break
-            window = self._store(work, window, point, interval)
-            if np.abs(_missed(work, window)).max(initial=0.0) <= self.guards.reach:
-                return _levelled(point, level, temper), {
-                    "tempered": float(temper)
-                } if temper else {}
-            for _ in range(self.guards.iterations):
+                point, _ = self._filter(work, begin, interval)
+            window = self._store(work, self._renewed(begin, state), point, interval)
+            if np.abs(_missed(work, window)).max(initial=0.0) <= guards.reach:
+                return _levelled(point, level, temper), tempered
+            for _ in range(guards.iterations):
                 window, status = self._replayed(work, window)
-                if not status.ok or _left(work, window) <= CONVERGED:
+                if not status.ok:
                     break
-            if status.ok and _left(work, window) <= CONVERGED:
-                notes = {"iterated": 1.0} | ({"tempered": float(temper)} if temper else {})
-                return _levelled(window.now, level, temper), notes
-            noise *= TEMPER
+                if _left(work, window) <= CONVERGED:
+                    return _levelled(window.now, level, temper), {"iterated": 1.0, **tempered}
         nothing = replace(interval, z1=np.full_like(interval.z1, np.nan))
-        point, _ = self._filter(work, state.now, nothing)
-        return point, {"held": 1.0}
+        return self._filter(work, state.now, nothing)[0], {"held": 1.0}
 
     def _rescued(
         self,
         work: Filter,
+        guards: Guards,
         state: SensitivityState,
         interval: Interval,
         new: SensitivityState,
         report: Report,
     ) -> tuple[SensitivityState, Report]:
-        """Return state and report after a sample that may have failed or be far off."""
-        guards = self.guards
-        assert guards is not None
+        """Return state and report after a sample that may have failed or be far off.
+
+        Whatever led there is not used again: the state is only carried on from the past.
+        """
         noise = state.now.level.scale * work.noise
+        scale = state.scale.add(interval.z1, interval.z1 - report.predicted)
 
         def astray(report: Report) -> bool:
             d = interval.z1 - report.predicted
-            return not report.status.ok or state.scale.beyond(d, noise) > guards.runaway
+            return not report.status.ok or scale.beyond(d, noise) > guards.runaway
 
-        scale = state.scale.add(interval.z1, interval.z1 - report.predicted)
         if not astray(report):
             return replace(new, scale=scale), report
-        past = state.past
-        known = [*past.samples.intervals(work.problem.channels), interval]
-        older = work.recentred(past.older)
+        older = work.recentred(state.past.older)
+        known = [*state.past.samples.intervals(work.problem.channels), interval]
+        silent = [replace(item, z1=np.full_like(item.z1, np.nan)) for item in known]
         for start in (work.loosened(older, 1.0), work.fresh(older)):
-            again, found = self._retaken(work, state, start, known)
+            again, found = self._retaken(work, state, start, silent)
             if not astray(found):
                 notes = {**found.notes, "restarted": 1.0}
-                return replace(again, scale=scale), replace(found, notes=notes)
+                again = replace(again, scale=scale, past=Past.start(again.now, again.samples))
+                return again, replace(found, notes=notes)
         if not report.status.ok:
             return state, report
         return replace(new, scale=scale), replace(report, notes={**report.notes, "runaway": 1.0})
@@ -407,6 +407,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
     def _watched(
         self,
         work: Filter,
+        jumps: Jumps,
         state: SensitivityState,
         interval: Interval,
         new: SensitivityState,
@@ -417,26 +418,25 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         After an alarm the samples since the jump are taken again, from before it: the state has
         gone astray with them, and what was measured before does not belong to the unknowns of now.
         """
-        assert self.jumps is not None
         usual, e = state.now.consistency, new.now.consistency.newest
-        watch, alarm = self.jumps.add(state.watch, e, usual)
+        watch, alarm = jumps.add(state.watch, e, usual)
         new = replace(new, watch=watch)
         if alarm:
             past = state.past
             known = [*past.samples.intervals(work.problem.channels), interval]
-            before = max(len(known) - self.jumps.onset(state.watch, e, usual), 0)
+            before = max(len(known) - jumps.onset(state.watch, e, usual), 0)
             point, status = work.recentred(past.older), Status()
             for earlier in known[:before]:
                 point, found = self._filter(work, point, earlier)
                 point, status = work.recentred(point), found.status
                 if not status.ok:
                     break
-            start = work.loosened(point, self.jumps.size)
+            start = work.loosened(point, jumps.size)
             again, found = self._retaken(work, new, start, known[before:])
             if status.ok and found.status.ok:
                 new = again
             else:
-                new = self._renewed(work.loosened(work.recentred(new.now), self.jumps.size), new)
+                new = self._renewed(work.loosened(work.recentred(new.now), jumps.size), new)
         return new, replace(report, notes={**report.notes, "jump": float(alarm)})
 
     def _store(
@@ -483,10 +483,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         new, refused = work.updated(moved, interval, predicted)
         if not np.isfinite(new.da).all():
             return failed(Status("not_finite", "the update is not finite"))
-        notes = {
-            "innovation_ratio": new.consistency.ratio,
-            "innovation_correlation": new.consistency.correlation,
-        }
+        notes = _consistent(new)
         if self.noise == "auto":
             notes["noise_level"] = new.level.scale
         if np.isfinite(self.gate):
@@ -541,3 +538,11 @@ def _left(work: Filter, state: SensitivityState) -> float:
 def _levelled(point: Point, level: NoiseLevel, tempered: int) -> Point:
     """Return a filter after a sample; a tempered one tells nothing about the noise."""
     return replace(point, level=level) if tempered else point
+
+
+def _consistent(point: Point) -> dict[str, float]:
+    """Return the notes on the innovations."""
+    return {
+        "innovation_ratio": point.consistency.ratio,
+        "innovation_correlation": point.consistency.correlation,
+    }
