@@ -129,7 +129,8 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         multiple for all sensors.
     drift
         Variance of a gained per unit of time, relative to the prior, by every unknown without an
-        evolution of its own: > 0 follows parameters that change.
+        evolution of its own: > 0 follows parameters that change. It gains the less the closer its
+        deviation is to the prior's, so that nothing winds up while the data tell nothing.
     memory
         Time after which what the state knows of the parameters has faded to 1/e.
     replay
