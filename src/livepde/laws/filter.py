@@ -212,6 +212,7 @@ class Filter:
         lower, upper = self.problem.model.latent.bounds
         return np.clip(q, lower, upper)
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
         """Return the filter at the end of an interval, substeps, and why it failed or None."""
         model, end = self.problem.model, self.moved(point, interval.t1 - interval.t0)
