@@ -158,7 +158,7 @@ def test_a_failure_that_nothing_helps_against_is_a_status():
 
 
 def test_no_burst_follows_a_rest():
-    """Excitation returns at once after 10 s without, in which the unknown may have gone anywhere."""
+    """Excitation returns at once after 10 s, in which the unknown may have gone anywhere."""
     model = rod(lambda t: float(t < 2 or t > 12), evolution=lp.RandomWalk(0.2))
     ends = {guards: [] for guards in (None, lp.Guards())}
     for seed in (3, 4, 5):
