@@ -135,7 +135,7 @@ class Result:
         self.fields_every = fields_every
         self.last: Estimate | None = None
         self._rows: list[tuple[Any, ...]] = []
-        self._fields: list[tuple[float, dict[str, Array]]] = []
+        self._fields: list[tuple[float, dict[str, Array], dict[str, tuple[float, int]]]] = []
 
     @classmethod
     def empty(
@@ -149,7 +149,7 @@ class Result:
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
-        values = estimate.parameters
+        values, rows = estimate.parameters, [*estimate.space.labels.values()]
         self._rows.append(
             (
                 estimate.t,
@@ -160,11 +160,21 @@ class Result:
                 STATUS_CODES.index(estimate.status.code),
                 estimate.notes,
                 estimate.steps,
+                estimate.belief.left(rows),
             )
         )
         if (len(self._rows) - 1) % self.fields_every == 0:
-            self._fields.append((estimate.t, self._profiles(estimate)))
+            self._fields.append((estimate.t, self._profiles(estimate), self._modes(estimate)))
         self.last = estimate
+
+    def _modes(self, estimate: Estimate) -> dict[str, tuple[float, int]]:
+        """Return of how many modes of each field the data have told, and how many it has."""
+        space, found = self.model.parameter_space, {}
+        for name in space.fields:
+            left = estimate.belief.modes_left(space.part(name))
+            if len(left):
+                found[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
+        return found
 
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
         """Return values and deviations of all fields at the vertices."""
@@ -192,18 +202,21 @@ class Result:
 
         Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
-        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes.
+        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
+        law with covariance also `_left`, the share of the prior deviation of a number that is left;
+        `_modes`, of how many modes of a field the data have told, over `snapshot`; and
+        `correlation` of the last numbers, over (`unknown`, `other`).
         """
         fields = list(self._fields)
         if self.last is not None and (not fields or fields[-1][0] != self.last.t):
-            fields.append((self.last.t, self._profiles(self.last)))
-        rows = list(zip(*self._rows, strict=True)) or [()] * 8
+            fields.append((self.last.t, self._profiles(self.last), self._modes(self.last)))
+        rows = list(zip(*self._rows, strict=True)) or [()] * 9
         points = self.model.mesh.p
         order = np.argsort(points[0]) if len(points) == 1 else np.arange(points.shape[1])
         data = xr.Dataset(
             coords={
                 "time": ("time", np.array(rows[0], dtype=float), {"units": self.model.time_unit}),
-                "snapshot": np.array([t for t, _ in fields]),
+                "snapshot": np.array([t for t, *_ in fields]),
                 "sensor": list(self.observed.names),
                 "withheld": list(self.withheld.names if self.withheld else ()),
                 **{
@@ -222,10 +235,17 @@ class Result:
             data[f"{label}_std"] = ("time", std, unit)
             for name, end in _ends(label, unknown, values, std).items():
                 data[name] = ("time", end, unit)
+            share = np.array([row[k] for row in rows[8]], dtype=float)
+            data[f"{label}_left"] = ("time", share, {"long_name": "share of the prior deviation"})
         for name in fields[0][1] if fields else ():
-            values = np.array([profile[name][order] for _, profile in fields])
+            values = np.array([profile[name][order] for _, profile, _ in fields])
             unit = {"units": units.get(_bare(name), "")}
             data[name] = (("snapshot", "vertex"), values, unit)
+        for name, (_, count) in (fields[-1][2] if fields else {}).items():
+            told = np.array([modes[name][0] for *_, modes in fields])
+            about = {"long_name": "modes that the data have told of", "of": count}
+            data[f"{name}_modes"] = ("snapshot", told, about)
+        self._correlate(data)
         unit = {"units": self.observed.observation.unit}
         shape = (len(self._rows), self.observed.size)
         data["innovation"] = (("time", "sensor"), np.reshape(rows[3], shape), unit)
@@ -246,6 +266,18 @@ class Result:
         components = self.model.state_space.fields.items()
         data.attrs["state"] = " ".join(key for n, b in components for key in _variables(n, b))
         return data
+
+    def _correlate(self, data: xr.Dataset) -> None:
+        """Add how the last estimates of numbers are correlated."""
+        labels = self.model.parameter_space.labels
+        factor = self.last.belief.q_factor if self.last is not None else None
+        if factor is None or len(labels) < 2 or "correlation" in data:
+            return
+        rows = factor[list(labels.values())]
+        size = np.linalg.norm(rows, axis=1)
+        unit = rows / np.where(size > 0.0, size, 1.0)[:, None]
+        data.coords["unknown"] = list(labels)
+        data["correlation"] = (("unknown", "other"), unit @ unit.T)
 
     def _units(self) -> dict[str, str]:
         unknowns = {**self.model.state_space.unknowns, **self.model.parameter_space.unknowns}

@@ -11,6 +11,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     StrictBool,
@@ -256,6 +257,15 @@ class ReplaySpec(Spec):
     iterations: PositiveInt = 4
 
 
+class JumpsSpec(Spec):
+    """Options of the test for sudden changes."""
+
+    probability: PositiveFloat = 1e-5
+    window: PositiveInt = 32
+    size: PositiveFloat = 1.0
+    settle: NonNegativeInt = 50
+
+
 class SensitivitySpec(Spec):
     """The law for sparse, noisy sensors."""
 
@@ -266,6 +276,7 @@ class SensitivitySpec(Spec):
     memory: Quantity | None = None
     replay: bool | ReplaySpec = False
     gate: PositiveFloat | None = None
+    jumps: bool | JumpsSpec = False
 
 
 class TikhonovSpec(Spec):

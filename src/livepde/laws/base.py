@@ -129,6 +129,32 @@ class Belief:
         std = _deviation(rows @ self.q_factor[part], self.inflation)
         return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
 
+    def left(self, rows: Any) -> Array:
+        """Return the share of the prior deviation that is left of each of some coefficients of q.
+
+        NaN without covariance.
+        """
+        if self.q_factor is None or self.prior_factor is None:
+            return np.full(len(self.q[rows]), np.nan)
+        before = np.linalg.norm(self.prior_factor[rows], axis=1)
+        after = self.inflation * np.linalg.norm(self.q_factor[rows], axis=1)
+        left: Array = after / np.where(before > 0.0, before, np.nan)
+        return left
+
+    def modes_left(self, part: Any) -> Array:
+        """Return the share of the prior deviation that is left of each mode of a part of q.
+
+        The modes are those of the posterior relative to the prior, so that their shares do not
+        depend on units: as many as the part has reduced coordinates, the least known first. None
+        at all without covariance.
+        """
+        if self.q_factor is None or self.prior_factor is None:
+            return np.zeros(0)
+        axes, sizes, _ = np.linalg.svd(self.prior_factor[part], full_matrices=False)
+        seen = sizes > 1e-12 * sizes.max(initial=0.0)
+        reduced = (axes[:, seen].T @ self.q_factor[part]) / sizes[seen, None]
+        return np.asarray(self.inflation * np.linalg.svd(reduced, compute_uv=False))
+
 
 def _deviation(factor: Array, inflation: float) -> Array:
     std: Array = inflation * np.sqrt((factor**2).sum(axis=1))

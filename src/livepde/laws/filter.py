@@ -79,11 +79,15 @@ class Motion:
         Where its reduced coordinates stand: copies times modes.
     evolution, std
         Its model, and the prior deviation of its latent coefficients.
+    saturates
+        True if it gains the less the closer its variance is to that of the prior: it may move, but
+        without data it is not less certain than at first.
     """
 
     part: slice
     evolution: Evolution
     std: float
+    saturates: bool = False
 
     def transition(self, h: float) -> Array:
         """Return the transition of its coordinates in a time h."""
@@ -94,6 +98,12 @@ class Motion:
         """Return the variance its coordinates gain in a time h."""
         gained = self.evolution.growth(h, self.std)
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
+
+    def gained(self, h: float, variance: Array) -> Array:
+        """Return what its coordinates gain in a time h, given their variances."""
+        room = np.maximum(1.0 - variance[self.part], 0.0) if self.saturates else 1.0
+        gained: Array = room * self.growth(h)
+        return gained
 
     def backward(self, h: float) -> Array:
         """Return what the coordinates are expected to have been a time h before: matrix on them."""
@@ -150,7 +160,8 @@ class Filter:
         if not self.moves or h == 0.0:
             return point
         F = self.transition(h)
-        gained = np.sqrt(np.concatenate([motion.growth(h) for motion in self.motions]))
+        variance = (point.C**2).sum(axis=1)
+        gained = np.sqrt(np.concatenate([m.gained(h, variance) for m in self.motions]))
         new = np.diag(gained)[:, gained > 0.0]
         q = self.problem.model.latent.moved(point.q, h)
         U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
@@ -238,6 +249,7 @@ class Filter:
         lower, upper = self.problem.model.latent.bounds
         return np.clip(q, lower, upper)
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
         """Return the filter at the end of an interval, substeps, and why it failed or None."""
         model, end = self.problem.model, self.moved(point, interval.t1 - interval.t0)
@@ -315,6 +327,14 @@ class Filter:
             U, C = _compressed(U, C, self.scale, self.rank)
         return replace(point, U=U, C=C)
 
+    def fresh(self, point: Point) -> Point:
+        """Return the filter with the prior of the unknowns, and the state as it is estimated."""
+        k = len(point.da)
+        prior = self.problem.model.latent.prior
+        state, U = point.u + point.du, np.zeros((len(point.u), k))
+        zero = np.zeros(k)
+        return replace(point, u=state, q=prior, du=0.0 * point.du, da=zero, U=U, C=np.eye(k))
+
     def recentred(self, point: Point) -> Point:
         """Return the filter with its reference at the estimate, within the bounds.
 
@@ -374,11 +394,12 @@ def reduction(
         else:
             phi = np.eye(item.size) * item.unknown.latent_std
         evolution = item.evolution
-        if drift and not evolution.moves:
+        drifts = bool(drift) and not evolution.moves
+        if drifts:
             evolution = RandomWalk(np.sqrt(drift) * item.unknown.latent_std)
         blocks.append(np.kron(np.eye(evolution.copies), phi))
         stop = start + blocks[-1].shape[1]
-        motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std))
+        motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std, drifts))
         start = stop
     Phi: Array = np.asarray(block_diag(*blocks))
     return Phi, tuple(motions)
