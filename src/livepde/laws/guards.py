@@ -47,7 +47,7 @@ class Guards:
         twice as many.
     """
 
-    reach: float = 1.0
+    reach: float = 0.25
     iterations: int = 10
     temperings: int = 2
     runaway: float = 10.0
