@@ -355,6 +355,8 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             begin = replace(state.now, level=level.times(TEMPER**temper))
             if temper:
                 point, _ = self._filter(work, begin, interval)
+            if np.abs(point.da - begin.da).max(initial=0.0) <= guards.reach:  # cheaper to see
+                return _levelled(point, level, temper), tempered
             window = self._store(work, self._renewed(begin, state), point, interval)
             if not self._far(work, window):
                 return _levelled(point, level, temper), tempered
