@@ -19,12 +19,12 @@ __all__ = ["Guards", "Past", "Samples", "Scale"]
 class Guards:
     """What `SensitivityLaw` does when its own assumptions fail; inert as long as they hold.
 
-    *Overconfident linearisation.* A sample that would move an unknown by more than `reach` prior
-    deviations is assimilated by Gauss-Newton steps over its interval, each at most one prior
-    deviation long, until reference and estimate agree within half a standard deviation (a law with
-    a `Replay` does so anyway). Where they do not converge the sample counts with ten times its
-    noise, and so on; after `temperings` of that it is not used. Notes: "iterated", "tempered",
-    "held".
+    *Overconfident linearisation.* A sample that moves an unknown by more than `reach` prior
+    deviations, and beyond half a standard deviation of what it leaves, is assimilated by
+    Gauss-Newton steps over its interval, each at most one prior deviation long, until reference
+    and estimate agree within that half (a law with a `Replay` does so anyway). Where they do not
+    converge the sample counts with ten times its noise, and so on; after `temperings` of that it
+    is not used. Notes: "iterated", "tempered", "held".
 
     *Runaway.* A step that fails, or a prediction that misses the data by more than `runaway` times
     all that the sensor has ever varied: the law goes back to before the last samples, adds one
@@ -47,7 +47,7 @@ class Guards:
         twice as many.
     """
 
-    reach: float = 1.0
+    reach: float = 0.25
     iterations: int = 10
     temperings: int = 2
     runaway: float = 10.0

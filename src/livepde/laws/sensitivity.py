@@ -249,12 +249,14 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         if not work.output(point, interval.end).any():
             return state
         form, begun = work.problem.model.form_initial, state
+        iterates = form is not None and not form.linear_in_parameter
         for _ in range(FIRST):
             new, _ = work.updated(point, interval, work.predict(point, interval.end))
             if not np.isfinite(new.da).all():
                 return state
             begun = replace(state, now=new, reference=point.q)
-            if form is None or form.linear_in_parameter or _left(work, begun) <= CONVERGED:
+            iterates = iterates or self._far(work, begun)
+            if not iterates or _left(work, begun) <= CONVERGED:
                 break
             point = _placed(work, state, _next(work, begun), interval.end)
         if self.replay is None:
@@ -262,6 +264,13 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             return replace(begun, now=now, past=Past.start(now, begun.samples))
         begun = self._store(work, begun, new, interval)
         return replace(begun, past=Past.start(new, begun.samples))
+
+    def _far(self, work: Filter, state: SensitivityState) -> bool:
+        """Return whether a law without replay moved an unknown too far by one linearisation."""
+        if self.guards is None or self.replay is not None:
+            return False
+        far = np.abs(_missed(work, state)).max(initial=0.0) > self.guards.reach
+        return bool(far) and _left(work, state) > CONVERGED
 
     def step(
         self, work: Filter, state: SensitivityState, interval: Interval
@@ -347,8 +356,10 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             begin = replace(state.now, level=level.times(TEMPER**temper))
             if temper:
                 point, _ = self._filter(work, begin, interval)
+            if np.abs(point.da - begin.da).max(initial=0.0) <= guards.reach:  # cheaper to see
+                return _levelled(point, level, temper), tempered
             window = self._store(work, self._renewed(begin, state), point, interval)
-            if np.abs(_missed(work, window)).max(initial=0.0) <= guards.reach:
+            if not self._far(work, window):
                 return _levelled(point, level, temper), tempered
             for _ in range(guards.iterations):
                 window, status = self._replayed(work, window)
