@@ -43,11 +43,31 @@ def test_intervals_hold_what_they_promise():
     assert not any(one.doubted for one in several)
 
 
-def test_a_wrong_model_is_doubted_or_its_interval_is_wide_enough():
-    large = replace(PROBLEMS["wrong model"], loss=lambda rng: 1.0)
-    assert twin(large, 0).doubted
-    several = [twin(PROBLEMS["wrong model"], seed) for seed in range(12)]
+@pytest.mark.parametrize(
+    ("name", "flaw"), [("missing loss", {"loss": 1.0}), ("missing layer", {"contrast": 0.8})]
+)
+def test_a_wrong_model_is_doubted_or_its_interval_is_wide_enough(name: str, flaw: dict[str, float]):
+    large = {key: lambda rng, value=value: value for key, value in flaw.items()}
+    doubted = twin(replace(PROBLEMS[name], **large), 0)
+    assert doubted.doubted
+    assert doubted.white == (False, False)
+    assert not PROBLEMS[name].right
+    several = [twin(PROBLEMS[name], seed) for seed in range(12)]
     assert np.mean([one.doubted or one.inside[0.95] == 1.0 for one in several]) > 0.8
+
+
+def test_innovations_are_white_if_the_model_is_right():
+    right = PROBLEMS["short run"]
+    square, correlation = np.mean([twin(right, seed).white for seed in range(40)], axis=0)
+    assert min(square, correlation) > 0.8  # 0.95 less four standard errors
+    lossy = replace(right, unknowns={"a": right.unknowns["a"]}, loss=lambda rng: 9.0)
+    assert twin(lossy, 0).white == (False, False)
+
+
+def test_a_field_seen_in_part_is_covered_outside_too():
+    several = [twin(PROBLEMS["field, seen in part"], seed) for seed in range(20)]
+    assert np.mean([one.inside[0.95] for one in several]) > 0.87
+    assert 0.7 < np.sqrt(np.mean([one.error for one in several])) < 1.3
 
 
 def test_the_command_prints_checks(monkeypatch: pytest.MonkeyPatch):

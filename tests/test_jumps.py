@@ -61,6 +61,32 @@ def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, se
     assert abs(value - 0.3 * change) < 5 * std < 0.02
 
 
+@pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.parametrize("seed", [1, 5, 7])
+def test_after_an_alarm_the_samples_since_the_jump_are_taken_again(replay: Any, seed: int):
+    """What the state has gone astray by in the meantime is not taken for a still larger jump."""
+    law = lp.SensitivityLaw(jumps=Jumps(), replay=replay)
+    found = run(law, samples(lambda t: 0.3 if t < 15.0 else 0.24, 340, seed))
+    values = [estimate.parameters["a"][0] for estimate in found[299:]]
+    assert min(values) > 0.18
+    assert max(values) < 0.31
+    assert values[-1] == pytest.approx(0.24, abs=0.01)
+
+
+def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
+    rng, jumps, hits = np.random.default_rng(0), Jumps(), 0
+    for length in (1, 3, 10, 30):
+        for _ in range(20):
+            watch, usual = jumps.start(), Consistency.start(2)
+            for k in range(60):
+                e = rng.standard_normal(2) * (5.0 if k >= 60 - length else 1.0)
+                e[rng.random(2) < 0.1] = np.nan
+                if k < 59:
+                    watch = watch.add(e)
+            hits += abs(jumps.onset(watch, e, usual) - length) <= 2
+    assert hits >= 72  # of 80
+
+
 def test_white_innovations_raise_no_alarm():
     rng, jumps = np.random.default_rng(0), Jumps(probability=1e-5)
     watch, usual, alarms = jumps.start(), Consistency.start(3), 0

@@ -15,8 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import livepde as lp
+from livepde.result import Result
 from livepde.runs.journal import Event, Journal
 from livepde.runs.live import Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
@@ -49,7 +51,9 @@ def rows(count: int):
 
 
 def journal(path: Path) -> Journal:
-    return Journal.create(path, ("a", "b", "left"), (1, 2, 0))
+    who = identifier()
+    result = Result.empty(who.model, who.observed, who.withheld)
+    return Journal.create(path, ("a", "b", "left"), result.layout)
 
 
 def live(folder: Path, source=None, **options) -> Live:
@@ -70,11 +74,12 @@ def same(one: Journal, other: Journal) -> None:
     mine, yours = list(one), list(other)
     assert len(mine) == len(yours) > 0
     for a, b in zip(mine, yours, strict=True):
-        for name in ("t", "values", "stds", "innovation", "status", "steps"):
+        for name in ("t", "numbers", "innovation", "status", "steps"):
             assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
-        assert (a.profiles is None) == (b.profiles is None)
-        for name in a.profiles or ():
-            assert np.array_equal(a.profiles[name], b.profiles[name])
+        assert (a.snapshot is None) == (b.snapshot is None)
+        if a.snapshot is not None:
+            for name, values in a.snapshot.profiles.items():
+                assert np.array_equal(values, b.snapshot.profiles[name])
 
 
 def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
@@ -88,6 +93,9 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     assert np.array_equal(found["k"], result.to_xarray()["k"])
     assert np.array_equal(found["innovation"], result.to_xarray()["innovation"], equal_nan=True)
     assert found.sizes["snapshot"] == 6
+    run.journal.close()
+    with Journal.open(tmp_path / "journal.sqlite") as reader:
+        xr.testing.assert_identical(reader.layout.dataset(list(reader)), found)
 
 
 CHILD = """

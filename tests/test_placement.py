@@ -70,10 +70,35 @@ def test_a_field_counts_with_its_mean_over_the_domain(rod: Path):
     assert 0 < found.then["alpha"] < found.now["alpha"] < 1
 
 
+WALK = {
+    "unknowns.alpha.evolution": {"kind": "random-walk", "rate": "1e-6 m^2/s/s^0.5"},
+    "law.replay": False,
+}
+
+
+def test_of_unknowns_that_move_it_keeps_its_promise_too(rod: Path):
+    found = advice(rod, LAYERS, WALK)
+    assert found.candidates == 41
+    at = f"{100 * found.position[0]} cm"
+    new = {SENSOR: {"role": "sensor", "column": "T_20", "at": at, "noise": "0.05 K"}}
+    for settings, left in ((LAYERS, found.now), (LAYERS | new, found.then)):
+        case = prepared(rod, settings, WALK)
+        told = {item.name: item.left for item in preview(case, case.stream).unknowns}
+        assert told == pytest.approx(dict(left), rel=2e-2)
+    assert sum(s**2 for s in found.then.values()) < sum(s**2 for s in found.now.values())
+
+
+def test_of_unknowns_that_move_hardly_another_vertex_is_better(rod: Path):
+    def mean(at: float) -> float:
+        new = {SENSOR: {"role": "sensor", "column": "T_20", "at": f"{at} m", "noise": "0.05 K"}}
+        case = prepared(rod, LAYERS, WALK, new)
+        return sum(item.left**2 for item in preview(case, case.stream).unknowns)
+
+    best = float(advice(rod, LAYERS, WALK).position[0])
+    assert all(mean(best) <= 1.05 * mean(at) for at in (0.05, 0.15, 0.25, 0.35))
+
+
 def test_what_it_cannot_say(rod: Path):
-    walk = {"unknowns.alpha.evolution": {"kind": "random-walk", "rate": "1e-7 m^2/s/s^0.5"}}
-    with pytest.raises(lp.ConfigurationError, match="alpha drifts at random"):
-        advice(rod, walk)
     rod.write_text(rod.read_text().replace('"sensitivity"', '"gradient"').replace("replay =", "# "))
     with pytest.raises(lp.ConfigurationError, match="needs a law with a covariance"):
         advice(rod)

@@ -135,13 +135,17 @@ def test_drift_and_memory_follow_a_jump():
     assert tracking.q_std[0] > 0
 
 
-def test_uncertainty_grows_with_drift_and_without_data():
+def test_uncertainty_returns_to_the_prior_with_drift_and_without_data():
     model = conductivity()
-    sensors, samples = stream(model, 1.0, 0.1 * np.arange(11))
-    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.1))
-    stds = [ident.step(t, [np.nan, np.nan], inputs).q_std[0] for t, _, inputs in samples]
+    sensors, samples = stream(model, 1.0, 0.1 * np.arange(101))
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.5))
+    seen = [ident.step(*sample).q_std[0] for sample in samples[:11]]
+    stds = [ident.step(t, [np.nan, np.nan], inputs).q_std[0] for t, _, inputs in samples[11:]]
+    assert seen[-1] < 0.1
     assert np.all(np.diff(stds) > 0)
-    assert stds[-1] == pytest.approx(np.sqrt(1 + 0.1 * 1.0))
+    # dV/dt = 0.5 (1 - V) from the variance after the last sample, by steps of 0.1
+    expected = 1.0 - (1.0 - seen[-1] ** 2) * 0.95 ** np.arange(1, 91)
+    assert np.square(stds) == pytest.approx(expected)
 
 
 def test_a_field_by_modes_of_its_prior():

@@ -9,6 +9,7 @@ from problems import CASES, laplace, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
+from livepde import spaces
 from livepde.diagnostics import check_space
 
 
@@ -186,3 +187,29 @@ def test_bad_unknowns():
         lp.Model(lp.Field(mesh, element), {}, product)
     with pytest.raises(lp.SpaceError, match="'R b': the name must be a Python identifier"):
         lp.Model(lp.Field(mesh, element), {"R b": lp.Scalar()}, product)
+
+
+def test_prior_variances_are_the_diagonal_of_the_inverse():
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (12, 12))
+    for inner in ("H1", lp.Sobolev(2.0, 0.3), lp.Sobolev(1.5, 0.3)):
+        unknown = {"q": lp.Field(mesh, lp.linear(mesh), inner=inner, std=2.0)}
+        model = lp.Model(lp.Field(mesh, lp.linear(mesh)), unknown, A=lambda q, u, v, x: q.q * u * v)
+        exact = np.diag(np.linalg.inv(model.Q.gram.toarray()))
+        assert model.Q.variance == pytest.approx(exact)
+
+
+def test_prior_variances_of_large_fields_are_interpolated(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(spaces, "SOLVED", 250)
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (24, 24))
+    for inner in (lp.Sobolev(2.0, 0.3), lp.Sobolev(1.5, 0.3)):
+        unknown = {"q": lp.Field(mesh, lp.linear(mesh), inner=inner, dirichlet={"left": 0.0})}
+        model = lp.Model(lp.Field(mesh, lp.linear(mesh)), unknown, A=lambda q, u, v, x: q.q * u * v)
+        exact = np.zeros(model.Q.dim)
+        free = np.flatnonzero(model.Q.free)
+        exact[free] = np.diag(np.linalg.inv(model.Q.gram.toarray()[np.ix_(free, free)]))
+        found = model.Q.variance
+        missed = np.abs(found - exact) / exact.max()
+        assert missed.max() < 0.35  # at corners, where the variance has its peaks
+        assert 0.0 < missed.mean() < 0.03
+        assert abs(found.sum() / exact.sum() - 1.0) < 0.03
+        assert (found[model.Q.fixed] == 0.0).all()

@@ -156,6 +156,6 @@ def test_soil_columns_find_what_the_other_code_finds(
     prepared = cases.load(CASE, allow_code=True, settings=place).prepare()
     prepared.identifier.run(prepared.stream)
     estimate = prepared.identifier.estimate()
-    found = {label: estimate.q[k] for label, k in estimate.labels.items()}
+    found = {label: value for label, (value, _) in estimate.parameters.items()}
     assert found["v"] == pytest.approx(v, rel=0.03)
     assert found["D"] == pytest.approx(dispersion, rel=0.25)

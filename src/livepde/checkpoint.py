@@ -102,4 +102,6 @@ def read(path: str | os.PathLike[str]) -> bytes:
     try:
         return Path(path).read_bytes()
     except OSError as error:
-        raise RunError(f"Cannot read the checkpoint {path}: {error.strerror or error}.") from error
+        raise RunError(
+            f"{path} is not a checkpoint that can be read: {error.strerror or error}."
+        ) from error

@@ -232,8 +232,13 @@ class Identifier:
             None if factor is None else latent.tangent(belief.q, factor)
             for factor in (belief.q_factor, belief.prior_factor)
         )
+        rest = None if belief.rest is None else latent.deviation(belief.q, belief.rest)
         return replace(
-            belief, q=latent.value(belief.q), q_factor=q_factor, prior_factor=prior_factor
+            belief,
+            q=latent.value(belief.q),
+            q_factor=q_factor,
+            prior_factor=prior_factor,
+            rest=rest,
         )
 
     def _estimate(

@@ -365,6 +365,7 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
         margin = 0.06 * (finite.max() - finite.min())
         ax.set_ylim(finite.min() - margin, finite.max() + margin)
     _mark_failures(data, ax)
+    _mark_jumps(data, ax)
     ax.set_xlabel(_labelled("t", clock))
     ax.set_ylabel(_labelled(name, unit))
     ax.set_title(f"{name}: estimate and 95 % band" if len(reach) > len(labels) else name)
@@ -383,6 +384,18 @@ def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
             transform=ax.get_xaxis_transform(),
             label=f"{len(failed)} failed steps",
         )
+
+
+def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
+    """Draw a line at each alarm of the test for jumps."""
+    if "jump" not in data or data["jump"].dims != ("time",):
+        return
+    times = data["time"].values[data["jump"].values > 0.0] / _clock(data)[0]
+    for k, t in enumerate(times):
+        label = f"jump at {t:.4g}" if len(times) == 1 else f"{len(times)} jumps"
+        if k:
+            label = "_jump"
+        ax.axvline(t, label=label, color=PALETTE[1], linestyle="--", linewidth=1.0)
 
 
 def _field_panels(data: xr.Dataset, name: str, times: Sequence[float] | int) -> list[Any]:
@@ -453,6 +466,7 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
     ax.axhline(0.0, color="black", linewidth=0.8)
     if first:
         ax.axvline(t[first], color=GREY, linestyle=":", label="assimilated from here")
+    _mark_jumps(data, ax)
     if len(names) <= MOST_LINES:
         for k, name in enumerate(names):
             label = f"{name}: RMSE {_rms(errors[first:, k]):.3g}"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,10 +17,9 @@ from livepde.laws import Belief, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
+from livepde.records import STATUS_CODES, Layout, Record, Records, Snapshot
 
-__all__ = ["Estimate", "Record", "Records", "Result"]
-
-STATUS_CODES = ("ok", "not_converged", "not_finite", "singular")
+__all__ = ["Estimate", "Result"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,44 +119,6 @@ def _unknown(space: FunctionSpace, label: str) -> Any:
     return space.unknowns[label.split("[")[0]]
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
-    """What is kept of an estimate.
-
-    Attributes
-    ----------
-    t, steps, notes, innovation, withheld_error
-        Of the estimate.
-    values, stds
-        Scalar unknowns and their standard deviations, in the order of their labels.
-    status
-        Index of the status code.
-    profiles
-        Fields and their deviations at the vertices of the mesh; None where none are kept.
-    """
-
-    t: float
-    values: Array
-    stds: Array
-    innovation: Array
-    withheld_error: Array
-    status: int
-    steps: int
-    notes: Mapping[str, float]
-    profiles: Mapping[str, Array] | None = None
-
-
-class Records(Protocol):
-    """Where records are kept: a list, or the journal of a run."""
-
-    def append(self, record: Record, /) -> None:
-        """Keep one more."""
-
-    def __iter__(self) -> Iterator[Record]: ...
-
-    def __len__(self) -> int: ...
-
-
 class Result:
     """Estimates of a run, as they are added.
 
@@ -195,25 +157,72 @@ class Result:
     def __len__(self) -> int:
         return self._count
 
+    @cached_property
+    def layout(self) -> Layout:
+        """What the numbers of the records mean."""
+        model = self.model
+        numbers: dict[str, dict[str, Any]] = {}
+        for label in model.parameter_space.labels:
+            unknown = _unknown(model.parameter_space, label)
+            unit: dict[str, Any] = {"units": unknown.unit}
+            numbers |= {label: {**unit, **_prior(unknown)}, f"{label}_std": unit}
+            numbers |= dict.fromkeys(_ends(label, unknown, 0.0, 0.0), unit)
+            numbers[f"{label}_left"] = {"long_name": "share of the prior deviation"}
+        points = model.mesh.p[:, self._order]
+        components = model.state_space.fields.items()
+        return Layout(
+            time_unit=model.time_unit,
+            sensor_unit=self.observed.observation.unit,
+            coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
+            sensors=list(self.observed.names),
+            withheld=None if self.withheld is None else list(self.withheld.names),
+            numbers=numbers,
+            units=self._units(),
+            scalars=list(model.parameter_space.labels),
+            fields=list(model.parameter_space.fields),
+            state=[key for name, block in components for key in _variables(name, block)],
+        )
+
+    @cached_property
+    def _order(self) -> Any:
+        """In which order vertices are kept: along an interval, else as the mesh has them."""
+        points = self.model.mesh.p
+        return np.argsort(points[0]) if len(points) == 1 else slice(None)
+
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
-        values = estimate.parameters
         keeps = self._count % self.fields_every == 0
-        self.records.append(
-            Record(
-                estimate.t,
-                np.array([value for value, _ in values.values()]),
-                np.array([std for _, std in values.values()]),
-                estimate.innovation,
-                estimate.withheld_error,
-                STATUS_CODES.index(estimate.status.code),
-                estimate.steps,
-                estimate.notes,
-                self._profiles(estimate) if keeps else None,
-            )
-        )
+        self.records.append(self._record(estimate, keeps))
         self._count += 1
         self.last = estimate
+
+    def _record(self, estimate: Estimate, keeps: bool) -> Record:
+        numbers: list[float] = []
+        left = estimate.belief.left([*estimate.space.labels.values()])
+        for (label, (value, std)), share in zip(estimate.parameters.items(), left, strict=True):
+            ends = _ends(label, _unknown(estimate.space, label), value, std)
+            numbers += [value, std, *map(float, ends.values()), float(share)]
+        return Record(
+            estimate.t,
+            np.array(numbers),
+            estimate.innovation,
+            estimate.withheld_error,
+            STATUS_CODES.index(estimate.status.code),
+            estimate.steps,
+            estimate.notes,
+            self.snapshot(estimate) if keeps else None,
+        )
+
+    def snapshot(self, estimate: Estimate) -> Snapshot:
+        """Return the fields at the vertices."""
+        space, told = self.model.parameter_space, {}
+        for name in space.fields:
+            left = estimate.belief.modes_left(space.part(name))
+            if len(left):
+                told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
+        profiles = self._profiles(estimate).items()
+        ordered = {name: values[self._order] for name, values in profiles}
+        return Snapshot(ordered, told, _correlation(estimate))
 
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
         """Return values and deviations of all fields at the vertices."""
@@ -229,9 +238,8 @@ class Result:
         for name, field in self.model.parameter_space.fields.items():
             part = self.model.parameter_space.part(name)
             found[name] = field.at_vertices @ estimate.q[part]
-            if belief.q_factor is not None:
-                squares = (field.at_vertices @ belief.q_factor[part]) ** 2
-                std = belief.inflation * np.sqrt(squares.sum(axis=1))
+            std = belief.deviation(field.at_vertices, part)
+            if std is not None:
                 found[f"{name}_std"] = std
                 unknown = self.model.parameter_space.unknowns[name]
                 found |= _ends(name, unknown, found[name], std)
@@ -242,65 +250,15 @@ class Result:
 
         Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
-        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes.
+        with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
+        law with covariance also `_left`, the share of the prior deviation of a number that is left;
+        `_modes`, of how many modes of a field the data have told, over `snapshot`; and
+        `correlation` of the last numbers, over (`unknown`, `other`).
         """
-        rows = list(self.records)
-        fields = [(row.t, row.profiles) for row in rows if row.profiles is not None]
-        if self.last is not None and (not fields or fields[-1][0] != self.last.t):
-            fields.append((self.last.t, self._profiles(self.last)))
-        times = np.array([row.t for row in rows], dtype=float)
-        points = self.model.mesh.p
-        order = np.argsort(points[0]) if len(points) == 1 else np.arange(points.shape[1])
-        data = xr.Dataset(
-            coords={
-                "time": ("time", times, {"units": self.model.time_unit}),
-                "snapshot": np.array([t for t, _ in fields]),
-                "sensor": list(self.observed.names),
-                "withheld": list(self.withheld.names if self.withheld else ()),
-                **{
-                    axis: ("vertex", coordinate[order])
-                    for axis, coordinate in zip("xyz", points, strict=False)
-                },
-            }
-        )
-        units = self._units()
-        for k, label in enumerate(self.model.parameter_space.labels):
-            unknown = _unknown(self.model.parameter_space, label)
-            values = np.array([row.values[k] for row in rows], dtype=float)
-            unit = {"units": unknown.unit}
-            data[label] = ("time", values, {**unit, **_prior(unknown)})
-            std = np.array([row.stds[k] for row in rows], dtype=float)
-            data[f"{label}_std"] = ("time", std, unit)
-            for name, end in _ends(label, unknown, values, std).items():
-                data[name] = ("time", end, unit)
-        for name in fields[0][1] if fields else ():
-            values = np.array([profile[name][order] for _, profile in fields])
-            unit = {"units": units.get(_bare(name), "")}
-            data[name] = (("snapshot", "vertex"), values, unit)
-        unit = {"units": self.observed.observation.unit}
-        shape = (len(rows), self.observed.size)
-        innovations = np.reshape([row.innovation for row in rows], shape)
-        data["innovation"] = (("time", "sensor"), innovations, unit)
-        if self.withheld is not None:
-            errors = np.reshape(
-                [row.withheld_error for row in rows], (len(rows), self.withheld.size)
-            )
-            data["withheld_error"] = (("time", "withheld"), errors, unit)
-        flags = {
-            "flag_values": list(range(len(STATUS_CODES))),
-            "flag_meanings": " ".join(STATUS_CODES),
-        }
-        data["status"] = ("time", np.array([row.status for row in rows], dtype=np.int32), flags)
-        steps = np.array([row.steps for row in rows], dtype=np.int32)
-        data["steps"] = ("time", steps, {"long_name": "substeps taken"})
-        for name in dict.fromkeys(key for row in rows for key in row.notes):
-            key = f"note_{name}" if name in data else name  # an unknown may have the same name
-            data[key] = ("time", np.array([row.notes.get(name, np.nan) for row in rows]))
-        data.attrs["fields"] = " ".join(self.model.parameter_space.fields)
-        data.attrs["scalars"] = "\n".join(self.model.parameter_space.labels)
-        components = self.model.state_space.fields.items()
-        data.attrs["state"] = " ".join(key for n, b in components for key in _variables(n, b))
-        return data
+        records = list(self.records)
+        if records and self.last is not None and records[-1].snapshot is None:
+            records[-1] = replace(records[-1], snapshot=self.snapshot(self.last))
+        return self.layout.dataset(records)
 
     def _units(self) -> dict[str, str]:
         unknowns = {**self.model.state_space.unknowns, **self.model.parameter_space.unknowns}
@@ -335,7 +293,7 @@ def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[s
     return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
 
 
-def _ends(name: str, unknown: Any, values: Array, std: Array) -> dict[str, Array]:
+def _ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
     """Return the variables with the ends of 95 % intervals, unless they are +- 1.96 deviations."""
     if unknown.symmetric:
         return {}
@@ -343,11 +301,16 @@ def _ends(name: str, unknown: Any, values: Array, std: Array) -> dict[str, Array
     return {f"{name}_low": low, f"{name}_high": high}
 
 
-def _bare(name: str) -> str:
-    """Return what a variable beside an unknown belongs to."""
-    for end in ("_std", "_low", "_high"):
-        name = name.removesuffix(end)
-    return name
+def _correlation(estimate: Estimate) -> Array | None:
+    """Return how the estimates of numbers are correlated."""
+    labels, factor = estimate.space.labels, estimate.belief.q_factor
+    if factor is None or len(labels) < 2:
+        return None
+    rows = factor[list(labels.values())]
+    size = np.linalg.norm(rows, axis=1)
+    unit = rows / np.where(size > 0.0, size, 1.0)[:, None]
+    correlation: Array = unit @ unit.T
+    return correlation
 
 
 def _prior(unknown: Any) -> dict[str, float]:

@@ -25,6 +25,8 @@ __all__ = ["BorderedSpace", "HilbertSpace", "product"]
 
 LARGEST_CONDITION = 1e14
 LARGEST_EXPLICIT = 2000  # coefficients up to which a bordered Gram matrix is written out
+SOLVED = 1000  # coefficients whose prior variance is computed; that of others lies in between
+BLOCK = 250  # right-hand sides solved at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +148,41 @@ class HilbertSpace:
     def _form(self, free: IntArray) -> Any:
         """Return G on the free coefficients, as an eigensolver wants it."""
         return self.tangent_gram[free][:, free]
+
+    @cached_property
+    def variance(self) -> Array:
+        """Prior variance of each coefficient: the diagonal of G^{-1}, shape (n,); 0 where fixed.
+
+        Solved for at most 1000 coefficients, evenly chosen. In between v_i G_ii, or v_i where G is
+        not written out, is harmonic on the graph of G: the mean of its neighbours.
+        """
+        variance, free = np.zeros(self.dim), np.flatnonzero(self.free)
+        solved = free[np.unique(np.linspace(0, len(free) - 1, SOLVED).astype(int))]
+        for start in range(0, len(solved), BLOCK):
+            at = solved[start : start + BLOCK]
+            unit = np.zeros((self.dim, len(at)))
+            unit[at, np.arange(len(at))] = 1.0
+            variance[at] = self.factor.solve(unit)[at, np.arange(len(at))]
+        rest = np.setdiff1d(free, solved)
+        if len(rest):
+            whole, links = self.augmented, self._links
+            scale = whole.diagonal() if whole.shape[0] == self.dim else np.ones(self.dim)
+            graph = sp.csr_array(sp.diags_array(links.sum(axis=1)) - links)
+            inner = sp.csr_array(graph[rest][:, rest])
+            pattern = Pattern.of(inner)
+            factor = analyse(pattern, symmetric=True).factorise(_data(inner, pattern))
+            known = graph[rest][:, solved] @ (variance * scale)[solved]
+            variance[rest] = -factor.solve(known) / scale[rest]
+        return variance
+
+    @property
+    def _links(self) -> sp.csr_array:
+        """One for each pair of coefficients that G couples, by auxiliary unknowns or not."""
+        whole = sp.csr_array(self.augmented)
+        ones = sp.csr_array((np.ones(whole.nnz), whole.indices, whole.indptr), whole.shape)
+        n = self.dim
+        links = sp.csr_array(ones[:n, :n] + ones[:n, n:] @ ones[n:, :n])
+        return sp.csr_array((np.ones(links.nnz), links.indices, links.indptr), links.shape)
 
     def modes(self, count: int, mass: sp.csr_array) -> tuple[Array, Array]:
         """Leading modes of the Gaussian measure with covariance G^{-1}.

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.bench.offline import fit
+from livepde.bench.offline import Trajectory, fit
 from livepde.bench.problems import PROBLEMS, Data, Problem
 from livepde.errors import LivepdeError
 from livepde.fem import FieldBlock, Inputs
@@ -136,6 +136,12 @@ class Judge:
             rows.append(row[(np.abs(np.delete(row, latent.fixed, axis=1)) > 0).any(axis=1)])
         return np.vstack(rows)
 
+    @cached_property
+    def rest(self) -> Array:
+        """Deviation of what `probe` evaluates in the modes that no estimator has, (rows,)."""
+        rest: Array = np.abs(self.probe) @ Trajectory(self.data, self.problem.modes).rest
+        return rest
+
     def error(self, q: Array, at: int) -> float:
         """Return the relative error of latent coefficients at a time."""
         return self.problem.error(self.data.process, self.model.latent.value(q), at)
@@ -146,7 +152,7 @@ class Judge:
         if factor is None or true is None:
             return math.nan
         distance = np.abs(self.probe @ (q - self.model.latent.inverse(true[at])))
-        std = np.sqrt(((self.probe @ factor) ** 2).sum(axis=1))
+        std = np.sqrt(((self.probe @ factor) ** 2).sum(axis=1) + self.rest**2)
         return float(np.mean(distance <= QUANTILE * std))
 
     def judged(self, beliefs: Iterable[tuple[int, Array, Array | None]]) -> tuple[float, float]:
@@ -236,8 +242,6 @@ def _law(builder: LawBuilder, forward: float) -> Contender:
 
 def _prior(problem: Problem, data: Data) -> Score:
     """Judge the prior: what is known without any sample."""
-    from livepde.bench.offline import Trajectory
-
     judge, trajectory = Judge(problem, data), Trajectory(data, problem.modes)
     nothing = np.zeros(trajectory.size)
     error, covered = judge.judged(

@@ -2,9 +2,11 @@
 
 Each twin draws its unknowns from the prior, makes its data with the estimator's own scheme, adds
 noise, and asks whether the truth lies in the 68 % and 95 % intervals. If prior, model and noise are
-right, as many do as the level says. In the last problem the model is wrong: its data have a loss of
-heat, of a random size, that the model does not know. Then the interval has to be wide enough, or
-the run has to say that the model does not explain the data.
+right, as many do as the level says, and the normalised innovations are white: of 100 twins 95 have
+a mean square within 1.96 standard errors of 1, and a correlation of successive ones within as many
+of 0. In the last problems the model is wrong: its data have a loss of heat, or a second layer, of a
+random size, that the model does not know. Then the interval has to be wide enough, or the run has
+to say that the model does not explain the data.
 """
 
 from __future__ import annotations
@@ -33,6 +35,8 @@ __all__ = ["PROBLEMS", "Problem", "Twin", "coverage", "twin"]
 
 LEVELS = (0.68, 0.95)
 WITHIN = {0.68: (0.60, 0.76), 0.95: (0.90, 0.98)}  # what the shares over 200 twins have to lie in
+AT_LEAST = 0.9  # share of twins with innovations within chance, which is 0.95
+CHANCE = 1.959964  # standard errors that hold a statistic of white noise in 95 of 100 cases
 HONEST = 0.9  # of the wrong models: wide enough, or doubted
 FALSE_ALARM = 0.05  # of the right models doubted, at most
 NOISE = 0.05
@@ -53,9 +57,10 @@ class Problem:
     law
         Of the estimator.
     sensors
-        How many, equidistant.
-    loss
-        rng -> heat loss of the truth that the model does not know; None: the model is right.
+        Where.
+    loss, contrast
+        rng -> what of the truth the model does not know; None: nothing. A heat loss; by which share
+        a is smaller in the second half than in the first, where the heat comes in.
     samples
         How many, 0.1 apart.
     """
@@ -63,15 +68,30 @@ class Problem:
     title: str
     unknowns: Mapping[str, Any]
     law: SensitivityLaw = field(default_factory=lambda: SensitivityLaw(replay=Replay()))
-    sensors: int = 3
+    sensors: Sequence[float] = (0.25, 0.5, 0.75)
     loss: Callable[[np.random.Generator], float] | None = None
+    contrast: Callable[[np.random.Generator], float] | None = None
     samples: int = 100
 
-    def model(self, loss: float = 0.0) -> Model:
-        """Return u_t - (a u_x)_x + (b + loss) (u - 2) = 0, with b among the unknowns or not."""
+    @property
+    def right(self) -> bool:
+        """True if the estimator has the model of the truth."""
+        return self.loss is None and self.contrast is None
+
+    def truth(self, rng: np.random.Generator) -> Model:
+        """Return the model of the truth."""
+        loss, contrast = (f(rng) if f else 0.0 for f in (self.loss, self.contrast))
+        return self.model(loss, contrast)
+
+    def model(self, loss: float = 0.0, contrast: float = 0.0) -> Model:
+        """Return u_t - (c a u_x)_x + (b + loss) (u - 2) = 0, with b among the unknowns or not.
+
+        c is 1 in the first half and 1 - contrast in the second.
+        """
 
         def flux(q: Any, u: Any, v: Any, x: Any) -> Any:
-            found = q.a * dot(grad(u), grad(v))
+            share = 1.0 - contrast * (x[0] > 0.5)
+            found = share * q.a * dot(grad(u), grad(v))
             return found + q.b * (u - 2.0) * v if "b" in self.unknowns else found
 
         ends: dict[str, Any] = {"left": lambda x, t: 5.0 * np.sin(t) + 0.0 * x[0], "right": 0.0}
@@ -83,24 +103,46 @@ class Problem:
         )
 
 
-A = Scalar(0.3, 0.06)
+A, B = Scalar(0.3, 0.06), Scalar(1.0, 0.4)
+PROFILE = Field(MESH, linear(MESH), inner="H1", prior=0.3, std=0.1, transform="log")
+SPREAD = (0.1667, 0.3333, 0.5, 0.6667, 0.8333)
+
+
+def _between(low: float, high: float) -> Callable[[np.random.Generator], float]:
+    """Return a draw whose logarithm is uniform."""
+    return lambda rng: float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
 PROBLEMS: Mapping[str, Problem] = {
-    "two numbers": Problem("diffusivity and heat loss", {"a": A, "b": Scalar(1.0, 0.4)}),
+    "two numbers": Problem("diffusivity and heat loss", {"a": A, "b": B}),
+    "short run": Problem("the same, from 20 samples", {"a": A, "b": B}, samples=20),
     "field": Problem(
         "diffusivity a(x), positive",
-        {"a": Field(MESH, linear(MESH), inner="H1", prior=0.3, std=0.1, transform="log")},
+        {"a": PROFILE},
         SensitivityLaw(modes=15, replay=Replay()),
-        sensors=5,
+        SPREAD,
+    ),
+    "field, few modes": Problem(
+        "the same with 6 modes", {"a": PROFILE}, SensitivityLaw(modes=6, replay=Replay()), SPREAD
+    ),
+    "field, seen in part": Problem(
+        "the same, seen from 0.1 to 0.4",
+        {"a": PROFILE},
+        SensitivityLaw(modes="auto", replay=Replay()),
+        (0.1, 0.175, 0.25, 0.325, 0.4),
     ),
     "random walk": Problem(
         "diffusivity that changes",
         {"a": Scalar(0.3, 0.06, transform="log", evolution=RandomWalk(0.1))},
         SensitivityLaw(),
     ),
-    "wrong model": Problem(
-        "diffusivity; a heat loss is missing in the model",
+    "missing loss": Problem(
+        "diffusivity; a heat loss is missing in the model", {"a": A}, loss=_between(0.003, 1.0)
+    ),
+    "missing layer": Problem(
+        "diffusivity of the heated half; that the other differs is missing in the model",
         {"a": A},
-        loss=lambda rng: float(np.exp(rng.uniform(np.log(0.003), np.log(1.0)))),
+        contrast=_between(0.003, 0.9),
     ),
 }
 
@@ -120,12 +162,16 @@ class Twin:
         Factor on the deviations at the end.
     doubted
         True if the run says that its model does not explain the data.
+    white
+        True if the mean square of the normalised innovations, and their correlation, are what those
+        of white noise are in 95 of 100 cases.
     """
 
     inside: Mapping[float, float]
     error: float
     inflation: float
     doubted: bool
+    white: tuple[bool, bool]
 
 
 def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
@@ -139,6 +185,7 @@ def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
         inside = {level: _mean([one.inside[level] for one in several]) for level in LEVELS}
         doubted = _mean([one.doubted for one in several])
         honest = _mean([one.doubted or one.inside[0.95] == 1.0 for one in several])
+        white = [_mean([one.white[k] for one in several]) for k in range(2)]
         rows.append(
             (
                 name,
@@ -147,20 +194,36 @@ def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
                 float(np.sqrt(_mean([one.error for one in several]))),
                 _mean([one.inflation for one in several]),
                 doubted,
+                *white,
             )
         )
-        if PROBLEMS[name].loss is None:
+        if PROBLEMS[name].right:
             checks += [
                 Check(f"{name}: in the {level:.0%} interval", inside[level], WITHIN[level], "in")
                 for level in LEVELS
             ]
             checks.append(Check(f"{name}: doubted", doubted, FALSE_ALARM, "<="))
+            checks += [
+                Check(f"{name}: {what} of innovations within chance", share, AT_LEAST, ">=")
+                for what, share in zip(("mean square", "correlation"), white, strict=True)
+            ]
         else:
             checks.append(Check(f"{name}: in the 95% interval, or doubted", honest, HONEST, ">="))
-    columns = ("problem", "unknown", "68 %", "95 %", "error / deviation", "inflation", "doubted")
+    columns = (
+        "problem",
+        "unknown",
+        "68 %",
+        "95 %",
+        "error / deviation",
+        "inflation",
+        "doubted",
+        "innovations: square",
+        "correlation",
+    )
     note = (
         f"True values are drawn from the prior, {twins} times; noise {NOISE:g}. Errors over "
-        "deviations are root mean squares, 1 if the deviations are right."
+        "deviations are root mean squares, 1 if the deviations are right. Innovations: share of "
+        "twins whose mean square and correlation are within 95 % chance of those of white noise."
     )
     return Outcome([Table("Share of true values in the interval", columns, rows)], checks, [note])
 
@@ -173,9 +236,8 @@ def twin(problem: Problem, seed: int) -> Twin:
     """Run one twin; the same seed gives the same numbers."""
     rng = np.random.default_rng(seed)
     model = problem.model()
-    truth = model if problem.loss is None else problem.model(problem.loss(rng))
-    positions = (np.arange(problem.sensors) + 1.0) / (problem.sensors + 1)
-    points = Points(positions.tolist(), noise=NOISE)
+    truth = model if problem.right else problem.truth(rng)
+    points = Points(list(problem.sensors), noise=NOISE)
     identifier = Identifier(model, points, problem.law, u0=0.0)
     times = np.linspace(0.0, 0.1 * problem.samples, problem.samples + 1)
     path = _path(truth, times, rng)
@@ -184,7 +246,7 @@ def twin(problem: Problem, seed: int) -> Twin:
     moving = model.latent.moves
     samples, scores = [], []
     for k, u in enumerate(_states(truth, path, times)):
-        z = G @ u + NOISE * rng.standard_normal(problem.sensors)
+        z = G @ u + NOISE * rng.standard_normal(len(problem.sensors))
         estimate = identifier.step(times[k], z)
         samples.append(estimate)
         if (moving and k in compared) or k == problem.samples:
@@ -198,6 +260,16 @@ def twin(problem: Problem, seed: int) -> Twin:
         _mean(errors),
         samples[-1].belief.inflation,
         any(sentence.startswith(MODEL_ERROR) for sentence in doubts(result.to_xarray())),
+        _white(samples[-1].notes, problem.samples * len(problem.sensors)),
+    )
+
+
+def _white(notes: Mapping[str, float], values: int) -> tuple[bool, bool]:
+    """Return whether statistics of so many normalised innovations are those of white noise."""
+    square, correlation = notes["innovation_ratio"] - 1.0, notes["innovation_correlation"]
+    return (
+        abs(square) <= CHANCE * np.sqrt(2.0 / values),
+        abs(correlation) <= CHANCE * np.sqrt(1.0 / values),
     )
 
 

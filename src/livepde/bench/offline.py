@@ -79,6 +79,7 @@ class Trajectory:
         fields = dict.fromkeys(self.model.parameter_space.fields, modes)
         work = SensitivityLaw(modes=fields).prepare(problem)
         self.Phi = work.Phi
+        self.rest = work.rest(0.0)
         widths = np.diff(process.times)
         growth = [
             np.sqrt(np.concatenate([m.growth(float(h)) for m in work.motions])) for h in widths

@@ -31,6 +31,7 @@ from livepde.laws import (
     ConstantDamping,
     Damping,
     GradientLaw,
+    Jumps,
     Replay,
     ResidualDamping,
     SensitivityLaw,
@@ -295,7 +296,10 @@ class Case:
         if not isinstance(spec.replay, bool):
             replay = Replay(**spec.replay.model_dump())
         gate = float(np.inf) if spec.gate is None else spec.gate
-        return SensitivityLaw(spec.modes, noise, drift, memory, replay, gate=gate)
+        jumps = Jumps() if spec.jumps is True else None
+        if not isinstance(spec.jumps, bool):
+            jumps = Jumps(**spec.jumps.model_dump())
+        return SensitivityLaw(spec.modes, noise, drift, memory, replay, gate=gate, jumps=jumps)
 
     @cached_property
     def scheme(self) -> Scheme:
@@ -338,6 +342,7 @@ class Case:
             "rmse",
             *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
             "innovation_ratio",
+            "jumps",
             "failed_steps",
         ]
         return [

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from livepde.cases.case import Prepared
-from livepde.cases.preview import MOST_SAMPLES
+from livepde.cases.preview import MOST_SAMPLES, NEVER
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
-from livepde.laws import Belief, SensitivityLaw
+from livepde.laws import Belief, Replay, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
+from livepde.observation import Combined, Observation, Points
 
 __all__ = ["Advice", "advise"]
 
 MOST_CANDIDATES = 400  # positions that are compared
+SHORT_LIST = 5  # of those, tried in a preview of their own where unknowns move
+NEW = "one more sensor"
+NOTHING = "advice on sensors: the data hold no measurement."
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +59,16 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     to the reduced coordinates a ~ N(0, I), over its noise, the posterior covariance of a is
     (I + sum of Y^T Y)^-1. So one run that assimilates nothing gives the sums of all candidates.
 
+    What old samples say of an unknown that moves fades, and does not add up. Then the candidates
+    are ranked by what one more reading would tell at each sample of the preview, from the joint
+    covariance of state and unknowns; the best few are tried in a preview of their own, and the one
+    that leaves the least at its end is the advice.
+
     Raises
     ------
     ConfigurationError
-        The law has no covariance, an unknown drifts at random, or it is not clear which component
-        of the state a sensor would see.
+        The law has no covariance, or it is not clear which component of the state a sensor would
+        see.
     """
     case, law = prepared.case, prepared.case.law
     if not isinstance(law, SensitivityLaw):
@@ -66,23 +76,15 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
             "advice on sensors needs a law with a covariance: kind = 'sensitivity'."
         )
     space = case.model.parameter_space
-    drifting = [
-        name
-        for name, unknown in space.unknowns.items()
-        if unknown.evolution.growth(1.0, unknown.latent_std).any()
-    ]
-    if drifting:
-        raise ConfigurationError(
-            f"advice on sensors: {', '.join(drifting)} drifts at random, and what old samples say "
-            "of it does not add up; leave out its evolution (--set)."
-        )
+    if law.drift or any(
+        unknown.evolution.growth(1.0, unknown.latent_std).any()
+        for unknown in space.unknowns.values()
+    ):
+        return _advise_moving(prepared, law, list(samples))
     silent = replace(prepared, assimilate_from=np.inf)
     identifier = silent.identifier_with(SensitivityLaw(law.modes, law.noise))
-    block, part = case.model.state_space.component(case.observation.of)
-    every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
-    values, positions = block.at_vertices[::every], block.field.mesh.p[:, ::every]
-    noise = identifier.observed.noise if law.noise is None else law.noise
-    noise = np.broadcast_to(np.asarray(noise, dtype=float), identifier.observed.size)
+    values, positions, part = _candidates(prepared)
+    noise = _noise(identifier, law)
     known: dict[str, float] = {}
     here: Array = np.zeros(0)
     each: Array = np.zeros(0)
@@ -112,8 +114,8 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
         if count >= MOST_SAMPLES:
             break
     if not count:
-        raise ConfigurationError("advice on sensors: the data hold no measurement.")
-    weights = _weights(case.model, estimate.belief)
+        raise ConfigurationError(NOTHING)
+    weights = _weights(case.model, estimate.belief.q_factor)
     before = np.linalg.inv(here)
     after = np.linalg.inv(here + each)
     mean = sum(weights.values()) / len(weights)
@@ -125,15 +127,113 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     return Advice(positions[:, best], now, then, len(after))
 
 
+def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
+    """Return what reads the state at each candidate, positions (d, candidates), and of what."""
+    case = prepared.case
+    block, part = case.model.state_space.component(case.observation.of)
+    every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
+    return block.at_vertices[::every], block.field.mesh.p[:, ::every], part
+
+
+def _noise(identifier: Identifier, law: SensitivityLaw) -> Array:
+    """Return the noise of each sensor: that of the law, or of the observation."""
+    found = identifier.observed.noise if isinstance(law.noise, str | None) else law.noise
+    return np.broadcast_to(np.asarray(found, dtype=float), identifier.observed.size)
+
+
+def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sample]) -> Advice:
+    """Return the advice where unknowns move: see `advise`."""
+    values, positions, part = _candidates(prepared)
+    model, told = prepared.case.model, np.zeros(positions.shape[1])
+    identifier = prepared.identifier
+    noise = float(np.median(_noise(identifier, law)))
+    weights: dict[str, Array] = {}
+    for belief in _previewed(prepared, law, samples, prepared.case.observation):
+        weights = weights or _weights(model, _physical(model, belief.prior_factor))
+        C = _reduced(model, belief)
+        if belief.u_factor is None:
+            continue
+        Y = (values @ belief.u_factor[part]) / noise
+        # One more reading y changes C C^T by C y y^T C^T / (1 + y^T y).
+        gain = np.einsum("cr,rs,cs->c", Y, C.T @ sum(weights.values()) @ C, Y)
+        told += gain / (1.0 + (Y**2).sum(axis=1))
+    if not weights:
+        raise ConfigurationError(NOTHING)
+    now = _left(weights, C)
+    tried = []
+    for best in np.argsort(-told)[:SHORT_LIST]:
+        at: Any = positions[:, best].tolist()
+        point = Points(
+            {NEW: at if len(at) > 1 else at[0]}, noise=noise, of=prepared.case.observation.of
+        )
+        sensors = Combined([prepared.case.observation, point])
+        for belief in _previewed(prepared, law, samples, sensors):
+            C = _reduced(model, belief)
+        then = _left(weights, C)
+        tried.append((sum(share**2 for share in then.values()), int(best), then))
+    _, place, then = min(tried, key=lambda item: item[0])
+    return Advice(positions[:, place], now, then, len(told))
+
+
+def _previewed(
+    prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample], sensors: Observation
+) -> Iterator[Belief]:
+    """Yield what a filter believes that is linear about the prior, after each measurement."""
+    case = prepared.case
+    linear = SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
+    identifier = Identifier(
+        case.model,
+        sensors,
+        linear,
+        u0=prepared.u0,
+        t0=float(prepared.first.t),
+        withheld=case.withheld,
+        scheme=case.scheme,
+        dt_max=case.dt_max,
+        assimilate_from=prepared.assimilate_from,
+    )
+    own = [name for name in identifier.observed.names if name != NEW]
+    count = 0
+    for sample in samples:
+        given: Mapping[str, float] = sample.z  # type: ignore[assignment]
+        seen = any(np.isfinite(given.get(name, np.nan)) for name in own)
+        # What it reads does not matter for the covariance, only that it reads.
+        z = {**given, **({NEW: 0.0} if seen and NEW in identifier.observed.names else {})}
+        identifier.step(sample.t, z, sample.inputs)
+        if seen and sample.t >= prepared.assimilate_from:
+            count += 1
+            yield identifier.latent_belief()
+        if count >= MOST_SAMPLES:
+            break
+
+
+def _physical(model: Model, factor: Array | None) -> Array | None:
+    """Return a latent factor in physical coefficients, linearised at the prior."""
+    return None if factor is None else model.latent.tangent(model.latent.prior, factor)
+
+
+def _reduced(model: Model, belief: Belief) -> Array:
+    """Return the square root of the posterior covariance in reduced coordinates, (k, r)."""
+    if belief.prior_factor is None or belief.q_factor is None:
+        return np.zeros((0, 0))
+    reduced: Array = belief.prior_factor.T @ model.Q.dual(belief.q_factor)
+    return reduced
+
+
+def _left(weights: Mapping[str, Array], C: Array) -> dict[str, float]:
+    """Return the share of the prior deviation that is left of each unknown."""
+    return {name: float(np.sqrt(np.sum(W * (C @ C.T)))) for name, W in weights.items()}
+
+
 def _inputs(identifier: Identifier, sample: Sample) -> dict[str, float]:
     """Return the inputs that a sample has."""
     given = {**(sample.z if isinstance(sample.z, Mapping) else {}), **(sample.inputs or {})}
     return {name: v for name in identifier.inputs if np.isfinite(v := given.get(name, np.nan))}
 
 
-def _weights(model: Model, belief: Belief) -> dict[str, Array]:
+def _weights(model: Model, factor: Array | None) -> dict[str, Array]:
     """Return unknown -> W with trace(W P) its mean variance over that of the prior, P = I."""
-    space, factor = model.parameter_space, belief.q_factor
+    space = model.parameter_space
     if factor is None:
         return {}
     found = {label: np.outer(factor[k], factor[k]) for label, k in space.labels.items()}

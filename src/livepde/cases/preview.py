@@ -10,8 +10,7 @@ import numpy as np
 from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
 from livepde.identifier import Sample
-from livepde.laws import Replay, SensitivityLaw
-from livepde.linalg import Array
+from livepde.laws import Belief, Replay, SensitivityLaw
 
 __all__ = ["Identified", "Preview", "preview"]
 
@@ -92,28 +91,30 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     prior, posterior = belief.prior_factor, belief.q_factor
     if not count or prior is None or posterior is None:
         return Preview()
-    before, after = (model.latent.tangent(model.latent.prior, f) for f in (prior, posterior))
+    latent = model.latent
+    rest = None if belief.rest is None else latent.deviation(latent.prior, belief.rest)
+    before, after = (
+        replace(belief, q_factor=latent.tangent(latent.prior, factor), rest=rest)
+        for factor in (prior, posterior)
+    )
     found = identifiability(model, belief)
     return Preview(tuple(_compare(prepared, before, after)), count, tuple(found.sentences))
 
 
-def _compare(prepared: Prepared, before: Array, after: Array) -> list[Identified]:
-    """Return the deviations of all unknowns, from square roots of their covariances."""
+def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identified]:
+    """Return the deviations of all unknowns before and after."""
     space = prepared.case.model.parameter_space
     units = {name: unknown.unit for name, unknown in space.unknowns.items()}
+    prior, posterior = (np.asarray(belief.q_std) for belief in (before, after))
     found = [
-        Identified(
-            label,
-            float(np.linalg.norm(before[k])),
-            float(np.linalg.norm(after[k])),
-            units.get(label.split("[")[0], ""),
-        )
+        Identified(label, float(prior[k]), float(posterior[k]), units.get(label.split("[")[0], ""))
         for label, k in space.labels.items()
     ]
     for name, block in space.fields.items():
         part = space.part(name)
-        prior = np.linalg.norm(block.at_vertices @ before[part], axis=1)
-        posterior = np.linalg.norm(block.at_vertices @ after[part], axis=1)
+        prior, posterior = (
+            np.asarray(belief.deviation(block.at_vertices, part)) for belief in (before, after)
+        )
         inside = np.flatnonzero(prior > 1e-12 * prior.max())
         left = posterior[inside] / prior[inside]
         for what, k in (("best", inside[left.argmin()]), ("worst", inside[left.argmax()])):

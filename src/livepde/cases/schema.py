@@ -11,6 +11,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    NonNegativeInt,
     PositiveFloat,
     PositiveInt,
     StrictBool,
@@ -252,8 +253,17 @@ class ReplaySpec(Spec):
     """Options of the replay."""
 
     window: PositiveInt = 4096
-    first: PositiveInt = 32
+    first: PositiveInt = 8
     iterations: PositiveInt = 4
+
+
+class JumpsSpec(Spec):
+    """Options of the test for sudden changes."""
+
+    probability: PositiveFloat = 1e-5
+    window: PositiveInt = 32
+    size: PositiveFloat = 1.0
+    settle: NonNegativeInt = 50
 
 
 class SensitivitySpec(Spec):
@@ -261,11 +271,12 @@ class SensitivitySpec(Spec):
 
     kind: Literal["sensitivity"]
     noise: Quantity | None = None
-    modes: PositiveInt = 12
+    modes: PositiveInt | Literal["auto"] = "auto"
     drift: Quantity = 0.0
     memory: Quantity | None = None
     replay: bool | ReplaySpec = False
     gate: PositiveFloat | None = None
+    jumps: bool | JumpsSpec = False
 
 
 class TikhonovSpec(Spec):

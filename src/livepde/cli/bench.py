@@ -85,6 +85,21 @@ def coverage(
 
 
 @bench.command()
+def alarms(
+    seeds: Annotated[int, typer.Option(min=1, help="Jumps up, and as many down, of each.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure how soon jumps are flagged, how seldom without cause, and which models are doubted.
+
+    Example:  livepde bench alarms --seeds 3
+    """
+    from livepde.bench.alarms import alarms as benchmark
+
+    command = ["livepde", "bench", "alarms", "--seeds", str(seeds)]
+    report_outcome(benchmark(seeds, progress=True), command, as_json)
+
+
+@bench.command()
 def accuracy(
     only: ProblemsOption = None,
     seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 3,

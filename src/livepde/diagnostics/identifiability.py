@@ -164,7 +164,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     for name in space.fields:
         item = latent.parts[name]
         block = reduced[np.abs(prior[item.part]).max(axis=0) > 0.0]
-        left = belief.inflation * np.linalg.svd(block, compute_uv=False)
+        left = belief.modes_left(item.part)
         counts = (int((left <= PINNED).sum()), int((left > FLAT).sum()), len(block))
         rms = float(np.sqrt((left**2).sum() / len(block)))
         unknowns.append(Known(name, rms, counts, moves=item.evolution.moves))

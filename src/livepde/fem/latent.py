@@ -129,6 +129,13 @@ class Latent:
         product: Array = self.V @ (self.slopes(a)[:, None] * directions)
         return product
 
+    def deviation(self, a: Array, std: Array) -> Array:
+        """Return deviations of q, shape (m,), for those of independent latent ones, (dim,)."""
+        if self.plain:
+            return std
+        deviation: Array = np.sqrt(self.V**2 @ (self.slopes(a) * std) ** 2)
+        return deviation
+
     def inverse(self, q: Array) -> Array:
         """Return latent coefficients of q; harmonics are zero.
 

@@ -13,6 +13,8 @@ from livepde.laws.bounds import (
 )
 from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
 from livepde.laws.gradient import GradientLaw
+from livepde.laws.guards import Guards
+from livepde.laws.jumps import Jumps
 from livepde.laws.operators import observed_operator, unobserved_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
 from livepde.laws.sensitivity import Replay, SensitivityLaw
@@ -26,6 +28,8 @@ __all__ = [
     "Damping",
     "ExactBound",
     "GradientLaw",
+    "Guards",
+    "Jumps",
     "KueglerLaw",
     "Law",
     "NoisyBound",

@@ -93,6 +93,9 @@ class Belief:
     prior_factor
         Square root of the covariance of q before the first sample, shape (m, k), its columns
         orthonormal in Q.
+    rest
+        Standard deviation of each coefficient of q in the modes that the law leaves out, which stay
+        as the prior has them: independent of q_factor, and not inflated, shape (m,). None: 0.
     """
 
     q: Array
@@ -101,21 +104,59 @@ class Belief:
     u_factor: Array | None = None
     inflation: float = 1.0
     prior_factor: Array | None = None
+    rest: Array | None = None
 
     @property
     def q_std(self) -> Array | None:
         """Standard deviation of each coefficient of q."""
-        return _deviation(self.q_factor, self.inflation)
+        if self.q_factor is None:
+            return None
+        std = _deviation(self.q_factor, self.inflation)
+        return std if self.rest is None else np.hypot(std, self.rest)
 
     @property
     def u_std(self) -> Array | None:
         """Standard deviation of each coefficient of u."""
-        return _deviation(self.u_factor, self.inflation)
+        return None if self.u_factor is None else _deviation(self.u_factor, self.inflation)
+
+    def deviation(self, rows: Any, part: slice) -> Array | None:
+        """Return the standard deviation of rows @ q[part] for a matrix, that of point values, say.
+
+        Where a row has several entries the rest counts as if it were fully correlated.
+        """
+        if self.q_factor is None:
+            return None
+        std = _deviation(rows @ self.q_factor[part], self.inflation)
+        return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
+
+    def left(self, rows: Any) -> Array:
+        """Return the share of the prior deviation that is left of each of some coefficients of q.
+
+        NaN without covariance.
+        """
+        if self.q_factor is None or self.prior_factor is None:
+            return np.full(len(self.q[rows]), np.nan)
+        before = np.linalg.norm(self.prior_factor[rows], axis=1)
+        after = self.inflation * np.linalg.norm(self.q_factor[rows], axis=1)
+        left: Array = after / np.where(before > 0.0, before, np.nan)
+        return left
+
+    def modes_left(self, part: Any) -> Array:
+        """Return the share of the prior deviation that is left of each mode of a part of q.
+
+        The modes are those of the posterior relative to the prior, so that their shares do not
+        depend on units: as many as the part has reduced coordinates, the least known first. None
+        at all without covariance.
+        """
+        if self.q_factor is None or self.prior_factor is None:
+            return np.zeros(0)
+        axes, sizes, _ = np.linalg.svd(self.prior_factor[part], full_matrices=False)
+        seen = sizes > 1e-12 * sizes.max(initial=0.0)
+        reduced = (axes[:, seen].T @ self.q_factor[part]) / sizes[seen, None]
+        return np.asarray(self.inflation * np.linalg.svd(reduced, compute_uv=False))
 
 
-def _deviation(factor: Array | None, inflation: float) -> Array | None:
-    if factor is None:
-        return None
+def _deviation(factor: Array, inflation: float) -> Array:
     std: Array = inflation * np.sqrt((factor**2).sum(axis=1))
     return std
 

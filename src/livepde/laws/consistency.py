@@ -117,15 +117,21 @@ class Consistency:
         """
         if not self.weight:
             return 1.0
-        values = self.count**2 / self.weight
+        averages = float(np.isfinite(self.last).sum()) + self.count**2 / self.weight / SLOW
+        slow = _beyond_chance(self.persistence, math.sqrt(2.0 / averages))
+        return max(self.scatter, math.sqrt(slow))
+
+    @property
+    def scatter(self) -> float:
+        """The part of `inflation` that comes from the size of innovations and their correlation.
+
+        Errors that hide below the noise are not: they hardly make the innovations larger.
+        """
+        if not self.weight:
+            return 1.0
         rho = max(self.correlation, 0.0)
         following = self.ratio * (1 + rho) / (1 - rho)
-        averages = float(np.isfinite(self.last).sum()) + values / SLOW
-        variances = (
-            _beyond_chance(following, math.sqrt(6.0 / values)),
-            _beyond_chance(self.persistence, math.sqrt(2.0 / averages)),
-        )
-        return math.sqrt(max(variances))
+        return math.sqrt(_beyond_chance(following, math.sqrt(6.0 * self.weight) / self.count))
 
 
 def _beyond_chance(variance: float, error: float) -> float:

@@ -18,6 +18,10 @@ from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
 __all__ = ["Filter", "Motion", "Point", "reduction"]
 
+ROUNDING = 1e-9  # share of a variance that is none
+LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
+MOST_MODES = 60  # of a field with modes="auto"
+
 
 @dataclass(frozen=True, eq=False)
 class Point:
@@ -40,6 +44,8 @@ class Point:
         Estimated noise as a multiple of the stated one; 1 unless the law finds it.
     evidence
         Logarithm of the likelihood of all samples so far, each given those before.
+    age
+        Time for which the unknowns have moved.
     """
 
     u: Array
@@ -52,6 +58,7 @@ class Point:
     refused: Array
     level: NoiseLevel
     evidence: float
+    age: float = 0.0
 
     def along(self, shift: Array) -> Array:
         """Return by how much the state is expected to move with a shift of a, shape (n,)."""
@@ -72,11 +79,15 @@ class Motion:
         Where its reduced coordinates stand: copies times modes.
     evolution, std
         Its model, and the prior deviation of its latent coefficients.
+    saturates
+        True if it gains the less the closer its variance is to that of the prior: it may move, but
+        without data it is not less certain than at first.
     """
 
     part: slice
     evolution: Evolution
     std: float
+    saturates: bool = False
 
     def transition(self, h: float) -> Array:
         """Return the transition of its coordinates in a time h."""
@@ -87,6 +98,12 @@ class Motion:
         """Return the variance its coordinates gain in a time h."""
         gained = self.evolution.growth(h, self.std)
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
+
+    def gained(self, h: float, variance: Array) -> Array:
+        """Return what its coordinates gain in a time h, given their variances."""
+        room = np.maximum(1.0 - variance[self.part], 0.0) if self.saturates else 1.0
+        gained: Array = room * self.growth(h)
+        return gained
 
     def backward(self, h: float) -> Array:
         """Return what the coordinates are expected to have been a time h before: matrix on them."""
@@ -143,11 +160,42 @@ class Filter:
         if not self.moves or h == 0.0:
             return point
         F = self.transition(h)
-        gained = np.sqrt(np.concatenate([motion.growth(h) for motion in self.motions]))
+        variance = (point.C**2).sum(axis=1)
+        gained = np.sqrt(np.concatenate([m.gained(h, variance) for m in self.motions]))
         new = np.diag(gained)[:, gained > 0.0]
         q = self.problem.model.latent.moved(point.q, h)
         U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
-        return replace(point, q=q, da=F @ point.da, U=U, C=np.hstack([F @ point.C, new]))
+        C, age = np.hstack([F @ point.C, new]), point.age + h
+        return replace(point, q=q, da=F @ point.da, U=U, C=C, age=age)
+
+    @cached_property
+    def _left_out(self) -> Array:
+        """Prior variance of each latent coefficient in the modes that are left out, shape (m,)."""
+        model = self.problem.model
+        variance = np.zeros(len(self.Phi))
+        for item in model.latent.parts.values():
+            if isinstance(item.block, FieldBlock):
+                first = slice(item.part.start, item.part.start + item.size)
+                whole = model.Q.restricted(first, item.block.fixed).variance
+                variance[item.part] = np.tile(whole, item.evolution.copies)
+        left = variance - (self.Phi**2).sum(axis=1)
+        return np.where(left > ROUNDING * variance, left, 0.0)
+
+    def rest(self, age: float) -> Array:
+        """Return the deviation of each latent coefficient in the modes that are left out, (m,).
+
+        They are as the prior has them, and have moved for a time `age`.
+        """
+        parts = self.problem.model.latent.parts.values()
+        grown = [
+            np.repeat(
+                (motion.evolution.transition(age) ** 2).sum(axis=1)
+                + motion.evolution.growth(age, motion.std),
+                item.size,
+            )
+            for motion, item in zip(self.motions, parts, strict=True)
+        ]
+        return np.asarray(np.sqrt(self._left_out * np.concatenate(grown)))
 
     def traced(self, q: Array, start: Array, h: float) -> Array:
         """Return the latent parameter that is expected to have become q in a time h.
@@ -201,6 +249,7 @@ class Filter:
         lower, upper = self.problem.model.latent.bounds
         return np.clip(q, lower, upper)
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
         """Return the filter at the end of an interval, substeps, and why it failed or None."""
         model, end = self.problem.model, self.moved(point, interval.t1 - interval.t0)
@@ -278,6 +327,14 @@ class Filter:
             U, C = _compressed(U, C, self.scale, self.rank)
         return replace(point, U=U, C=C)
 
+    def fresh(self, point: Point) -> Point:
+        """Return the filter with the prior of the unknowns, and the state as it is estimated."""
+        k = len(point.da)
+        prior = self.problem.model.latent.prior
+        state, U = point.u + point.du, np.zeros((len(point.u), k))
+        zero = np.zeros(k)
+        return replace(point, u=state, q=prior, du=0.0 * point.du, da=zero, U=U, C=np.eye(k))
+
     def recentred(self, point: Point) -> Point:
         """Return the filter with its reference at the estimate, within the bounds.
 
@@ -301,7 +358,7 @@ class Filter:
 
 
 def reduction(
-    problem: Problem, modes: int | dict[str, int], drift: float
+    problem: Problem, modes: int | str | dict[str, int], drift: float
 ) -> tuple[Array, tuple[Motion, ...]]:
     """Return Phi, shape (m, k), and how its coordinates move.
 
@@ -312,7 +369,13 @@ def reduction(
     """
     model = problem.model
     fields = model.parameter_space.fields
-    counts = modes if isinstance(modes, dict) else dict.fromkeys(fields, modes)
+    if isinstance(modes, str) and modes != "auto":
+        raise LawError(
+            f"SensitivityLaw: modes must be a number, 'auto', or a number for each field; got "
+            f"{modes!r}."
+        )
+    most = MOST_MODES if isinstance(modes, str) else modes
+    counts = most if isinstance(most, dict) else dict.fromkeys(fields, most)
     if set(counts) != set(fields):
         raise LawError(
             f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
@@ -324,18 +387,29 @@ def reduction(
             part = model.parameter_space.part(name)
             inner = model.Q.restricted(first, item.block.fixed)
             count = min(counts[name], int(inner.free.sum()))
-            phi, _ = inner.modes(count, model.parameter_mass[part, part])
+            mass = model.parameter_mass[part, part]
+            phi, _ = inner.modes(count, mass)
+            if modes == "auto":
+                phi = phi[:, : _enough(phi, inner.variance, mass.diagonal())]
         else:
             phi = np.eye(item.size) * item.unknown.latent_std
         evolution = item.evolution
-        if drift and not evolution.moves:
+        drifts = bool(drift) and not evolution.moves
+        if drifts:
             evolution = RandomWalk(np.sqrt(drift) * item.unknown.latent_std)
         blocks.append(np.kron(np.eye(evolution.copies), phi))
         stop = start + blocks[-1].shape[1]
-        motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std))
+        motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std, drifts))
         start = stop
     Phi: Array = np.asarray(block_diag(*blocks))
     return Phi, tuple(motions)
+
+
+def _enough(phi: Array, variance: Array, mass: Array) -> int:
+    """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
+    held = np.cumsum(mass @ phi**2)
+    short = int((held < (1.0 - LEFT_OUT) * (mass @ variance)).sum())
+    return min(short + 1, len(held))
 
 
 def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:

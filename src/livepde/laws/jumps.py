@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaincc
@@ -30,15 +30,23 @@ class Watch:
     counts: Array
     seen: int
 
+    def add(self, e: Array) -> Watch:
+        """Return the value after a sample of normalised innovations, NaN where missing."""
+        seen = np.isfinite(e)
+        squares = np.concatenate([[float((e[seen] ** 2).sum())], self.squares[:-1]])
+        counts = np.concatenate([[float(seen.sum())], self.counts[:-1]])
+        return Watch(squares, counts, self.seen + 1)
+
 
 @dataclass(frozen=True)
 class Jumps:
     """Watch for sudden changes of the unknowns, and let them move when there is one.
 
     The innovations of the last 1, 2, 4, ... samples, normalised by what is expected of them and by
-    their usual size and correlation, are compared with the chi-square distribution. An alarm adds
-    `size` prior deviations to the uncertainty of every unknown, so that the law learns again
-    without a restart; what is known of the state is kept.
+    their usual size and correlation, are compared with the chi-square distribution. After an alarm
+    the law goes back to where the innovations most likely became too large, adds `size` prior
+    deviations to the uncertainty of every unknown there, and takes the samples since again: so it
+    learns anew without a restart, and what was known of the state before the jump is kept.
 
     Parameters
     ----------
@@ -49,7 +57,7 @@ class Jumps:
     size
         What an alarm adds, in prior deviations.
     settle
-        No alarm in so many samples after the start, and after an alarm.
+        So many samples after the start, and after an alarm, are not looked at.
     """
 
     probability: float = 1e-5
@@ -81,15 +89,26 @@ class Jumps:
         usual
             Their statistics before this sample.
         """
-        seen = np.isfinite(e)
-        squares = np.concatenate([[float((e[seen] ** 2).sum())], watch.squares[:-1]])
-        counts = np.concatenate([[float(seen.sum())], watch.counts[:-1]])
-        new = Watch(squares, counts, watch.seen + 1)
-        if new.seen <= self.settle or not seen.any():
+        if watch.seen < self.settle:  # the first linearisations are poor: what they miss is no jump
+            return replace(watch, seen=watch.seen + 1), False
+        new = watch.add(e)
+        if not new.counts[0]:
             return new, False
         lengths = 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
-        sums, freedom = np.cumsum(squares)[lengths], np.cumsum(counts)[lengths]
-        chance = gammaincc(0.5 * freedom, 0.5 * sums / usual.inflation**2)
+        sums, freedom = np.cumsum(new.squares)[lengths], np.cumsum(new.counts)[lengths]
+        chance = gammaincc(0.5 * freedom, 0.5 * sums / usual.scatter**2)
         if float(chance.min()) * len(lengths) >= self.probability:
             return new, False
         return self.start(), True
+
+    def onset(self, watch: Watch, e: Array, usual: Consistency) -> int:
+        """Return of how many samples, up to this one, the innovations are most likely too large.
+
+        The number n that maximises the likelihood ratio n (r - 1 - log r)/2 of innovations of mean
+        square r > 1 since n samples against 1. Parameters as for `add`.
+        """
+        new = watch.add(e)
+        freedom = np.cumsum(new.counts)
+        ratio = np.cumsum(new.squares) / usual.scatter**2 / np.maximum(freedom, 1.0)
+        ratio = np.maximum(ratio, 1.0)
+        return 1 + int(np.argmax(freedom * (ratio - 1.0 - np.log(ratio))))

@@ -36,6 +36,10 @@ class NoiseLevel:
         """The multiple."""
         return float(np.sqrt(self.square))
 
+    def times(self, factor: float) -> NoiseLevel:
+        """Return the level of noise that is larger by a factor."""
+        return NoiseLevel(self.square * factor**2, self.count)
+
     def add(self, left: float) -> NoiseLevel:
         """Return the level after a sample.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from livepde.fem import Inputs, Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
 from livepde.laws.filter import Filter, Point, reduction
+from livepde.laws.guards import Guards, Past, Samples, Scale
 from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.level import NoiseLevel
 from livepde.linalg import Array
@@ -20,6 +21,7 @@ __all__ = ["Replay", "SensitivityLaw", "SensitivityState"]
 
 CONVERGED = 0.5  # standard deviations between reference and estimate at which replays stop
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
+TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
 STRIDE = 1.0  # prior deviations that a replay moves its reference at most: a trust region
 
 
@@ -47,7 +49,7 @@ class Replay:
     """
 
     window: int = 4096
-    first: int = 32
+    first: int = 8
     iterations: int = 4
 
     def __post_init__(self) -> None:
@@ -55,28 +57,6 @@ class Replay:
             raise LawError("Replay: needs 1 <= first <= window.")
         if self.iterations < 1:
             raise LawError(f"Replay: iterations must be at least 1; got {self.iterations}.")
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Stored samples since the start of the window, in time order.
-
-    Attributes
-    ----------
-    t, z, inputs
-        Shapes (count + 1,), (count + 1, sensors), (count + 1, channels); first row: the start,
-        with what was assimilated there.
-    """
-
-    t: Array
-    z: Array
-    inputs: Array
-
-    def append(self, t: float, z: Array, inputs: Array) -> Samples:
-        """Return the samples with one more."""
-        return Samples(
-            np.append(self.t, t), np.vstack([self.z, z]), np.vstack([self.inputs, inputs])
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +77,8 @@ class SensitivityState:
         Latent parameter at the start of the window from which the reference of `now` comes.
     watch
         Innovations of the last samples, for `Jumps`.
+    past, scale
+        What the law can go back to, and what the sensors have shown, for `Guards`.
     """
 
     now: Point
@@ -107,6 +89,8 @@ class SensitivityState:
     initial: bool
     reference: Array
     watch: Watch
+    past: Past
+    scale: Scale
 
     @property
     def span(self) -> float:
@@ -138,14 +122,16 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
     Parameters
     ----------
     modes
-        Number of modes for each field: one number, or name -> number.
+        Number of modes for each field: one number, or name -> number. "auto": so many that they
+        hold 99.99 % of the prior variance, at most 60.
     noise
         Standard deviation of the measurement noise; default what the observation says. "auto": what
         the observation says is a first guess, and the level is found from the samples, the same
         multiple for all sensors.
     drift
         Variance of a gained per unit of time, relative to the prior, by every unknown without an
-        evolution of its own: > 0 follows parameters that change.
+        evolution of its own: > 0 follows parameters that change. It gains the less the closer its
+        deviation is to the prior's, so that nothing winds up while the data tell nothing.
     memory
         Time after which what the state knows of the parameters has faded to 1/e.
     replay
@@ -160,9 +146,11 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         After so many refusals in a row a sensor is believed again: something has really changed.
     jumps
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
+    guards
+        What to do when a linearisation is overconfident or the estimate runs away; None: nothing.
     """
 
-    modes: int | dict[str, int] = 12
+    modes: int | str | dict[str, int] = "auto"
     noise: float | str | None = None
     drift: float = 0.0
     memory: float = np.inf
@@ -171,6 +159,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
     gate: float = np.inf
     gate_patience: int = 10
     jumps: Jumps | None = None
+    guards: Guards | None = field(default_factory=Guards)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.drift) and self.drift >= 0):
@@ -241,10 +230,11 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             NoiseLevel(),
             0.0,
         )
-        empty = Samples(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, len(channels))))
+        empty = Samples.empty(sensors, len(channels))
         due = self.replay.first if self.replay else 0
         watch = (self.jumps or Jumps()).start()
-        return SensitivityState(start, start, empty, 0, due, False, q0, watch)
+        past, scale = Past.start(start, empty), Scale.start(sensors)
+        return SensitivityState(start, start, empty, 0, due, False, q0, watch, past, scale)
 
     def start(self, work: Filter, q0: Array, u0: Array, moment: Moment) -> SensitivityState:
         state, model = self.init(work, q0, u0), work.problem.model
@@ -259,29 +249,51 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         if not work.output(point, interval.end).any():
             return state
         form, begun = work.problem.model.form_initial, state
+        iterates = form is not None and not form.linear_in_parameter
         for _ in range(FIRST):
             new, _ = work.updated(point, interval, work.predict(point, interval.end))
             if not np.isfinite(new.da).all():
                 return state
             begun = replace(state, now=new, reference=point.q)
-            if form is None or form.linear_in_parameter or _left(work, begun) <= CONVERGED:
+            iterates = iterates or self._far(work, begun)
+            if not iterates or _left(work, begun) <= CONVERGED:
                 break
             point = _placed(work, state, _next(work, begun), interval.end)
         if self.replay is None:
-            return replace(begun, now=work.recentred(new))
-        return self._store(work, begun, new, interval)
+            now = work.recentred(new)
+            return replace(begun, now=now, past=Past.start(now, begun.samples))
+        begun = self._store(work, begun, new, interval)
+        return replace(begun, past=Past.start(new, begun.samples))
+
+    def _far(self, work: Filter, state: SensitivityState) -> bool:
+        """Return whether a law without replay moved an unknown too far by one linearisation."""
+        if self.guards is None or self.replay is not None:
+            return False
+        far = np.abs(_missed(work, state)).max(initial=0.0) > self.guards.reach
+        return bool(far) and _left(work, state) > CONVERGED
 
     def step(
         self, work: Filter, state: SensitivityState, interval: Interval
     ) -> tuple[SensitivityState, Report]:
+        new, report = self._assimilated(work, state, interval)
+        if (guards := self.guards) is not None:
+            new, report = self._rescued(work, guards, state, interval, new, report)
+        if report.status.ok and (jumps := self.jumps) is not None:
+            new, report = self._watched(work, jumps, state, interval, new, report)
+        return new, report
+
+    def _assimilated(
+        self, work: Filter, state: SensitivityState, interval: Interval
+    ) -> tuple[SensitivityState, Report]:
+        """Return the state after a sample."""
         point, report = self._filter(work, state.now, interval)
         if not report.status.ok:
             return state, report
-        state, point, report, alarm = self._watched(work, state, point, report)
         if self.replay is None:
-            return replace(state, now=work.recentred(point)), report
-        if alarm:  # what was measured before does not belong to the unknowns of now
-            return self._renewed(work.recentred(point), state), report
+            if (guards := self.guards) is not None:
+                point, notes = self._iterated(work, guards, state, interval, point)
+                report = replace(report, notes={**report.notes, **_consistent(point), **notes})
+            return self._remember(work, replace(state, now=work.recentred(point)), interval), report
         state = self._store(work, state, point, interval)
         if state.assimilated >= state.due:
             for _ in range(self.replay.iterations):
@@ -296,37 +308,154 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
                     break
         if len(state.samples.t) > self.replay.window:
             state = self._renewed(work.recentred(state.now), state)
-        return state, report
+        return self._remember(work, state, interval), report
+
+    def _remember(
+        self, work: Filter, state: SensitivityState, interval: Interval
+    ) -> SensitivityState:
+        """Return a state whose past holds the sample."""
+        if self.guards is None and self.jumps is None:
+            return state
+        length = max(
+            self.guards.past if self.guards is not None else 0,
+            self.jumps.window if self.jumps is not None else 0,
+        )
+        past = state.past.add(state.now, interval, work.problem.channels, length)
+        return replace(state, past=past)
 
     def _renewed(self, start: Point, state: SensitivityState) -> SensitivityState:
         """Return a state whose window begins here."""
-        empty = Samples(state.samples.t[:0], state.samples.z[:0], state.samples.inputs[:0])
+        empty = state.samples.since(len(state.samples.t))
         first = self.replay.first if self.replay else 0
-        return SensitivityState(start, start, empty, 0, first, False, start.q, state.watch)
+        return replace(
+            state,
+            now=start,
+            start=start,
+            samples=empty,
+            assimilated=0,
+            due=first,
+            initial=False,
+            reference=start.q,
+        )
+
+    def _iterated(
+        self,
+        work: Filter,
+        guards: Guards,
+        state: SensitivityState,
+        interval: Interval,
+        point: Point,
+    ) -> tuple[Point, dict[str, float]]:
+        """Return the filter after a sample that may have moved it too far, and notes.
+
+        Too far is cured by a replay of this one sample from where the interval began.
+        """
+        level = state.now.level
+        for temper in range(guards.temperings + 1):
+            tempered = {"tempered": 1.0} if temper else {}
+            begin = replace(state.now, level=level.times(TEMPER**temper))
+            if temper:
+                point, _ = self._filter(work, begin, interval)
+            if np.abs(point.da - begin.da).max(initial=0.0) <= guards.reach:  # cheaper to see
+                return _levelled(point, level, temper), tempered
+            window = self._store(work, self._renewed(begin, state), point, interval)
+            if not self._far(work, window):
+                return _levelled(point, level, temper), tempered
+            for _ in range(guards.iterations):
+                window, status = self._replayed(work, window)
+                if not status.ok:
+                    break
+                if _left(work, window) <= CONVERGED:
+                    return _levelled(window.now, level, temper), {"iterated": 1.0, **tempered}
+        nothing = replace(interval, z1=np.full_like(interval.z1, np.nan))
+        return self._filter(work, state.now, nothing)[0], {"held": 1.0}
+
+    def _rescued(
+        self,
+        work: Filter,
+        guards: Guards,
+        state: SensitivityState,
+        interval: Interval,
+        new: SensitivityState,
+        report: Report,
+    ) -> tuple[SensitivityState, Report]:
+        """Return state and report after a sample that may have failed or be far off.
+
+        Whatever led there is not used again: the state is only carried on from the past.
+        """
+        noise = state.now.level.scale * work.noise
+        scale = state.scale.add(interval.z1, interval.z1 - report.predicted)
+
+        def astray(report: Report) -> bool:
+            d = interval.z1 - report.predicted
+            return not report.status.ok or scale.beyond(d, noise) > guards.runaway
+
+        if not astray(report):
+            return replace(new, scale=scale), report
+        older = work.recentred(state.past.older)
+        known = [*state.past.samples.intervals(work.problem.channels), interval]
+        silent = [replace(item, z1=np.full_like(item.z1, np.nan)) for item in known]
+        for start in (work.loosened(older, 1.0), work.fresh(older)):
+            again, found = self._retaken(work, state, start, silent)
+            if not astray(found):
+                notes = {**found.notes, "restarted": 1.0}
+                again = replace(again, scale=scale, past=Past.start(again.now, again.samples))
+                return again, replace(found, notes=notes)
+        if not report.status.ok:
+            return state, report
+        return replace(new, scale=scale), replace(report, notes={**report.notes, "runaway": 1.0})
+
+    def _retaken(
+        self, work: Filter, state: SensitivityState, start: Point, intervals: list[Interval]
+    ) -> tuple[SensitivityState, Report]:
+        """Return state and report after some samples, taken again from another start."""
+        state = self._renewed(start, state)
+        state = replace(state, past=Past.start(start, state.samples))
+        for interval in intervals:
+            state, report = self._assimilated(work, state, interval)
+            if not report.status.ok:
+                break
+        return state, report
 
     def _watched(
-        self, work: Filter, state: SensitivityState, point: Point, report: Report
-    ) -> tuple[SensitivityState, Point, Report, bool]:
-        """Return state, filter and report after the test for a jump, and whether there is one."""
-        if self.jumps is None:
-            return state, point, report, False
-        usual = state.now.consistency
-        watch, alarm = self.jumps.add(state.watch, point.consistency.newest, usual)
-        report = replace(report, notes={**report.notes, "jump": float(alarm)})
+        self,
+        work: Filter,
+        jumps: Jumps,
+        state: SensitivityState,
+        interval: Interval,
+        new: SensitivityState,
+        report: Report,
+    ) -> tuple[SensitivityState, Report]:
+        """Return state and report after the test for a jump.
+
+        After an alarm the samples since the jump are taken again, from before it: the state has
+        gone astray with them, and what was measured before does not belong to the unknowns of now.
+        """
+        usual, e = state.now.consistency, new.now.consistency.newest
+        watch, alarm = jumps.add(state.watch, e, usual)
+        new = replace(new, watch=watch)
         if alarm:
-            point = work.loosened(point, self.jumps.size)
-        return replace(state, watch=watch), point, report, alarm
+            past = state.past
+            known = [*past.samples.intervals(work.problem.channels), interval]
+            before = max(len(known) - jumps.onset(state.watch, e, usual), 0)
+            point, status = work.recentred(past.older), Status()
+            for earlier in known[:before]:
+                point, found = self._filter(work, point, earlier)
+                point, status = work.recentred(point), found.status
+                if not status.ok:
+                    break
+            start = work.loosened(point, jumps.size)
+            again, found = self._retaken(work, new, start, known[before:])
+            if status.ok and found.status.ok:
+                new = again
+            else:
+                new = self._renewed(work.loosened(work.recentred(new.now), jumps.size), new)
+        return new, replace(report, notes={**report.notes, "jump": float(alarm)})
 
     def _store(
         self, work: Filter, state: SensitivityState, now: Point, interval: Interval
     ) -> SensitivityState:
-        channels = work.problem.channels
-        samples = state.samples
-        if not len(samples.t) and interval.t1 > interval.t0:
-            first = np.array([interval.inputs0[c] for c in channels])
-            samples = samples.append(interval.t0, np.full_like(interval.z1, np.nan), first)
-        values = np.array([interval.inputs1[c] for c in channels])
-        samples = samples.append(interval.t1, interval.z1, values)
+        samples = state.samples.add(interval, work.problem.channels)
         used = state.assimilated + bool(interval.present.any())
         return replace(state, now=now, samples=samples, assimilated=used)
 
@@ -334,22 +463,13 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         """Run the stored samples again about a reference at the estimate, or on the way to it."""
         samples, q = state.samples, _next(work, state)
         channels = work.problem.channels
-        named = [dict(zip(channels, row, strict=True)) for row in samples.inputs]
-        first = Moment(samples.t[0], Inputs(named[0]))
+        first = Moment(samples.t[0], Inputs(dict(zip(channels, samples.inputs[0], strict=True))))
         point = _placed(work, state, q, first)
         if np.isfinite(samples.z[0]).any():
             z = samples.z[0]
             at = Interval(first.t, first.t, first.inputs, first.inputs, z, z)
             point, _ = work.updated(point, at, work.predict(point, first))
-        for k in range(1, len(samples.t)):
-            interval = Interval(
-                samples.t[k - 1],
-                samples.t[k],
-                Inputs(named[k - 1]),
-                Inputs(named[k]),
-                samples.z[k - 1],
-                samples.z[k],
-            )
+        for interval in samples.intervals(channels):
             point, report = self._filter(work, point, interval)
             if not report.status.ok:
                 return state, report.status
@@ -376,10 +496,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         new, refused = work.updated(moved, interval, predicted)
         if not np.isfinite(new.da).all():
             return failed(Status("not_finite", "the update is not finite"))
-        notes = {
-            "innovation_ratio": new.consistency.ratio,
-            "innovation_correlation": new.consistency.correlation,
-        }
+        notes = _consistent(new)
         if self.noise == "auto":
             notes["noise_level"] = new.level.scale
         if np.isfinite(self.gate):
@@ -395,6 +512,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             now.U,
             now.consistency.inflation,
             work.Phi,
+            work.rest(now.age),
         )
 
 
@@ -429,3 +547,16 @@ def _left(work: Filter, state: SensitivityState) -> float:
     point, shift = state.now, work.transition(state.span) @ _missed(work, state)
     deviations = np.linalg.lstsq(point.C, shift, rcond=None)[0]
     return float(np.linalg.norm(deviations)) / point.consistency.inflation
+
+
+def _levelled(point: Point, level: NoiseLevel, tempered: int) -> Point:
+    """Return a filter after a sample; a tempered one tells nothing about the noise."""
+    return replace(point, level=level) if tempered else point
+
+
+def _consistent(point: Point) -> dict[str, float]:
+    """Return the notes on the innovations."""
+    return {
+        "innovation_ratio": point.consistency.ratio,
+        "innovation_correlation": point.consistency.correlation,
+    }

@@ -126,9 +126,9 @@ def _words(truth: str) -> str:
     if truth == "discrete":
         return (
             f"The data are exact; the sensitivity law is told a noise level of {NOISE_LEVEL:g} "
-            "(the state is of size 1), since a filter needs one. Its error is the same to a "
-            "quarter for every level from 1e-2 to 1e-6; below 1e-2 its first steps are "
-            "overconfident, which the inflated deviation shows."
+            "(the state is of size 1), since a filter needs one; the smaller it is, the smaller "
+            "the error. The first sample moves q by several prior deviations and is iterated by "
+            "the law's guards."
         )
     return (
         "Data and estimator do not share the scheme here, so the truncation error of h = 0.05 "

@@ -7,11 +7,12 @@ from livepde.runs.directory import open_run as open
 from livepde.runs.doubts import doubts
 from livepde.runs.drive import Driven, drive
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.runs.summary import checks_of, measures, tables
+from livepde.runs.summary import Jump, checks_of, jumps, measures, tables
 
 __all__ = [
     "Check",
     "Driven",
+    "Jump",
     "Outcome",
     "Run",
     "RunWriter",
@@ -20,6 +21,7 @@ __all__ = [
     "doubts",
     "drive",
     "free_path",
+    "jumps",
     "measures",
     "open",
     "refuse_taken",

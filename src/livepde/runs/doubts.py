@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from livepde.runs.summary import scalars, scored
+from livepde.runs.summary import digits, jumps, scalars, scored, when
 
 __all__ = ["MODEL_ERROR", "doubts"]
 
@@ -16,6 +16,10 @@ MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: 
 OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
 SETTLED = 0.25  # share of a run after which means are taken
 LEFT = 1.0  # deviations between estimate and reference after the last replay
+MOST_JUMPS = 5  # that get a sentence of their own
+WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
+SHORTEST = 20  # values at least to tell whether an estimate wanders
+RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 HARDLY = 0.9  # of the prior deviation left: nothing was learned
 
 
@@ -25,11 +29,20 @@ def doubts(data: xr.Dataset) -> list[str]:
     The model does not explain the data if at the end the mean square of the innovations, over the
     last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
     bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
-    ended more than one deviation away from where it has to end.
+    ended more than one deviation away from where it has to end. Guards had to give up samples or to
+    restart. With a fixed gain an estimate wanders, in the last half of a run, by more than 0.3 of
+    what it has learned. Something jumped.
     """
     if not data.sizes["time"]:
         return []
-    return [*_model_error(data), *_replays(data), *_unknowns(data)]
+    return [
+        *_model_error(data),
+        *_replays(data),
+        *_unknowns(data),
+        *_guards(data),
+        *_gain(data),
+        *_jumps(data),
+    ]
 
 
 def _model_error(data: xr.Dataset) -> list[str]:
@@ -98,3 +111,88 @@ def _unknowns(data: xr.Dataset) -> list[str]:
                 "that of the prior."
             )
     return found
+
+
+def _jumps(data: xr.Dataset) -> list[str]:
+    alarms, found = jumps(data), []
+    for jump in alarms[:MOST_JUMPS]:
+        at = when(data, jump.t)
+        went = [
+            f"{label} from {digits(before, std)[0]} to {' ± '.join(digits(after, std))}"
+            for label, (before, after, std) in jump.moved.items()
+        ]
+        if went:
+            found.append(
+                f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
+                f"allowed to move; since then {', '.join(went)}."
+            )
+        else:
+            found.append(
+                f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
+                "allowed to move, but no number has changed for good: a passing disturbance, or "
+                "a change that the model does not know."
+            )
+    if len(alarms) > MOST_JUMPS:
+        found.append(
+            f"{len(alarms) - MOST_JUMPS} more jumps: the unknowns may rather move all the time "
+            "(evolution), or a process is missing in the model."
+        )
+    return found
+
+
+def _guards(data: xr.Dataset) -> list[str]:
+    def times(name: str) -> Any:
+        noted = data[name].values == 1.0 if name in data else np.zeros(data.sizes["time"], bool)
+        return data["time"].values[noted]
+
+    tempered, held = times("tempered"), times("held")
+    restarted, runaway = times("restarted"), times("runaway")
+    found = []
+    if len(tempered) or len(held):
+        found.append(
+            f"{len(tempered)} samples were used with more than their noise and {len(held)} not at "
+            "all, because the law could not be linearised where they would have moved the unknowns "
+            f"(last at t = {max([*tempered, *held]):g}): look at the sensors then, state a larger "
+            "noise, or start from a better prior."
+        )
+    if len(restarted):
+        found.append(
+            f"The estimate ran away and was restarted from before: {len(restarted)} times, last at "
+            f"t = {restarted[-1]:g}. Look at sensors and inputs before that time; bounds or a "
+            "transform keep an unknown where the model can be simulated."
+        )
+    if len(runaway):
+        found.append(
+            f"{len(runaway)} predictions missed a sensor by more than all that it has ever varied, "
+            f"and a restart did not help (last at t = {runaway[-1]:g}): look at inputs, boundary "
+            "values and their units."
+        )
+    return found
+
+
+def _gain(data: xr.Dataset) -> list[str]:
+    """Return what there is to say of a law with a fixed gain, which has no covariance."""
+    if "residual" not in data or "gain" in data:
+        return []
+    names = [*scalars(data), *str(data.attrs.get("fields", "")).split()]
+    wandering = [name for name in names if name in data and _wanders(data[name].values)]
+    if not wandering:
+        return []
+    return [
+        f"{', '.join(wandering)}: the estimate wanders by more than {WANDERS:g} of what it has "
+        "learned: the gain is too large for the noise, and the estimate follows it. Take "
+        "gain='auto', or a smaller one."
+    ]
+
+
+def _wanders(values: np.ndarray[Any, Any]) -> bool:
+    """Return whether values over time, shape (times, ...), scatter about a line in the end."""
+    late = values[len(values) // 2 :].reshape(len(values) - len(values) // 2, -1)
+    if len(late) < SHORTEST or not np.isfinite(late).all():
+        return False
+    line = np.vander(np.linspace(-1.0, 1.0, len(late)), 2)
+    left = late - line @ np.linalg.lstsq(line, late, rcond=None)[0]
+    learned = np.linalg.norm(late.mean(axis=0) - values[0].ravel())
+    scatter = np.sqrt((left**2).sum(axis=1).mean())
+    size = np.linalg.norm(late.mean(axis=0))
+    return bool(scatter > WANDERS * learned and scatter > RESTS * size)

@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 
 from livepde.errors import RunError
 from livepde.linalg import Array
-from livepde.result import Record
+from livepde.records import Layout, Record, Snapshot
 
 __all__ = ["Event", "Journal", "Taken"]
 
@@ -37,7 +37,7 @@ CREATE TABLE estimates (
     id INTEGER PRIMARY KEY, t REAL NOT NULL, status INTEGER NOT NULL, steps INTEGER NOT NULL,
     numbers BLOB NOT NULL, notes TEXT NOT NULL
 );
-CREATE TABLE fields (id INTEGER PRIMARY KEY, profiles BLOB NOT NULL);
+CREATE TABLE fields (id INTEGER PRIMARY KEY, content BLOB NOT NULL);
 CREATE TABLE checkpoints (id INTEGER PRIMARY KEY, state BLOB NOT NULL);
 CREATE TABLE events (
     id INTEGER PRIMARY KEY, t REAL, kind TEXT NOT NULL, channel TEXT NOT NULL, message TEXT NOT NULL
@@ -76,8 +76,8 @@ class Journal:
         The SQLite file.
     channels
         Names of all channels of a sample, in the order in which they are kept.
-    sizes
-        Numbers of scalar unknowns, sensors, and withheld sensors.
+    layout
+        What the numbers of the records mean.
 
     Raises
     ------
@@ -91,28 +91,26 @@ class Journal:
         self._lock = lock
         meta = self.meta
         self.channels: tuple[str, ...] = tuple(json.loads(meta["channels"]))
-        self._sizes: tuple[int, int, int] = tuple(json.loads(meta["sizes"]))
+        self.layout = Layout.from_dict(json.loads(meta["layout"]))
         self._last = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
         self._current = self._last
 
     # --- opening -------------------------------------------------------------------------------
 
     @classmethod
-    def create(cls, path: Path, channels: Sequence[str], sizes: tuple[int, int, int]) -> Journal:
+    def create(cls, path: Path, channels: Sequence[str], layout: Layout) -> Journal:
         """Make a new journal and be its writer."""
         lock = _locked(path)
         try:
             connection = _connect(path)
             with connection:
                 connection.executescript(SCHEMA)
-                rows = {"format": str(FORMAT), "channels": channels, "sizes": sizes}
-                connection.executemany(
-                    "INSERT INTO meta VALUES (?, ?)",
-                    [
-                        (k, v if isinstance(v, str) else json.dumps(list(v)))
-                        for k, v in rows.items()
-                    ],
-                )
+                rows = {
+                    "format": str(FORMAT),
+                    "channels": json.dumps(list(channels)),
+                    "layout": json.dumps(layout.to_dict()),
+                }
+                connection.executemany("INSERT INTO meta VALUES (?, ?)", rows.items())
         except sqlite3.Error as error:
             lock.release()
             raise _failed(path, error) from error
@@ -189,9 +187,7 @@ class Journal:
     def append(self, record: Record, /) -> None:
         """Keep the estimate of the last sample that `accept` or `samples` has returned."""
         number = self._current
-        numbers = np.concatenate(
-            [record.values, record.stds, record.innovation, record.withheld_error]
-        )
+        numbers = np.concatenate([record.numbers, record.innovation, record.withheld_error])
         self._execute(
             "INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?)",
             number,
@@ -201,12 +197,14 @@ class Journal:
             numbers.tobytes(),
             json.dumps(dict(record.notes)),
         )
-        if record.profiles is not None:
-            names = {name: len(values) for name, values in record.profiles.items()}
-            head = json.dumps(names).encode()
-            body = b"".join(values.tobytes() for values in record.profiles.values())
-            self._execute("INSERT INTO fields VALUES (?, ?)", number, head + b"\0" + body)
+        if record.snapshot is not None:
+            self.keep(record.snapshot)
         self._last = number
+
+    def keep(self, snapshot: Snapshot) -> None:
+        """Keep the fields of the last sample."""
+        content = _packed(snapshot)
+        self._execute("INSERT OR REPLACE INTO fields VALUES (?, ?)", self._current, content)
 
     def checkpoint(self, state: bytes) -> None:
         """Keep the identifier's state after the last sample."""
@@ -292,16 +290,16 @@ class Journal:
         return int(self._one("SELECT COUNT(*) FROM estimates"))
 
     def __iter__(self) -> Iterator[Record]:
-        scalars, sensors, _ = self._sizes
-        cuts = np.cumsum([scalars, scalars, sensors])
+        layout = self.layout
+        cuts = np.cumsum([len(layout.numbers), len(layout.sensors)])
         rows = self._execute(
-            "SELECT t, status, steps, numbers, notes, profiles "
+            "SELECT t, status, steps, numbers, notes, content "
             "FROM estimates LEFT JOIN fields USING (id) ORDER BY id"
         )
-        for t, status, steps, numbers, notes, profiles in rows:
-            values, stds, innovation, error = np.split(np.frombuffer(numbers), cuts)
-            kept = None if profiles is None else _profiles(profiles)
-            yield Record(t, values, stds, innovation, error, status, steps, json.loads(notes), kept)
+        for t, status, steps, numbers, notes, content in rows:
+            values, innovation, error = np.split(np.frombuffer(numbers), cuts)
+            snapshot = None if content is None else _unpacked(content)
+            yield Record(t, values, innovation, error, status, steps, json.loads(notes), snapshot)
 
     @property
     def events(self) -> list[Event]:
@@ -334,11 +332,27 @@ class Journal:
         return self._execute(command).fetchone()[0]
 
 
-def _profiles(content: bytes) -> dict[str, Array]:
-    head, body = content.split(b"\0", 1)
-    names = json.loads(head)
-    parts = np.split(np.frombuffer(body), np.cumsum(list(names.values()))[:-1])
-    return dict(zip(names, parts, strict=True))
+def _packed(snapshot: Snapshot) -> bytes:
+    """Return a snapshot as names and sizes in JSON, a zero byte, and the numbers."""
+    arrays = dict(snapshot.profiles)
+    head: dict[str, Any] = {"told": snapshot.told}
+    head["profiles"] = {name: len(values) for name, values in arrays.items()}
+    body = [values.tobytes() for values in arrays.values()]
+    if snapshot.correlation is not None:
+        head["correlation"] = len(snapshot.correlation)
+        body.append(snapshot.correlation.tobytes())
+    return json.dumps(head).encode() + b"\0" + b"".join(body)
+
+
+def _unpacked(content: bytes) -> Snapshot:
+    text, body = content.split(b"\0", 1)
+    head = json.loads(text)
+    sizes = head["profiles"]
+    *parts, rest = np.split(np.frombuffer(body), np.cumsum([*sizes.values()]))
+    told = {name: (told, count) for name, (told, count) in head["told"].items()}
+    n = head.get("correlation")
+    correlation: Array | None = None if n is None else rest.reshape(n, n)
+    return Snapshot(dict(zip(sizes, parts, strict=True)), told, correlation)
 
 
 def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:

@@ -154,6 +154,8 @@ class Live:
                 self._take(self._waiting.popleft())
             elif self.source.done:
                 break
+        if self.result.last is not None:
+            self.journal.keep(self.result.snapshot(self.result.last))
         self.journal.checkpoint(self.identifier.dump())
 
     @property

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from livepde.diagnostics.identifiability import TRADED, Known
 from livepde.plots import interval_95
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
-__all__ = ["checks_of", "digits", "measures", "scalars", "scored", "shown", "tables"]
+__all__ = [
+    "Jump",
+    "checks_of",
+    "digits",
+    "jumps",
+    "measures",
+    "scalars",
+    "scored",
+    "shown",
+    "tables",
+    "when",
+]
 
 MOST_ROWS = 40
+SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0}
+MOVED = 3.0  # deviations by which an unknown has moved after an alarm
+JUMP = "jump"  # what the law notes of each sample
 CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
 
 
@@ -86,6 +103,51 @@ def scalars(data: xr.Dataset) -> list[str]:
     return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
 
 
+@dataclass(frozen=True)
+class Jump:
+    """An alarm of `Jumps`.
+
+    Attributes
+    ----------
+    t
+        Time of the sample that raised it.
+    moved
+        Numbers that have moved by more than three deviations between this alarm and the next one,
+        or the end: label -> value before and after, with the deviation after.
+    """
+
+    t: float
+    moved: Mapping[str, tuple[float, float, float]]
+
+
+def jumps(data: xr.Dataset) -> list[Jump]:
+    """Return the alarms of a run, in time order; none without the test for jumps."""
+    if JUMP not in data or data[JUMP].dims != ("time",):
+        return []
+    at = np.flatnonzero(data[JUMP].values > 0.0)
+    ends = np.append(at, data.sizes["time"])[1:] - 1
+    found = []
+    for k, end in zip(at, ends, strict=True):
+        moved = {}
+        for label in scalars(data):
+            values, std = data[label].values, data[f"{label}_std"].values
+            before = max(int(k) - 1, 0)
+            spread = math.hypot(float(std[before]), float(std[end]))
+            if abs(values[end] - values[before]) > MOVED * spread:
+                moved[label] = float(values[before]), float(values[end]), float(std[end])
+        found.append(Jump(float(data["time"].values[k]), moved))
+    return found
+
+
+def when(data: xr.Dataset, t: float) -> str:
+    """Return a time of a run as text: a date if it has one."""
+    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
+    if origin is None or unit not in SECONDS:
+        return f"t = {t:.6g} {unit}".rstrip()
+    date = datetime.fromisoformat(str(origin)) + timedelta(seconds=t * SECONDS[unit])
+    return date.isoformat(sep=" ", timespec="seconds")
+
+
 def _interval(data: xr.Dataset, label: str) -> str:
     """Return the last 95 % interval as text, its ends to the second digit of the deviation."""
     std = float(data[f"{label}_std"][-1])
@@ -115,7 +177,7 @@ def measures(data: xr.Dataset) -> dict[str, float]:
     reference `.error`, relative to it, and `.deviations`, the distance from it in deviations;
     `rmse` one-step, of all sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`,
     `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to what is expected;
-    `failed_steps`.
+    `jumps`, the number of alarms, if the law tests for them; `failed_steps`.
     """
     found: dict[str, float] = {}
     if data.sizes["time"]:
@@ -136,6 +198,8 @@ def measures(data: xr.Dataset) -> dict[str, float]:
         found[f"rmse.{name}"] = _rmse(errors)
     if "innovation_ratio" in data and data.sizes["time"]:
         found["innovation_ratio"] = float(data["innovation_ratio"].values[-1])
+    if JUMP in data:
+        found["jumps"] = float(len(jumps(data)))
     found["failed_steps"] = float((data["status"].values != 0).sum())
     return found
 
@@ -150,7 +214,10 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 
 
 def tables(data: xr.Dataset) -> list[Table]:
-    """Return the tables of a run: estimates with references, and errors of each channel."""
+    """Return the tables of a run.
+
+    Estimates with references, errors of each channel, what the data have told, and jumps.
+    """
     result: list[Table] = []
     labels = scalars(data) if data.sizes["time"] else []
     rows: list[tuple[Any, ...]] = []
@@ -197,4 +264,56 @@ def tables(data: xr.Dataset) -> list[Table]:
     ]
     columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))
-    return result
+    return result + [table for table in (_told(data, labels), _jumped(data)) if table.rows]
+
+
+def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
+    """Return how much the data have told of each unknown."""
+    rows: list[tuple[Any, ...]] = []
+    for label in labels:
+        attrs, left = data[label].attrs, data.get(f"{label}_left")
+        if left is None or not math.isfinite(share := float(left[-1])):
+            continue
+        value = float(data[label][-1])
+        bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
+        known = Known(
+            label, share, bound=bounds[0] if bounds else math.nan, moves="prior_std" not in attrs
+        )
+        state = "moves" if known.moves and known.verdict == "partly" else known.verdict
+        others = _traded(data, label)
+        if others and known.verdict != "pinned":
+            state += f", traded off with {', '.join(others)}"
+        rows.append((label, _share(share), state))
+    for name in str(data.attrs.get("fields", "")).split():
+        if f"{name}_modes" not in data:
+            continue
+        modes = data[f"{name}_modes"]
+        count, told = int(modes.attrs["of"]), float(modes[-1])
+        share = math.sqrt(max(1.0 - told / count, 0.0)) if count else math.nan
+        rows.append((name, _share(share), f"{told:.1f} of {count} modes told"))
+    return Table("What the data have told", ("unknown", "prior deviation left", "state"), rows)
+
+
+def _share(left: float) -> str:
+    return f"{100 * left:.0f} %" if left >= 1.0 else f"{100 * left:.2g} %"
+
+
+def _traded(data: xr.Dataset, label: str) -> list[str]:
+    """Return the numbers of which the data tell only a combination with this one."""
+    if "correlation" not in data or data["correlation"].dims != ("unknown", "other"):
+        return []
+    names = [str(name) for name in data["unknown"].values]
+    row = data["correlation"].values[names.index(label)]
+    return [name for name, r in zip(names, row, strict=True) if name != label and abs(r) > TRADED]
+
+
+def _jumped(data: xr.Dataset) -> Table:
+    """Return when something jumped, and what moved then."""
+    rows: list[tuple[Any, ...]] = []
+    for jump in jumps(data):
+        at = when(data, jump.t)
+        rows += [
+            (at, label, digits(before, std)[0], " ± ".join(digits(after, std)))
+            for label, (before, after, std) in jump.moved.items()
+        ] or [(at, "–", "–", "–")]
+    return Table("Jumps", ("when", "unknown", "before", "since then"), rows)

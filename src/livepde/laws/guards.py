@@ -1,0 +1,177 @@
+"""When a filter is out of its depth: what it notices, and the past it can go back to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.fem import Inputs
+from livepde.laws.filter import Point
+from livepde.linalg import Array
+from livepde.stepping import Interval
+
+__all__ = ["Guards", "Past", "Samples", "Scale"]
+
+
+@dataclass(frozen=True)
+class Guards:
+    """What `SensitivityLaw` does when its own assumptions fail; inert as long as they hold.
+
+    *Overconfident linearisation.* A sample that moves an unknown by more than `reach` prior
+    deviations, and beyond half a standard deviation of what it leaves, is assimilated by
+    Gauss-Newton steps over its interval, each at most one prior deviation long, until reference
+    and estimate agree within that half (a law with a `Replay` does so anyway). Where they do not
+    converge the sample counts with ten times its noise, and so on; after `temperings` of that it
+    is not used. Notes: "iterated", "tempered", "held".
+
+    *Runaway.* A step that fails, or a prediction that misses the data by more than `runaway` times
+    all that the sensor has ever varied: the law goes back to before the last samples, adds one
+    prior deviation to what is uncertain there, and carries the state on without those samples; if
+    that fails as well, with the prior. Note: "restarted". If nothing helps a failed step is
+    reported as such and changes nothing; "runaway" notes a prediction that stays away.
+
+    Parameters
+    ----------
+    reach
+        Prior deviations that a sample moves an unknown at most, unless iterated.
+    iterations
+        At most this many Gauss-Newton steps for a sample.
+    temperings
+        How often a sample whose steps do not converge is taken again with ten times its noise.
+    runaway
+        How many times the range of a sensor its prediction misses it at least.
+    past
+        A restart goes back by this many samples at least, if there are so many, and by less than
+        twice as many.
+    """
+
+    reach: float = 0.25
+    iterations: int = 10
+    temperings: int = 2
+    runaway: float = 10.0
+    past: int = 32
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "runaway"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise LawError(f"Guards: {name} must be a positive number; got {value}.")
+        for name, least in (("iterations", 1), ("temperings", 0), ("past", 1)):
+            value = getattr(self, name)
+            if value < least:
+                raise LawError(f"Guards: {name} must be at least {least}; got {value}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Stored samples since the start of the window, in time order.
+
+    Attributes
+    ----------
+    t, z, inputs
+        Shapes (count + 1,), (count + 1, sensors), (count + 1, channels); first row: the start,
+        with what was assimilated there.
+    """
+
+    t: Array
+    z: Array
+    inputs: Array
+
+    @classmethod
+    def empty(cls, sensors: int, channels: int) -> Samples:
+        """Return no samples."""
+        return cls(np.zeros(0), np.zeros((0, sensors)), np.zeros((0, channels)))
+
+    def add(self, interval: Interval, channels: tuple[str, ...]) -> Samples:
+        """Return the samples with that at the end of an interval; the first brings the start."""
+        samples = self
+        if not len(self.t) and interval.t1 > interval.t0:
+            nothing = np.full_like(interval.z1, np.nan)
+            samples = samples._append(interval.t0, nothing, interval.inputs0, channels)
+        return samples._append(interval.t1, interval.z1, interval.inputs1, channels)
+
+    def _append(self, t: float, z: Array, inputs: object, channels: tuple[str, ...]) -> Samples:
+        row = np.array([inputs[c] for c in channels])  # type: ignore[index]
+        return Samples(np.append(self.t, t), np.vstack([self.z, z]), np.vstack([self.inputs, row]))
+
+    def since(self, first: int) -> Samples:
+        """Return the samples from one on, which is the start of them."""
+        z = self.z[first:].copy()
+        z[:1] = np.nan
+        return Samples(self.t[first:], z, self.inputs[first:])
+
+    def intervals(self, channels: tuple[str, ...]) -> list[Interval]:
+        """Return the intervals between them, in time order."""
+        named = [Inputs(dict(zip(channels, row.tolist(), strict=True))) for row in self.inputs]
+        return [
+            Interval(self.t[k - 1], self.t[k], named[k - 1], named[k], self.z[k - 1], self.z[k])
+            for k in range(1, len(self.t))
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """Two filters of before, and the samples since: what a law can go back to.
+
+    Attributes
+    ----------
+    older, newer
+        The filter at the start of `samples`, and after `between` of them.
+    """
+
+    older: Point
+    newer: Point
+    between: int
+    samples: Samples
+
+    @classmethod
+    def start(cls, point: Point, samples: Samples) -> Past:
+        """Return a past that begins now; of `samples` none is kept."""
+        return cls(point, point, 0, samples.since(len(samples.t)))
+
+    @property
+    def count(self) -> int:
+        """Number of samples since the older filter."""
+        return max(len(self.samples.t) - 1, 0)
+
+    def add(self, point: Point, interval: Interval, channels: tuple[str, ...], length: int) -> Past:
+        """Return the past after a sample: the older filter is `length` to 2 `length` - 1 ago."""
+        samples = self.samples.add(interval, channels)
+        past = replace(self, samples=samples)
+        if past.count - self.between < length:
+            return past
+        return Past(self.newer, point, past.count - self.between, samples.since(self.between))
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """How far the values of each sensor have been apart, and its first innovation.
+
+    Attributes
+    ----------
+    low, high, first
+        Least and largest value, and size of the first innovation, shapes (sensors,); NaN before.
+    """
+
+    low: Array
+    high: Array
+    first: Array
+
+    @classmethod
+    def start(cls, sensors: int) -> Scale:
+        """Return the value before any sample."""
+        never = np.full(sensors, np.nan)
+        return cls(never, never, never)
+
+    def add(self, z: Array, d: Array) -> Scale:
+        """Return the value after a sample z with innovations d, shapes (sensors,), NaN missing."""
+        first = np.where(np.isnan(self.first), np.abs(d), self.first)
+        return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
+
+    def beyond(self, d: Array, noise: Array) -> float:
+        """Return the largest innovation as a multiple of what was there before, or of the noise."""
+        largest = np.maximum(np.maximum(self.high - self.low, self.first), noise)
+        ratio = np.abs(d) / np.where(np.isnan(largest), np.inf, largest)
+        return float(np.max(ratio, initial=0.0, where=~np.isnan(ratio)))

@@ -1,0 +1,183 @@
+"""What is kept of each estimate, and the dataset that it becomes.
+
+A record holds numbers and arrays only; what they mean (names, units, coordinates) stands once, in a
+layout of plain values. So a run can be read without its model, and while it goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import xarray as xr
+
+from livepde.linalg import Array
+
+__all__ = ["STATUS_CODES", "Layout", "Record", "Records", "Snapshot", "bare"]
+
+STATUS_CODES = ("ok", "not_converged", "not_finite", "singular")
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """Fields at one time.
+
+    Attributes
+    ----------
+    profiles
+        Variable -> values at the vertices, in the order of `Layout.coordinates`.
+    told
+        Field -> of how many modes the data have told, and how many there are.
+    correlation
+        Of the numbers, shape (unknowns, unknowns); None without covariance.
+    """
+
+    profiles: Mapping[str, Array]
+    told: Mapping[str, tuple[float, int]]
+    correlation: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What is kept of an estimate.
+
+    Attributes
+    ----------
+    t, steps, notes, innovation, withheld_error
+        Of the estimate.
+    numbers
+        Values of the variables `Layout.numbers`, shape (numbers,).
+    status
+        Index in `STATUS_CODES`.
+    snapshot
+        The fields; None where none are kept.
+    """
+
+    t: float
+    numbers: Array
+    innovation: Array
+    withheld_error: Array
+    status: int
+    steps: int
+    notes: Mapping[str, float]
+    snapshot: Snapshot | None = None
+
+
+class Records(Protocol):
+    """Where records are kept: a list, or the journal of a run."""
+
+    def append(self, record: Record, /) -> None:
+        """Keep one more."""
+
+    def __iter__(self) -> Iterator[Record]: ...
+
+    def __len__(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the numbers of records mean, in plain values.
+
+    Attributes
+    ----------
+    time_unit, sensor_unit
+        Units of time and innovations.
+    coordinates
+        Axis -> coordinates of the vertices.
+    sensors, withheld
+        Names; `withheld` is None if no sensor is.
+    numbers
+        Variable over time -> its attributes, in the order of `Record.numbers`.
+    units
+        Unknown or component of the state -> unit.
+    scalars, fields, state
+        Labels of scalar unknowns, names of unknown fields and of variables of the state.
+    """
+
+    time_unit: str
+    sensor_unit: str
+    coordinates: Mapping[str, Sequence[float]]
+    sensors: Sequence[str]
+    withheld: Sequence[str] | None
+    numbers: Mapping[str, Mapping[str, Any]]
+    units: Mapping[str, str]
+    scalars: Sequence[str]
+    fields: Sequence[str]
+    state: Sequence[str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the layout as JSON can hold it."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Layout:
+        """Return the layout that `to_dict` gave."""
+        return cls(**content)
+
+    def dataset(self, records: Sequence[Record]) -> xr.Dataset:
+        """Return records as a dataset; see `Result.to_xarray`."""
+        kept = [(row.t, row.snapshot) for row in records if row.snapshot is not None]
+        times = np.array([row.t for row in records], dtype=float)
+        data = xr.Dataset(
+            coords={
+                "time": ("time", times, {"units": self.time_unit}),
+                "snapshot": np.array([t for t, _ in kept]),
+                "sensor": list(self.sensors),
+                "withheld": list(self.withheld or ()),
+                **{axis: ("vertex", np.array(x)) for axis, x in self.coordinates.items()},
+            }
+        )
+        numbers = np.reshape([row.numbers for row in records], (len(records), len(self.numbers)))
+        for (name, attrs), values in zip(self.numbers.items(), numbers.T, strict=True):
+            data[name] = ("time", values, dict(attrs))
+        self._add_snapshots(data, [snapshot for _, snapshot in kept])
+        self._add_errors(data, records)
+        flags = {
+            "flag_values": list(range(len(STATUS_CODES))),
+            "flag_meanings": " ".join(STATUS_CODES),
+        }
+        data["status"] = ("time", np.array([row.status for row in records], dtype=np.int32), flags)
+        steps = np.array([row.steps for row in records], dtype=np.int32)
+        data["steps"] = ("time", steps, {"long_name": "substeps taken"})
+        for name in dict.fromkeys(key for row in records for key in row.notes):
+            key = f"note_{name}" if name in data else name  # an unknown may have the same name
+            data[key] = ("time", np.array([row.notes.get(name, np.nan) for row in records]))
+        data.attrs["fields"] = " ".join(self.fields)
+        data.attrs["scalars"] = "\n".join(self.scalars)
+        data.attrs["state"] = " ".join(self.state)
+        return data
+
+    def _add_snapshots(self, data: xr.Dataset, kept: Sequence[Snapshot]) -> None:
+        if not kept:
+            return
+        for name in kept[0].profiles:
+            values = np.array([snapshot.profiles[name] for snapshot in kept])
+            unit = {"units": self.units.get(bare(name), "")}
+            data[name] = (("snapshot", "vertex"), values, unit)
+        for name, (_, count) in kept[-1].told.items():
+            told = np.array([snapshot.told[name][0] for snapshot in kept])
+            about = {"long_name": "modes that the data have told of", "of": count}
+            data[f"{name}_modes"] = ("snapshot", told, about)
+        last = kept[-1].correlation
+        if last is not None and len(self.scalars) > 1 and "correlation" not in data:
+            data.coords["unknown"] = list(self.scalars)
+            data["correlation"] = (("unknown", "other"), last)
+
+    def _add_errors(self, data: xr.Dataset, records: Sequence[Record]) -> None:
+        unit = {"units": self.sensor_unit}
+        shape = (len(records), len(self.sensors))
+        innovations = np.reshape([row.innovation for row in records], shape)
+        data["innovation"] = (("time", "sensor"), innovations, unit)
+        if self.withheld is not None:
+            shape = (len(records), len(self.withheld))
+            errors = np.reshape([row.withheld_error for row in records], shape)
+            data["withheld_error"] = (("time", "withheld"), errors, unit)
+
+
+def bare(name: str) -> str:
+    """Return what a variable beside an unknown belongs to."""
+    for end in ("_std", "_low", "_high"):
+        name = name.removesuffix(end)
+    return name
