@@ -250,12 +250,13 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             return state
         form, begun = work.problem.model.form_initial, state
         iterates = form is not None and not form.linear_in_parameter
+        if self.guards is not None and self.replay is None:
+            iterates = iterates or not work.problem.observed.linear
         for _ in range(FIRST):
             new, _ = work.updated(point, interval, work.predict(point, interval.end))
             if not np.isfinite(new.da).all():
                 return state
             begun = replace(state, now=new, reference=point.q)
-            iterates = iterates or self._far(work, begun)
             if not iterates or _left(work, begun) <= CONVERGED:
                 break
             point = _placed(work, state, _next(work, begun), interval.end)
