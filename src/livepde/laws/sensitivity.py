@@ -536,9 +536,9 @@ def _placed(work: Filter, state: SensitivityState, q: Array, first: Moment) -> P
     start, model = replace(state.start, level=state.now.level), work.problem.model
     shift = work.reduced(q - start.q)
     if state.initial:
-        U = model.initial_directions(q, work.Phi, first)
-        u, du = model.initial_state(q, first), -U @ shift
-        return replace(start, q=q, u=u, du=du, da=-shift, U=U)
+        initial = model.initial_directions(q, work.Phi, first)
+        u, du = model.initial_state(q, first), -initial @ shift
+        return replace(start, q=q, u=u, du=du, da=-shift, U=initial @ start.C)
     along = start.along(shift)
     return replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
 
