@@ -285,7 +285,7 @@ class AutoSpec(Spec):
 
     kind: Literal["auto"]
     noise: Quantity | None = None
-    modes: PositiveInt = 12
+    modes: PositiveInt | Literal["auto"] = "auto"
     gate: PositiveFloat | None = None
 
 

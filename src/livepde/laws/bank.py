@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from math import comb
 
 import numpy as np
@@ -12,11 +10,12 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
 from livepde.errors import LawError
-from livepde.fem import Inputs, Moment, RandomWalk
+from livepde.fem import Moment, RandomWalk
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.filter import Filter
+from livepde.laws.guards import Past, Samples
 from livepde.laws.jumps import Jumps, Watch
-from livepde.laws.sensitivity import Replay, Samples, SensitivityLaw, SensitivityState
+from livepde.laws.sensitivity import Replay, SensitivityLaw, SensitivityState
 from livepde.linalg import Array, IntArray
 from livepde.stepping import ForwardStage, Interval
 
@@ -72,6 +71,11 @@ class Bank:
     stated: bool
 
     @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of all input channels."""
+        return self.filters[0].problem.channels
+
+    @property
     def chances(self) -> Array:
         """Logarithms of the weights before the first sample."""
         chances = np.log([candidate.chance for candidate in self.candidates])
@@ -84,7 +88,7 @@ class Bank:
             motions = tuple(
                 motion
                 if motion.evolution.moves
-                else replace(motion, evolution=RandomWalk(np.sqrt(drift / tick) * motion.std))
+                else replace(motion, evolution=_walk(drift / tick, motion.std), saturates=True)
                 for motion in filter_.motions
             )
             filter_ = replace(filter_, motions=motions)
@@ -173,7 +177,7 @@ class AutoLaw(Law[Bank, AutoState]):
     Parameters
     ----------
     modes
-        Number of modes for each field: one number, or name -> number.
+        As for `SensitivityLaw`.
     noise
         Standard deviation of the measurement noise; default what the observation says. The law
         raises it where the innovations say so, and never lowers it: whoever states more than the
@@ -186,7 +190,7 @@ class AutoLaw(Law[Bank, AutoState]):
         As for `SensitivityLaw`.
     """
 
-    modes: int | dict[str, int] = 12
+    modes: int | str | dict[str, int] = "auto"
     noise: float | None = None
     replay: Replay = field(default_factory=Replay)
     gate: float = np.inf
@@ -249,7 +253,7 @@ class AutoLaw(Law[Bank, AutoState]):
 
     def begin(self, work: Bank, state: AutoState, interval: Interval) -> AutoState:
         if not state.known:
-            return replace(state, waiting=_stored(work, state.waiting, interval))
+            return replace(state, waiting=state.waiting.add(interval, work.channels))
         members = tuple(
             work.laws[k].begin(work.filter(k, 0.0, state.noise), member, interval)
             for k, member in enumerate(state.members)
@@ -265,16 +269,19 @@ class AutoLaw(Law[Bank, AutoState]):
         free, report = self.member.step(work.filter(0, 0.0, ones), state.members[0], silent)
         if not report.status.ok:
             return state, report
-        waiting = _stored(work, state.waiting, interval)
+        waiting = state.waiting.add(interval, work.channels)
         noise = _guess(waiting.z)
         if noise is None:
             return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
         begun = replace(self._initial(work, state.start), noise=noise)
         notes: dict[str, float] = {}
-        for part in _intervals(waiting, work.filters[0].problem.channels):
-            if part.t0 == part.t1:
-                begun = self.begin(work, begun, part)
-                continue
+        each = waiting.intervals(work.channels)
+        if np.isfinite(waiting.z[0]).any():  # measured at the start
+            first = each[0]
+            begun = self.begin(
+                work, begun, replace(first, t1=first.t0, inputs1=first.inputs0, z1=first.z0)
+            )
+        for part in each:
             begun, taken = self._assimilated(work, begun, part)
             if not taken.status.ok:
                 return state, taken
@@ -380,7 +387,8 @@ class AutoLaw(Law[Bank, AutoState]):
             if k == WIDE and not alarm:
                 continue
             begun = work.filters[WIDE].loosened(now, JUMPS.size) if k == WIDE else now
-            members[k] = law._renewed(begun, best)
+            copied = law._renewed(begun, best)
+            members[k] = replace(copied, past=Past.start(begun, copied.samples))
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)
         return replace(
@@ -425,25 +433,31 @@ class AutoLaw(Law[Bank, AutoState]):
             return each[0]
         q = sum((w * b.q for w, b in zip(weights, each, strict=True)), np.zeros_like(each[0].q))
         u = sum((w * b.u for w, b in zip(weights, each, strict=True)), np.zeros_like(each[0].u))
+        first = (each[0].prior_factor, each[0].rest)
         q_factor, u_factor = [], []
         for w, b in zip(np.sqrt(weights), each, strict=True):
             # The differences of the means are no deviations that correlation inflates.
             if b.q_factor is not None and b.u_factor is not None:
                 q_factor.append(w * np.column_stack([b.inflation * b.q_factor, b.q - q]))
                 u_factor.append(w * np.column_stack([b.inflation * b.u_factor, b.u - u]))
-        return Belief(q, u, np.hstack(q_factor), np.hstack(u_factor), 1.0, each[0].prior_factor)
+        return Belief(q, u, np.hstack(q_factor), np.hstack(u_factor), 1.0, *first)
 
 
 def _scaled(state: SensitivityState, scale: float) -> SensitivityState:
     """Return a filter before the first sample with another prior deviation."""
     start = replace(state.start, U=scale * state.start.U, C=scale * state.start.C)
-    return replace(state, start=start, now=start)
+    return replace(state, start=start, now=start, past=Past.start(start, state.samples))
 
 
 def _asleep(state: SensitivityState) -> SensitivityState:
     """Return what is kept of a member that sleeps: nothing that takes room."""
     start = replace(state.start, U=state.start.U[:, :0], C=state.start.C[:, :0])
-    return replace(state, start=start, now=start)
+    return replace(state, start=start, now=start, past=Past.start(start, state.samples))
+
+
+def _walk(rate: float, std: float) -> RandomWalk:
+    """Return an evolution that gains `rate` prior variances per unit of time."""
+    return RandomWalk(float(np.sqrt(rate)) * std)
 
 
 def _same(work: Bank, state: AutoState, j: int, k: int) -> bool:
@@ -463,26 +477,6 @@ def _same(work: Bank, state: AutoState, j: int, k: int) -> bool:
     distance = sum(float(shift @ cho_solve(factor, shift)) for factor in factors)
     size = len(shift)
     return 0.25 * (traces - 2 * size + distance) < SAME * size
-
-
-def _stored(work: Bank, samples: Samples, interval: Interval) -> Samples:
-    """Return stored samples with one more, the first with the start before it."""
-    channels = work.filters[0].problem.channels
-    if not len(samples.t) and interval.t1 > interval.t0:
-        first = np.array([interval.inputs0[c] for c in channels])
-        samples = samples.append(interval.t0, np.full_like(interval.z1, np.nan), first)
-    values = np.array([interval.inputs1[c] for c in channels])
-    return samples.append(interval.t1, interval.z1, values)
-
-
-def _intervals(samples: Samples, channels: tuple[str, ...]) -> Iterator[Interval]:
-    """Yield what was stored, first the start if something was measured there."""
-    inputs = [Inputs(dict(zip(channels, row, strict=True))) for row in samples.inputs]
-    t, z = samples.t.tolist(), samples.z
-    if np.isfinite(z[0]).any():
-        yield Interval(t[0], t[0], inputs[0], inputs[0], z[0], z[0])
-    for k, j in pairwise(range(len(t))):
-        yield Interval(t[k], t[j], inputs[k], inputs[j], z[k], z[j])
 
 
 def _guess(z: Array) -> Array | None:
