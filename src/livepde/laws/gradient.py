@@ -13,12 +13,15 @@ from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.coupled import PULL, CoupledStage, Gains
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
+from livepde.laws.smoothing import Balance, Smoother
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval, Newton, advance
 
 __all__ = ["GradientLaw", "GradientState"]
+
+HOLD = 1e12  # times heavier is a prior that keeps q where it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +39,10 @@ class GradientState:
 
 @dataclass(frozen=True, eq=False)
 class LearningState(GradientState):
-    """The same of a law that tunes itself, with what the data have taught."""
+    """The same of a law that tunes itself, with what the data have taught on q and on noise."""
 
     learned: Learned
+    balance: Balance
 
 
 class GradientWork:
@@ -52,6 +56,7 @@ class GradientWork:
         self.newton = newton
         self.learning = learning
         self._stages: dict[Split, CoupledStage] = {}
+        self._smoothers: dict[Split, Smoother] = {}
 
     def stage(self, present: Array) -> CoupledStage:
         """Return the coupled stage for the sensors present."""
@@ -64,6 +69,25 @@ class GradientWork:
                 self.problem.model, split, self.gains, self.newton, memory
             )
         return self._stages[split]
+
+    @property
+    def smooths(self) -> bool:
+        """True if the law chooses how to smooth: the samples are a function, and nothing is given.
+
+        Averages are not differentiated, so that their noise needs no smoothing in space.
+        """
+        observed = self.problem.observed
+        given = observed.observation.reconstruction.regularises
+        return self.learning is not None and observed.observation.nodal and not given
+
+    def smoother(self, present: Array) -> Smoother:
+        """Return the smoother for the sensors present."""
+        split = self.problem.observed.split(present)
+        if split not in self._smoothers:
+            if len(self._smoothers) >= 8:
+                self._smoothers.clear()
+            self._smoothers[split] = Smoother(self.problem.observed, present)
+        return self._smoothers[split]
 
 
 @dataclass(frozen=True)
@@ -160,7 +184,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         rate = np.zeros(len(u0) + len(q0))
         if work.learning is not None:
-            return LearningState(u0, q0, rate, work.learning.init(q0))
+            balance = Balance.none(work.problem.observed.size, len(u0))
+            return LearningState(u0, q0, rate, work.learning.init(q0), balance)
         return GradientState(u0, q0, rate)
 
     def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
@@ -182,12 +207,19 @@ class GradientLaw(Law[GradientWork, GradientState]):
         coupled = work.stage(interval.present)
         zero = np.zeros(model.X.dim)
         regularises = observed.observation.reconstruction.regularises
+        smoother, balance, alpha, waits = None, None, 0.0, False
+        if work.smooths and isinstance(state, LearningState):
+            smoother = work.smoother(interval.present)
+            balance = smoother.add(state.balance, z1, model.impose(zero, interval.end))
+            alpha, waits = smoother.alpha(balance), smoother.waits(balance)
 
         def reconstruct(t: float) -> Reconstructed:
             boundary = model.impose(zero, interval.at(t))
             present = interval.present
             if regularises:
                 return observed.reconstruct(interval.z(t), boundary=boundary, present=present)
+            if smoother is not None and alpha > 0.0:
+                return Reconstructed(smoother(alpha, interval.z(t), boundary), alpha, 0.0, None)
             return Reconstructed(coupled.split.reconstruct(interval.z(t), boundary), 0.0, 0.0, None)
 
         found = Reconstructed(zero, 0.0, 0.0, None)
@@ -197,7 +229,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             observed_now = reconstruct(interval.t1).u
             w = observed_now + coupled.split.P @ state.u
             seen = learning.coupling(coupled.split, w, state.q, interval.end)
-            spread = learning.spread(state.learned, seen, length)
+            spread = learning.spread(state.learned, seen, length) * (HOLD if waits else 1.0)
             metric = learning.metric(state.learned, spread, state.q, length)
 
         def stage(c: Array, t: float, h: float) -> Array:
@@ -205,7 +237,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             found = reconstruct(t)
             # The observed part moves with the data, the rest as in the step before.
             start = c + h * state.rate
-            if regularises:
+            if regularises or alpha > 0.0:
                 start[: model.X.dim] += found.u - reconstruct(t - h).u
             else:
                 start[: model.X.dim] += (
@@ -228,14 +260,18 @@ class GradientLaw(Law[GradientWork, GradientState]):
         notes = {"residual": model.X.norm(observed_u - found.u)}
         if regularises:
             notes |= {"alpha": found.alpha, "misfit": found.misfit}
+        elif smoother is not None:
+            notes |= {"alpha": alpha}
         predicted = work.problem.predict(u, q, interval.end)
         if learning is None or not isinstance(state, LearningState):
             return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
         r = observed_u - found.u
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
-        learned = learning.learn(state.learned, spread, seen, r, length)
+        learned = state.learned
+        if not waits:
+            learned = learning.learn(learned, spread, seen, r, length)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
-        return LearningState(u, q, rate, learned), Report(Status(), predicted, steps, notes)
+        return LearningState(u, q, rate, learned, balance or state.balance), Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)
