@@ -13,7 +13,7 @@ from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.coupled import PULL, CoupledStage, Gains
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
-from livepde.laws.smoothing import Balance, Smoother
+from livepde.laws.smoothing import Balance, Smoother, smooths
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.observation import Reconstructed, Split
@@ -49,9 +49,15 @@ class GradientWork:
     """The problem with its operators M_op and N_op and a stage for each set of present sensors."""
 
     def __init__(
-        self, problem: Problem, gains: Gains, newton: Newton, learning: Learning | None = None
+        self,
+        problem: Problem,
+        gains: Gains,
+        newton: Newton,
+        learning: Learning | None = None,
+        smooths: bool = False,
     ) -> None:
         self.problem = problem
+        self.smooths = smooths
         self.gains = gains
         self.newton = newton
         self.learning = learning
@@ -69,16 +75,6 @@ class GradientWork:
                 self.problem.model, split, self.gains, self.newton, memory
             )
         return self._stages[split]
-
-    @property
-    def smooths(self) -> bool:
-        """True if the law chooses how to smooth: the samples are a function, and nothing is given.
-
-        Averages are not differentiated, so that their noise needs no smoothing in space.
-        """
-        observed = self.problem.observed
-        given = observed.observation.reconstruction.regularises
-        return self.learning is not None and observed.observation.nodal and not given
 
     def smoother(self, present: Array) -> Smoother:
         """Return the smoother for the sensors present."""
@@ -114,10 +110,12 @@ class GradientLaw(Law[GradientWork, GradientState]):
         alone. The inverse of the information that the data have given so far takes the place of
         gain G_Q^{-1}, weighed against the prior by a noise level that is estimated as well
         (`livepde.laws.memory` derives it); M_op is the mass and theta h = 10, so `damping`, `M_op`
-        and `sigma` are not to be given. For constant unknowns. What early data taught stays when
-        the excitation dies out. The notes of each report hold gain, the scale of the inner product
-        before any information, and information, the trace of J G_Q^{-1}/S: beyond 1 the data say
-        more than the prior.
+        and `sigma` are not to be given. Samples of a function (`Subdomain`, `Full`) without a
+        `reconstruction` are smoothed as much as their own noise asks for
+        (`livepde.laws.smoothing`); exact ones are not. For constant unknowns. What early data
+        taught stays when the excitation dies out. The notes of each report hold gain, the scale of
+        the inner product before any information, and information, the trace of J G_Q^{-1}/S:
+        beyond 1 the data say more than the prior.
     damping
         Rule for theta = mu / ||r||_V~.
     nu
@@ -179,7 +177,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         N_op = model.bilinear(self.N_op)
         gains = Gains(np.inf, self.damping, self.nu, 0.0, model.mass, N_op)
         learning = Learning(model, problem.observed.observation.nodal)
-        return GradientWork(problem, gains, self.newton, learning)
+        return GradientWork(problem, gains, self.newton, learning, smooths(problem.observed))
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         rate = np.zeros(len(u0) + len(q0))
@@ -210,7 +208,11 @@ class GradientLaw(Law[GradientWork, GradientState]):
         smoother, balance, alpha, waits = None, None, 0.0, False
         if work.smooths and isinstance(state, LearningState):
             smoother = work.smoother(interval.present)
-            balance = smoother.add(state.balance, z1, model.impose(zero, interval.end))
+            balance = state.balance
+            times = (interval.t1,) if balance.samples else (interval.t0, interval.t1)
+            for t in times:
+                z = z1 if t == interval.t1 else z0
+                balance = smoother.add(balance, z, model.impose(zero, interval.at(t)))
             alpha, waits = smoother.alpha(balance), smoother.waits(balance)
 
         def reconstruct(t: float) -> Reconstructed:
@@ -271,7 +273,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         if not waits:
             learned = learning.learn(learned, spread, seen, r, length)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
-        return LearningState(u, q, rate, learned, balance or state.balance), Report(Status(), predicted, steps, notes)
+        return LearningState(u, q, rate, learned, balance or state.balance), Report(
+            Status(), predicted, steps, notes
+        )
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)
