@@ -490,9 +490,9 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             steps += taken
             if failure is not None:
                 return failed(Status.of(failure))
-        if not all(np.isfinite(x).all() for x in (moved.u, moved.U, moved.du)):
-            return failed(Status("not_finite", "the prediction is not finite"))
-        moved = replace(moved, U=np.exp(-(interval.t1 - interval.t0) / self.memory) * moved.U)
+        if np.isfinite(self.memory):
+            fade = np.exp(-(interval.t1 - interval.t0) / self.memory)
+            moved = replace(moved, U=fade * moved.U)
         predicted = work.predict(moved, interval.end)
         new, refused = work.updated(moved, interval, predicted)
         if not np.isfinite(new.da).all():
