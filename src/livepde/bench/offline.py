@@ -114,7 +114,8 @@ class Trajectory:
         q: Array = self.model.latent.prior + self.directions(at) @ a
         return q
 
-    def _inputs(self, at: int) -> Inputs:
+    def inputs(self, at: int) -> Inputs:
+        """Return the input channels of the sample with this number."""
         values: Mapping[str, float] = (self.data.process.inputs or [{}] * (at + 1))[at]
         return Inputs(dict(values))
 
@@ -134,14 +135,14 @@ class Trajectory:
         hidden = np.full((len(times), self.withheld.size if self.withheld else 0), np.nan)
         jacobian = np.zeros((*self.data.z.shape, width))
         y = np.zeros((model.X.dim, 1 + width))
-        at = Interval(times[0], times[0], self._inputs(0), self._inputs(0), none, none)
+        at = Interval(times[0], times[0], self.inputs(0), self.inputs(0), none, none)
         y[:, 0] = model.initial(process.u0, at.end)
         for k, (t0, t1) in enumerate(pairwise(times), start=1):
             q = self.latent(a, k)
             # Later increments of a walk do not act yet.
             live = min(width, self.Phi.shape[1] + k * len(self.moving))
             D = self.directions(k)[:, :live]
-            interval = Interval(t0, t1, self._inputs(k - 1), self._inputs(k), none, none)
+            interval = Interval(t0, t1, self.inputs(k - 1), self.inputs(k), none, none)
 
             def stage(
                 c: Array, t: float, h: float, q: Array = q, D: Array = D, of: Interval = interval

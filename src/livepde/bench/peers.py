@@ -101,7 +101,7 @@ class Augmented:
     @cached_property
     def moments(self) -> list[Moment]:
         """Time and inputs of each sample."""
-        return [Moment(t, self.trajectory._inputs(k)) for k, t in enumerate(self.times)]
+        return [Moment(t, self.trajectory.inputs(k)) for k, t in enumerate(self.times)]
 
     @cached_property
     def start(self) -> Array:
