@@ -51,42 +51,30 @@ SAMPLES = 1000  # for which that time is promised
 # --- our laws ------------------------------------------------------------------------------------
 
 
-def _sensitivity(data: Data) -> tuple[Observation, AnyLaw]:
-    return data.observation, SensitivityLaw(modes=data.modes)
+def _sensitivity(replay: Replay | None, data: Data) -> tuple[Observation, AnyLaw]:
+    return data.observation, SensitivityLaw(modes=data.modes, replay=replay)
 
 
-def _replay(data: Data) -> tuple[Observation, AnyLaw]:
-    return data.observation, SensitivityLaw(modes=data.modes, replay=Replay())
-
-
-def _gradient(data: Data) -> tuple[Observation, AnyLaw] | None:
-    gain = data.problem.gain
-    return None if gain is None else (data.observation, GradientLaw(gain, ResidualDamping(1.0)))
-
-
-def _smoothed(data: Data) -> tuple[Observation, AnyLaw] | None:
-    built = _gradient(data)
-    if built is None:
+def _gradient(auto: bool, smooth: bool, data: Data) -> tuple[Observation, AnyLaw] | None:
+    gain, observation = data.problem.gain, data.observation
+    if gain is None:
         return None
-    weights = data.process.weights
-    gram = np.eye(len(data.noise)) if weights is None else weights
-    delta = float(np.sqrt(data.noise @ (np.diag(gram) * data.noise)))
-    smoothing = Tikhonov(alpha=Discrepancy(delta=delta))
-    return replace(data.observation, reconstruction=smoothing), built[1]
-
-
-def _auto_gain(data: Data) -> tuple[Observation, AnyLaw] | None:
-    if data.problem.gain is None:
-        return None
-    return data.observation, GradientLaw(gain="auto")
+    law = GradientLaw(gain="auto") if auto else GradientLaw(gain, ResidualDamping(1.0))
+    if smooth:
+        weights = data.process.weights
+        gram = np.eye(len(data.noise)) if weights is None else weights
+        delta = float(np.sqrt(data.noise @ (np.diag(gram) * data.noise)))
+        observation = replace(observation, reconstruction=Tikhonov(alpha=Discrepancy(delta=delta)))
+    return observation, law
 
 
 LAWS: dict[str, LawBuilder] = {
-    "sensitivity": _sensitivity,
-    "sensitivity, replay": _replay,
-    "gradient": _gradient,
-    "gradient, smoothed": _smoothed,
-    "gradient, auto": _auto_gain,
+    "sensitivity": partial(_sensitivity, None),
+    "sensitivity, replay": partial(_sensitivity, Replay()),
+    "gradient": partial(_gradient, False, False),
+    "gradient, smoothed": partial(_gradient, False, True),
+    "gradient, auto": partial(_gradient, True, False),
+    "gradient, auto, smoothed": partial(_gradient, True, True),
 }
 """Row -> observation and law for a data set; None where it is not meant for the sensors.
 
