@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.linalg import block_diag, lapack
@@ -151,7 +151,7 @@ class Filter:
 
     def transition(self, h: float) -> Array:
         """Return the transition of all reduced coordinates in a time h, shape (k, k)."""
-        return np.asarray(block_diag(*(motion.transition(h) for motion in self.motions)))
+        return _transition(self.motions, h)
 
     def moved(self, point: Point, h: float) -> Point:
         """Return a point whose unknowns have moved for a time h; those of its state have not.
@@ -411,6 +411,11 @@ def _enough(phi: Array, variance: Array, mass: Array) -> int:
     held = np.cumsum(mass @ phi**2)
     short = int((held < (1.0 - LEFT_OUT) * (mass @ variance)).sum())
     return min(short + 1, len(held))
+
+
+@lru_cache(maxsize=64)
+def _transition(motions: tuple[Motion, ...], h: float) -> Array:
+    return np.asarray(block_diag(*(motion.transition(h) for motion in motions)))
 
 
 def _contraction(Y: Array) -> tuple[Array, float]:
