@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -87,7 +88,7 @@ class Consistency:
         """Mean of e^2; 1 if the noise level is right."""
         return self.square / self.count if self.count else 1.0
 
-    @property
+    @cached_property
     def correlation(self) -> float:
         """Correlation of successive innovations; 0 if the model explains the data."""
         if not self.pairs or not self.square:

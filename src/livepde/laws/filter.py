@@ -182,11 +182,17 @@ class Filter:
         left = variance - (self.Phi**2).sum(axis=1)
         return np.where(left > ROUNDING * variance, left, 0.0)
 
+    @cached_property
+    def _still(self) -> Array:
+        return np.asarray(np.sqrt(self._left_out))
+
     def rest(self, age: float) -> Array:
         """Return the deviation of each latent coefficient in the modes that are left out, (m,).
 
         They are as the prior has them, and have moved for a time `age`.
         """
+        if age == 0.0 or not self._left_out.any():
+            return self._still
         parts = self.problem.model.latent.parts.values()
         grown = [
             np.repeat(
