@@ -130,7 +130,7 @@ def test_seed_excited_reaches_its_bounds(excited: Outcome) -> None:
 
 
 @pytest.mark.parametrize("level", [1e-2, 1e-5])
-def test_the_noise_level_told_to_the_filter_hardly_matters(level: float) -> None:
+def test_no_noise_level_told_to_the_filter_does_harm(level: float) -> None:
     model, full = seed_excited.build()
     stream = Twin(
         model=model,
@@ -142,7 +142,7 @@ def test_the_noise_level_told_to_the_filter_hardly_matters(level: float) -> None
     law = lp.SensitivityLaw(modes=12, noise=level)
     identifier = lp.Identifier(model, full, law, u0=lambda x: seed_excited.u_true(x, 0.0))
     found = track(identifier, stream, "")
-    assert found.error(60.0) == pytest.approx(2.9e-4, rel=0.25)
+    assert found.error(60.0) < 3.6e-4
 
 
 def test_seed_excited_with_exact_data_checks_nothing() -> None:
