@@ -17,6 +17,7 @@ from livepde.cases.settings import parse, to_toml
 from livepde.cases.template import write_template
 from livepde.cases.units import convert
 from livepde.runs import checks_of, measures, tables
+from livepde.streams import Twin
 
 SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 
@@ -174,6 +175,39 @@ def test_gradient_law_on_averages(rod):
     assert not prepared.case.notes
     assert preview(prepared, prepared.stream) == Preview()
     assert (data.status == 0).all()
+
+
+def test_gradient_law_tunes_itself_on_means_over_subdomains(tmp_path):
+    """A rod of 1 m, warmed and cooled at its left end, seen as means over its tenths."""
+    mesh, times = lp.interval(0, 1, 40), 0.05 * np.arange(201)
+    rod = lp.models.heat(mesh, lp.Scalar(0.1), {"left": lambda x, t: np.sin(2 * t) + 0 * x[0]})
+    parts = {f"T{k}": (k / 10, (k + 1) / 10) for k in range(10)}
+    means = lp.Averages(
+        {k: (lambda x, a=a, b=b: (x[0] > a) & (x[0] < b)) for k, (a, b) in parts.items()}
+    )
+    twin = Twin(model=rod, observation=means, q_true=[0.1], u0=0.0, times=times)
+    rows = [[t, np.sin(2 * t), *z] for t, z in zip(times, twin.exact_data, strict=True)]
+    lines = [",".join(["t", "left", *parts]), *(",".join(map(str, row)) for row in rows)]
+    (tmp_path / "data.csv").write_text("\n".join(lines))
+    channels = "\n".join(
+        f'{k} = {{ role = "sensor", column = "{k}", over = [{a}, {b}] }}'
+        for k, (a, b) in parts.items()
+    )
+    (tmp_path / "case.toml").write_text(f"""
+equation = "heat"
+initial = 0.0
+mesh = {{ from = 0, to = 1, cells = 40 }}
+data = {{ file = "data.csv", time = "t", time_unit = "s" }}
+unknowns.alpha = {{ prior = 0.05, std = 0.05 }}
+law = {{ kind = "gradient", gain = "auto" }}
+[channels]
+left = {{ role = "boundary", column = "left", at = "left" }}
+{channels}
+""")
+    prepared, data = result_of(tmp_path / "case.toml")
+    assert prepared.case.law == lp.GradientLaw(gain="auto")
+    assert (data.status == 0).all()
+    assert float(data.alpha[-1]) == pytest.approx(0.1, rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -53,11 +53,20 @@ def rod(
     )
 
 
-def run(model: lp.Model, twin: Twin, noise: float = 0.0) -> tuple[float, np.ndarray, dict]:
-    """Return the error at the end, the estimate, and the last notes; noise is smoothed in space."""
+def run(
+    model: lp.Model, twin: Twin, noise: float = 0.0, own: bool = True, told: float = 0.0
+) -> tuple[float, np.ndarray, dict]:
+    """Return the error at the end, the estimate, and the last notes.
+
+    Noise is smoothed by the law's own choice, `told` times the noise level if that is not zero, or
+    by the discrepancy principle.
+    """
     rng = np.random.default_rng(3)
     smooth = lp.Full(reconstruction=lp.Tikhonov("V", lp.Discrepancy(level=noise or 1.0)))
-    observation = smooth if noise else twin.observation
+    observation = smooth if noise and not own else twin.observation
+    if told:
+        size = np.sqrt(np.mean([(z**2).mean() for z in twin.exact_data]))
+        observation = lp.Full(noise=told * noise * size)
     identifier = lp.Identifier(model, observation, AUTO, q0=0.0, u0=0.0)
     for sample in twin:
         size = noise * np.sqrt((sample.z**2).mean())
@@ -97,13 +106,15 @@ def test_excited_twin_with_exact_data() -> None:
     assert twin.error(estimate.q) <= 0.005
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize(
+    "options", [{}, {"noise": 0.02}, {"noise": 0.02, "told": 1.0}, {"noise": 0.02, "own": False}]
+)
 @pytest.mark.parametrize(
     "units", [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
 )
-def test_units_scale_out(units: dict[str, float], noise: float) -> None:
-    _, plain, _ = run(*rod(), noise=noise)
-    _, scaled, notes = run(*rod(**units), noise=noise)
+def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> None:
+    _, plain, _ = run(*rod(), **options)
+    _, scaled, notes = run(*rod(**units), **options)
     size = units.get("q", 1.0)
     assert np.abs(scaled / size - plain).max() <= 1e-6 * np.abs(plain).max()
     assert notes["information"] > 1.0
@@ -116,15 +127,47 @@ def test_sampling_rate_and_mesh_do_not_matter_without_noise() -> None:
 
 def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:
     # Noise of one spectral density: a deviation that grows with the root of the rate.
-    notes = [run(*rod(dt=dt), noise=0.02 * np.sqrt(0.1 / dt))[2] for dt in (0.1, 0.05, 0.025)]
+    notes = [
+        run(*rod(dt=dt), noise=0.02 * np.sqrt(0.1 / dt), own=False)[2] for dt in (0.1, 0.05, 0.025)
+    ]
     information = [one["information"] for one in notes]
     assert max(information) <= 2 * min(information)
 
 
 def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
     # Noise of each node by itself: twice the nodes are twice the data.
-    information = [run(*rod(cells=n), noise=0.02)[2]["information"] / n for n in (20, 40, 80)]
+    information = [
+        run(*rod(cells=n), noise=0.02, own=False)[2]["information"] / n for n in (20, 40, 80)
+    ]
     assert max(information) <= 1.5 * min(information)
+
+
+def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
+    # Noise of each sensor by itself, of one spectral density.
+    rates, meshes = (0.1, 0.05, 0.025), (20, 40, 80)
+    found = [run(*rod(dt=dt), noise=0.01 * np.sqrt(0.1 / dt), told=1.0) for dt in rates]
+    found += [run(*rod(cells=n), noise=0.01 * np.sqrt(n / 20), told=1.0) for n in meshes]
+    assert max(error for error, _, _ in found) <= 0.15
+    alphas = [notes["alpha"] for _, _, notes in found[len(rates) :]]
+    assert max(alphas) <= 1.2 * min(alphas)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03, 0.1])
+def test_smoothing_that_balances_its_biases_beats_the_discrepancy_principle(noise: float) -> None:
+    untold = run(*rod(), noise=noise)[0]
+    assert untold <= 0.5 * run(*rod(), noise=noise, own=False)[0]
+    # What is stated is an upper bound; the samples show how large the noise is.
+    for told in (1.0, 2.0):
+        assert run(*rod(), noise=noise, told=told)[0] <= 1.2 * untold
+
+
+def test_exact_data_are_not_smoothed() -> None:
+    for told in (0.0, 1e-3):
+        model, twin = rod()
+        sensors = lp.Full(noise=told) if told else lp.Full()
+        identifier = lp.Identifier(model, sensors, AUTO, q0=0.0, u0=0.0)
+        alphas = [identifier.step(s.t, s.z).notes.get("alpha", 0.0) for s in twin]
+        assert max(alphas) == 0.0
 
 
 def test_more_noise_less_weight_on_the_data() -> None:
@@ -222,5 +265,13 @@ def test_what_cannot_be_is_one_sentence() -> None:
         lp.Scalar(prior=1.0, evolution=lp.RandomWalk(0.1)),
         lambda q, u, v, x: q * u * v,
     )
+    both = lp.Model(
+        {"a": lp.Field(mesh, ElementLineP1()), "b": lp.Field(mesh, ElementLineP1())},
+        lp.Scalar(prior=1.0),
+        lambda q, u, v, x: q * (u.a * v.a + u.b * v.b),
+    )
+    lp.Identifier(both, lp.Full(of="a"), AUTO, u0=0.0)
+    with pytest.raises(LawError, match="one component"):
+        lp.Identifier(both, lp.Full(of="a", noise=0.1), AUTO, u0=0.0)
     with pytest.raises(LawError, match="moves"):
         lp.Identifier(model, lp.Full(), AUTO, u0=0.0)

@@ -64,6 +64,7 @@ from livepde.fem import (
 )
 from livepde.identifier import Identifier, Sample
 from livepde.laws import (
+    AutoLaw,
     BaumeisterLaw,
     Belief,
     ConstantDamping,
@@ -113,6 +114,7 @@ __all__ = [
     "Advance",
     "Alexander2",
     "Apriori",
+    "AutoLaw",
     "Averages",
     "BaumeisterLaw",
     "Belief",

@@ -20,7 +20,10 @@ __all__ = ["flatten", "packed", "read", "rebuild", "unpacked", "write"]
 
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
-    """Return the leaves of nested dataclasses of arrays and numbers, by dotted path."""
+    """Return the leaves of nested dataclasses and tuples of arrays and numbers, by dotted path."""
+    if isinstance(value, tuple):
+        parts = [flatten(item, f"{prefix}.{k}") for k, item in enumerate(value)]
+        return {path: leaf for part in parts for path, leaf in part.items()}
     if not is_dataclass(value) or isinstance(value, type):
         return {prefix: value}
     leaves: dict[str, Any] = {}
@@ -37,6 +40,10 @@ def rebuild(
     One axis of an array may have another length: the first one (stored samples), or what the
     metadata of its dataclass field say, as in field(metadata={"grows": 1}).
     """
+    if isinstance(template, tuple):
+        return tuple(
+            rebuild(item, leaves, f"{prefix}.{k}", grows) for k, item in enumerate(template)
+        )
     if is_dataclass(template) and not isinstance(template, type):
         parts = {
             item.name: rebuild(

@@ -37,6 +37,8 @@ class Fit:
 
     Attributes
     ----------
+    coordinates
+        The reduced coordinates, shape (size,).
     q, factor
         Latent coefficients at each time, shape (times, dim), and a function of the time's number
         that returns a square root of their covariance, shape (dim, coordinates).
@@ -48,6 +50,7 @@ class Fit:
         False if the iteration was cut off.
     """
 
+    coordinates: Array
     q: Array
     trajectory: Trajectory
     root: Array
@@ -70,14 +73,13 @@ class Trajectory:
     random walk by its normalised increments.
     """
 
-    def __init__(self, data: Data, modes: int) -> None:
+    def __init__(self, data: Data) -> None:
         self.data = data
         process = data.process
         self.model = process.model
         problem = Problem(self.model, data.observed, Advance(process.scheme, process.dt_max))
         self.control = problem.control
-        fields = dict.fromkeys(self.model.parameter_space.fields, modes)
-        work = SensitivityLaw(modes=fields).prepare(problem)
+        work = SensitivityLaw(modes=data.modes).prepare(problem)
         self.Phi = work.Phi
         self.rest = work.rest(0.0)
         widths = np.diff(process.times)
@@ -112,7 +114,8 @@ class Trajectory:
         q: Array = self.model.latent.prior + self.directions(at) @ a
         return q
 
-    def _inputs(self, at: int) -> Inputs:
+    def inputs(self, at: int) -> Inputs:
+        """Return the input channels of the sample with this number."""
         values: Mapping[str, float] = (self.data.process.inputs or [{}] * (at + 1))[at]
         return Inputs(dict(values))
 
@@ -132,14 +135,14 @@ class Trajectory:
         hidden = np.full((len(times), self.withheld.size if self.withheld else 0), np.nan)
         jacobian = np.zeros((*self.data.z.shape, width))
         y = np.zeros((model.X.dim, 1 + width))
-        at = Interval(times[0], times[0], self._inputs(0), self._inputs(0), none, none)
+        at = Interval(times[0], times[0], self.inputs(0), self.inputs(0), none, none)
         y[:, 0] = model.initial(process.u0, at.end)
         for k, (t0, t1) in enumerate(pairwise(times), start=1):
             q = self.latent(a, k)
             # Later increments of a walk do not act yet.
             live = min(width, self.Phi.shape[1] + k * len(self.moving))
             D = self.directions(k)[:, :live]
-            interval = Interval(t0, t1, self._inputs(k - 1), self._inputs(k), none, none)
+            interval = Interval(t0, t1, self.inputs(k - 1), self.inputs(k), none, none)
 
             def stage(
                 c: Array, t: float, h: float, q: Array = q, D: Array = D, of: Interval = interval
@@ -192,23 +195,33 @@ class Trajectory:
         return self._evaluated(a)[1]
 
 
-def fit(data: Data, modes: int) -> Fit:
-    """Return the most probable parameter given all data."""
-    start = process_time()
-    trajectory = Trajectory(data, modes)
+def fit(data: Data, start: Array | None = None) -> Fit:
+    """Return the most probable parameter given all data.
+
+    Parameters
+    ----------
+    start
+        Where the iteration starts, leading coordinates; default the prior.
+    """
+    begun = process_time()
+    trajectory = Trajectory(data)
+    first = np.zeros(trajectory.size)
+    if start is not None:
+        first[: len(start)] = start
     found = least_squares(
         trajectory.residual,
-        np.zeros(trajectory.size),
+        first,
         jac=trajectory.jacobian,
         xtol=1e-6,
         ftol=1e-8,
         max_nfev=EVALUATIONS,
     )
     root = np.linalg.inv(np.linalg.qr(trajectory.jacobian(found.x), mode="r"))
-    seconds = process_time() - start
+    seconds = process_time() - begun
     predicted, hidden, _ = trajectory.run(found.x, sensitivities=False)
     q = np.array([trajectory.latent(found.x, k) for k in range(len(data))])
     return Fit(
+        found.x,
         q,
         trajectory,
         root,

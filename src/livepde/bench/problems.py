@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from itertools import pairwise
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from livepde.cases import load
 from livepde.errors import CaseError
 from livepde.fem import (
     Field,
+    Inputs,
     On,
     RandomWalk,
     Scalar,
@@ -39,11 +41,21 @@ from livepde.model import Model
 from livepde.models import burgers
 from livepde.observation import Observation, Observed, Points
 from livepde.reproduce import seed, seed_excited
-from livepde.stepping import Advance, Alexander2, ImplicitEuler, Scheme, simulate
+from livepde.stepping import (
+    Advance,
+    Alexander2,
+    ForwardStage,
+    ImplicitEuler,
+    Interval,
+    Scheme,
+    advance,
+    simulate,
+)
 from livepde.streams import Twin
 
-__all__ = ["PROBLEMS", "Data", "Problem", "Process"]
+__all__ = ["PROBLEMS", "WARM_UP", "Data", "Problem", "Process"]
 
+WARM_UP = 2  # samples whose time does not count: matrices are built that are built once
 LEVELS = (0.0, 0.01, 0.05, 0.1)
 
 
@@ -92,11 +104,11 @@ class Process:
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """One noisy data set of a process.
+    """One noisy data set of a problem.
 
     Attributes
     ----------
-    process
+    problem, process
         Where it comes from.
     observation
         The sensors, with the noise level that estimators are told.
@@ -106,6 +118,7 @@ class Data:
         Measurements, shape (times, sensors).
     """
 
+    problem: Problem
     process: Process
     observation: Observation
     noise: Array
@@ -131,6 +144,55 @@ class Data:
         """The sensors bound to the model."""
         model = self.process.model
         return self.observation.bind(model.state_space, model.X, model.parameter_space)
+
+    @cached_property
+    def forward(self) -> float:
+        """Processor time of a forward step with the parameter at its prior: the unit of cost."""
+        return float(np.median([self._forward() for _ in range(3)]))
+
+    def _forward(self) -> float:
+        process, model = self.process, self.process.model
+        stage_of, control = ForwardStage(model), Advance(process.scheme, process.dt_max)
+        q, none = model.latent.prior, np.zeros(0)
+        rows = [Inputs(dict(row)) for row in process.inputs or [{}] * len(self)]
+        times = process.times.tolist()
+        at = Interval(times[0], times[0], rows[0], rows[0], none, none)
+        u = model.initial(process.u0, at.end)
+        start = process_time()
+        for k in range(1, len(times)):
+            interval = Interval(times[k - 1], times[k], rows[k - 1], rows[k], none, none)
+
+            def stage(c: Array, t: float, h: float, of: Interval = interval) -> Array:
+                return stage_of.solve(c, q, h, of.at(t))
+
+            u, _, failure = advance(control, stage, u, interval)
+            if failure is not None:
+                raise failure
+            if k == WARM_UP:
+                start = process_time()
+        return (process_time() - start) / (len(times) - 1 - WARM_UP)
+
+    @property
+    def modes(self) -> dict[str, int]:
+        """Modes of each field, as `SensitivityLaw` takes them."""
+        return dict.fromkeys(self.process.model.parameter_space.fields, self.problem.modes)
+
+    def until(self, at: int) -> Data:
+        """Return the data up to the sample with this number."""
+        process, stop = self.process, at + 1
+
+        def cut(values: Any) -> Any:
+            return None if values is None else values[:stop]
+
+        shorter = replace(
+            process,
+            times=process.times[:stop],
+            exact=process.exact[:stop],
+            q_true=cut(process.q_true),
+            inputs=cut(process.inputs),
+            hidden=cut(process.hidden),
+        )
+        return replace(self, process=shorter, z=self.z[:stop])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,12 +236,16 @@ class Problem:
             )
             noise = observed.noise
             told = np.ones(observed.size) if noise is None else noise
-            return Data(process, process.observation, told, process.exact)
+            return Data(self, process, process.observation, told, process.exact)
         rng = np.random.default_rng([seed, 1])
         noise = process.size * rng.standard_normal(process.exact.shape)
         told = max(level, self.floor) * process.size
         observation = replace(process.observation, noise=told.tolist())
-        return Data(process, observation, told, process.exact + level * noise)
+        return Data(self, process, observation, told, process.exact + level * noise)
+
+    def chosen(self, levels: Sequence[float] | None) -> Sequence[float | None]:
+        """Return the noise levels to run: those given, if the data are not measured."""
+        return self.levels if levels is None or None in self.levels else levels
 
     def error(self, process: Process, q: Array, at: int = -1) -> float:
         """Return the relative error of q at a time: the root mean square over the unknowns."""

@@ -20,7 +20,7 @@ from livepde.cases.frame import Frame
 from livepde.cases.instruments import expanded
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
-from livepde.cases.schema import GradientSpec, SensitivitySpec, VariantSpec
+from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec, VariantSpec
 from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
 from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError, LawError
@@ -28,6 +28,7 @@ from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
 from livepde.laws import (
     AnyLaw,
+    AutoLaw,
     ConstantDamping,
     Damping,
     GradientLaw,
@@ -274,16 +275,16 @@ class Case:
         """The update law."""
         spec = self.frame.spec.law
         try:
-            return _gradient(spec) if isinstance(spec, GradientSpec) else self._sensitivity(spec)
+            if isinstance(spec, GradientSpec):
+                return _gradient(spec)
+            return self._auto(spec) if isinstance(spec, AutoSpec) else self._sensitivity(spec)
         except LawError as error:
             raise self.frame.error("law", str(error)) from None
 
     def _sensitivity(self, spec: SensitivitySpec) -> SensitivityLaw:
         frame, time = self.frame, self.frame.equation.time_unit
-        noise, memory = None, float(np.inf)
-        if spec.noise is not None:
-            noise = frame.positive(spec.noise, frame.equation.state.unit, "law.noise")
-        elif noise_of(frame, "sensor") is None:
+        noise, memory = self._noise(spec), float(np.inf)
+        if noise is None and noise_of(frame, "sensor") is None:
             raise frame.missing(
                 "law.noise",
                 "the sensitivity law weighs the sensors by their noise (a standard deviation); "
@@ -295,11 +296,19 @@ class Case:
         replay = Replay() if spec.replay is True else None
         if not isinstance(spec.replay, bool):
             replay = Replay(**spec.replay.model_dump())
-        gate = float(np.inf) if spec.gate is None else spec.gate
         jumps = Jumps() if spec.jumps is True else None
         if not isinstance(spec.jumps, bool):
             jumps = Jumps(**spec.jumps.model_dump())
+        gate = spec.gate or np.inf
         return SensitivityLaw(spec.modes, noise, drift, memory, replay, gate=gate, jumps=jumps)
+
+    def _auto(self, spec: AutoSpec) -> AutoLaw:
+        return AutoLaw(spec.modes, self._noise(spec), gate=spec.gate or np.inf)
+
+    def _noise(self, spec: AutoSpec | SensitivitySpec) -> float | None:
+        if spec.noise is None:
+            return None
+        return self.frame.positive(spec.noise, self.frame.equation.state.unit, "law.noise")
 
     @cached_property
     def scheme(self) -> Scheme:

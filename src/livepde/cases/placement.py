@@ -13,7 +13,7 @@ from livepde.cases.preview import MOST_SAMPLES, NEVER
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
-from livepde.laws import Belief, Replay, SensitivityLaw
+from livepde.laws import AutoLaw, Belief, Replay, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Combined, Observation, Points
@@ -71,6 +71,8 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
         see.
     """
     case, law = prepared.case, prepared.case.law
+    if isinstance(law, AutoLaw):
+        law = law.member
     if not isinstance(law, SensitivityLaw):
         raise ConfigurationError(
             "advice on sensors needs a law with a covariance: kind = 'sensitivity'."

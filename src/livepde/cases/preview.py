@@ -10,7 +10,7 @@ import numpy as np
 from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
 from livepde.identifier import Sample
-from livepde.laws import Belief, Replay, SensitivityLaw
+from livepde.laws import AutoLaw, Belief, Replay, SensitivityLaw
 
 __all__ = ["Identified", "Preview", "preview"]
 
@@ -74,8 +74,12 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     and a model without error. Nothing for a law without covariance.
     """
     law = prepared.case.law
+    if isinstance(law, AutoLaw):
+        law = law.member
     if not isinstance(law, SensitivityLaw):
         return Preview()
+    if law.noise is None and prepared.identifier.observed.noise is None:
+        return Preview()  # to be found from the samples
     linear = SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
     identifier = prepared.identifier_with(linear)
     count = 0

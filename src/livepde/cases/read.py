@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from livepde.cases.schema import (
+    AutoSpec,
     CaseSpec,
     ChannelSpec,
     CorrelatedSpec,
@@ -117,7 +118,7 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
         return f"the key '{key}.kind' is missing; expected 'sensitivity' or 'gradient'."
     if kind == "union_tag_invalid":
         tag = str(context["tag"])
-        return f"{key}.kind: got '{tag}'; {did_you_mean(tag, ['sensitivity', 'gradient'])}"
+        return f"{key}.kind: got '{tag}'; {did_you_mean(tag, ['auto', 'sensitivity', 'gradient'])}"
     if kind == "literal_error":
         choices = str(context["expected"]).replace(" or ", ", ").replace("'", "").split(", ")
         return f"{key}: got {got!r}; {did_you_mean(str(got), choices)}"
@@ -155,7 +156,8 @@ def _keys(path: list[str], raw: Mapping[str, Any]) -> list[str]:
     model: type[BaseModel] | None = CaseSpec
     if path == ["law"]:
         kind = raw["law"].get("kind") if isinstance(raw.get("law"), dict) else ""
-        model = GradientSpec if kind == "gradient" else SensitivitySpec
+        laws: dict[str, type[BaseModel]] = {"auto": AutoSpec, "gradient": GradientSpec}
+        model = laws.get(str(kind), SensitivitySpec)
     elif path:
         first = path[0].partition("[")[0]  # variants[0] is one of the variants
         names = (".".join(path), f"*.{path[-1]}", f"{first}.*")

@@ -21,6 +21,7 @@ from pydantic import (
 from livepde.runs.outcome import Bound, Sense
 
 __all__ = [
+    "AutoSpec",
     "CaseSpec",
     "ChannelSpec",
     "CorrelatedSpec",
@@ -279,6 +280,15 @@ class SensitivitySpec(Spec):
     jumps: bool | JumpsSpec = False
 
 
+class AutoSpec(Spec):
+    """The law for sparse, noisy sensors that tunes itself."""
+
+    kind: Literal["auto"]
+    noise: Quantity | None = None
+    modes: PositiveInt | Literal["auto"] = "auto"
+    gate: PositiveFloat | None = None
+
+
 class TikhonovSpec(Spec):
     """Regularised reconstruction of the observed part from noisy samples."""
 
@@ -335,7 +345,7 @@ class VariantSpec(Spec):
     expect: Expected = Field(default_factory=dict)
 
 
-Law: TypeAlias = Annotated[SensitivitySpec | GradientSpec, Field(discriminator="kind")]
+Law: TypeAlias = Annotated[AutoSpec | SensitivitySpec | GradientSpec, Field(discriminator="kind")]
 
 
 class CaseSpec(Spec):

@@ -17,6 +17,13 @@ ProblemsOption = Annotated[
     list[str] | None, typer.Option("--only", help="Only this problem. Repeat it for more.")
 ]
 
+LevelsOption = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--level", min=0.0, max=1.0, help="Noise over the data's root mean square. Repeat for more."
+    ),
+]
+
 bench = typer.Typer(
     name="bench",
     help="""Measure what things cost, as ratios that hold on any machine, and what they find.
@@ -102,6 +109,7 @@ def alarms(
 @bench.command()
 def accuracy(
     only: ProblemsOption = None,
+    level: LevelsOption = None,
     seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 3,
     as_json: JsonOption = False,
 ) -> None:
@@ -111,14 +119,15 @@ def accuracy(
     """
     from livepde.bench.accuracy import accuracy as benchmark
 
-    outcome = benchmark(_problems(only), seeds, progress=True)
-    report_outcome(outcome, _command("accuracy", only, seeds), as_json)
+    outcome = benchmark(_problems(only), seeds, levels=level, progress=True)
+    report_outcome(outcome, _command("accuracy", only, level, seeds), as_json)
 
 
 @bench.command()
 def peers(
     only: ProblemsOption = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Data sets of each problem.")] = 1,
+    level: LevelsOption = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Hold our sensitivity law against other packages, where they are installed.
@@ -127,8 +136,8 @@ def peers(
     """
     from livepde.bench.peers import peers as benchmark
 
-    outcome = benchmark(_problems(only), seeds, progress=True)
-    report_outcome(outcome, _command("peers", only, seeds), as_json)
+    outcome = benchmark(_problems(only), seeds, levels=level or [0.01], progress=True)
+    report_outcome(outcome, _command("peers", only, level, seeds), as_json)
 
 
 def _problems(only: Sequence[str] | None) -> list[str]:
@@ -139,6 +148,9 @@ def _problems(only: Sequence[str] | None) -> list[str]:
     return list(only or ())
 
 
-def _command(name: str, only: Sequence[str] | None, seeds: int) -> list[str]:
+def _command(
+    name: str, only: Sequence[str] | None, levels: Sequence[float] | None, seeds: int
+) -> list[str]:
     chosen = [word for problem in only or () for word in ("--only", problem)]
+    chosen += [word for level in levels or () for word in ("--level", f"{level:g}")]
     return ["livepde", "bench", name, *chosen, "--seeds", str(seeds)]

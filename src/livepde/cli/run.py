@@ -121,9 +121,9 @@ def run(
 def _traded(prepared: Prepared) -> list[str]:
     """Return what a run's data tell only together."""
     from livepde.diagnostics import identifiability
-    from livepde.laws import SensitivityLaw
+    from livepde.laws import AutoLaw, SensitivityLaw
 
-    if not isinstance(prepared.case.law, SensitivityLaw):
+    if not isinstance(prepared.case.law, AutoLaw | SensitivityLaw):
         return []
     belief = prepared.identifier.latent_belief()
     return identifiability(prepared.case.model, belief).sentences

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from livepde.laws.bank import AutoLaw
 from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.laws.bounds import (
     Constants,
@@ -21,6 +22,7 @@ from livepde.laws.sensitivity import Replay, SensitivityLaw
 
 __all__ = [
     "AnyLaw",
+    "AutoLaw",
     "BaumeisterLaw",
     "Belief",
     "ConstantDamping",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -58,21 +59,24 @@ class Consistency:
 
     def add(self, e: Array) -> Consistency:
         """Return the value after one more vector of normalised innovations."""
-        products = e * self.last
-        both = np.isfinite(products)
         seen = np.isfinite(e)
-        slow = np.where(seen, self.slow + (e - self.slow) / SLOW, self.slow)
+        count = int(np.count_nonzero(seen))
+        known = np.where(seen, e, 0.0)
+        # Before its first value a sensor has no product, and later none where it is missing.
+        both = seen & np.isfinite(self.last)
+        before = np.where(both, self.last, 0.0)
+        slow = self.slow + np.where(seen, (known - self.slow) / SLOW, 0.0)
         kept = (1.0 - 1.0 / SLOW) ** 2 * self.slow_variance + 1.0 / SLOW**2
         slow_variance = np.where(seen, kept, self.slow_variance)
         fade = 1.0 - 1.0 / WINDOW
         return Consistency(
-            fade * self.count + float(seen.sum()),
-            fade**2 * self.weight + float(seen.sum()),
-            fade * self.square + float(np.nansum(e**2)),
-            fade * self.pairs + float(both.sum()),
-            fade * self.product + float(products[both].sum()),
-            fade * self.slow_expected + float(slow_variance[seen].sum()),
-            fade * self.slow_square + float((slow[seen] ** 2).sum()),
+            fade * self.count + count,
+            fade**2 * self.weight + count,
+            fade * self.square + float(known @ known),
+            fade * self.pairs + int(np.count_nonzero(both)),
+            fade * self.product + float(known @ before),
+            fade * self.slow_expected + float(slow_variance @ seen),
+            fade * self.slow_square + float((slow * slow) @ seen),
             np.where(seen, e, self.last),
             e,
             slow,
@@ -84,7 +88,7 @@ class Consistency:
         """Mean of e^2; 1 if the noise level is right."""
         return self.square / self.count if self.count else 1.0
 
-    @property
+    @cached_property
     def correlation(self) -> float:
         """Correlation of successive innovations; 0 if the model explains the data."""
         if not self.pairs or not self.square:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, lapack
 
 from livepde.errors import LawError
 from livepde.fem import Evolution, FieldBlock, Moment, RandomWalk
@@ -21,6 +21,7 @@ __all__ = ["Filter", "Motion", "Point", "reduction"]
 ROUNDING = 1e-9  # share of a variance that is none
 LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
 MOST_MODES = 60  # of a field with modes="auto"
+BLOCK = 32  # columns that LAPACK's QR takes at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +151,7 @@ class Filter:
 
     def transition(self, h: float) -> Array:
         """Return the transition of all reduced coordinates in a time h, shape (k, k)."""
-        return np.asarray(block_diag(*(motion.transition(h) for motion in self.motions)))
+        return _transition(self.motions, h)
 
     def moved(self, point: Point, h: float) -> Point:
         """Return a point whose unknowns have moved for a time h; those of its state have not.
@@ -181,11 +182,17 @@ class Filter:
         left = variance - (self.Phi**2).sum(axis=1)
         return np.where(left > ROUNDING * variance, left, 0.0)
 
+    @cached_property
+    def _still(self) -> Array:
+        return np.asarray(np.sqrt(self._left_out))
+
     def rest(self, age: float) -> Array:
         """Return the deviation of each latent coefficient in the modes that are left out, (m,).
 
         They are as the prior has them, and have moved for a time `age`.
         """
+        if age == 0.0 or not self._left_out.any():
+            return self._still
         parts = self.problem.model.latent.parts.values()
         grown = [
             np.repeat(
@@ -268,8 +275,10 @@ class Filter:
 
         columns = np.column_stack([end.u, end.U, end.du])
         y, steps, failure = advance(self.problem.control, stage, columns, interval)
-        if failure is not None or not np.isfinite(y).all():
-            return replace(end, u=y[:, 0], U=y[:, 1:-1], du=y[:, -1]), steps, failure
+        if failure is None and not np.isfinite(y).all():
+            failure = StepFailed("not_finite", "the prediction is not finite")
+        if failure is not None:
+            return point, steps, failure
         U, C = y[:, 1:-1], end.C
         if C.shape[1] > self.rank:
             U, C = _compressed(U, C, self.scale, self.rank)
@@ -295,15 +304,13 @@ class Filter:
         point = replace(point, consistency=point.consistency.add(e))
         if not used.any():
             return point, count
-        Y = Y[used]
-        # (I + Y^T Y)^-1 = W W^T with W = R^-1 from a QR factorisation of [I; Y].
-        root: Array = np.asarray(np.linalg.qr(np.vstack([np.eye(Y.shape[1]), Y]), mode="r"))
-        # SciPy's triangular solve would start threads for this small matrix; this one does not.
-        W: Array = np.asarray(np.linalg.inv(root), dtype=float)
-        d = (d / noise)[used]
+        d /= noise
+        if not used.all():
+            Y, d, noise = Y[used], d[used], noise[used]
+        W, spread = _contraction(Y)
         half = W.T @ (Y.T @ d)
         U, C = point.U @ W, point.C @ W
-        spread = float(np.log(np.abs(np.diag(root))).sum() + np.log(noise[used]).sum())
+        spread += float(np.log(noise).sum())
         evidence = point.evidence - 0.5 * float(d @ d - half @ half) - spread
         new = replace(
             point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U, evidence=evidence
@@ -410,6 +417,27 @@ def _enough(phi: Array, variance: Array, mass: Array) -> int:
     held = np.cumsum(mass @ phi**2)
     short = int((held < (1.0 - LEFT_OUT) * (mass @ variance)).sum())
     return min(short + 1, len(held))
+
+
+@lru_cache(maxsize=64)
+def _transition(motions: tuple[Motion, ...], h: float) -> Array:
+    return np.asarray(block_diag(*(motion.transition(h) for motion in motions)))
+
+
+def _contraction(Y: Array) -> tuple[Array, float]:
+    """Return W with W W^T = (I + Y^T Y)^-1, shape (r, r), and the logarithm of 1/|det W|.
+
+    W = R^-1 from a QR factorisation of [I; Y]: nothing is squared.
+    """
+    count, r = Y.shape
+    stacked = np.zeros((r, r + count))  # transposed: LAPACK counts down the columns
+    stacked[:, r:] = Y.T
+    stacked.flat[:: r + count + 1] = 1.0
+    factored, _, _, _ = lapack.dgeqrf(stacked.T, lwork=BLOCK * r, overwrite_a=1)
+    root = np.triu(factored[:r])
+    # SciPy's triangular solve would start threads for this small matrix; this one does not.
+    W: Array = np.asarray(np.linalg.inv(root), dtype=float)
+    return W, float(np.log(np.abs(root.diagonal())).sum())
 
 
 def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:

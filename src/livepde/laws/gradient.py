@@ -13,12 +13,15 @@ from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.coupled import PULL, CoupledStage, Gains
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
+from livepde.laws.smoothing import Balance, Smoother, smooths
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval, Newton, advance
 
 __all__ = ["GradientLaw", "GradientState"]
+
+HOLD = 1e12  # times heavier is a prior that keeps q where it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,22 +39,30 @@ class GradientState:
 
 @dataclass(frozen=True, eq=False)
 class LearningState(GradientState):
-    """The same of a law that tunes itself, with what the data have taught."""
+    """The same of a law that tunes itself, with what the data have taught on q and on noise."""
 
     learned: Learned
+    balance: Balance
 
 
 class GradientWork:
     """The problem with its operators M_op and N_op and a stage for each set of present sensors."""
 
     def __init__(
-        self, problem: Problem, gains: Gains, newton: Newton, learning: Learning | None = None
+        self,
+        problem: Problem,
+        gains: Gains,
+        newton: Newton,
+        learning: Learning | None = None,
+        smooths: bool = False,
     ) -> None:
         self.problem = problem
+        self.smooths = smooths
         self.gains = gains
         self.newton = newton
         self.learning = learning
         self._stages: dict[Split, CoupledStage] = {}
+        self._smoothers: dict[Split, Smoother] = {}
 
     def stage(self, present: Array) -> CoupledStage:
         """Return the coupled stage for the sensors present."""
@@ -64,6 +75,15 @@ class GradientWork:
                 self.problem.model, split, self.gains, self.newton, memory
             )
         return self._stages[split]
+
+    def smoother(self, present: Array) -> Smoother:
+        """Return the smoother for the sensors present."""
+        split = self.problem.observed.split(present)
+        if split not in self._smoothers:
+            if len(self._smoothers) >= 8:
+                self._smoothers.clear()
+            self._smoothers[split] = Smoother(self.problem.observed, present)
+        return self._smoothers[split]
 
 
 @dataclass(frozen=True)
@@ -90,10 +110,12 @@ class GradientLaw(Law[GradientWork, GradientState]):
         alone. The inverse of the information that the data have given so far takes the place of
         gain G_Q^{-1}, weighed against the prior by a noise level that is estimated as well
         (`livepde.laws.memory` derives it); M_op is the mass and theta h = 10, so `damping`, `M_op`
-        and `sigma` are not to be given. For constant unknowns. What early data taught stays when
-        the excitation dies out. The notes of each report hold gain, the scale of the inner product
-        before any information, and information, the trace of J G_Q^{-1}/S: beyond 1 the data say
-        more than the prior.
+        and `sigma` are not to be given. Samples of a function (`Subdomain`, `Full`) without a
+        `reconstruction` are smoothed as much as their own noise asks for
+        (`livepde.laws.smoothing`); exact ones are not. For constant unknowns. What early data
+        taught stays when the excitation dies out. The notes of each report hold gain, the scale of
+        the inner product before any information, and information, the trace of J G_Q^{-1}/S:
+        beyond 1 the data say more than the prior.
     damping
         Rule for theta = mu / ||r||_V~.
     nu
@@ -155,12 +177,13 @@ class GradientLaw(Law[GradientWork, GradientState]):
         N_op = model.bilinear(self.N_op)
         gains = Gains(np.inf, self.damping, self.nu, 0.0, model.mass, N_op)
         learning = Learning(model, problem.observed.observation.nodal)
-        return GradientWork(problem, gains, self.newton, learning)
+        return GradientWork(problem, gains, self.newton, learning, smooths(problem.observed))
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         rate = np.zeros(len(u0) + len(q0))
         if work.learning is not None:
-            return LearningState(u0, q0, rate, work.learning.init(q0))
+            balance = Balance.none(work.problem.observed.size, len(u0))
+            return LearningState(u0, q0, rate, work.learning.init(q0), balance)
         return GradientState(u0, q0, rate)
 
     def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
@@ -182,12 +205,23 @@ class GradientLaw(Law[GradientWork, GradientState]):
         coupled = work.stage(interval.present)
         zero = np.zeros(model.X.dim)
         regularises = observed.observation.reconstruction.regularises
+        smoother, balance, alpha, waits = None, None, 0.0, False
+        if work.smooths and isinstance(state, LearningState):
+            smoother = work.smoother(interval.present)
+            balance = state.balance
+            times = (interval.t1,) if balance.samples else (interval.t0, interval.t1)
+            for t in times:
+                z = z1 if t == interval.t1 else z0
+                balance = smoother.add(balance, z, model.impose(zero, interval.at(t)))
+            alpha, waits = smoother.alpha(balance), smoother.waits(balance)
 
         def reconstruct(t: float) -> Reconstructed:
             boundary = model.impose(zero, interval.at(t))
             present = interval.present
             if regularises:
                 return observed.reconstruct(interval.z(t), boundary=boundary, present=present)
+            if smoother is not None and alpha > 0.0:
+                return Reconstructed(smoother(alpha, interval.z(t), boundary), alpha, 0.0, None)
             return Reconstructed(coupled.split.reconstruct(interval.z(t), boundary), 0.0, 0.0, None)
 
         found = Reconstructed(zero, 0.0, 0.0, None)
@@ -197,7 +231,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             observed_now = reconstruct(interval.t1).u
             w = observed_now + coupled.split.P @ state.u
             seen = learning.coupling(coupled.split, w, state.q, interval.end)
-            spread = learning.spread(state.learned, seen, length)
+            spread = learning.spread(state.learned, seen, length) * (HOLD if waits else 1.0)
             metric = learning.metric(state.learned, spread, state.q, length)
 
         def stage(c: Array, t: float, h: float) -> Array:
@@ -205,7 +239,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             found = reconstruct(t)
             # The observed part moves with the data, the rest as in the step before.
             start = c + h * state.rate
-            if regularises:
+            if regularises or alpha > 0.0:
                 start[: model.X.dim] += found.u - reconstruct(t - h).u
             else:
                 start[: model.X.dim] += (
@@ -228,14 +262,20 @@ class GradientLaw(Law[GradientWork, GradientState]):
         notes = {"residual": model.X.norm(observed_u - found.u)}
         if regularises:
             notes |= {"alpha": found.alpha, "misfit": found.misfit}
+        elif smoother is not None:
+            notes |= {"alpha": alpha}
         predicted = work.problem.predict(u, q, interval.end)
         if learning is None or not isinstance(state, LearningState):
             return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
         r = observed_u - found.u
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
-        learned = learning.learn(state.learned, spread, seen, r, length)
+        learned = state.learned
+        if not waits:
+            learned = learning.learn(learned, spread, seen, r, length)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
-        return LearningState(u, q, rate, learned), Report(Status(), predicted, steps, notes)
+        return LearningState(u, q, rate, learned, balance or state.balance), Report(
+            Status(), predicted, steps, notes
+        )
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

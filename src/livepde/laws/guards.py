@@ -47,7 +47,7 @@ class Guards:
         twice as many.
     """
 
-    reach: float = 0.25
+    reach: float = 1.0
     iterations: int = 10
     temperings: int = 2
     runaway: float = 10.0

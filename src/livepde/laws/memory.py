@@ -21,11 +21,12 @@ For M^{-1} stands D^{-1} with a diagonal D >= M (Gershgorin), so J is as sparse 
 larger than what the data have taught: the gain errs to the large side, where the coupled step is
 stable and only noise is lost.
 
-S is estimated online. The equation error of a wrong q moves with the excitation, noise jumps from
-sample to sample: so S is read from second differences of r, as far as q can see them,
+S is estimated online. The equation error of a wrong q moves with the excitation and goes on, noise
+turns back with the next sample: so S is read from products of successive differences of r, as far
+as q can see them,
 
-    S = mean of c/(2 h) ||A^T D2 r||^2_{Q*} / trace(G_Q^{-1} A^T R D^{-1} R^T A),
-    c = (1 + rho)/(rho^2 (3 - rho)),     rho = 1/(1 + PULL),
+    S = mean of -c/h (A^T D r_k, A^T D r_{k-1})_{Q*} / trace(G_Q^{-1} A^T R D^{-1} R^T A),
+    c = (1 + rho)/(rho^2 (1 - rho)),     rho = 1/(1 + PULL),
 
 where c undoes the filter; the trace is that of a few fixed random probes. The mean weighs a sample
 at time t by t^2: it forgets the start, and no time constant is asked for. J weighs it by t: the
@@ -38,8 +39,10 @@ Every number above is a ratio of quantities with the same units: scaling u, q (w
 scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
 itself.
 
-What S does not know is a bias: a reconstruction G_alpha that smooths too much leaves an equation
-error that moves with w, as a wrong q does, and q takes it up.
+What S does not know is a bias: smoothing that takes too much or too little leaves an equation error
+that moves with w, as a wrong q does, and q takes it up. Counting as noise what is slow in r, too
+(sums of A^T r over an eighth of the elapsed time), was tried: such a bias leaves nothing in r, and
+exact data are learned more slowly. What helps is smoothing without it (`livepde.laws.smoothing`).
 """
 
 from __future__ import annotations
@@ -62,7 +65,7 @@ FORGETS = 2.0  # power of time that weighs a sample in the mean of S
 FADES = 1.0  # power of time that weighs a sample in J
 RESOLUTION = 1e7  # largest ratio of information to prior: deviations of 1 in 3000
 _RHO = 1.0 / (1.0 + PULL)
-_FILTER = (1.0 + _RHO) / (_RHO**2 * (3.0 - _RHO))
+_TURNS = (1.0 + _RHO) / (_RHO**2 * (1.0 - _RHO))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,17 +152,21 @@ class Learning:
         information = self.pattern.matrix(learned.information)
         return Metric(spread, information, learned.information, shift)
 
+    def _product(self, coupling: sp.csr_array, one: Array, other: Array) -> float:
+        """Return the inner product of two r as far as q can see them."""
+        return float((coupling.T @ one) @ self.model.Q.riesz(coupling.T @ other))
+
     def learn(
         self, learned: Learned, spread: float, coupling: sp.csr_array, r: Array, h: float
     ) -> Learned:
         """Return what is known after a step of length h that ended with A(w) and r."""
         force = coupling.T @ self.probes
         trace = float((force * self.model.Q.riesz(force)).sum()) / PROBES
-        # Differences of the first samples have one or two terms: variance 1, 2, 6.
-        jump = (r, r - learned.last, r - 2.0 * learned.last + learned.before)
-        order = min(learned.samples, 2)
-        sight = coupling.T @ jump[order]
-        noise = _FILTER * float(sight @ self.model.Q.riesz(sight)) / (2.0 * h)
+        if learned.samples < 2:  # all of r may be noise
+            noise = -_TURNS * self._product(coupling, r, -r) / h
+        else:
+            steps = r - learned.last, learned.last - learned.before
+            noise = -_TURNS * self._product(coupling, *steps) / h
         elapsed = learned.elapsed + h
         kept = max(0.0, 1.0 - FORGETS * h / elapsed)
         faded = max(0.0, 1.0 - FADES * h / elapsed)

@@ -250,12 +250,13 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             return state
         form, begun = work.problem.model.form_initial, state
         iterates = form is not None and not form.linear_in_parameter
+        if self.guards is not None and self.replay is None:
+            iterates = iterates or not work.problem.observed.linear
         for _ in range(FIRST):
             new, _ = work.updated(point, interval, work.predict(point, interval.end))
             if not np.isfinite(new.da).all():
                 return state
             begun = replace(state, now=new, reference=point.q)
-            iterates = iterates or self._far(work, begun)
             if not iterates or _left(work, begun) <= CONVERGED:
                 break
             point = _placed(work, state, _next(work, begun), interval.end)
@@ -489,9 +490,9 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             steps += taken
             if failure is not None:
                 return failed(Status.of(failure))
-        if not all(np.isfinite(x).all() for x in (moved.u, moved.U, moved.du)):
-            return failed(Status("not_finite", "the prediction is not finite"))
-        moved = replace(moved, U=np.exp(-(interval.t1 - interval.t0) / self.memory) * moved.U)
+        if np.isfinite(self.memory):
+            fade = np.exp(-(interval.t1 - interval.t0) / self.memory)
+            moved = replace(moved, U=fade * moved.U)
         predicted = work.predict(moved, interval.end)
         new, refused = work.updated(moved, interval, predicted)
         if not np.isfinite(new.da).all():
@@ -535,9 +536,9 @@ def _placed(work: Filter, state: SensitivityState, q: Array, first: Moment) -> P
     start, model = replace(state.start, level=state.now.level), work.problem.model
     shift = work.reduced(q - start.q)
     if state.initial:
-        U = model.initial_directions(q, work.Phi, first)
-        u, du = model.initial_state(q, first), -U @ shift
-        return replace(start, q=q, u=u, du=du, da=-shift, U=U)
+        initial = model.initial_directions(q, work.Phi, first)
+        u, du = model.initial_state(q, first), -initial @ shift
+        return replace(start, q=q, u=u, du=du, da=-shift, U=initial @ start.C)
     along = start.along(shift)
     return replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
 

@@ -37,6 +37,7 @@ __all__ = [
     "Reconstructed",
     "Reconstruction",
     "Reconstructor",
+    "Spectral",
     "Tikhonov",
 ]
 
@@ -282,10 +283,10 @@ class Tikhonov(Reconstruction):
             )
 
     def prepare(self, observed: Observed, present: Array) -> Reconstructor:
-        return _Filter(self, observed, present)
+        return Spectral(self, observed, present)
 
 
-class _Filter(Reconstructor):
+class Spectral(Reconstructor):
     """The minimiser for every alpha at once.
 
     Both quadratic forms are diagonal in one basis phi of N(G)^perp, s for ||G v||_Z^2 and k for

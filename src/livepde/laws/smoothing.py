@@ -1,0 +1,188 @@
+"""How `GradientLaw(gain="auto")` smooths noisy samples of a function, with no level given.
+
+The law differentiates what the sensors say: noise of w and noise of B(w) are correlated, and what
+smoothing takes from B(w) moves with w. Neither averages out, and both look like a wrong q. So alpha
+is not the one of the best u_alpha, but the one where the two biases cancel. With z the data, n
+their noise, and L = (|.|^2)^{1/2}, second derivatives for `Tikhonov("V")`,
+
+    E (u_alpha, L (u_alpha - u)) = 0,    that is    E (u_alpha, L (z - u_alpha)) = E (u_alpha, L n).
+
+Smoothing is Tikhonov's, iterated: u_j minimises ||G v - z||_Z^2 + alpha |v - u_{j-1}|^2. Its
+factors on the modes of G and |.| are 1 - f, f = (alpha k/(s + alpha k))^ORDER: the bias of what is
+smooth falls with the power, that of noise does not. Both sides of the balance are running means
+over the samples so far, for each alpha of a grid, and alpha is the first where they meet.
+
+The level of the noise is read from the rougher half of the modes, where a smooth state has next to
+none, and there from products of successive differences in time,
+
+    E (z_k - z_{k-1}) (z_{k-1} - z_{k-2}) = -sigma^2:
+
+noise turns back, what moves goes on. It is not more than the observation states. Exact data turn
+back nowhere, so alpha is zero. Noise is independent from sensor to sensor with the deviations that
+the observation states, or white in Z if it states none. Nothing is learned from the first samples,
+which cannot tell the level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.linalg import Array
+from livepde.observation import Observed, Tikhonov
+from livepde.observation.reconstruction import Spectral
+
+__all__ = ["Balance", "Smoother", "smooths"]
+
+ORDER = 4  # of the iterated Tikhonov method
+GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
+LARGEST = 3000  # sensors: the modes are those of a dense matrix
+FEWEST = 8  # modes below which their rougher half says nothing about noise
+WAIT = 4  # samples before the level is believed: two products
+
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """Running means over the samples.
+
+    Attributes
+    ----------
+    left
+        (u_alpha, L (z - u_alpha)) for each alpha, shape (alphas,).
+    noise
+        E (u_alpha, L n) for noise of the stated level, or of level 1, shape (alphas,).
+    power
+        Square of the noise level, as a multiple of that.
+    samples, pairs
+        Number of samples, and of those that told of the level.
+    z, boundary
+        The last two samples and the boundary values at their times, shapes (2, sensors), (2, n).
+    """
+
+    left: Array
+    noise: Array
+    power: float
+    samples: int
+    pairs: int
+    z: Array
+    boundary: Array
+
+    @classmethod
+    def none(cls, sensors: int, n: int) -> Balance:
+        """Return the means before the first sample."""
+        left, z = np.zeros(len(GRID)), np.full((2, sensors), np.nan)
+        return cls(left, left, 0.0, 0, 0, z, np.zeros((2, n)))
+
+
+def smooths(observed: Observed) -> bool:
+    """Return true if smoothing is chosen here: for samples of a function, if nothing else is said.
+
+    Averages are not differentiated, so noise of theirs needs no smoothing in space. Raises
+    `LawError` for noisy samples of which the law cannot say how to smooth them.
+    """
+    observation = observed.observation
+    if not observation.nodal or observation.reconstruction.regularises:
+        return False
+    if len(observed.state.fields) == 1 and observed.size <= LARGEST:
+        return True
+    if observed.noise is not None:
+        raise LawError(
+            f"GradientLaw: gain='auto' chooses how to smooth a state of one component with up to "
+            f"{LARGEST} sensors: give the observation a reconstruction=, such as Tikhonov('X'), or "
+            "leave out noise= if the data are exact."
+        )
+    return False
+
+
+class Smoother:
+    """G_alpha for one set of present sensors, and what a sample adds to the balance."""
+
+    def __init__(self, observed: Observed, present: Array) -> None:
+        self.spectral = filter_ = Spectral(Tikhonov("V"), observed, present)
+        self.stated = observed.noise is not None
+        self.size = filter_.size
+        if self.size == 0:
+            return
+        s, k = filter_.s, filter_.k
+        stiff = k > 0.0
+        self.inverse = np.where(stiff, 1.0 / np.where(stiff, k, 1.0), 0.0)
+        if observed.noise is None:
+            self.variance = np.ones(self.size)
+        else:
+            spread = filter_.fitted * observed.noise[present]
+            self.variance = (spread**2).sum(axis=1) / s
+        self.removed = self._removed(GRID[:, None] * filter_.rho)
+        self.weight = np.sqrt(k * s)
+        self.noise = (1.0 - self.removed) @ (np.sqrt(k / s) * self.variance)
+
+    def _removed(self, alpha: Array | float) -> Array:
+        s, k = self.spectral.s, self.spectral.k
+        out: Array = (alpha * k / (s + alpha * k)) ** ORDER
+        return out
+
+    def _rough(self, z: Array, boundary: Array) -> tuple[Array, Array]:
+        """Return the modes of the data, and those without what the boundary alone continues to."""
+        filter_ = self.spectral
+        known = z[filter_.present] - filter_.G @ boundary
+        modes = (filter_.fitted @ known) / filter_.s
+        return modes, modes + (boundary @ filter_.pulled) * self.inverse
+
+    def add(self, balance: Balance, z: Array, boundary: Array) -> Balance:
+        """Return the means with one more sample, z of shape (sensors,)."""
+        if self.size == 0 or not np.isfinite(z[self.spectral.present]).all():
+            return balance
+        _, e = self._rough(z, boundary)
+        left = (self.removed * (1.0 - self.removed)) @ (self.weight * e**2)
+        share = 1.0 / (balance.samples + 1)
+        power, pairs = balance.power, balance.pairs
+        if self.size >= FEWEST and np.isfinite(balance.z[:, self.spectral.present]).all():
+            before, last = (
+                self._rough(*pair)[1] for pair in zip(balance.z, balance.boundary, strict=True)
+            )
+            back = -self.spectral.s * (e - last) * (last - before) / self.variance
+            half = slice(0, self.size // 2)  # s ascends: the roughest come first
+            pairs += 1
+            power += (float(back[half].mean()) - power) / pairs
+        return Balance(
+            left=balance.left + share * (left - balance.left),
+            noise=balance.noise + share * (self.noise - balance.noise),
+            power=power,
+            samples=balance.samples + 1,
+            pairs=pairs,
+            z=np.stack([balance.z[1], z]),
+            boundary=np.stack([balance.boundary[1], boundary]),
+        )
+
+    def waits(self, balance: Balance) -> bool:
+        """Return true while the samples cannot tell the level: nothing is learned from them."""
+        return self.size >= FEWEST and balance.samples < WAIT
+
+    def alpha(self, balance: Balance) -> float:
+        """Return the first alpha where smoothing takes as much as noise has brought."""
+        if self.size == 0:
+            return 0.0
+        power = max(balance.power, 0.0)
+        if self.stated:
+            power = min(power, 1.0) if self.size >= FEWEST else 1.0
+        if power == 0.0:
+            return 0.0
+        excess = balance.left - power * balance.noise
+        above = np.flatnonzero(excess > 0.0)
+        if not len(above):
+            return float(GRID[-1] * self.spectral.rho)
+        first = int(above[0])
+        if first == 0:
+            return 0.0
+        low, high = excess[first - 1], excess[first]
+        part = low / (low - high)
+        return float(GRID[first - 1] ** (1 - part) * GRID[first] ** part * self.spectral.rho)
+
+    def __call__(self, alpha: float, z: Array, boundary: Array) -> Array:
+        """Return u_alpha, shape (n,)."""
+        if self.size == 0:
+            return np.zeros(len(boundary))
+        modes, rough = self._rough(z, boundary)
+        u: Array = self.spectral.phi @ (modes - self._removed(alpha) * rough)
+        return u
