@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -20,7 +21,7 @@ import xarray as xr
 import livepde as lp
 from livepde.result import Result
 from livepde.runs.journal import Event, Journal
-from livepde.runs.live import Backlog, Live
+from livepde.runs.live import Backlog, Gathered, Live, Samples
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.streams.intake import Intake, Policy
 from livepde.streams.sources import Follow, Rows, json_row
@@ -62,7 +63,7 @@ def live(folder: Path, source=None, **options) -> Live:
     if source is None:
         source = Follow(folder / "data.csv", position=kept.position)
     intake = Intake(COLUMNS, CLOCK, origin=0.0, last=kept.last)
-    return Live(identifier(), source, intake, kept, fields_every=10, **options)
+    return Live(identifier(), Gathered(source, intake), kept, fields_every=10, **options)
 
 
 def write(folder: Path, count: int) -> None:
@@ -96,6 +97,26 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     run.journal.close()
     with Journal.open(tmp_path / "journal.sqlite") as reader:
         xr.testing.assert_identical(reader.layout.dataset(list(reader)), found)
+
+
+def test_samples_in_order_go_on_after_the_last_one(tmp_path):
+    def samples():
+        return (lp.Sample(row.pop("t"), row) for row in rows(20))
+
+    with journal(tmp_path / "one.sqlite") as kept:
+        run = Live(identifier(), Samples(samples()), kept)
+        run.run()
+        whole = list(kept)
+    path = tmp_path / "two.sqlite"
+    with journal(path) as kept:
+        run = Live(identifier(), Samples(itertools.islice(samples(), 8)), kept)
+        run.run()
+    with Journal.open(path, write=True) as kept:
+        run = Live(identifier(), Samples(samples(), kept.last), kept)
+        assert run.resume() == 0
+        run.run()
+        assert [record.t for record in kept] == [record.t for record in whole]
+        assert np.array_equal(list(kept)[-1].numbers, whole[-1].numbers)
 
 
 CHILD = """

@@ -114,7 +114,7 @@ def test_what_was_not_safe_comes_again(server, tmp_path):
     assert [round(record.t, 6) for record in again.journal] == [
         round(0.1 * k, 6) for k in range(40)
     ]
-    again.source.close()
+    again.feed.close()
 
 
 def test_numbers_with_topics_of_their_own(server):

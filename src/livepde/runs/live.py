@@ -5,23 +5,165 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from livepde.errors import DataError
-from livepde.identifier import Identifier
+from livepde.identifier import Identifier, Sample
 from livepde.result import Estimate, Result
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.streams.intake import Intake, Ready, Refused
 from livepde.streams.sources import Row, Source
 
-__all__ = ["Backlog", "Live", "Sink"]
+__all__ = ["Backlog", "Feed", "Gathered", "Live", "Samples", "Sink"]
 
 CHECKPOINT = 256  # samples between two checkpoints
 LOOK = 0.5  # seconds between two looks at whether to stop
+
+
+class Feed(Protocol):
+    """Brings samples in time order, complete and checked."""
+
+    @property
+    def done(self) -> bool:
+        """True if nothing more will come."""
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the samples that are there, or after at most `wait` seconds none."""
+
+    def heard(self) -> bool:
+        """Return whether anything has come since this was asked last, be it of no use."""
+
+    def refused(self) -> Sequence[Refused]:
+        """Return what has come since this was asked last and is not used."""
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """Return from where to go on if these samples are still to be taken."""
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Hear that a sample has been taken for good, or never will be."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+class Gathered:
+    """Samples from the rows of a source, as an `Intake` puts them in order.
+
+    Parameters
+    ----------
+    source, intake
+        Where rows come from, and how they become samples.
+    """
+
+    def __init__(self, source: Source, intake: Intake) -> None:
+        self.source = source
+        self.intake = intake
+        self._heard = False
+        self._refused: list[Refused] = []
+        self._flushed = False
+
+    @property
+    def done(self) -> bool:
+        """True when the source has ended and all its samples are out."""
+        return self._flushed
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the samples that are ready."""
+        rows = self.source.poll(wait)
+        self._heard |= bool(rows)
+        found: list[Ready] = []
+        for row in rows:
+            found += self._taken(row)
+        if self.source.done and not self._flushed:
+            self._flushed = True
+            found += self.intake.flush()
+        return found
+
+    def _taken(self, row: Row) -> list[Ready]:
+        ready: list[Ready] = []
+        refused = [Refused("malformed", "", row.broken)]
+        if not row.broken:
+            ready, refused = self.intake.take(row.values, row.token)
+        self._refused += refused
+        waiting = [*self.intake.waiting, *(t for one in ready for t in one.tokens)]
+        if refused and row.token not in waiting:
+            self.source.acknowledge([row.token])  # it is not needed again
+        return ready
+
+    def heard(self) -> bool:
+        """Return whether a row has come since this was asked last."""
+        heard, self._heard = self._heard, False
+        return heard
+
+    def refused(self) -> Sequence[Refused]:
+        """Return the rows and values that are not used."""
+        found, self._refused = self._refused, []
+        return found
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """Return where the source stands if these samples are still to be taken."""
+        tokens = [token for ready in waiting for token in ready.tokens]
+        return self.source.position([*tokens, *self.intake.waiting])
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Tell the source."""
+        self.source.acknowledge(ready.tokens)
+
+    def close(self) -> None:
+        """Close the source."""
+        self.source.close()
+
+
+class Samples:
+    """Samples that are in order already: a table, or any iterable that raises `DataError`.
+
+    Parameters
+    ----------
+    samples
+        With a mapping z.
+    after
+        Time of the last one that was taken before; those up to it are passed over.
+    """
+
+    def __init__(self, samples: Iterable[Sample], after: float = -np.inf) -> None:
+        self._samples = iter(samples)
+        self._after = after
+        self._done = False
+
+    @property
+    def done(self) -> bool:
+        """True when there are no more."""
+        return self._done
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the next sample."""
+        for sample in self._samples:
+            if sample.t > self._after and isinstance(sample.z, Mapping):
+                return [Ready(sample.t, dict(sample.z), ())]
+        self._done = True
+        return []
+
+    def heard(self) -> bool:
+        """Samples that are there are never silent."""
+        return True
+
+    def refused(self) -> Sequence[Refused]:
+        """Nothing is refused: what is wrong raises."""
+        return ()
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """The time of the last sample is enough to go on."""
+        return ""
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Nobody waits to hear it."""
+
+    def close(self) -> None:
+        """Nothing is held."""
 
 
 class Sink(Protocol):
@@ -78,8 +220,8 @@ class Live:
     ----------
     identifier
         As it was when the run began; `resume` brings it to where it was.
-    source, intake, journal, sinks
-        Where rows come from, how they become samples, what is kept, and where estimates go.
+    feed, journal, sinks
+        Where samples come from, what is kept, and where estimates go.
     fields_every
         Fields of every so many samples are kept.
     backlog
@@ -91,8 +233,7 @@ class Live:
     def __init__(
         self,
         identifier: Identifier,
-        source: Source,
-        intake: Intake,
+        feed: Feed,
         journal: Journal,
         *,
         sinks: Sequence[Sink] = (),
@@ -102,8 +243,7 @@ class Live:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
-        self.source = source
-        self.intake = intake
+        self.feed = feed
         self.journal = journal
         self.sinks = sinks
         self.backlog = backlog or Backlog()
@@ -139,20 +279,19 @@ class Live:
     def run(self) -> None:
         """Go on until the source ends or `stopping` is set; what was taken is kept then."""
         while not self.stopping.is_set():
-            rows = self.source.poll(0.0 if self._waiting else LOOK)
-            self._watch(bool(rows))
-            for row in rows:
-                self._hear(row)
-            if self.source.done:
-                self._waiting.extend(self.intake.flush())
+            self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
+            self._watch(self.feed.heard())
+            for item in self.feed.refused():
+                self.journal.count(item.kind, item.channel)
             relieved = self.backlog.relieved(self._waiting)
             if relieved:
                 self.journal.count(self.backlog.overflow, "", len(relieved))
             if self.backlog.overflow == "drop":
-                self.source.acknowledge(token for ready in relieved for token in ready.tokens)
+                for ready in relieved:
+                    self.feed.acknowledge(ready)
             if self._waiting:
                 self._take(self._waiting.popleft())
-            elif self.source.done:
+            elif self.feed.done:
                 break
         if self.result.last is not None:
             self.journal.keep(self.result.snapshot(self.result.last))
@@ -172,26 +311,10 @@ class Live:
             "status": "" if last is None else last.status.code,
         }
 
-    def _hear(self, row: Row) -> None:
-        if row.broken:
-            ready: list[Ready] = []
-            refused = [Refused("malformed", "", row.broken)]
-        else:
-            ready, refused = self.intake.take(row.values, row.token)
-        for item in refused:
-            self.journal.count(item.kind, item.channel)
-        self._waiting.extend(ready)
-        if refused and row.token not in self._tokens():
-            self.source.acknowledge([row.token])  # it is not needed again
-
-    def _tokens(self) -> list[Any]:
-        """Return the tokens of all rows that are not taken for good yet."""
-        return [*self.intake.waiting, *(t for ready in self._waiting for t in ready.tokens)]
-
     def _take(self, ready: Ready) -> None:
-        position = self.source.position(self._tokens())
+        position = self.feed.position(self._waiting)
         taken = self.journal.accept(ready.t, ready.values, position)
-        self.source.acknowledge(ready.tokens)
+        self.feed.acknowledge(ready)
         self._step(taken)
 
     def _step(self, taken: Taken, *, again: bool = False) -> None:
