@@ -112,7 +112,7 @@ def test_samples_in_order_go_on_after_the_last_one(tmp_path):
         run = Live(identifier(), Samples(itertools.islice(samples(), 8)), kept)
         run.run()
     with Journal.open(path, write=True) as kept:
-        run = Live(identifier(), Samples(samples(), kept.last), kept)
+        run = Live(identifier(), Samples(samples(), after=kept.last), kept)
         assert run.resume() == 0
         run.run()
         assert [record.t for record in kept] == [record.t for record in whole]

@@ -7,13 +7,16 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
 
 from livepde.errors import DataError
 from livepde.identifier import Identifier, Sample
 from livepde.result import Result
+from livepde.runs.journal import Journal
+from livepde.runs.live import Live, Samples
 
-__all__ = ["Driven", "drive"]
+__all__ = ["Driven", "conduct", "drive", "journal_of"]
 
 
 @dataclass
@@ -35,30 +38,39 @@ class Driven:
     error: DataError | None = None
 
 
-@dataclass
-class _Breaker:
-    """Ctrl-C ends a run between two samples: a step is never cut in half."""
-
-    asked: bool = False
-    busy: bool = False
-
-    def handle(self, number: int, frame: FrameType | None) -> None:
-        if self.asked or not self.busy:
-            raise KeyboardInterrupt
-        self.asked = True
-
-
 @contextmanager
-def _breaker() -> Iterator[_Breaker]:
-    breaker = _Breaker()
+def _stopped_by_signals(live: Live) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end a run between two samples; a second one ends it at once."""
     if threading.current_thread() is not threading.main_thread():
-        yield breaker
+        yield
         return
-    previous = signal.signal(signal.SIGINT, breaker.handle)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if live.stopping.is_set() or not live.busy:
+            raise KeyboardInterrupt
+        live.stopping.set()
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield breaker
+        yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def conduct(live: Live) -> Driven:
+    """Let a run go on until its source or a signal ends it; what it has is kept in any case."""
+    driven = Driven(live.result)
+    with _stopped_by_signals(live):
+        try:
+            live.run()
+            if live.stopping.is_set():
+                driven.status = "interrupted"
+        except KeyboardInterrupt:
+            driven.status = "interrupted"
+        except DataError as error:
+            driven.status, driven.error = "failed", error
+    return driven
 
 
 def drive(
@@ -68,6 +80,7 @@ def drive(
     progress: bool = False,
     total: int | None = None,
     fields_every: int = 1,
+    journal: Journal | None = None,
 ) -> Driven:
     """Run an identifier on a stream; what was reached is returned also if it ends early.
 
@@ -79,22 +92,22 @@ def drive(
         Number of samples, for the time left.
     fields_every
         Keep fields of every so many samples.
+    journal
+        Where to keep samples and estimates, and to go on from what it holds; default in memory.
     """
     from livepde.progress import watched
 
-    result = Result.empty(identifier.model, identifier.observed, identifier.withheld, fields_every)
-    driven = Driven(result)
-    with _breaker() as breaker:
-        try:
-            for sample in watched(stream, total) if progress else stream:
-                breaker.busy = True
-                result.add(identifier.step(sample.t, sample.z, sample.inputs))
-                breaker.busy = False
-                if breaker.asked:
-                    driven.status = "interrupted"
-                    break
-        except KeyboardInterrupt:
-            driven.status = "interrupted"
-        except DataError as error:
-            driven.status, driven.error = "failed", error
-    return driven
+    if journal is None:
+        journal = journal_of(identifier)
+    feed = Samples(
+        watched(stream, total) if progress else stream, identifier.observed.names, journal.last
+    )
+    live = Live(identifier, feed, journal, fields_every=fields_every, strict=True)
+    live.resume()
+    return conduct(live)
+
+
+def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
+    """Return a new journal for what an identifier takes and finds; without a path in memory."""
+    result = Result.empty(identifier.model, identifier.observed, identifier.withheld)
+    return Journal.create(path, identifier.channels, result.layout)

@@ -26,6 +26,7 @@ from livepde.records import Layout, Record, Snapshot
 __all__ = ["Event", "Journal", "Taken"]
 
 FORMAT = 1
+MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 
 SCHEMA = """
@@ -98,9 +99,10 @@ class Journal:
     # --- opening -------------------------------------------------------------------------------
 
     @classmethod
-    def create(cls, path: Path, channels: Sequence[str], layout: Layout) -> Journal:
-        """Make a new journal and be its writer."""
-        lock = _locked(path)
+    def create(cls, path: Path | None, channels: Sequence[str], layout: Layout) -> Journal:
+        """Make a new journal and be its writer; without a path in memory only."""
+        lock = None if path is None else _locked(path)
+        path = path or MEMORY
         try:
             connection = _connect(path)
             with connection:
@@ -112,7 +114,8 @@ class Journal:
                 }
                 connection.executemany("INSERT INTO meta VALUES (?, ?)", rows.items())
         except sqlite3.Error as error:
-            lock.release()
+            if lock is not None:
+                lock.release()
             raise _failed(path, error) from error
         return cls(path, connection, lock)
 
@@ -183,6 +186,12 @@ class Journal:
         self._run(self._db.commit)
         self._current = int(cursor.lastrowid or 0)
         return Taken(self._current, t, dict(zip(self.channels, row.tolist(), strict=True)))
+
+    def withdraw(self) -> None:
+        """Forget the last sample, of which nothing could be made."""
+        self._execute("DELETE FROM samples WHERE id = ?", self._current)
+        self._run(self._db.commit)
+        self._current = self._last
 
     def append(self, record: Record, /) -> None:
         """Keep the estimate of the last sample that `accept` or `samples` has returned."""
@@ -356,6 +365,8 @@ def _unpacked(content: bytes) -> Snapshot:
 
 
 def _connect(path: Path, *, read_only: bool = False) -> sqlite3.Connection:
+    if path == MEMORY:
+        return sqlite3.connect(":memory:")
     mode = "ro" if read_only else "rwc"
     connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True)
     if not read_only:

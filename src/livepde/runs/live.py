@@ -124,13 +124,18 @@ class Samples:
     Parameters
     ----------
     samples
-        With a mapping z.
+        The samples.
+    names
+        Sensors whose values an array z holds.
     after
         Time of the last one that was taken before; those up to it are passed over.
     """
 
-    def __init__(self, samples: Iterable[Sample], after: float = -np.inf) -> None:
+    def __init__(
+        self, samples: Iterable[Sample], names: Sequence[str] = (), after: float = -np.inf
+    ) -> None:
         self._samples = iter(samples)
+        self._names = names
         self._after = after
         self._done = False
 
@@ -142,10 +147,16 @@ class Samples:
     def poll(self, wait: float) -> Sequence[Ready]:
         """Return the next sample."""
         for sample in self._samples:
-            if sample.t > self._after and isinstance(sample.z, Mapping):
-                return [Ready(sample.t, dict(sample.z), ())]
+            if sample.t > self._after:
+                return [Ready(sample.t, self._values(sample), ())]
         self._done = True
         return []
+
+    def _values(self, sample: Sample) -> dict[str, float]:
+        values = sample.z
+        if not isinstance(values, Mapping):
+            values = dict(zip(self._names, np.atleast_1d(values).tolist(), strict=True))
+        return {**values, **(sample.inputs or {})}
 
     def heard(self) -> bool:
         """Samples that are there are never silent."""
@@ -228,6 +239,9 @@ class Live:
         What happens when samples come faster than steps.
     silence
         Seconds without a row after which the source is said to be silent.
+    strict
+        A sample that the identifier cannot use ends the run with its `DataError`; otherwise it is
+        an event.
     """
 
     def __init__(
@@ -240,6 +254,7 @@ class Live:
         fields_every: int = 1,
         backlog: Backlog | None = None,
         silence: float = np.inf,
+        strict: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
@@ -248,8 +263,10 @@ class Live:
         self.sinks = sinks
         self.backlog = backlog or Backlog()
         self.silence = silence
+        self.strict = strict
         self.silent = False
         self.stopping = threading.Event()
+        self.busy = False  # a step is taken
         self._clock = clock
         self._heard = clock()
         self._waiting: deque[Ready] = deque()
@@ -278,6 +295,14 @@ class Live:
 
     def run(self) -> None:
         """Go on until the source ends or `stopping` is set; what was taken is kept then."""
+        try:
+            self._run()
+        finally:
+            if self.result.last is not None:
+                self.journal.keep(self.result.snapshot(self.result.last))
+            self.journal.checkpoint(self.identifier.dump())
+
+    def _run(self) -> None:
         while not self.stopping.is_set():
             self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
             self._watch(self.feed.heard())
@@ -293,9 +318,6 @@ class Live:
                 self._take(self._waiting.popleft())
             elif self.feed.done:
                 break
-        if self.result.last is not None:
-            self.journal.keep(self.result.snapshot(self.result.last))
-        self.journal.checkpoint(self.identifier.dump())
 
     @property
     def health(self) -> dict[str, Any]:
@@ -318,11 +340,19 @@ class Live:
         self._step(taken)
 
     def _step(self, taken: Taken, *, again: bool = False) -> None:
+        self.busy = True
         try:
-            estimate = self.identifier.step(taken.t, taken.values)
+            self._estimate(taken, again)
         except DataError as error:
+            self.journal.withdraw()
+            if self.strict:
+                raise
             self.journal.note(Event(taken.t, "refused", "", str(error)))
-            return
+        finally:
+            self.busy = False
+
+    def _estimate(self, taken: Taken, again: bool) -> None:
+        estimate = self.identifier.step(taken.t, taken.values)
         self.result.add(estimate)
         if not again:
             for sink in self.sinks:
