@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
 import livepde
-from livepde import cli
+from livepde import cli, runs
 from livepde.cases.template import write_template
 from livepde.errors import LivepdeError
 from livepde.runs import Check, Outcome, Table
@@ -296,6 +299,26 @@ def test_ctrl_c_keeps_what_there_is(rod, here):
     assert "Traceback" not in errors
     assert json.loads(record.read_text())["status"] == "interrupted"
     assert json.loads(record.read_text())["samples"] == 8
+
+
+def test_resume_goes_on_where_a_run_was_killed(rod, here):
+    assert call("run", rod, "--out", "whole")[0] == 0
+    whole = runs.open("whole").dataset
+    shutil.copytree("whole", "cut")
+    with sqlite3.connect("cut/journal.sqlite") as journal:
+        journal.execute("DELETE FROM checkpoints")
+        journal.execute("DELETE FROM samples WHERE id > 60")
+        journal.execute("DELETE FROM estimates WHERE id > 59")
+        journal.execute("DELETE FROM fields WHERE id > 59")
+    journal.close()
+    assert call("run", rod, "--out", "cut", "--resume")[0] == 0
+    xr.testing.assert_identical(runs.open("cut").dataset, whole)
+    assert len(runs.open("cut").record["resumed"]) == 1
+    assert "--resume needs --out" in bad("run", rod, "--resume")
+    assert "another case or other settings" in bad(
+        "run", rod, "--out", "cut", "--resume", "--set", "law.noise=1 K"
+    )
+    assert "there is no journal" in bad("run", rod, "--out", "nothing", "--resume")
 
 
 def test_no_figures_without_matplotlib(rod, here, monkeypatch):

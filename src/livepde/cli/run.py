@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,9 +28,11 @@ from livepde.cli.printing import (
     show,
     terminal,
 )
+from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from livepde.cases import Prepared
+    from livepde.cases import Case, Prepared
+    from livepde.runs import Journal, RunWriter
 
 __all__ = ["run"]
 
@@ -45,6 +48,10 @@ def run(
         ),
     ] = None,
     out: OutOption = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the run in --out, as if it had never stopped."),
+    ] = False,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
@@ -55,25 +62,19 @@ def run(
 
     Example:  livepde run mycase/case.toml
     Live:     logger | livepde run mycase/case.toml --data -
+    Resume:   livepde run mycase/case.toml --out runs/mycase --resume
     """
-    from livepde.runs import RunWriter, checks_of, doubts, drive, free_path, tables
+    from livepde.runs import checks_of, doubts, drive, tables
     from livepde.streams import Table as Samples
 
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
-    if out is not None and out.exists():
+    if resume and out is None:
+        raise ConfigurationError("--resume needs --out: the folder of the run to go on with.")
+    if out is not None and out.exists() and not resume:
         _must_be_empty(out)
     prepared = loaded.prepare(source)
-    folder = out or free_path(Path("runs") / loaded.name)
-    writer = RunWriter.create(
-        folder,
-        version=__version__,
-        command=["livepde", *sys.argv[1:]],
-        title=loaded.title,
-        case=loaded.text,
-        settings=settings or (),
-        original=loaded.original,
-    )
+    folder, writer, journal = _opened(loaded, prepared, out, settings or (), resume)
     total = len(prepared.stream) if isinstance(prepared.stream, Samples) else None
     driven = drive(
         prepared.identifier,
@@ -81,6 +82,7 @@ def run(
         progress=not as_json,
         total=total,
         fields_every=loaded.fields_every,
+        journal=journal,
     )
     dataset = driven.result.to_xarray()
     prepared.describe(dataset)
@@ -103,6 +105,7 @@ def run(
         notes=notes,
         figures=figures_of(dataset, loaded.title) if can_draw(err) else {},
     )
+    journal.close()
     if driven.error is not None:
         raise driven.error
     if as_json:
@@ -116,6 +119,33 @@ def run(
         raise typer.Exit(INTERRUPTED)
     if as_json and not all(item.ok for item in checks):
         raise typer.Exit(CHECK_FAILED)
+
+
+def _opened(
+    loaded: Case, prepared: Prepared, out: Path | None, settings: Sequence[str], resume: bool
+) -> tuple[Path, RunWriter, Journal]:
+    """Return the run directory, its writer and its journal, new or to go on with."""
+    from livepde.runs import Journal, RunWriter, free_path, journal_of
+
+    command = ["livepde", *sys.argv[1:]]
+    folder = out or free_path(Path("runs") / loaded.name)
+    path = folder / "journal.sqlite"
+    if resume:
+        journal = Journal.open(path, write=True)
+        writer = RunWriter.reopen(
+            folder, version=__version__, command=command, case=loaded.text, settings=settings
+        )
+        return folder, writer, journal
+    writer = RunWriter.create(
+        folder,
+        version=__version__,
+        command=command,
+        title=loaded.title,
+        case=loaded.text,
+        settings=settings,
+        original=loaded.original,
+    )
+    return folder, writer, journal_of(prepared.identifier, path)
 
 
 def _traded(prepared: Prepared) -> list[str]:

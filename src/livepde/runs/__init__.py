@@ -5,22 +5,26 @@ from __future__ import annotations
 from livepde.runs.directory import Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
 from livepde.runs.doubts import doubts
-from livepde.runs.drive import Driven, drive
+from livepde.runs.drive import Driven, conduct, drive, journal_of
+from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.runs.summary import Jump, checks_of, jumps, measures, tables
 
 __all__ = [
     "Check",
     "Driven",
+    "Journal",
     "Jump",
     "Outcome",
     "Run",
     "RunWriter",
     "Table",
     "checks_of",
+    "conduct",
     "doubts",
     "drive",
     "free_path",
+    "journal_of",
     "jumps",
     "measures",
     "open",

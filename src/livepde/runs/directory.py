@@ -4,6 +4,7 @@
 
     RUN/run.json          version, command, status, checks, hash of the case
     RUN/case.toml         a copy of the case
+    RUN/journal.sqlite    samples and estimates while they come: what survives a kill
     RUN/estimates.nc      the dataset (netCDF 3: any netCDF reader opens it)
     RUN/checkpoint.npz    the identifier's state
     RUN/report.md         tables
@@ -26,6 +27,7 @@ import xarray as xr
 
 from livepde.errors import RunError
 from livepde.identifier import Identifier
+from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, FigureFactory, Table
 from livepde.runs.summary import tables
 
@@ -43,6 +45,7 @@ __all__ = [
 FORMAT = 1
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
+JOURNAL = "journal.sqlite"
 
 
 def free_path(wanted: Path) -> Path:
@@ -124,6 +127,32 @@ class RunWriter:
             raise
         except OSError as error:
             raise RunError(f"{path}: cannot be made: {error.strerror or error}.") from error
+        return writer
+
+    @classmethod
+    def reopen(
+        cls, path: Path, *, version: str, command: Sequence[str], case: str, settings: Sequence[str]
+    ) -> RunWriter:
+        """Return the writer of a run that ended early, to go on with it.
+
+        Raises
+        ------
+        RunError
+            There is no such run, or it was of another case.
+        """
+        run = open_run(path)
+        if not (path / CASE).is_file() or not (path / JOURNAL).is_file():
+            raise RunError(f"{path} has no case and journal: it cannot be resumed.")
+        same = (path / CASE).read_text(encoding="utf-8") == case
+        if not same or run.settings != list(settings):
+            raise RunError(
+                f"{path} was run with another case or other settings: resume it with those, or "
+                "choose another folder."
+            )
+        resumed = [*run.record.get("resumed", []), {"at": _now(), "livepde": version}]
+        record = run.record | {"status": "running", "resumed": resumed}
+        writer = cls(path, record | {"command": run.record.get("command", list(command))})
+        writer._save_record()
         return writer
 
     def finish(
@@ -208,6 +237,10 @@ class Run:
     def dataset(self) -> xr.Dataset:
         """Estimates over time, as `Result.to_xarray` gave them."""
         path = self.path / ESTIMATES
+        journal = self.path / JOURNAL
+        if self.status == "running" and journal.is_file():
+            with Journal.open(journal) as kept:
+                return kept.layout.dataset(list(kept))
         if not path.is_file():
             raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.")
         try:
