@@ -69,6 +69,7 @@ class Bank:
     laws: tuple[SensitivityLaw, ...]
     filters: tuple[Filter, ...]
     stated: bool
+    _made: dict[tuple[int, float, bytes], Filter] = field(default_factory=dict)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -82,7 +83,18 @@ class Bank:
         return np.asarray(chances - logsumexp(chances))
 
     def filter(self, k: int, tick: float, noise: Array) -> Filter:
-        """Return the filter of a candidate, for samples a time `tick` apart."""
+        """Return the filter of a candidate, for samples a time `tick` apart.
+
+        Made once: it keeps what it has computed.
+        """
+        key = (k, tick, noise.tobytes())
+        if key not in self._made:
+            if len(self._made) > 3 * len(self.candidates):
+                self._made.clear()
+            self._made[key] = self._filter(k, tick, noise)
+        return self._made[key]
+
+    def _filter(self, k: int, tick: float, noise: Array) -> Filter:
         drift, filter_ = self.candidates[k].drift, self.filters[k]
         if drift and tick:
             motions = tuple(
