@@ -208,7 +208,9 @@ def test_a_prediction_runs_away_beyond_all_that_was_seen():
     assert scale.beyond(np.array([4.0, 100.0]), noise) == 1.0  # the second is not known yet
     scale = scale.add(np.array([13.0, 1.0]), np.array([0.1, 0.0]))
     assert scale.beyond(np.array([80.0, 0.0]), noise) == 10.0
-    assert scale.beyond(np.array([np.nan, 2.0]), noise) == 20.0
+    # What reaches a sensor that has been quiet so far is nothing unheard of.
+    assert scale.beyond(np.array([np.nan, 2.0]), noise) == 0.25
+    assert scale.beyond(np.array([np.nan, 2.0]), np.array([0.1, 0.001])) == 25.0
 
 
 @pytest.mark.parametrize("gain", [1.0, 1e4])

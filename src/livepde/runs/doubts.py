@@ -16,6 +16,7 @@ MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: 
 OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
 SETTLED = 0.25  # share of a run after which means are taken
 LEFT = 1.0  # deviations between estimate and reference after the last replay
+MOST_SENSORS = 6  # that are named
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
@@ -67,6 +68,8 @@ def _model_error(data: xr.Dataset) -> list[str]:
         if abs(mean) > OFFSET * float(np.sqrt((late**2).mean())):
             side = "above" if mean > 0 else "below"
             off.append(f"{name} reads {abs(mean):.2g} {unit}".rstrip() + f" {side} it")
+    if len(off) > MOST_SENSORS:
+        off = [*off[:MOST_SENSORS], f"{len(off) - MOST_SENSORS} more read too much or too little"]
     if off:
         found.append(
             f"{'; '.join(off)} nearly all the time: give these sensors an unknown offset, or a "
