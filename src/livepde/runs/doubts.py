@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from livepde.diagnostics.identifiability import FLAT
 from livepde.runs.summary import digits, jumps, scalars, scored, when
 
 __all__ = ["MODEL_ERROR", "doubts"]
@@ -20,7 +21,6 @@ MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
-HARDLY = 0.9  # of the prior deviation left: nothing was learned
 
 
 def doubts(data: xr.Dataset) -> list[str]:
@@ -105,7 +105,7 @@ def _unknowns(data: xr.Dataset) -> list[str]:
                     f"{label} ends at its bound {value:g}: the bound decides, not the data."
                 )
         prior = float(attrs.get("prior_std", math.nan))
-        if std > HARDLY * prior:
+        if std > FLAT * prior:
             found.append(
                 f"{label}: the data have told hardly anything; its deviation is still about "
                 "that of the prior."
