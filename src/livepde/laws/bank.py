@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
 from livepde.errors import LawError
-from livepde.fem import Moment, RandomWalk
+from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.filter import Filter
 from livepde.laws.guards import Past, Samples
@@ -97,12 +97,7 @@ class Bank:
     def _filter(self, k: int, tick: float, noise: Array) -> Filter:
         drift, filter_ = self.candidates[k].drift, self.filters[k]
         if drift and tick:
-            motions = tuple(
-                motion
-                if motion.evolution.moves
-                else replace(motion, evolution=_walk(drift / tick, motion.std), saturates=True)
-                for motion in filter_.motions
-            )
+            motions = tuple(motion.drifting(drift / tick) for motion in filter_.motions)
             filter_ = replace(filter_, motions=motions)
         return replace(filter_, noise=noise)
 
@@ -276,9 +271,9 @@ class AutoLaw(Law[Bank, AutoState]):
         if state.known:
             return self._assimilated(work, state, interval)
         # Until the noise is guessed the bank runs free.
-        silent = replace(interval, z1=np.full_like(interval.z1, np.nan))
-        ones = np.ones_like(state.noise)
-        free, report = self.member.step(work.filter(0, 0.0, ones), state.members[0], silent)
+        free, report = self.member.step(
+            work.filter(0, 0.0, np.ones_like(state.noise)), state.members[0], interval.silent
+        )
         if not report.status.ok:
             return state, report
         waiting = state.waiting.add(interval, work.channels)
@@ -287,13 +282,10 @@ class AutoLaw(Law[Bank, AutoState]):
             return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
         begun = replace(self._initial(work, state.start), noise=noise)
         notes: dict[str, float] = {}
-        each = waiting.intervals(work.channels)
-        if np.isfinite(waiting.z[0]).any():  # measured at the start
-            first = each[0]
-            begun = self.begin(
-                work, begun, replace(first, t1=first.t0, inputs1=first.inputs0, z1=first.z0)
-            )
-        for part in each:
+        first = waiting.first(work.channels)
+        if first.present.any():
+            begun = self.begin(work, begun, first)
+        for part in waiting.intervals(work.channels):
             begun, taken = self._assimilated(work, begun, part)
             if not taken.status.ok:
                 return state, taken
@@ -394,12 +386,12 @@ class AutoLaw(Law[Bank, AutoState]):
             if awake[k]:
                 if alarm:
                     recent = work.filters[k].recentred(members[k].now)
-                    members[k] = law._renewed(recent, members[k])
+                    members[k] = law.renewed(recent, members[k])
                 continue
             if k == WIDE and not alarm:
                 continue
             begun = work.filters[WIDE].loosened(now, JUMPS.size) if k == WIDE else now
-            copied = law._renewed(begun, best)
+            copied = law.renewed(begun, best)
             members[k] = replace(copied, past=Past.start(begun, copied.samples))
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)
@@ -465,11 +457,6 @@ def _asleep(state: SensitivityState) -> SensitivityState:
     """Return what is kept of a member that sleeps: nothing that takes room."""
     start = replace(state.start, U=state.start.U[:, :0], C=state.start.C[:, :0])
     return replace(state, start=start, now=start, past=Past.start(start, state.samples))
-
-
-def _walk(rate: float, std: float) -> RandomWalk:
-    """Return an evolution that gains `rate` prior variances per unit of time."""
-    return RandomWalk(float(np.sqrt(rate)) * std)
 
 
 def _same(work: Bank, state: AutoState, j: int, k: int) -> bool:

@@ -90,6 +90,15 @@ class Motion:
     std: float
     saturates: bool = False
 
+    def drifting(self, rate: float) -> Motion:
+        """Return it with a drift of `rate` prior variances per unit of time.
+
+        The same if it moves by itself.
+        """
+        if not rate or self.evolution.moves:
+            return self
+        return replace(self, evolution=RandomWalk(float(np.sqrt(rate)) * self.std), saturates=True)
+
     def transition(self, h: float) -> Array:
         """Return the transition of its coordinates in a time h."""
         F = self.evolution.transition(h)
@@ -400,13 +409,10 @@ def reduction(
                 phi = phi[:, : _enough(phi, inner.variance, mass.diagonal())]
         else:
             phi = np.eye(item.size) * item.unknown.latent_std
-        evolution = item.evolution
-        drifts = bool(drift) and not evolution.moves
-        if drifts:
-            evolution = RandomWalk(np.sqrt(drift) * item.unknown.latent_std)
-        blocks.append(np.kron(np.eye(evolution.copies), phi))
+        blocks.append(np.kron(np.eye(item.evolution.copies), phi))
         stop = start + blocks[-1].shape[1]
-        motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std, drifts))
+        motion = Motion(slice(start, stop), item.evolution, item.unknown.latent_std)
+        motions.append(motion.drifting(drift))
         start = stop
     Phi: Array = np.asarray(block_diag(*blocks))
     return Phi, tuple(motions)

@@ -103,6 +103,11 @@ class Samples:
         z[:1] = np.nan
         return Samples(self.t[first:], z, self.inputs[first:])
 
+    def first(self, channels: tuple[str, ...]) -> Interval:
+        """Return what was measured at the start, as an interval without length."""
+        inputs = Inputs(dict(zip(channels, self.inputs[0].tolist(), strict=True)))
+        return Interval(self.t[0], self.t[0], inputs, inputs, self.z[0], self.z[0])
+
     def intervals(self, channels: tuple[str, ...]) -> list[Interval]:
         """Return the intervals between them, in time order."""
         named = [Inputs(dict(zip(channels, row.tolist(), strict=True))) for row in self.inputs]

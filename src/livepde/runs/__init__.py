@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.runs.directory import Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
-from livepde.runs.doubts import doubts
+from livepde.runs.doubts import doubts, unexplained
 from livepde.runs.drive import Driven, drive
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.runs.summary import Jump, checks_of, jumps, measures, tables
@@ -26,4 +26,5 @@ __all__ = [
     "open",
     "refuse_taken",
     "tables",
+    "unexplained",
 ]

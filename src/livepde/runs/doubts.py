@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from livepde.diagnostics.identifiability import FLAT
 from livepde.runs.summary import digits, jumps, scalars, scored, when
 
-__all__ = ["MODEL_ERROR", "doubts"]
+__all__ = ["doubts", "unexplained"]
 
 MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: twice as large
 OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
@@ -21,7 +22,6 @@ MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
-HARDLY = 0.9  # of the prior deviation left: nothing was learned
 
 
 def doubts(data: xr.Dataset) -> list[str]:
@@ -46,12 +46,17 @@ def doubts(data: xr.Dataset) -> list[str]:
     ]
 
 
+def unexplained(data: xr.Dataset) -> bool:
+    """Return whether a run says that its model does not explain the data: see `doubts`."""
+    if "innovation_ratio" not in data or not data.sizes["time"]:
+        return False
+    return bool(data["innovation_ratio"].values[-1] > MODEL_ERROR)
+
+
 def _model_error(data: xr.Dataset) -> list[str]:
-    if "innovation_ratio" not in data:
+    if not unexplained(data):
         return []
     ratio = float(data["innovation_ratio"].values[-1])
-    if not ratio > MODEL_ERROR:
-        return []
     found = [
         "The model does not explain the data: the sensors miss what is expected of them by "
         f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
@@ -108,7 +113,7 @@ def _unknowns(data: xr.Dataset) -> list[str]:
                     f"{label} ends at its bound {value:g}: the bound decides, not the data."
                 )
         prior = float(attrs.get("prior_std", math.nan))
-        if std > HARDLY * prior:
+        if std > FLAT * prior:
             found.append(
                 f"{label}: the data have told hardly anything; its deviation is still about "
                 "that of the prior."
