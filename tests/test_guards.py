@@ -287,7 +287,7 @@ def test_the_law_goes_on_when_excitation_returns():
     data = learned(model, full(model, 1000), gain=10.0)
     held = holds(data)
     assert held[590:600].all()
-    assert not held[610:].any()
+    assert not held[620:].any()
     true = 2 + np.sin(np.pi * data["x"].values)
     assert np.abs(data["c"][-1] - true).max() < 0.7 * np.abs(data["c"][590] - true).max()
     assert any("samples, last at t = 30" in s for s in doubts(data))

@@ -30,8 +30,8 @@ def doubts(data: xr.Dataset) -> list[str]:
     last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
     bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
     ended more than one deviation away from where it has to end. Guards had to give up samples or to
-    restart, or to hold unknowns that nothing excited. With a fixed gain an estimate wanders, in the last half of a run, by more than 0.3 of
-    what it has learned. Something jumped.
+    restart, or to hold unknowns that nothing excited. With a fixed gain an estimate wanders, in the
+    last half of a run, by more than 0.3 of what it has learned. Something jumped.
     """
     if not data.sizes["time"]:
         return []
@@ -183,8 +183,8 @@ def _rests(data: xr.Dataset) -> list[str]:
         return [f"{found}, as {earlier} times before." if earlier else f"{found}."]
     last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
     return [
-        f"Nothing but noise excited the unknowns in {held.sum()} samples, last at {last}: they were "
-        "held then."
+        f"Nothing but noise excited the unknowns in {held.sum()} samples, last at {last}: they "
+        "were held then."
     ]
 
 
