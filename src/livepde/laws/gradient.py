@@ -269,7 +269,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 Status.of(failure), work.problem.predict(state.u, state.q, interval.end)
             )
         lower, upper = model.latent.bounds
-        u, q = end[: model.X.dim], np.clip(end[model.X.dim :], lower, upper)
+        u, q = end[: model.X.dim], end[model.X.dim :].clip(lower, upper)
         observed_u = coupled.split.R @ u
         rate = end - y
         rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
