@@ -333,7 +333,7 @@ def test_a_rest_is_told_from_noise_alone():
 def test_probes_see_the_same_by_assembly_in_every_unit():
     model = reaction(lambda t: 1.0)
     split = lp.Full().bind(model.state_space, model.X, model.parameter_space).split()
-    probes = Probes(model, split.R)
+    probes = Probes(model, split)
     w, q = np.random.default_rng(0).standard_normal((2, model.X.dim))
     seen = probes(w, q, lp.Moment(0.0))
     assert probes.fixed is not None

@@ -176,7 +176,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         M_op = model.bilinear(self.M_op)
         N_op = M_op if self.N_op is self.M_op else model.bilinear(self.N_op)
         gains = Gains(self.gain, self.damping, self.nu, self.sigma, M_op, N_op)
-        probes = None if self.rest is None else Probes(model, problem.observed.split().R)
+        probes = None if self.rest is None else Probes(model, problem.observed.split())
         return GradientWork(problem, gains, self.newton, probes=probes)
 
     def _tuned(self, problem: Problem) -> GradientWork:

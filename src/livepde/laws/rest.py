@@ -23,7 +23,9 @@ import scipy.sparse as sp
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.linalg import Array
-from livepde.model import Model
+from livepde.model import Model, h1_form, mass_form
+from livepde.observation import Split
+from livepde.spaces import HilbertSpace
 
 __all__ = ["Excitation", "Probes", "Rest"]
 
@@ -75,12 +77,14 @@ class Rest:
         size = float(a @ a)
         scale = math.sqrt(size * excitation.size)
         share = 1.0 / self.window
+        product = float(a @ excitation.last)
         correlation = excitation.correlation
         if scale > 0.0:
-            correlation += share * (float(a @ excitation.last) / scale - correlation)
+            correlation += share * (product / scale - correlation)
         energy = excitation.energy + share * (size - excitation.energy)
-        largest = max(excitation.largest, correlation * energy)
-        return Excitation(a, size, correlation, energy, largest)
+        correlated = excitation.correlated + share * (product - excitation.correlated)
+        largest = max(excitation.largest, correlated)
+        return Excitation(a, size, correlation, energy, correlated, largest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,34 +95,44 @@ class Excitation:
     ----------
     last, size
         What the probes have seen in the last sample, shape (PROBES,), and its square.
-    correlation, energy
-        Fading means of the correlation of successive samples and of the square.
+    correlation, energy, correlated
+        Fading means: of the correlation of successive samples, of the square, and of the product
+        with the sample before, in which noise and outliers have little part.
     largest
-        The largest product of both.
+        The largest `correlated`.
     """
 
     last: Array
     size: float
     correlation: float
     energy: float
+    correlated: float
     largest: float
 
     @classmethod
     def none(cls) -> Excitation:
         """Return the value before any sample."""
-        return cls(np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0)
+        return cls(np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class Probes:
     """(A(w) e_k, p_k) for fixed random pairs: e_k in the unit balls of Q, p_k = R p_k.
 
-    They are as smooth as X and Q, so that what is rough in w counts no more than in A(w)^T r.
+    p_k minimises a Dirichlet integral under a white load, among what R leaves as it is, so that what
+    is rough in w, as noise is, does not outweigh the rest.
     """
 
-    def __init__(self, model: Model, R: sp.csr_array) -> None:
+    def __init__(self, model: Model, split: Split) -> None:
         self.form = model.form_A
         rng = np.random.default_rng(0)
-        self.p = R @ model.X.riesz(rng.standard_normal((model.X.dim, PROBES)))
+        extent = float(np.ptp(model.mesh.p, axis=1).max())
+        mass = model.bilinear(mass_form)
+        smooth = mass + extent**2 * (model.bilinear(h1_form) - mass)
+        parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
+        space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
+        root = np.sqrt(mass.diagonal())[:, None]
+        white = root * rng.standard_normal((model.X.dim, PROBES))
+        self.p = split.R @ space.riesz(split.R.T @ white)
         self.e = model.Q.riesz(rng.standard_normal((model.Q.dim, PROBES)))
         for part in (item.part for item in model.latent.parts.values()):
             for e in self.e.T:
