@@ -118,8 +118,8 @@ class Excitation:
 class Probes:
     """(A(w) e_k, p_k) for fixed random pairs: e_k in the unit balls of Q, p_k = R p_k.
 
-    p_k minimises a Dirichlet integral under a white load, among what R leaves as it is, so that what
-    is rough in w, as noise is, does not outweigh the rest.
+    p_k minimises a Dirichlet integral under a white load, among what R leaves as it is: what is
+    rough in w, as noise is, does not outweigh the rest then.
     """
 
     def __init__(self, model: Model, split: Split) -> None:
