@@ -38,7 +38,8 @@ class Rest:
 
     A step holds q, and u goes on, if up to the sample before, in fading means, what excites q was
     correlated from sample to sample by less than `correlation`, and its mean square was less than
-    `energy` of the largest that was correlated. Note: "held".
+    `energy` of the largest that was correlated. An unknown that moves by itself (evolution=) goes
+    on by that. Note: "held".
 
     Noise that is itself correlated in time, as behind a stream stage that averages, is no noise
     here; where it is a third of the excitation or more, rests are not told from it.
