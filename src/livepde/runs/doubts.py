@@ -31,8 +31,8 @@ def doubts(data: xr.Dataset) -> list[str]:
     last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
     bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
     ended more than one deviation away from where it has to end. Guards had to give up samples or to
-    restart. With a fixed gain an estimate wanders, in the last half of a run, by more than 0.3 of
-    what it has learned. Something jumped.
+    restart, or to hold unknowns that nothing excited. With a fixed gain an estimate wanders, in the
+    last half of a run, by more than 0.3 of what it has learned. Something jumped.
     """
     if not data.sizes["time"]:
         return []
@@ -40,7 +40,7 @@ def doubts(data: xr.Dataset) -> list[str]:
         *_model_error(data),
         *_replays(data),
         *_unknowns(data),
-        *_guards(data),
+        *(_rests(data) if "residual" in data else _guards(data)),
         *_gain(data),
         *_jumps(data),
     ]
@@ -176,6 +176,24 @@ def _guards(data: xr.Dataset) -> list[str]:
             "values and their units."
         )
     return found
+
+
+def _rests(data: xr.Dataset) -> list[str]:
+    """Return when the gradient law has held q."""
+    if "at_rest" not in data:
+        return []
+    held = data["at_rest"].values == 1.0
+    begin = np.flatnonzero(held & ~np.append(False, held[:-1]))
+    if held[-1]:
+        at = when(data, float(data["time"][begin[-1]]))
+        found = f"Nothing but noise excited the unknowns from {at} on: they were held"
+        earlier = len(begin) - 1
+        return [f"{found}, as {earlier} times before." if earlier else f"{found}."]
+    last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
+    return [
+        f"Nothing but noise excited the unknowns in {held.sum()} samples, last at {last}: they "
+        "were held then."
+    ]
 
 
 def _gain(data: xr.Dataset) -> list[str]:
