@@ -290,6 +290,23 @@ def test_what_makes_no_sense_is_refused():
         lp.AutoLaw(gate=0.0)
 
 
+def test_a_window_that_is_full_begins_anew():
+    law = lp.AutoLaw(replay=lp.Replay(window=32))
+    value, std = run(build(law), still()[:120])[-1].parameters["a"]
+    assert abs(value - stays(0.0)) <= 3.0 * std <= 0.03
+
+
+def test_the_first_interval_may_be_of_any_length():
+    late, nothing = moving()[100:250], np.full(len(POINTS), np.nan)
+    (value, std), *others = (
+        run(build(dt_max=0.05), [*early, *late])[-1].parameters["a"]
+        for early in ([(t, nothing) for t, _ in moving()[:100]], [], [(1e-6, nothing)])
+    )
+    for other, deviation in others:
+        assert abs(other - value) <= 0.3 * std
+        assert deviation == pytest.approx(std, rel=0.2)
+
+
 # --- in a case -----------------------------------------------------------------------------------
 
 

@@ -116,7 +116,7 @@ class AutoState:
     noise
         First guess of the deviation of each sensor, shape (sensors,); NaN while there is none.
     tick
-        Time from one sample to the next that drifts refer to; 0 before there is one.
+        Usual time from one sample to the next, which drifts refer to; 0 before there is one.
     waiting
         Samples that wait for a first guess of the noise.
     start
@@ -183,8 +183,8 @@ class AutoLaw(Law[Bank, AutoState]):
     A model with errors is a process that changes, as far as samples can tell: where it is known
     that the unknowns stay, `SensitivityLaw(replay=Replay())` says so.
 
-    Nothing has a unit: drifts are counted in prior variances for each sample, with the time between
-    the first samples.
+    Nothing has a unit: drifts are counted in prior variances for each sample, with the usual time
+    between samples.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ class AutoLaw(Law[Bank, AutoState]):
         self, work: Bank, state: AutoState, interval: Interval
     ) -> tuple[AutoState, Report]:
         """Let all members that are awake take a sample, and weigh them anew."""
-        tick = state.tick or interval.t1 - interval.t0
+        tick = _tick(state, interval)
         members, gained = list(state.members), np.full(len(state.members), -np.inf)
         reports: dict[int, Report] = {}
         for k in state.awake:
@@ -314,7 +314,8 @@ class AutoLaw(Law[Bank, AutoState]):
             change = new.now.evidence - members[k].now.evidence
             if new.due != members[k].due:
                 # A replay mends the evidence of all samples in its window: what is left of them.
-                change *= min(1.0, MEMORY / new.assimilated)
+                # The window may begin anew with this sample.
+                change *= min(1.0, MEMORY / (members[k].assimilated + 1))
             if work.stated and new.now.level.square < 1.0:
                 least = replace(new.now.level, square=1.0)
                 new = replace(new, now=replace(new.now, level=least))
@@ -453,6 +454,18 @@ class AutoLaw(Law[Bank, AutoState]):
                 q_factor.append(w * np.column_stack([b.inflation * b.q_factor, b.q - q]))
                 u_factor.append(w * np.column_stack([b.inflation * b.u_factor, b.u - u]))
         return Belief(q, u, np.hstack(q_factor), np.hstack(u_factor), 1.0, *first)
+
+
+def _tick(state: AutoState, interval: Interval) -> float:
+    """Return the usual time between samples: a geometric mean, of which old ones fade.
+
+    The time before the first sample does not count: what is as uncertain as the prior gains nothing
+    then.
+    """
+    h = interval.t1 - interval.t0
+    if state.count < 2:
+        return h
+    return float(state.tick * (h / state.tick) ** (1.0 / min(state.count, MEMORY)))
 
 
 def _scaled(state: SensitivityState, scale: float) -> SensitivityState:
