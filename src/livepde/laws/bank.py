@@ -28,10 +28,12 @@ TRIAL = 64  # samples that a member has at least to show what it can
 CHECKED = 16  # samples between two looks at who may sleep
 ORDERS = (1, 2, 3, 4, 5)  # of differences
 MEDIAN = 0.6745  # of the size of a normal variable of deviation 1
+ROUNDING = 1e-12  # of the size of readings: no noise
 SCATTER = 0.5  # of the logarithm of such a guess
 GUESSED = 12  # samples from which the noise is guessed where nobody states it
 STAYS, WIDE = 0, 1  # the first two candidates
 JUMPS = Jumps()
+SILENCE = 512  # samples that tell nothing of the noise, after which the bank starts where it is
 PATIENCE = 48  # samples after which a sensor that shows nothing new is guessed by the others
 
 
@@ -283,6 +285,11 @@ class AutoLaw(Law[Bank, AutoState]):
             return state, report
         waiting = state.waiting.add(interval, work.channels)
         noise = _guess(waiting.z)
+        if noise is None and len(waiting.t) > SILENCE:
+            begun = self.member._renewed(work.filters[0].recentred(free.now), free)
+            begun = replace(begun, past=Past.start(begun.now, begun.samples))
+            members = (begun, *state.members[1:])
+            return replace(state, waiting=begun.samples, start=begun, members=members), report
         if noise is None:
             return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
         begun = replace(self._initial(work, state.start), noise=noise)
@@ -520,11 +527,15 @@ def _guess(z: Array) -> Array | None:
     if len(z) <= GUESSED:
         return None
     guesses = []
+    rounding = ROUNDING * np.nanmax(np.abs(z), axis=0, initial=0.0)
     for order in ORDERS:
         bends = np.abs(np.diff(z, order, axis=0))
         seen = np.isfinite(bends).sum(axis=0) >= GUESSED // 2
-        size = np.nanmedian(np.where(seen, bends, 0.0), axis=0) / MEDIAN
-        guesses.append(np.where(size > 0.0, size / np.sqrt(comb(2 * order, order)), np.inf))
+        bends = np.where(seen, bends, 0.0)
+        size = np.nanmedian(bends, axis=0) / MEDIAN
+        if len(z) >= PATIENCE:  # readings of a coarse resolution repeat most of the time
+            size = np.where(size > rounding, size, np.sqrt(np.nanmean(bends**2, axis=0)))
+        guesses.append(np.where(size > rounding, size / np.sqrt(comb(2 * order, order)), np.inf))
     known = np.isfinite(guesses).all(axis=0)
     sizes = [float(np.log(guess[known]).sum()) for guess in guesses]
     noise: Array = guesses[int(np.argmin(sizes))].copy()
