@@ -288,6 +288,10 @@ def test_what_makes_no_sense_is_refused():
         lp.AutoLaw(noise=-1.0)
     with pytest.raises(lp.LawError, match="gate must be positive"):
         lp.AutoLaw(gate=0.0)
+    with pytest.raises(lp.LawError, match="got 'auto'. The law finds the level by itself"):
+        lp.AutoLaw(noise="auto")  # type: ignore[arg-type]
+    with pytest.raises(lp.LawError, match="replay must be a Replay; got True"):
+        lp.AutoLaw(replay=True)  # type: ignore[arg-type]
 
 
 def test_a_window_that_is_full_begins_anew():

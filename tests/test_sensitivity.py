@@ -311,3 +311,15 @@ class TestConsistency:
 
     def test_before_any_innovation(self):
         assert Consistency.start(2).inflation == 1.0
+
+
+@pytest.mark.parametrize("name", ["replay", "jumps", "guards"])
+def test_a_switch_is_no_option(name: str):
+    with pytest.raises(lp.LawError, match=f"{name} must be a {name.title()}, or None"):
+        lp.SensitivityLaw(**{name: True})
+
+
+@pytest.mark.parametrize("modes", [0, -1, 2.5])
+def test_modes_are_counted(modes: float):
+    with pytest.raises(lp.LawError, match="modes must be whole numbers of at least 1"):
+        lp.Identifier(excited(4), lp.Points([0.5], noise=0.1), lp.SensitivityLaw(modes=modes))

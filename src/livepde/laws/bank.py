@@ -211,8 +211,14 @@ class AutoLaw(Law[Bank, AutoState]):
     gate_patience: int = 10
 
     def __post_init__(self) -> None:
-        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
-            raise LawError(f"AutoLaw: noise must be a positive number; got {self.noise}.")
+        number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
+        if not (self.noise is None or number):
+            raise LawError(
+                f"AutoLaw: noise must be a positive number; got {self.noise!r}. The law finds the "
+                "level by itself: leave noise= out of law and observation to state none."
+            )
+        if not isinstance(self.replay, Replay):
+            raise LawError(f"AutoLaw: replay must be a Replay; got {self.replay!r}.")
         _ = self.member
 
     @property
