@@ -288,7 +288,7 @@ def test_what_makes_no_sense_is_refused():
         lp.AutoLaw(noise=-1.0)
     with pytest.raises(lp.LawError, match="gate must be positive"):
         lp.AutoLaw(gate=0.0)
-    with pytest.raises(lp.LawError, match="got 'auto'. The law finds the level by itself"):
+    with pytest.raises(lp.LawError, match=r"got 'auto'\. The law finds the level by itself"):
         lp.AutoLaw(noise="auto")  # type: ignore[arg-type]
     with pytest.raises(lp.LawError, match="replay must be a Replay; got True"):
         lp.AutoLaw(replay=True)  # type: ignore[arg-type]

@@ -292,10 +292,10 @@ class AutoLaw(Law[Bank, AutoState]):
         waiting = state.waiting.add(interval, work.channels)
         noise = _guess(waiting.z)
         if noise is None and len(waiting.t) > SILENCE:
-            begun = self.member._renewed(work.filters[0].recentred(free.now), free)
-            begun = replace(begun, past=Past.start(begun.now, begun.samples))
-            members = (begun, *state.members[1:])
-            return replace(state, waiting=begun.samples, start=begun, members=members), report
+            here = self.member._renewed(work.filters[0].recentred(free.now), free)
+            here = replace(here, past=Past.start(here.now, here.samples))
+            members = (here, *state.members[1:])
+            return replace(state, waiting=here.samples, start=here, members=members), report
         if noise is None:
             return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
         begun = replace(self._initial(work, state.start), noise=noise)
