@@ -33,6 +33,7 @@ SCATTER = 0.5  # of the logarithm of such a guess
 GUESSED = 12  # samples from which the noise is guessed where nobody states it
 STAYS, WIDE = 0, 1  # the first two candidates
 JUMPS = Jumps()
+REGULAR = 1e-6  # share of a time between samples that is rounding
 SILENCE = 512  # samples that tell nothing of the noise, after which the bank starts where it is
 PATIENCE = 48  # samples after which a sensor that shows nothing new is guessed by the others
 
@@ -186,7 +187,7 @@ class AutoLaw(Law[Bank, AutoState]):
     that the unknowns stay, `SensitivityLaw(replay=Replay())` says so.
 
     Nothing has a unit: drifts are counted in prior variances for each sample, with the usual time
-    between samples.
+    between the first samples.
 
     Parameters
     ----------
@@ -470,15 +471,18 @@ class AutoLaw(Law[Bank, AutoState]):
 
 
 def _tick(state: AutoState, interval: Interval) -> float:
-    """Return the usual time between samples: a geometric mean, of which old ones fade.
+    """Return the usual time between the first samples: a geometric mean, then fixed.
 
-    The time before the first sample does not count: what is as uncertain as the prior gains nothing
-    then.
+    The time before the first of them does not count: what is as uncertain as the prior gains
+    nothing then.
     """
     h = interval.t1 - interval.t0
     if state.count < 2:
         return h
-    return float(state.tick * (h / state.tick) ** (1.0 / min(state.count, MEMORY)))
+    ratio = h / state.tick
+    if state.count > TRIAL or abs(ratio - 1.0) < REGULAR:  # the same filters serve again
+        return state.tick
+    return float(state.tick * ratio ** (1.0 / state.count))
 
 
 def _scaled(state: SensitivityState, scale: float) -> SensitivityState:

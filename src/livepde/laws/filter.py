@@ -389,7 +389,7 @@ def reduction(
         raise LawError(
             f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
         )
-    if any(not isinstance(count, int | np.integer) or count < 1 for count in counts.values()):
+    if any(count < 1 or count % 1 for count in counts.values()):
         raise LawError(f"SensitivityLaw: modes must be whole numbers of at least 1; got {modes!r}.")
     blocks, motions, start = [], [], 0
     for name, item in model.latent.parts.items():
