@@ -28,10 +28,13 @@ TRIAL = 64  # samples that a member has at least to show what it can
 CHECKED = 16  # samples between two looks at who may sleep
 ORDERS = (1, 2, 3, 4, 5)  # of differences
 MEDIAN = 0.6745  # of the size of a normal variable of deviation 1
+ROUNDING = 1e-12  # of the size of readings: no noise
 SCATTER = 0.5  # of the logarithm of such a guess
 GUESSED = 12  # samples from which the noise is guessed where nobody states it
 STAYS, WIDE = 0, 1  # the first two candidates
 JUMPS = Jumps()
+REGULAR = 1e-6  # share of a time between samples that is rounding
+SILENCE = 512  # samples that tell nothing of the noise, after which the bank starts where it is
 PATIENCE = 48  # samples after which a sensor that shows nothing new is guessed by the others
 
 
@@ -111,7 +114,7 @@ class AutoState:
     noise
         First guess of the deviation of each sensor, shape (sensors,); NaN while there is none.
     tick
-        Time from one sample to the next that drifts refer to; 0 before there is one.
+        Usual time from one sample to the next, which drifts refer to; 0 before there is one.
     waiting
         Samples that wait for a first guess of the noise.
     start
@@ -178,8 +181,8 @@ class AutoLaw(Law[Bank, AutoState]):
     A model with errors is a process that changes, as far as samples can tell: where it is known
     that the unknowns stay, `SensitivityLaw(replay=Replay())` says so.
 
-    Nothing has a unit: drifts are counted in prior variances for each sample, with the time between
-    the first samples.
+    Nothing has a unit: drifts are counted in prior variances for each sample, with the usual time
+    between the first samples.
 
     Parameters
     ----------
@@ -204,8 +207,14 @@ class AutoLaw(Law[Bank, AutoState]):
     gate_patience: int = 10
 
     def __post_init__(self) -> None:
-        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
-            raise LawError(f"AutoLaw: noise must be a positive number; got {self.noise}.")
+        number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
+        if not (self.noise is None or number):
+            raise LawError(
+                f"AutoLaw: noise must be a positive number; got {self.noise!r}. The law finds the "
+                "level by itself: leave noise= out of law and observation to state none."
+            )
+        if not isinstance(self.replay, Replay):
+            raise LawError(f"AutoLaw: replay must be a Replay; got {self.replay!r}.")
         _ = self.member
 
     @property
@@ -278,6 +287,11 @@ class AutoLaw(Law[Bank, AutoState]):
             return state, report
         waiting = state.waiting.add(interval, work.channels)
         noise = _guess(waiting.z)
+        if noise is None and len(waiting.t) > SILENCE:
+            here = self.member.renewed(work.filters[0].recentred(free.now), free)
+            here = replace(here, past=Past.start(here.now, here.samples))
+            members = (here, *state.members[1:])
+            return replace(state, waiting=here.samples, start=here, members=members), report
         if noise is None:
             return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
         begun = replace(self._initial(work, state.start), noise=noise)
@@ -296,7 +310,7 @@ class AutoLaw(Law[Bank, AutoState]):
         self, work: Bank, state: AutoState, interval: Interval
     ) -> tuple[AutoState, Report]:
         """Let all members that are awake take a sample, and weigh them anew."""
-        tick = state.tick or interval.t1 - interval.t0
+        tick = _tick(state, interval)
         members, gained = list(state.members), np.full(len(state.members), -np.inf)
         reports: dict[int, Report] = {}
         for k in state.awake:
@@ -306,7 +320,8 @@ class AutoLaw(Law[Bank, AutoState]):
             change = new.now.evidence - members[k].now.evidence
             if new.due != members[k].due:
                 # A replay mends the evidence of all samples in its window: what is left of them.
-                change *= min(1.0, MEMORY / new.assimilated)
+                # The window may begin anew with this sample.
+                change *= min(1.0, MEMORY / (members[k].assimilated + 1))
             if work.stated and new.now.level.square < 1.0:
                 least = replace(new.now.level, square=1.0)
                 new = replace(new, now=replace(new.now, level=least))
@@ -447,6 +462,21 @@ class AutoLaw(Law[Bank, AutoState]):
         return Belief(q, u, np.hstack(q_factor), np.hstack(u_factor), 1.0, *first)
 
 
+def _tick(state: AutoState, interval: Interval) -> float:
+    """Return the usual time between the first samples: a geometric mean, then fixed.
+
+    The time before the first of them does not count: what is as uncertain as the prior gains
+    nothing then.
+    """
+    h = interval.t1 - interval.t0
+    if state.count < 2:
+        return h
+    ratio = h / state.tick
+    if state.count > TRIAL or abs(ratio - 1.0) < REGULAR:  # the same filters serve again
+        return state.tick
+    return float(state.tick * ratio ** (1.0 / state.count))
+
+
 def _scaled(state: SensitivityState, scale: float) -> SensitivityState:
     """Return a filter before the first sample with another prior deviation."""
     start = replace(state.start, U=scale * state.start.U, C=scale * state.start.C)
@@ -494,11 +524,15 @@ def _guess(z: Array) -> Array | None:
     if len(z) <= GUESSED:
         return None
     guesses = []
+    rounding = ROUNDING * np.nanmax(np.abs(z), axis=0, initial=0.0)
     for order in ORDERS:
         bends = np.abs(np.diff(z, order, axis=0))
         seen = np.isfinite(bends).sum(axis=0) >= GUESSED // 2
-        size = np.nanmedian(np.where(seen, bends, 0.0), axis=0) / MEDIAN
-        guesses.append(np.where(size > 0.0, size / np.sqrt(comb(2 * order, order)), np.inf))
+        bends = np.where(seen, bends, 0.0)
+        size = np.nanmedian(bends, axis=0) / MEDIAN
+        if len(z) >= PATIENCE:  # readings of a coarse resolution repeat most of the time
+            size = np.where(size > rounding, size, np.sqrt(np.nanmean(bends**2, axis=0)))
+        guesses.append(np.where(size > rounding, size / np.sqrt(comb(2 * order, order)), np.inf))
     known = np.isfinite(guesses).all(axis=0)
     sizes = [float(np.log(guess[known]).sum()) for guess in guesses]
     noise: Array = guesses[int(np.argmin(sizes))].copy()

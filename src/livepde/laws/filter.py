@@ -111,9 +111,11 @@ class Motion:
 
     def gained(self, h: float, variance: Array) -> Array:
         """Return what its coordinates gain in a time h, given their variances."""
-        room = np.maximum(1.0 - variance[self.part], 0.0) if self.saturates else 1.0
-        gained: Array = room * self.growth(h)
-        return gained
+        growth = self.growth(h)
+        if not self.saturates:
+            return growth
+        room: Array = np.maximum(1.0 - variance[self.part], 0.0)
+        return -np.expm1(-growth) * room  # V' = growth (1 - V)/h, whatever the length of the step
 
     def backward(self, h: float) -> Array:
         """Return what the coordinates are expected to have been a time h before: matrix on them."""
@@ -396,6 +398,8 @@ def reduction(
         raise LawError(
             f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
         )
+    if any(count < 1 or count % 1 for count in counts.values()):
+        raise LawError(f"SensitivityLaw: modes must be whole numbers of at least 1; got {modes!r}.")
     blocks, motions, start = [], [], 0
     for name, item in model.latent.parts.items():
         first = slice(item.part.start, item.part.start + item.size)

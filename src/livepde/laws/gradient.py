@@ -264,6 +264,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
 
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stage, y, interval)
+        held = failure is not None and metric is not None
+        if held and metric is not None:  # the state goes on, and nothing is learned
+            metric = replace(metric, spread=HOLD * spread, shift=np.zeros_like(state.q))
+            end, steps, failure = advance(work.problem.control, stage, y, interval)
         if failure is not None:
             return state, Report(
                 Status.of(failure), work.problem.predict(state.u, state.q, interval.end)
@@ -290,8 +294,11 @@ class GradientLaw(Law[GradientWork, GradientState]):
             return after, Report(Status(), predicted, steps, notes)
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
-        if not waits:
-            learned = learning.learn(learned, spread, seen, r, length)
+        if held:
+            notes["held"] = 1.0
+        elif not waits:
+            same = np.array_equal(np.isnan(interval.z0), np.isnan(interval.z1))
+            learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
         after = LearningState(u, q, rate, excitation, learned, balance or state.balance)
         return after, Report(Status(), predicted, steps, notes)

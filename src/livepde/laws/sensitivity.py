@@ -175,6 +175,12 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             raise LawError(
                 f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
             )
+        for name, kind in (("replay", Replay), ("jumps", Jumps), ("guards", Guards)):
+            value = getattr(self, name)
+            if not (value is None or isinstance(value, kind)):
+                raise LawError(
+                    f"SensitivityLaw: {name} must be a {kind.__name__}, or None; got {value!r}."
+                )
         if not self.gate > 0:
             raise LawError(f"SensitivityLaw: gate must be positive; got {self.gate}.")
         if self.gate_patience < 1:
