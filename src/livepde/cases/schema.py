@@ -276,9 +276,9 @@ class SensitivitySpec(Spec):
     modes: PositiveInt | Literal["auto"] = "auto"
     drift: Quantity = 0.0
     memory: Quantity | None = None
-    replay: bool | ReplaySpec = False
+    replay: StrictBool | ReplaySpec = False
     gate: PositiveFloat | None = None
-    jumps: bool | JumpsSpec = False
+    jumps: StrictBool | JumpsSpec = False
 
 
 class AutoSpec(Spec):

@@ -434,6 +434,7 @@ class AutoLaw(Law[Bank, AutoState]):
         notes = dict(leading.notes)
         notes["noise_level"] = float(weights @ levels)
         notes["drift"] = float(weights @ drifts)
+        notes["drifting"] = float(weights @ (drifts > 0.0))
         notes["prior_scale"] = float(np.exp(weights @ scales))
         notes["awake"] = float(len(state.awake))
         return Report(Status(), np.asarray(predicted), leading.steps, notes)

@@ -17,6 +17,7 @@ MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: 
 OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
 SETTLED = 0.25  # share of a run after which means are taken
 LEFT = 1.0  # deviations between estimate and reference after the last replay
+BELIEVED = 0.5  # weight of the members of a bank that drift
 MOST_SENSORS = 6  # that are named
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
@@ -32,7 +33,8 @@ def doubts(data: xr.Dataset) -> list[str]:
     bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
     ended more than one deviation away from where it has to end. Guards had to give up samples or to
     restart, or to hold unknowns that nothing excited. With a fixed gain an estimate wanders, in the
-    last half of a run, by more than 0.3 of what it has learned. Something jumped.
+    last half of a run, by more than 0.3 of what it has learned. A bank believes that unknowns
+    drift. Something jumped.
     """
     if not data.sizes["time"]:
         return []
@@ -40,7 +42,8 @@ def doubts(data: xr.Dataset) -> list[str]:
         *_model_error(data),
         *_replays(data),
         *_unknowns(data),
-        *(_rests(data) if "residual" in data else _guards(data)),
+        *([*_rests(data), *_lost(data)] if "residual" in data else _guards(data)),
+        *_drifts(data),
         *_gain(data),
         *_jumps(data),
     ]
@@ -193,6 +196,29 @@ def _rests(data: xr.Dataset) -> list[str]:
     return [
         f"Nothing but noise excited the unknowns in {held.sum()} samples, last at {last}: they "
         "were held then."
+    ]
+
+
+def _lost(data: xr.Dataset) -> list[str]:
+    """Return where a gradient law could not learn from a sample, because no step converged."""
+    if "held" not in data:
+        return []
+    held = data["held"].values == 1.0
+    last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
+    return [
+        f"In {held.sum()} samples, last at {last}, no step converged with the unknowns: they were "
+        "held, and the state went on. Look at sensors and noise level then."
+    ]
+
+
+def _drifts(data: xr.Dataset) -> list[str]:
+    """Return whether a bank believes that unknowns drift of which nobody has said so."""
+    if "drifting" not in data or not float(data["drifting"][-1]) > BELIEVED:
+        return []
+    return [
+        "The samples speak for unknowns that drift, which also a model with errors looks like. If "
+        "they cannot, do not trust these estimates: take kind = 'sensitivity' with replay = true, "
+        "or mend the model; if they can, give them an evolution."
     ]
 
 
