@@ -100,11 +100,11 @@ def test_a_replay_that_did_not_converge_is_said():
     assert any("The last replay has not converged" in sentence for sentence in found)
 
 
-@pytest.mark.parametrize(("weight", "said"), [(0.1, False), (0.9, True)])
-def test_a_bank_that_believes_in_drift_is_said(weight: float, said: bool):
+@pytest.mark.parametrize(("count", "said"), [(5, False), (50, True)])
+def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
     model = rod(lp.Scalar(0.5, 0.3))
     data = run(model, model)
-    data["drifting"] = ("time", np.full(data.sizes["time"], weight))
+    data["drifting"] = ("time", np.where(np.arange(data.sizes["time"]) < count, 0.9, 0.1))
     assert any("unknowns that drift" in note for note in doubts(data)) == said
 
 

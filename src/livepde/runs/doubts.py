@@ -18,6 +18,7 @@ OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: alwa
 SETTLED = 0.25  # share of a run after which means are taken
 LEFT = 1.0  # deviations between estimate and reference after the last replay
 BELIEVED = 0.5  # weight of the members of a bank that drift
+DRIFTING = 0.03  # share of the samples in which they are believed
 MOST_SENSORS = 6  # that are named
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
@@ -33,8 +34,8 @@ def doubts(data: xr.Dataset) -> list[str]:
     bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
     ended more than one deviation away from where it has to end. Guards had to give up samples or to
     restart, or to hold unknowns that nothing excited. With a fixed gain an estimate wanders, in the
-    last half of a run, by more than 0.3 of what it has learned. A bank believes that unknowns
-    drift. Something jumped.
+    last half of a run, by more than 0.3 of what it has learned. In more than 0.03 of the samples
+    a bank believes that unknowns drift. Something jumped.
     """
     if not data.sizes["time"]:
         return []
@@ -212,13 +213,18 @@ def _lost(data: xr.Dataset) -> list[str]:
 
 
 def _drifts(data: xr.Dataset) -> list[str]:
-    """Return whether a bank believes that unknowns drift of which nobody has said so."""
-    if "drifting" not in data or not float(data["drifting"][-1]) > BELIEVED:
+    """Return whether a bank has believed for long that unknowns drift: nobody has said so."""
+    if "drifting" not in data:
         return []
+    drifting = data["drifting"].values > BELIEVED
+    if not drifting.mean() > DRIFTING:
+        return []
+    last = when(data, float(data["time"][np.flatnonzero(drifting)[-1]]))
     return [
-        "The samples speak for unknowns that drift, which also a model with errors looks like. If "
-        "they cannot, do not trust these estimates: take kind = 'sensitivity' with replay = true, "
-        "or mend the model; if they can, give them an evolution."
+        f"In {drifting.sum()} samples, last at {last}, the data spoke for unknowns that drift, "
+        "which also a model with errors looks like. If they cannot, do not trust these estimates: "
+        "take kind = 'sensitivity' with replay = true, or mend the model; if they can, give them "
+        "an evolution."
     ]
 
 
