@@ -68,20 +68,20 @@ class GradientWork:
         self._stages: dict[tuple[Split, bool], CoupledStage] = {}
         self._smoothers: dict[Split, Smoother] = {}
 
-    def stage(self, present: Array, held: bool = False) -> CoupledStage:
+    def stage(self, present: Array, resting: bool = False) -> CoupledStage:
         """Return the coupled stage for the sensors present; one that holds q."""
         split = self.problem.observed.split(present)
-        if (split, held) not in self._stages:
+        if (split, resting) not in self._stages:
             if len(self._stages) >= 8:
                 self._stages.clear()
             gains = self.gains
-            if held:
+            if resting:
                 gains = replace(gains, gain=gains.gain / HOLD, sigma=0.0)
             memory = None if self.learning is None else self.learning.pattern
-            self._stages[split, held] = CoupledStage(
+            self._stages[split, resting] = CoupledStage(
                 self.problem.model, split, gains, self.newton, memory
             )
-        return self._stages[split, held]
+        return self._stages[split, resting]
 
     def smoother(self, present: Array) -> Smoother:
         """Return the smoother for the sensors present."""
@@ -216,8 +216,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         if z1 is not interval.z1:  # a nonlinear sensor
             interval = replace(interval, z0=z0, z1=z1)
         rest, excitation = self.rest, state.excitation
-        held = rest is not None and work.probes is not None and rest.holds(excitation)
-        coupled = work.stage(interval.present, held)
+        resting = rest is not None and work.probes is not None and rest.holds(excitation)
+        coupled = work.stage(interval.present, resting)
         zero = np.zeros(model.X.dim)
         regularises = observed.observation.reconstruction.regularises
         smoother, balance, alpha, waits = None, None, 0.0, False
@@ -280,7 +280,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         rate /= length
         r = observed_u - found.u
         notes = {"residual": model.X.norm(r)}
-        if held:
+        if resting:
             notes |= {"at_rest": 1.0}
         if regularises:
             notes |= {"alpha": found.alpha, "misfit": found.misfit}
