@@ -21,9 +21,10 @@ from time import process_time
 import numpy as np
 
 import livepde as lp
-from livepde.bench.accuracy import Judge, run_law
+from livepde.bench.accuracy import run_law
 from livepde.bench.offline import fit
 from livepde.bench.problems import FLOW_SIDES, PROBLEMS, Data, Problem
+from livepde.bench.scoring import Judge
 from livepde.models import burgers
 
 DRIFTS = (0.0, 0.01, 0.1, 1.0, 10.0)  # prior variances gained in the whole run
@@ -50,21 +51,21 @@ def data_of(problem: Problem, level: float, seed: int) -> Data:
     return replace(data, process=replace(data.process, model=model))
 
 
-def try_out(problem: Problem, data: Data, law: lp.Law, noise: float | None = 1.0) -> Tried:
+def try_out(data: Data, law: lp.Law, noise: float | None = 1.0) -> Tried:
     """Run a law that is told a multiple of the noise level, or nothing."""
     told = None if noise is None else (noise * data.noise).tolist()
     start = process_time()
     try:
-        score = run_law(problem, data, (replace(data.observation, noise=told), law), 1.0)
+        score = run_law(data, replace(data.observation, noise=told), law)
     except (lp.LivepdeError, np.linalg.LinAlgError, FloatingPointError):
         return Tried(np.inf, 0.0, process_time() - start)
     error = score.error if np.isfinite(score.error) else np.inf
     return Tried(error, score.covered, process_time() - start)
 
 
-def offline(problem: Problem, data: Data) -> float:
+def offline(data: Data) -> float:
     """Return the error of the fit of all data."""
-    found, judge = fit(data, problem.modes), Judge(problem, data)
+    found, judge = fit(data), Judge(data)
     return judge.judged((k, found.q[k], None) for k in judge.scored)[0]
 
 
@@ -87,13 +88,13 @@ def main() -> None:
             times, space = data.process.times, data.process.model.parameter_space
             modes = dict.fromkeys(space.fields, problem.modes)
             for noise, tried in auto.items():
-                tried.append(try_out(problem, data, lp.AutoLaw(modes), noise))
+                tried.append(try_out(data, lp.AutoLaw(modes), noise))
             for drift, noise in product(drifts, factors):
                 replay, rate = None if drift else lp.Replay(), drift / float(np.ptp(times))
                 law = lp.SensitivityLaw(modes, drift=rate, replay=replay)
-                hand.setdefault((drift, noise), []).append(try_out(problem, data, law, noise))
+                hand.setdefault((drift, noise), []).append(try_out(data, law, noise))
             if not problem.varying:
-                limits.append(offline(problem, data))
+                limits.append(offline(data))
         errors = {key: float(np.median([t.error for t in tried])) for key, tried in hand.items()}
         best = min(errors, key=lambda key: errors[key])
         mine, tripled, untold = (float(np.median([t.error for t in x])) for x in auto.values())

@@ -288,6 +288,47 @@ def test_what_makes_no_sense_is_refused():
         lp.AutoLaw(noise=-1.0)
     with pytest.raises(lp.LawError, match="gate must be positive"):
         lp.AutoLaw(gate=0.0)
+    with pytest.raises(lp.LawError, match=r"got 'auto'\. The law finds the level by itself"):
+        lp.AutoLaw(noise="auto")  # type: ignore[arg-type]
+    with pytest.raises(lp.LawError, match="replay must be a Replay; got True"):
+        lp.AutoLaw(replay=True)  # type: ignore[arg-type]
+
+
+def test_a_window_that_is_full_begins_anew():
+    law = lp.AutoLaw(replay=lp.Replay(window=32))
+    value, std = run(build(law), still()[:120])[-1].parameters["a"]
+    assert abs(value - stays(0.0)) <= 3.0 * std <= 0.03
+
+
+def test_the_first_interval_may_be_of_any_length():
+    late, nothing = moving()[100:250], np.full(len(POINTS), np.nan)
+    (value, std), *others = (
+        run(build(dt_max=0.05), [*early, *late])[-1].parameters["a"]
+        for early in ([(t, nothing) for t, _ in moving()[:100]], [], [(1e-6, nothing)])
+    )
+    for other, deviation in others:
+        assert abs(other - value) <= 0.3 * std
+        assert deviation == pytest.approx(std, rel=0.2)
+
+
+@pytest.mark.parametrize("resolution", [0.02, 0.1])
+def test_readings_of_a_coarse_resolution_tell_their_noise(resolution: float):
+    coarse = [(t, np.round(z / resolution) * resolution) for t, z in still()[:200]]
+    last = run(build(noise=None), coarse)[-1]
+    value, std = last.parameters["a"]
+    assert abs(value - stays(0.0)) <= 3.0 * std <= 0.1
+    assert 0.1 <= last.notes["noise_level"] <= 10.0
+
+
+def test_a_slow_signal_of_coarse_resolution_starts_the_bank():
+    steps = [(t, np.round(0.1 * t * np.ones(len(POINTS)), 1)) for t, _ in still()[: PATIENCE + 40]]
+    assert "noise_level" in run(build(noise=None), steps)[-1].notes
+
+
+def test_silence_is_not_stored():
+    quiet = build(noise=None)
+    run(quiet, [(0.05 * k, np.zeros(len(POINTS))) for k in range(1, 601)])
+    assert len(quiet._state.waiting.t) < 200
 
 
 # --- in a case -----------------------------------------------------------------------------------

@@ -98,3 +98,21 @@ def test_a_replay_that_did_not_converge_is_said():
     once = lp.Replay(first=300, iterations=1)
     found = doubts(run(far, rod(lp.Scalar(0.2)), replay=once))
     assert any("The last replay has not converged" in sentence for sentence in found)
+
+
+@pytest.mark.parametrize(("count", "said"), [(5, False), (50, True)])
+def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
+    model = rod(lp.Scalar(0.5, 0.3))
+    data = run(model, model)
+    data["drifting"] = ("time", np.where(np.arange(data.sizes["time"]) < count, 0.9, 0.1))
+    assert any("unknowns that drift" in note for note in doubts(data)) == said
+
+
+def test_samples_of_which_nothing_could_be_learned_are_said():
+    model = rod(lp.Scalar(0.5, 0.3))
+    data = run(model, model)
+    data["residual"] = ("time", np.zeros(data.sizes["time"]))
+    held = np.full(data.sizes["time"], np.nan)
+    held[[3, 5]] = 1.0
+    data["held"] = ("time", held)
+    assert any("In 2 samples, last at t = 0.25" in note for note in doubts(data))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,12 @@ def test_every_example_is_tested():
         "nonlinear_sensor",
         "smoothing_sensor",
     }
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "experiments").glob("*.py")), ids=lambda p: p.stem)
+def test_experiments_find_what_they_import(path, monkeypatch):
+    monkeypatch.syspath_prepend(str(path.parent))
+    assert runpy.run_path(str(path), run_name="imported")
 
 
 @pytest.mark.parametrize(

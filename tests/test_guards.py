@@ -12,6 +12,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.laws.guards import Past, Samples, Scale
+from livepde.laws.rest import Excitation, Probes
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
 from livepde.stepping import ForwardStage, Interval
@@ -208,7 +209,9 @@ def test_a_prediction_runs_away_beyond_all_that_was_seen():
     assert scale.beyond(np.array([4.0, 100.0]), noise) == 1.0  # the second is not known yet
     scale = scale.add(np.array([13.0, 1.0]), np.array([0.1, 0.0]))
     assert scale.beyond(np.array([80.0, 0.0]), noise) == 10.0
-    assert scale.beyond(np.array([np.nan, 2.0]), noise) == 20.0
+    # What reaches a sensor that has been quiet so far is nothing unheard of.
+    assert scale.beyond(np.array([np.nan, 2.0]), noise) == 0.25
+    assert scale.beyond(np.array([np.nan, 2.0]), np.array([0.1, 0.001])) == 25.0
 
 
 @pytest.mark.parametrize("gain", [1.0, 1e4])
@@ -229,6 +232,136 @@ def test_a_gain_too_large_for_the_noise_is_said(gain: float):
         stream.append((t1, (u + 0.01 * rng.standard_normal(len(u)))[model.X.free > 0]))
     said = doubts(identifier.run(stream).to_xarray())
     assert any("the gain is too large for the noise" in s for s in said) == (gain > 1.0)
+
+
+def reaction(drive: Any) -> lp.Model:
+    """u_t - 0.3 u_xx + c u = 0 between ends that a function of time drives."""
+    ends = {
+        "left": lambda x, t: drive(t) * (1 + np.sin(t)) + 0.0 * x[0],
+        "right": lambda x, t: drive(t) + 0.0 * x[0],
+    }
+    return lp.Model(
+        lp.Field(MESH, ElementLineP1(), dirichlet=ends),
+        {"c": lp.Field(MESH, ElementLineP1(), inner="H1", prior=1.0)},
+        A=lambda q, u, v, x: q.c * u * v,
+        B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
+def full(model: lp.Model, count: int, h: float = 0.05, noise: float = 0.01) -> Any:
+    rng, forward, u = np.random.default_rng(0), ForwardStage(model), model.initial(0.0)
+    q = model.initial_parameter({"c": lambda x: 2 + np.sin(np.pi * x[0])})
+    for t0, t1 in pairwise((h * np.arange(count + 1)).tolist()):
+        u = forward.solve(u, q, t1 - t0, lp.Moment(t1))
+        yield t1, (u + noise * rng.standard_normal(len(u)))[model.X.free > 0]
+
+
+def learned(model: lp.Model, stream: Any, gain: float = 100.0, **options: Any) -> Any:
+    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(1.0), **options)
+    return lp.Identifier(model, lp.Full(), law, u0=0.0).run(stream).to_xarray()
+
+
+def holds(data: Any) -> np.ndarray:
+    held = data["at_rest"].values if "at_rest" in data else np.full(data.sizes["time"], np.nan)
+    return held == 1.0
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: float):
+    model = reaction(lambda t: 1.0 * (t < 20.0))
+    stream = list(full(model, 1000))
+    free = learned(model, stream, rest=None, sigma=sigma)
+    held = learned(model, stream, sigma=sigma)
+    first = int(np.flatnonzero(holds(held))[0])
+    assert 400 < first < 500
+    assert holds(held)[first:].all()
+    np.testing.assert_array_equal(held["c"][:first], free["c"][:first])
+    went = [float(np.abs(data["c"][-1] - data["c"][first]).max()) for data in (held, free)]
+    assert went[0] < 1e-6
+    assert went[1] > 1.0
+    at = held["time"].values[first]
+    assert any(f"Nothing but noise excited the unknowns from t = {at:g}" in s for s in doubts(held))
+    assert not any("Nothing but noise" in s for s in doubts(free))
+
+
+def test_the_law_goes_on_when_excitation_returns():
+    model = reaction(lambda t: 1.0 * (t < 2.0 or t > 20.0))
+    data = learned(model, full(model, 1000), gain=1.0)
+    held = holds(data)
+    assert held[390:400].all()
+    assert not held[420:].any()
+    true = 2 + np.sin(np.pi * data["x"].values)
+    before, after = (float(np.abs(data["c"][k].values - true).max()) for k in (399, -1))
+    assert after < 0.6 * before
+    assert any("samples, last at t = 20" in s for s in doubts(data))
+
+
+def test_a_process_faster_than_the_samples_is_not_at_rest():
+    values = np.random.default_rng(1).standard_normal(700)
+    fast = learned(m := reaction(lambda t: values[round(t / 2.0)]), full(m, 600, h=2.0))
+    assert not holds(fast).any()
+    later = lambda t: 1.0 if t < 200.0 else values[round(t / 2.0)]  # noqa: E731
+    late = learned(m := reaction(later), full(m, 600, h=2.0))
+    assert not holds(late).any()
+
+
+def test_an_exact_excitation_that_dies_out_is_none():
+    model = reaction(lambda t: 1.0 / (1.0 + t) ** 2)
+    data = learned(model, full(model, 600, noise=0.0), gain=1e4)
+    assert not holds(data).any()
+
+
+def test_a_rest_is_told_from_noise_alone():
+    rng, rest = np.random.default_rng(0), lp.Rest()
+    slow, noise = np.sin(0.1 * np.arange(300))[:, None], rng.standard_normal((300, 16))
+
+    def after(*parts: np.ndarray) -> Excitation:
+        state = Excitation.none()
+        for a in np.vstack(parts):
+            state = rest.add(state, a)
+        return state
+
+    signal = 10.0 * slow * np.ones(16)
+    for unit in (1e-9, 1.0, 1e9):
+        assert rest.holds(after(unit * (signal + noise), unit * noise))
+        assert not rest.holds(after(unit * (signal + noise)))
+        assert not rest.holds(after(unit * (signal + noise), unit * noise, unit * signal[100:105]))
+        assert not rest.holds(after(unit * (signal + noise), 0.1 * unit * signal))  # weak, no noise
+        assert not rest.holds(after(unit * noise))  # never more than that: perhaps a fast process
+        assert not rest.holds(after(unit * signal, 10.0 * unit * noise))
+    assert not rest.holds(after(np.zeros((300, 16))))
+
+
+def test_probes_see_the_same_by_assembly_in_every_unit():
+    model = reaction(lambda t: 1.0)
+    split = lp.Full().bind(model.state_space, model.X, model.parameter_space).split()
+    probes = Probes(model, split)
+    w, q = np.random.default_rng(0).standard_normal((2, model.X.dim))
+    seen = probes(w, q, lp.Moment(0.0))
+    assert probes.fixed is not None
+    probes.fixed = None
+    np.testing.assert_allclose(probes(w, q, lp.Moment(0.0)), seen, rtol=1e-10)
+    np.testing.assert_allclose([e @ model.Q.dual(e) for e in probes.e.T], 1.0)
+
+
+def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
+    model = reaction(lambda t: 1.0 * (t < 5.0))
+    stream = list(full(model, 300))
+    identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=100.0), u0=0.0)
+    for t, z in stream[:150]:
+        identifier.step(t, z)
+    identifier.save(tmp_path / "rest.npz")
+    again = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=100.0), u0=0.0)
+    again.load(tmp_path / "rest.npz")
+    pairs = [(identifier.step(t, z), again.step(t, z)) for t, z in stream[150:]]
+    assert any(one.notes.get("at_rest") for one, _ in pairs)
+    assert all(one.notes == other.notes for one, other in pairs)
+
+
+@pytest.mark.parametrize("options", [{"window": 0.5}, {"correlation": 1.0}, {"energy": 0.0}])
+def test_rests_that_cannot_be_meant_are_refused(options: Any):
+    with pytest.raises(lp.LawError, match=next(iter(options))):
+        lp.Rest(**options)
 
 
 @pytest.mark.parametrize("options", [{"reach": 0.0}, {"runaway": -1.0}, {"past": 0}])

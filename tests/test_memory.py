@@ -275,3 +275,31 @@ def test_what_cannot_be_is_one_sentence() -> None:
         lp.Identifier(both, lp.Full(of="a", noise=0.1), AUTO, u0=0.0)
     with pytest.raises(LawError, match="moves"):
         lp.Identifier(model, lp.Full(), AUTO, u0=0.0)
+
+
+def test_missing_sensors_are_no_noise_that_turns_back():
+    """What a change of the sensors leaves in r made the noise level negative, and the gain huge."""
+    points, rng = np.linspace(0.1, 0.9, 9), np.random.default_rng(1)
+    mesh = lp.interval(0.0, 1.0, 30)
+    ends = {"left": lambda x, t: np.sin(t) + 0.0 * x[0], "right": 0.0}
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
+        lp.Field(mesh, ElementLineP1(), inner="H1", prior=1.0, std=1.0),
+        lambda q, u, v, x: q * u * v,
+        lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - 5.0 * v,
+    )
+    twin = Twin(
+        model=model,
+        observation=lp.Points(points),
+        q_true=lambda x: 1.0 + np.sin(3.0 * x[0]),
+        u0=0.0,
+        times=0.1 * np.arange(61),
+    )
+    identifier = lp.Identifier(model, twin.observation, AUTO, q0=0.5, u0=0.0)
+    for sample in twin:
+        z = sample.z + 0.01 * rng.standard_normal(len(points))
+        z[rng.random(len(points)) < 0.2] = np.nan
+        estimate = identifier.step(sample.t, z)
+        assert estimate.status.ok
+        assert "held" not in estimate.notes
+        assert np.abs(estimate.q).max() < 5.0

@@ -30,7 +30,7 @@ def test_the_reference_holds_what_is_exported():
     for name in livepde.__all__:
         owner = getattr(getattr(livepde, name), "__module__", "livepde")
         assert owner.startswith("livepde") != (name in helpers), name
-    for package in ("", ".models", ".diagnostics", ".streams"):
+    for package in ("", ".models", ".diagnostics", ".runs", ".streams"):
         assert f"::: livepde{package}\n" in reference
         module = importlib.import_module(f"livepde{package}")
         for name in module.__all__:

@@ -143,9 +143,19 @@ def test_uncertainty_returns_to_the_prior_with_drift_and_without_data():
     stds = [ident.step(t, [np.nan, np.nan], inputs).q_std[0] for t, _, inputs in samples[11:]]
     assert seen[-1] < 0.1
     assert np.all(np.diff(stds) > 0)
-    # dV/dt = 0.5 (1 - V) from the variance after the last sample, by steps of 0.1
-    expected = 1.0 - (1.0 - seen[-1] ** 2) * 0.95 ** np.arange(1, 91)
+    # dV/dt = 0.5 (1 - V) from the variance after the last sample
+    expected = 1.0 - (1.0 - seen[-1] ** 2) * np.exp(-0.05 * np.arange(1, 91))
     assert np.square(stds) == pytest.approx(expected)
+
+
+def test_a_long_gap_leaves_no_more_uncertainty_than_the_prior():
+    model = conductivity()
+    sensors, samples = stream(model, 1.0, 0.1 * np.arange(11))
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.5))
+    for sample in samples:
+        ident.step(*sample)
+    t, _, inputs = samples[-1]
+    assert ident.step(t + 100.0, [np.nan, np.nan], inputs).q_std[0] == pytest.approx(1.0)
 
 
 def test_a_field_by_modes_of_its_prior():
@@ -301,3 +311,15 @@ class TestConsistency:
 
     def test_before_any_innovation(self):
         assert Consistency.start(2).inflation == 1.0
+
+
+@pytest.mark.parametrize("name", ["replay", "jumps", "guards"])
+def test_a_switch_is_no_option(name: str):
+    with pytest.raises(lp.LawError, match=f"{name} must be a {name.title()}, or None"):
+        lp.SensitivityLaw(**{name: True})
+
+
+@pytest.mark.parametrize("modes", [0, -1, 2.5])
+def test_modes_are_counted(modes: float):
+    with pytest.raises(lp.LawError, match="modes must be whole numbers of at least 1"):
+        lp.Identifier(excited(4), lp.Points([0.5], noise=0.1), lp.SensitivityLaw(modes=modes))

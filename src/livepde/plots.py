@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["ensemble", "figure", "history", "interval_95", "overview", "profiles"]
+__all__ = ["NORMAL_95", "ensemble", "figure", "history", "interval_95", "overview", "profiles"]
 
 # Okabe and Ito (2008): told apart with every common kind of colour blindness. Yellow is left out:
 # it cannot be seen on white.

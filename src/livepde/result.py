@@ -325,7 +325,7 @@ def _prior(unknown: Any) -> dict[str, float]:
 def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
     """Return the table of a run's dataset: last estimates, and errors of each channel."""
     rows: dict[str, dict[str, float]] = {}
-    for label in filter(None, data.attrs["scalars"].split("\n")):
+    for label in filter(None, data.attrs["scalars"].split("\n") if data.sizes["time"] else ()):
         rows[label] = {
             "value": float(data[label][-1]),
             "std": float(data[f"{label}_std"][-1]),

@@ -36,7 +36,7 @@ from livepde.progress import watched
 from livepde.runs.outcome import Check, Outcome
 from livepde.stepping import StepFailed
 
-__all__ = ["LAWS", "ROWS", "accuracy"]
+__all__ = ["LAWS", "ROWS", "accuracy", "run_law"]
 
 LawBuilder: TypeAlias = Callable[[Data], tuple[Observation, AnyLaw] | None]
 
@@ -88,11 +88,12 @@ Everything as it comes, but for the number of modes and the hand-set gain that t
 
 
 def _law(builder: LawBuilder, data: Data) -> Score | None:
-    """Run a law over a data set."""
     built = builder(data)
-    if built is None:
-        return None
-    observation, law = built
+    return None if built is None else run_law(data, *built)
+
+
+def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
+    """Run a law over a data set; `observation` says what it is told of the sensors."""
     process, samples = data.process, list(data)
     identifier = Identifier(
         process.model,

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from livepde.bench.cases import find_cases
-from livepde.bench.coverage import MODEL_ERROR
 from livepde.cases import load
 from livepde.errors import LivepdeError
 from livepde.fem import Field, Piecewise, Scalar, dot, grad, interval, linear
@@ -29,9 +28,10 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import burgers
 from livepde.observation import Observation, Points, Subdomain
+from livepde.plots import NORMAL_95
 from livepde.progress import watched
 from livepde.reproduce import seed_excited
-from livepde.runs import Check, Outcome, Table, doubts, drive
+from livepde.runs import Check, Outcome, Table, drive, unexplained
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
 __all__ = ["PROCESSES", "SUSPECTS", "Process", "Suspect", "Told", "alarms", "followed", "warned"]
@@ -266,7 +266,7 @@ def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0)
     # The interval in latent coefficients, through which every transform maps its ends.
     std = np.asarray(belief.q_std, dtype=float)
     exact = latent.inverse((1.0 + change) * data.q)
-    inside = np.abs(belief.q - exact) <= 1.959964 * std
+    inside = np.abs(belief.q - exact) <= NORMAL_95 * std
     return Told(
         late[0] if late else np.inf,
         len(alarms) - len(late),
@@ -359,12 +359,8 @@ def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
         law = SensitivityLaw(replay=Replay())
         identifier = Identifier(model, data.observation, law, u0=0.0)
         run = identifier.run(zip(times[1:], data.z[1:], strict=True))
-        told.append(_doubted(run.to_xarray()))
+        told.append(unexplained(run.to_xarray()))
     return told[0], told[1]
-
-
-def _doubted(data: Any) -> bool:
-    return any(sentence.startswith(MODEL_ERROR) for sentence in doubts(data))
 
 
 # --- all of it -----------------------------------------------------------------------------------
@@ -426,7 +422,7 @@ def _case(name: str, settings: Mapping[str, Any]) -> bool:
     prepared = load(path, settings=settings).prepare()
     data = drive(prepared.identifier, prepared.stream).result.to_xarray()
     prepared.describe(data)
-    return _doubted(data)
+    return unexplained(data)
 
 
 def _jumps(found: Mapping[str, Sequence[Told]]) -> Table:

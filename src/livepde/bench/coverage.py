@@ -25,9 +25,10 @@ from livepde.laws import Belief, Replay, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
+from livepde.plots import NORMAL_95
 from livepde.progress import watched
 from livepde.result import Estimate
-from livepde.runs import doubts
+from livepde.runs import unexplained
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.stepping import Advance, ForwardStage, ImplicitEuler, Interval, advance
 
@@ -36,11 +37,9 @@ __all__ = ["PROBLEMS", "Problem", "Twin", "coverage", "twin"]
 LEVELS = (0.68, 0.95)
 WITHIN = {0.68: (0.60, 0.76), 0.95: (0.90, 0.98)}  # what the shares over 200 twins have to lie in
 AT_LEAST = 0.9  # share of twins with innovations within chance, which is 0.95
-CHANCE = 1.959964  # standard errors that hold a statistic of white noise in 95 of 100 cases
 HONEST = 0.9  # of the wrong models: wide enough, or doubted
 FALSE_ALARM = 0.05  # of the right models doubted, at most
 NOISE = 0.05
-MODEL_ERROR = "The model does not explain the data"
 MESH = line(0.0, 1.0, 20)
 
 
@@ -259,7 +258,7 @@ def twin(problem: Problem, seed: int) -> Twin:
         {level: _mean([one[level] for one in inside]) for level in LEVELS},
         _mean(errors),
         samples[-1].belief.inflation,
-        any(sentence.startswith(MODEL_ERROR) for sentence in doubts(result.to_xarray())),
+        unexplained(result.to_xarray()),
         _white(samples[-1].notes, problem.samples * len(problem.sensors)),
     )
 
@@ -268,8 +267,8 @@ def _white(notes: Mapping[str, float], values: int) -> tuple[bool, bool]:
     """Return whether statistics of so many normalised innovations are those of white noise."""
     square, correlation = notes["innovation_ratio"] - 1.0, notes["innovation_correlation"]
     return (
-        abs(square) <= CHANCE * np.sqrt(2.0 / values),
-        abs(correlation) <= CHANCE * np.sqrt(1.0 / values),
+        abs(square) <= NORMAL_95 * np.sqrt(2.0 / values),
+        abs(correlation) <= NORMAL_95 * np.sqrt(1.0 / values),
     )
 
 

@@ -16,6 +16,7 @@ from livepde.bench.problems import WARM_UP, Data
 from livepde.errors import LivepdeError
 from livepde.fem import FieldBlock
 from livepde.linalg import Array
+from livepde.plots import NORMAL_95
 from livepde.runs.outcome import Table
 from livepde.stepping import StepFailed
 
@@ -32,7 +33,6 @@ __all__ = [
     "table_of",
 ]
 
-QUANTILE = 1.959964  # of the normal distribution, for 95 %
 QUICK = 1.0  # s
 TIMES = 11  # in the second half, at which a parameter that moves is scored
 
@@ -117,7 +117,7 @@ class Judge:
             return math.nan
         distance = np.abs(self.probe @ (q - self.model.latent.inverse(true[at])))
         std = np.sqrt(((self.probe @ factor) ** 2).sum(axis=1) + self.rest**2)
-        return float(np.mean(distance <= QUANTILE * std))
+        return float(np.mean(distance <= NORMAL_95 * std))
 
     def judged(self, beliefs: Iterable[tuple[int, Array, Array | None]]) -> tuple[float, float]:
         """Return error (root mean square over the scored times) and coverage."""

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.case import Prepared
-from livepde.cases.preview import MOST_SAMPLES, NEVER
+from livepde.cases.preview import MOST_SAMPLES, linearised
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
-from livepde.laws import AutoLaw, Belief, Replay, SensitivityLaw
+from livepde.laws import Belief, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Combined, Observation, Points
@@ -70,12 +70,10 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
         The law has no covariance, or it is not clear which component of the state a sensor would
         see.
     """
-    case, law = prepared.case, prepared.case.law
-    if isinstance(law, AutoLaw):
-        law = law.member
-    if not isinstance(law, SensitivityLaw):
+    case, law = prepared.case, linearised(prepared.case.law)
+    if law is None:
         raise ConfigurationError(
-            "advice on sensors needs a law with a covariance: kind = 'sensitivity'."
+            "advice on sensors needs a law with a covariance: kind = 'sensitivity' or 'auto'."
         )
     space = case.model.parameter_space
     if law.drift or any(
@@ -182,11 +180,10 @@ def _previewed(
 ) -> Iterator[Belief]:
     """Yield what a filter believes that is linear about the prior, after each measurement."""
     case = prepared.case
-    linear = SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
     identifier = Identifier(
         case.model,
         sensors,
-        linear,
+        law,
         u0=prepared.u0,
         t0=float(prepared.first.t),
         withheld=case.withheld,

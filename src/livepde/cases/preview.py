@@ -10,9 +10,9 @@ import numpy as np
 from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
 from livepde.identifier import Sample
-from livepde.laws import AutoLaw, Belief, Replay, SensitivityLaw
+from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw
 
-__all__ = ["Identified", "Preview", "preview"]
+__all__ = ["Identified", "Preview", "linearised", "preview"]
 
 MOST_SAMPLES = 500
 NEVER = 1 << 60
@@ -65,6 +65,18 @@ class Preview:
     sentences: tuple[str, ...] = ()
 
 
+def linearised(law: AnyLaw) -> SensitivityLaw | None:
+    """Return the law as a filter that is linear about the prior; None for one without covariance.
+
+    Of a bank the member whose unknowns stay.
+    """
+    if isinstance(law, AutoLaw):
+        law = law.member
+    if not isinstance(law, SensitivityLaw):
+        return None
+    return SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
+
+
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     """Return what the first samples would tell, linearised at the prior.
 
@@ -73,14 +85,11 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     reference, and its estimates are thrown away. What is left is the best case: noise as stated,
     and a model without error. Nothing for a law without covariance.
     """
-    law = prepared.case.law
-    if isinstance(law, AutoLaw):
-        law = law.member
-    if not isinstance(law, SensitivityLaw):
+    linear = linearised(prepared.case.law)
+    if linear is None:
         return Preview()
-    if law.noise is None and prepared.identifier.observed.noise is None:
+    if linear.noise is None and prepared.identifier.observed.noise is None:
         return Preview()  # to be found from the samples
-    linear = SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
     identifier = prepared.identifier_with(linear)
     count = 0
     for sample in samples:

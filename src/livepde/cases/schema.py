@@ -18,6 +18,7 @@ from pydantic import (
     model_validator,
 )
 
+from livepde.laws import Jumps, Replay
 from livepde.runs.outcome import Bound, Sense
 
 __all__ = [
@@ -253,18 +254,18 @@ class ChannelSpec(Spec):
 class ReplaySpec(Spec):
     """Options of the replay."""
 
-    window: PositiveInt = 4096
-    first: PositiveInt = 8
-    iterations: PositiveInt = 4
+    window: PositiveInt = Replay.window
+    first: PositiveInt = Replay.first
+    iterations: PositiveInt = Replay.iterations
 
 
 class JumpsSpec(Spec):
     """Options of the test for sudden changes."""
 
-    probability: PositiveFloat = 1e-5
-    window: PositiveInt = 32
-    size: PositiveFloat = 1.0
-    settle: NonNegativeInt = 50
+    probability: PositiveFloat = Jumps.probability
+    window: PositiveInt = Jumps.window
+    size: PositiveFloat = Jumps.size
+    settle: NonNegativeInt = Jumps.settle
 
 
 class SensitivitySpec(Spec):
@@ -275,9 +276,9 @@ class SensitivitySpec(Spec):
     modes: PositiveInt | Literal["auto"] = "auto"
     drift: Quantity = 0.0
     memory: Quantity | None = None
-    replay: bool | ReplaySpec = False
+    replay: StrictBool | ReplaySpec = False
     gate: PositiveFloat | None = None
-    jumps: bool | JumpsSpec = False
+    jumps: StrictBool | JumpsSpec = False
 
 
 class AutoSpec(Spec):

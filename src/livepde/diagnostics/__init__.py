@@ -5,7 +5,7 @@ from __future__ import annotations
 from livepde.diagnostics.bounds import Errors, TwinTracker, bounds, conditions
 from livepde.diagnostics.constants import Part, Spaces, constants
 from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
-from livepde.diagnostics.identifiability import Identifiability, identifiability
+from livepde.diagnostics.identifiability import Direction, Identifiability, Known, identifiability
 from livepde.diagnostics.law import check_law
 from livepde.diagnostics.links import Interpolation, Link, interpolation, link
 from livepde.diagnostics.model import check_model
@@ -24,11 +24,13 @@ from livepde.diagnostics.theory import OnlineTracker, Sheet, TheoryReport, theor
 __all__ = [
     "CheckLine",
     "CheckReport",
+    "Direction",
     "Errors",
     "Excitation",
     "ExcitationState",
     "Identifiability",
     "Interpolation",
+    "Known",
     "Link",
     "OnlineStopping",
     "OnlineTracker",

@@ -143,7 +143,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     prior, posterior = belief.prior_factor, belief.q_factor
     if prior is None or posterior is None:
         raise ConfigurationError(
-            "identifiability needs a belief with a covariance: run the SensitivityLaw."
+            "identifiability needs a belief with a covariance: run SensitivityLaw or AutoLaw."
         )
     latent, space = model.latent, model.parameter_space
     labels = list(space.labels)

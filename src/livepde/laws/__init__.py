@@ -18,6 +18,7 @@ from livepde.laws.guards import Guards
 from livepde.laws.jumps import Jumps
 from livepde.laws.operators import observed_operator, unobserved_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
+from livepde.laws.rest import Rest
 from livepde.laws.sensitivity import Replay, SensitivityLaw
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "Report",
     "Residual",
     "ResidualDamping",
+    "Rest",
     "SensitivityLaw",
     "SmoothedBound",
     "Status",

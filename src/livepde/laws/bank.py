@@ -10,7 +10,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import logsumexp
 
 from livepde.errors import LawError
-from livepde.fem import Moment, RandomWalk
+from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.filter import Filter
 from livepde.laws.guards import Past, Samples
@@ -28,10 +28,13 @@ TRIAL = 64  # samples that a member has at least to show what it can
 CHECKED = 16  # samples between two looks at who may sleep
 ORDERS = (1, 2, 3, 4, 5)  # of differences
 MEDIAN = 0.6745  # of the size of a normal variable of deviation 1
+ROUNDING = 1e-12  # of the size of readings: no noise
 SCATTER = 0.5  # of the logarithm of such a guess
 GUESSED = 12  # samples from which the noise is guessed where nobody states it
 STAYS, WIDE = 0, 1  # the first two candidates
 JUMPS = Jumps()
+REGULAR = 1e-6  # share of a time between samples that is rounding
+SILENCE = 512  # samples that tell nothing of the noise, after which the bank starts where it is
 PATIENCE = 48  # samples after which a sensor that shows nothing new is guessed by the others
 
 
@@ -69,6 +72,7 @@ class Bank:
     laws: tuple[SensitivityLaw, ...]
     filters: tuple[Filter, ...]
     stated: bool
+    _made: dict[tuple[int, float, bytes], Filter] = field(default_factory=dict)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -82,15 +86,21 @@ class Bank:
         return np.asarray(chances - logsumexp(chances))
 
     def filter(self, k: int, tick: float, noise: Array) -> Filter:
-        """Return the filter of a candidate, for samples a time `tick` apart."""
+        """Return the filter of a candidate, for samples a time `tick` apart.
+
+        Made once: it keeps what it has computed.
+        """
+        key = (k, tick, noise.tobytes())
+        if key not in self._made:
+            if len(self._made) > 3 * len(self.candidates):
+                self._made.clear()
+            self._made[key] = self._filter(k, tick, noise)
+        return self._made[key]
+
+    def _filter(self, k: int, tick: float, noise: Array) -> Filter:
         drift, filter_ = self.candidates[k].drift, self.filters[k]
         if drift and tick:
-            motions = tuple(
-                motion
-                if motion.evolution.moves
-                else replace(motion, evolution=_walk(drift / tick, motion.std), saturates=True)
-                for motion in filter_.motions
-            )
+            motions = tuple(motion.drifting(drift / tick) for motion in filter_.motions)
             filter_ = replace(filter_, motions=motions)
         return replace(filter_, noise=noise)
 
@@ -104,7 +114,7 @@ class AutoState:
     noise
         First guess of the deviation of each sensor, shape (sensors,); NaN while there is none.
     tick
-        Time from one sample to the next that drifts refer to; 0 before there is one.
+        Usual time from one sample to the next, which drifts refer to; 0 before there is one.
     waiting
         Samples that wait for a first guess of the noise.
     start
@@ -171,8 +181,8 @@ class AutoLaw(Law[Bank, AutoState]):
     A model with errors is a process that changes, as far as samples can tell: where it is known
     that the unknowns stay, `SensitivityLaw(replay=Replay())` says so.
 
-    Nothing has a unit: drifts are counted in prior variances for each sample, with the time between
-    the first samples.
+    Nothing has a unit: drifts are counted in prior variances for each sample, with the usual time
+    between the first samples.
 
     Parameters
     ----------
@@ -197,8 +207,14 @@ class AutoLaw(Law[Bank, AutoState]):
     gate_patience: int = 10
 
     def __post_init__(self) -> None:
-        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
-            raise LawError(f"AutoLaw: noise must be a positive number; got {self.noise}.")
+        number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
+        if not (self.noise is None or number):
+            raise LawError(
+                f"AutoLaw: noise must be a positive number; got {self.noise!r}. The law finds the "
+                "level by itself: leave noise= out of law and observation to state none."
+            )
+        if not isinstance(self.replay, Replay):
+            raise LawError(f"AutoLaw: replay must be a Replay; got {self.replay!r}.")
         _ = self.member
 
     @property
@@ -264,24 +280,26 @@ class AutoLaw(Law[Bank, AutoState]):
         if state.known:
             return self._assimilated(work, state, interval)
         # Until the noise is guessed the bank runs free.
-        silent = replace(interval, z1=np.full_like(interval.z1, np.nan))
-        ones = np.ones_like(state.noise)
-        free, report = self.member.step(work.filter(0, 0.0, ones), state.members[0], silent)
+        free, report = self.member.step(
+            work.filter(0, 0.0, np.ones_like(state.noise)), state.members[0], interval.silent
+        )
         if not report.status.ok:
             return state, report
         waiting = state.waiting.add(interval, work.channels)
         noise = _guess(waiting.z)
+        if noise is None and len(waiting.t) > SILENCE:
+            here = self.member.renewed(work.filters[0].recentred(free.now), free)
+            here = replace(here, past=Past.start(here.now, here.samples))
+            members = (here, *state.members[1:])
+            return replace(state, waiting=here.samples, start=here, members=members), report
         if noise is None:
             return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
         begun = replace(self._initial(work, state.start), noise=noise)
         notes: dict[str, float] = {}
-        each = waiting.intervals(work.channels)
-        if np.isfinite(waiting.z[0]).any():  # measured at the start
-            first = each[0]
-            begun = self.begin(
-                work, begun, replace(first, t1=first.t0, inputs1=first.inputs0, z1=first.z0)
-            )
-        for part in each:
+        first = waiting.first(work.channels)
+        if first.present.any():
+            begun = self.begin(work, begun, first)
+        for part in waiting.intervals(work.channels):
             begun, taken = self._assimilated(work, begun, part)
             if not taken.status.ok:
                 return state, taken
@@ -292,7 +310,7 @@ class AutoLaw(Law[Bank, AutoState]):
         self, work: Bank, state: AutoState, interval: Interval
     ) -> tuple[AutoState, Report]:
         """Let all members that are awake take a sample, and weigh them anew."""
-        tick = state.tick or interval.t1 - interval.t0
+        tick = _tick(state, interval)
         members, gained = list(state.members), np.full(len(state.members), -np.inf)
         reports: dict[int, Report] = {}
         for k in state.awake:
@@ -302,7 +320,8 @@ class AutoLaw(Law[Bank, AutoState]):
             change = new.now.evidence - members[k].now.evidence
             if new.due != members[k].due:
                 # A replay mends the evidence of all samples in its window: what is left of them.
-                change *= min(1.0, MEMORY / new.assimilated)
+                # The window may begin anew with this sample.
+                change *= min(1.0, MEMORY / (members[k].assimilated + 1))
             if work.stated and new.now.level.square < 1.0:
                 least = replace(new.now.level, square=1.0)
                 new = replace(new, now=replace(new.now, level=least))
@@ -382,12 +401,12 @@ class AutoLaw(Law[Bank, AutoState]):
             if awake[k]:
                 if alarm:
                     recent = work.filters[k].recentred(members[k].now)
-                    members[k] = law._renewed(recent, members[k])
+                    members[k] = law.renewed(recent, members[k])
                 continue
             if k == WIDE and not alarm:
                 continue
             begun = work.filters[WIDE].loosened(now, JUMPS.size) if k == WIDE else now
-            copied = law._renewed(begun, best)
+            copied = law.renewed(begun, best)
             members[k] = replace(copied, past=Past.start(begun, copied.samples))
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)
@@ -415,6 +434,7 @@ class AutoLaw(Law[Bank, AutoState]):
         notes = dict(leading.notes)
         notes["noise_level"] = float(weights @ levels)
         notes["drift"] = float(weights @ drifts)
+        notes["drifting"] = float(weights @ (drifts > 0.0))
         notes["prior_scale"] = float(np.exp(weights @ scales))
         notes["awake"] = float(len(state.awake))
         return Report(Status(), np.asarray(predicted), leading.steps, notes)
@@ -443,6 +463,21 @@ class AutoLaw(Law[Bank, AutoState]):
         return Belief(q, u, np.hstack(q_factor), np.hstack(u_factor), 1.0, *first)
 
 
+def _tick(state: AutoState, interval: Interval) -> float:
+    """Return the usual time between the first samples: a geometric mean, then fixed.
+
+    The time before the first of them does not count: what is as uncertain as the prior gains
+    nothing then.
+    """
+    h = interval.t1 - interval.t0
+    if state.count < 2:
+        return h
+    ratio = h / state.tick
+    if state.count > TRIAL or abs(ratio - 1.0) < REGULAR:  # the same filters serve again
+        return state.tick
+    return float(state.tick * ratio ** (1.0 / state.count))
+
+
 def _scaled(state: SensitivityState, scale: float) -> SensitivityState:
     """Return a filter before the first sample with another prior deviation."""
     start = replace(state.start, U=scale * state.start.U, C=scale * state.start.C)
@@ -453,11 +488,6 @@ def _asleep(state: SensitivityState) -> SensitivityState:
     """Return what is kept of a member that sleeps: nothing that takes room."""
     start = replace(state.start, U=state.start.U[:, :0], C=state.start.C[:, :0])
     return replace(state, start=start, now=start, past=Past.start(start, state.samples))
-
-
-def _walk(rate: float, std: float) -> RandomWalk:
-    """Return an evolution that gains `rate` prior variances per unit of time."""
-    return RandomWalk(float(np.sqrt(rate)) * std)
 
 
 def _same(work: Bank, state: AutoState, j: int, k: int) -> bool:
@@ -495,11 +525,15 @@ def _guess(z: Array) -> Array | None:
     if len(z) <= GUESSED:
         return None
     guesses = []
+    rounding = ROUNDING * np.nanmax(np.abs(z), axis=0, initial=0.0)
     for order in ORDERS:
         bends = np.abs(np.diff(z, order, axis=0))
         seen = np.isfinite(bends).sum(axis=0) >= GUESSED // 2
-        size = np.nanmedian(np.where(seen, bends, 0.0), axis=0) / MEDIAN
-        guesses.append(np.where(size > 0.0, size / np.sqrt(comb(2 * order, order)), np.inf))
+        bends = np.where(seen, bends, 0.0)
+        size = np.nanmedian(bends, axis=0) / MEDIAN
+        if len(z) >= PATIENCE:  # readings of a coarse resolution repeat most of the time
+            size = np.where(size > rounding, size, np.sqrt(np.nanmean(bends**2, axis=0)))
+        guesses.append(np.where(size > rounding, size / np.sqrt(comb(2 * order, order)), np.inf))
     known = np.isfinite(guesses).all(axis=0)
     sizes = [float(np.log(guess[known]).sum()) for guess in guesses]
     noise: Array = guesses[int(np.argmin(sizes))].copy()

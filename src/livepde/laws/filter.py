@@ -90,6 +90,15 @@ class Motion:
     std: float
     saturates: bool = False
 
+    def drifting(self, rate: float) -> Motion:
+        """Return it with a drift of `rate` prior variances per unit of time.
+
+        The same if it moves by itself.
+        """
+        if not rate or self.evolution.moves:
+            return self
+        return replace(self, evolution=RandomWalk(float(np.sqrt(rate)) * self.std), saturates=True)
+
     def transition(self, h: float) -> Array:
         """Return the transition of its coordinates in a time h."""
         F = self.evolution.transition(h)
@@ -102,9 +111,11 @@ class Motion:
 
     def gained(self, h: float, variance: Array) -> Array:
         """Return what its coordinates gain in a time h, given their variances."""
-        room = np.maximum(1.0 - variance[self.part], 0.0) if self.saturates else 1.0
-        gained: Array = room * self.growth(h)
-        return gained
+        growth = self.growth(h)
+        if not self.saturates:
+            return growth
+        room: Array = np.maximum(1.0 - variance[self.part], 0.0)
+        return -np.expm1(-growth) * room  # V' = growth (1 - V)/h, whatever the length of the step
 
     def backward(self, h: float) -> Array:
         """Return what the coordinates are expected to have been a time h before: matrix on them."""
@@ -387,6 +398,8 @@ def reduction(
         raise LawError(
             f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
         )
+    if any(count < 1 or count % 1 for count in counts.values()):
+        raise LawError(f"SensitivityLaw: modes must be whole numbers of at least 1; got {modes!r}.")
     blocks, motions, start = [], [], 0
     for name, item in model.latent.parts.items():
         first = slice(item.part.start, item.part.start + item.size)
@@ -400,13 +413,10 @@ def reduction(
                 phi = phi[:, : _enough(phi, inner.variance, mass.diagonal())]
         else:
             phi = np.eye(item.size) * item.unknown.latent_std
-        evolution = item.evolution
-        drifts = bool(drift) and not evolution.moves
-        if drifts:
-            evolution = RandomWalk(np.sqrt(drift) * item.unknown.latent_std)
-        blocks.append(np.kron(np.eye(evolution.copies), phi))
+        blocks.append(np.kron(np.eye(item.evolution.copies), phi))
         stop = start + blocks[-1].shape[1]
-        motions.append(Motion(slice(start, stop), evolution, item.unknown.latent_std, drifts))
+        motion = Motion(slice(start, stop), item.evolution, item.unknown.latent_std)
+        motions.append(motion.drifting(drift))
         start = stop
     Phi: Array = np.asarray(block_diag(*blocks))
     return Phi, tuple(motions)

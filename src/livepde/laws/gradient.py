@@ -13,6 +13,7 @@ from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.coupled import PULL, CoupledStage, Gains
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
+from livepde.laws.rest import Excitation, Probes, Rest
 from livepde.laws.smoothing import Balance, Smoother, smooths
 from livepde.linalg import Array
 from livepde.model import h1_form
@@ -29,12 +30,13 @@ class GradientState:
     """Estimates u^ and q^, shapes (n,) and (m,), and how fast they moved.
 
     `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,): where the next
-    iteration starts.
+    iteration starts. `excitation` is what `Rest` goes by.
     """
 
     u: Array
     q: Array
     rate: Array
+    excitation: Excitation
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,26 +57,31 @@ class GradientWork:
         newton: Newton,
         learning: Learning | None = None,
         smooths: bool = False,
+        probes: Probes | None = None,
     ) -> None:
         self.problem = problem
         self.smooths = smooths
         self.gains = gains
         self.newton = newton
         self.learning = learning
-        self._stages: dict[Split, CoupledStage] = {}
+        self.probes = probes
+        self._stages: dict[tuple[Split, bool], CoupledStage] = {}
         self._smoothers: dict[Split, Smoother] = {}
 
-    def stage(self, present: Array) -> CoupledStage:
-        """Return the coupled stage for the sensors present."""
+    def stage(self, present: Array, resting: bool = False) -> CoupledStage:
+        """Return the coupled stage for the sensors present; one that holds q."""
         split = self.problem.observed.split(present)
-        if split not in self._stages:
+        if (split, resting) not in self._stages:
             if len(self._stages) >= 8:
                 self._stages.clear()
+            gains = self.gains
+            if resting:
+                gains = replace(gains, gain=gains.gain / HOLD, sigma=0.0)
             memory = None if self.learning is None else self.learning.pattern
-            self._stages[split] = CoupledStage(
-                self.problem.model, split, self.gains, self.newton, memory
+            self._stages[split, resting] = CoupledStage(
+                self.problem.model, split, gains, self.newton, memory
             )
-        return self._stages[split]
+        return self._stages[split, resting]
 
     def smoother(self, present: Array) -> Smoother:
         """Return the smoother for the sensors present."""
@@ -128,6 +135,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         `observed_operator(omega, D)` and `unobserved_operator(omega, D)` are the paper's, with |D|.
     newton
         The nonlinear iteration.
+    rest
+        With a number for gain: when q is held, because nothing excites it but noise, with which it
+        would drift; None: never.
     """
 
     gain: float | Literal["auto"] = 1.0
@@ -137,6 +147,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
     M_op: Any = h1_form
     N_op: Any = h1_form
     newton: Newton = field(default_factory=Newton)
+    rest: Rest | None = field(default_factory=Rest)
 
     def __post_init__(self) -> None:
         gain: Any = self.gain
@@ -165,7 +176,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         M_op = model.bilinear(self.M_op)
         N_op = M_op if self.N_op is self.M_op else model.bilinear(self.N_op)
         gains = Gains(self.gain, self.damping, self.nu, self.sigma, M_op, N_op)
-        return GradientWork(problem, gains, self.newton)
+        probes = None if self.rest is None else Probes(model, problem.observed.split())
+        return GradientWork(problem, gains, self.newton, probes=probes)
 
     def _tuned(self, problem: Problem) -> GradientWork:
         model = problem.model
@@ -181,10 +193,11 @@ class GradientLaw(Law[GradientWork, GradientState]):
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         rate = np.zeros(len(u0) + len(q0))
+        excitation = Excitation.none()
         if work.learning is not None:
             balance = Balance.none(work.problem.observed.size, len(u0))
-            return LearningState(u0, q0, rate, work.learning.init(q0), balance)
-        return GradientState(u0, q0, rate)
+            return LearningState(u0, q0, rate, excitation, work.learning.init(q0), balance)
+        return GradientState(u0, q0, rate, excitation)
 
     def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
         form = work.problem.model.form_initial
@@ -202,7 +215,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         z0, z1 = (observed.linearised(z, state.u) for z in (interval.z0, interval.z1))
         if z1 is not interval.z1:  # a nonlinear sensor
             interval = replace(interval, z0=z0, z1=z1)
-        coupled = work.stage(interval.present)
+        rest, excitation = self.rest, state.excitation
+        resting = rest is not None and work.probes is not None and rest.holds(excitation)
+        coupled = work.stage(interval.present, resting)
         zero = np.zeros(model.X.dim)
         regularises = observed.observation.reconstruction.regularises
         smoother, balance, alpha, waits = None, None, 0.0, False
@@ -249,33 +264,44 @@ class GradientLaw(Law[GradientWork, GradientState]):
 
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stage, y, interval)
+        held = failure is not None and metric is not None
+        if held and metric is not None:  # the state goes on, and nothing is learned
+            metric = replace(metric, spread=HOLD * spread, shift=np.zeros_like(state.q))
+            end, steps, failure = advance(work.problem.control, stage, y, interval)
         if failure is not None:
             return state, Report(
                 Status.of(failure), work.problem.predict(state.u, state.q, interval.end)
             )
         lower, upper = model.latent.bounds
-        u, q = end[: model.X.dim], np.clip(end[model.X.dim :], lower, upper)
+        u, q = end[: model.X.dim], end[model.X.dim :].clip(lower, upper)
         observed_u = coupled.split.R @ u
         rate = end - y
         rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
         rate /= length
-        notes = {"residual": model.X.norm(observed_u - found.u)}
+        r = observed_u - found.u
+        notes = {"residual": model.X.norm(r)}
+        if resting:
+            notes |= {"at_rest": 1.0}
         if regularises:
             notes |= {"alpha": found.alpha, "misfit": found.misfit}
         elif smoother is not None:
             notes |= {"alpha": alpha}
         predicted = work.problem.predict(u, q, interval.end)
+        if rest is not None and work.probes is not None:
+            excitation = rest.add(excitation, work.probes(u - r, q, interval.end))
         if learning is None or not isinstance(state, LearningState):
-            return GradientState(u, q, rate), Report(Status(), predicted, steps, notes)
-        r = observed_u - found.u
+            after = GradientState(u, q, rate, excitation)
+            return after, Report(Status(), predicted, steps, notes)
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
-        if not waits:
-            learned = learning.learn(learned, spread, seen, r, length)
+        if held:
+            notes["held"] = 1.0
+        elif not waits:
+            same = np.array_equal(np.isnan(interval.z0), np.isnan(interval.z1))
+            learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
-        return LearningState(u, q, rate, learned, balance or state.balance), Report(
-            Status(), predicted, steps, notes
-        )
+        after = LearningState(u, q, rate, excitation, learned, balance or state.balance)
+        return after, Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

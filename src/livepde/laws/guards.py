@@ -27,10 +27,11 @@ class Guards:
     is not used. Notes: "iterated", "tempered", "held".
 
     *Runaway.* A step that fails, or a prediction that misses the data by more than `runaway` times
-    all that the sensor has ever varied: the law goes back to before the last samples, adds one
-    prior deviation to what is uncertain there, and carries the state on without those samples; if
-    that fails as well, with the prior. Note: "restarted". If nothing helps a failed step is
-    reported as such and changes nothing; "runaway" notes a prediction that stays away.
+    all that any sensor has ever varied (each in units of its noise): the law goes back to before
+    the last samples, adds one prior deviation to what is uncertain there, and carries the state on
+    without those samples; if that fails as well, with the prior. Note: "restarted". If nothing
+    helps a failed step is reported as such and changes nothing; "runaway" notes a prediction that
+    stays away.
 
     Parameters
     ----------
@@ -41,7 +42,7 @@ class Guards:
     temperings
         How often a sample whose steps do not converge is taken again with ten times its noise.
     runaway
-        How many times the range of a sensor its prediction misses it at least.
+        How many times the largest range of the sensors a prediction misses one at least.
     past
         A restart goes back by this many samples at least, if there are so many, and by less than
         twice as many.
@@ -101,6 +102,11 @@ class Samples:
         z = self.z[first:].copy()
         z[:1] = np.nan
         return Samples(self.t[first:], z, self.inputs[first:])
+
+    def first(self, channels: tuple[str, ...]) -> Interval:
+        """Return what was measured at the start, as an interval without length."""
+        inputs = Inputs(dict(zip(channels, self.inputs[0].tolist(), strict=True)))
+        return Interval(self.t[0], self.t[0], inputs, inputs, self.z[0], self.z[0])
 
     def intervals(self, channels: tuple[str, ...]) -> list[Interval]:
         """Return the intervals between them, in time order."""
@@ -171,7 +177,12 @@ class Scale:
         return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
 
     def beyond(self, d: Array, noise: Array) -> float:
-        """Return the largest innovation as a multiple of what was there before, or of the noise."""
-        largest = np.maximum(np.maximum(self.high - self.low, self.first), noise)
-        ratio = np.abs(d) / np.where(np.isnan(largest), np.inf, largest)
-        return float(np.max(ratio, initial=0.0, where=~np.isnan(ratio)))
+        """Return the largest innovation as a multiple of what was there before, or of the noise.
+
+        Counted in the noise of each sensor, against the sensor that has varied most: one that a
+        wave has not reached yet knows nothing of its size.
+        """
+        largest = np.maximum(np.maximum(self.high - self.low, self.first), noise) / noise
+        seen = ~np.isnan(largest)
+        missed = np.abs(d / noise)[seen & ~np.isnan(d)]
+        return float(missed.max() / largest[seen].max()) if len(missed) else 0.0

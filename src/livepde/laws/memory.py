@@ -86,6 +86,8 @@ class Learned:
         trace(G_Q^{-1} J).
     elapsed, samples
         Time and number of samples.
+    alike
+        Of the last of them how many, before the last one, had the same sensors as that.
     last, before
         The last two r, shape (n,).
     """
@@ -98,6 +100,7 @@ class Learned:
     total: float
     elapsed: float
     samples: int
+    alike: int
     last: Array
     before: Array
 
@@ -125,7 +128,7 @@ class Learning:
     def init(self, q0: Array) -> Learned:
         """Return what is known before the first sample: nothing."""
         r = np.zeros(self.model.X.dim)
-        return Learned(q0, np.zeros(self.pattern.nnz), 0.0, 0.0, 0.0, 0.0, 0.0, 0, r, r)
+        return Learned(q0, np.zeros(self.pattern.nnz), 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, r, r)
 
     def coupling(self, split: Split, w: Array, q: Array, moment: Moment) -> sp.csr_array:
         """Return R^T A(w), on free coefficients, shape (n, m)."""
@@ -157,12 +160,23 @@ class Learning:
         return float((coupling.T @ one) @ self.model.Q.riesz(coupling.T @ other))
 
     def learn(
-        self, learned: Learned, spread: float, coupling: sp.csr_array, r: Array, h: float
+        self,
+        learned: Learned,
+        spread: float,
+        coupling: sp.csr_array,
+        r: Array,
+        h: float,
+        same: bool,
     ) -> Learned:
-        """Return what is known after a step of length h that ended with A(w) and r."""
+        """Return what is known after a step of length h that ended with A(w) and r.
+
+        `same`: the sensors are those of the sample before. What changes with them is no noise that
+        turns back.
+        """
+        alike = learned.alike + 1 if same and learned.samples else 0
         force = coupling.T @ self.probes
         trace = float((force * self.model.Q.riesz(force)).sum()) / PROBES
-        if learned.samples < 2:  # all of r may be noise
+        if alike < 2:  # all of r may be noise
             noise = -_TURNS * self._product(coupling, r, -r) / h
         else:
             steps = r - learned.last, learned.last - learned.before
@@ -180,6 +194,7 @@ class Learning:
             total=faded * learned.total + h * trace,
             elapsed=elapsed,
             samples=learned.samples + 1,
+            alike=alike,
             last=r,
             before=learned.last,
         )

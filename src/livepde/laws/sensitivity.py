@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.fem import Inputs, Moment
+from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
 from livepde.laws.filter import Filter, Point, reduction
@@ -175,6 +175,12 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             raise LawError(
                 f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
             )
+        for name, kind in (("replay", Replay), ("jumps", Jumps), ("guards", Guards)):
+            value = getattr(self, name)
+            if not (value is None or isinstance(value, kind)):
+                raise LawError(
+                    f"SensitivityLaw: {name} must be a {kind.__name__}, or None; got {value!r}."
+                )
         if not self.gate > 0:
             raise LawError(f"SensitivityLaw: gate must be positive; got {self.gate}.")
         if self.gate_patience < 1:
@@ -308,7 +314,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
                 if not status.ok or left <= CONVERGED:
                     break
         if len(state.samples.t) > self.replay.window:
-            state = self._renewed(work.recentred(state.now), state)
+            state = self.renewed(work.recentred(state.now), state)
         return self._remember(work, state, interval), report
 
     def _remember(
@@ -324,8 +330,8 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         past = state.past.add(state.now, interval, work.problem.channels, length)
         return replace(state, past=past)
 
-    def _renewed(self, start: Point, state: SensitivityState) -> SensitivityState:
-        """Return a state whose window begins here."""
+    def renewed(self, start: Point, state: SensitivityState) -> SensitivityState:
+        """Return a state whose window begins at a filter, with no samples yet."""
         empty = state.samples.since(len(state.samples.t))
         first = self.replay.first if self.replay else 0
         return replace(
@@ -359,7 +365,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
                 point, _ = self._filter(work, begin, interval)
             if np.abs(point.da - begin.da).max(initial=0.0) <= guards.reach:  # cheaper to see
                 return _levelled(point, level, temper), tempered
-            window = self._store(work, self._renewed(begin, state), point, interval)
+            window = self._store(work, self.renewed(begin, state), point, interval)
             if not self._far(work, window):
                 return _levelled(point, level, temper), tempered
             for _ in range(guards.iterations):
@@ -368,8 +374,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
                     break
                 if _left(work, window) <= CONVERGED:
                     return _levelled(window.now, level, temper), {"iterated": 1.0, **tempered}
-        nothing = replace(interval, z1=np.full_like(interval.z1, np.nan))
-        return self._filter(work, state.now, nothing)[0], {"held": 1.0}
+        return self._filter(work, state.now, interval.silent)[0], {"held": 1.0}
 
     def _rescued(
         self,
@@ -395,7 +400,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             return replace(new, scale=scale), report
         older = work.recentred(state.past.older)
         known = [*state.past.samples.intervals(work.problem.channels), interval]
-        silent = [replace(item, z1=np.full_like(item.z1, np.nan)) for item in known]
+        silent = [item.silent for item in known]
         for start in (work.loosened(older, 1.0), work.fresh(older)):
             again, found = self._retaken(work, state, start, silent)
             if not astray(found):
@@ -410,7 +415,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         self, work: Filter, state: SensitivityState, start: Point, intervals: list[Interval]
     ) -> tuple[SensitivityState, Report]:
         """Return state and report after some samples, taken again from another start."""
-        state = self._renewed(start, state)
+        state = self.renewed(start, state)
         state = replace(state, past=Past.start(start, state.samples))
         for interval in intervals:
             state, report = self._assimilated(work, state, interval)
@@ -450,7 +455,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             if status.ok and found.status.ok:
                 new = again
             else:
-                new = self._renewed(work.loosened(work.recentred(new.now), jumps.size), new)
+                new = self.renewed(work.loosened(work.recentred(new.now), jumps.size), new)
         return new, replace(report, notes={**report.notes, "jump": float(alarm)})
 
     def _store(
@@ -464,12 +469,10 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         """Run the stored samples again about a reference at the estimate, or on the way to it."""
         samples, q = state.samples, _next(work, state)
         channels = work.problem.channels
-        first = Moment(samples.t[0], Inputs(dict(zip(channels, samples.inputs[0], strict=True))))
-        point = _placed(work, state, q, first)
-        if np.isfinite(samples.z[0]).any():
-            z = samples.z[0]
-            at = Interval(first.t, first.t, first.inputs, first.inputs, z, z)
-            point, _ = work.updated(point, at, work.predict(point, first))
+        first = samples.first(channels)
+        point = _placed(work, state, q, first.end)
+        if first.present.any():
+            point, _ = work.updated(point, first, work.predict(point, first.end))
         for interval in samples.intervals(channels):
             point, report = self._filter(work, point, interval)
             if not report.status.ok:

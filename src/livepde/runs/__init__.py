@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.runs.directory import Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
-from livepde.runs.doubts import doubts
+from livepde.runs.doubts import doubts, unexplained
 from livepde.runs.drive import Driven, conduct, drive, journal_of
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, Outcome, Table
@@ -30,4 +30,5 @@ __all__ = [
     "open",
     "refuse_taken",
     "tables",
+    "unexplained",
 ]

@@ -8,19 +8,22 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from livepde.diagnostics.identifiability import FLAT
 from livepde.runs.summary import digits, jumps, scalars, scored, when
 
-__all__ = ["MODEL_ERROR", "doubts"]
+__all__ = ["doubts", "unexplained"]
 
 MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: twice as large
 OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
 SETTLED = 0.25  # share of a run after which means are taken
 LEFT = 1.0  # deviations between estimate and reference after the last replay
+BELIEVED = 0.5  # weight of the members of a bank that drift
+DRIFTING = 0.03  # share of the samples in which they are believed
+MOST_SENSORS = 6  # that are named
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
-HARDLY = 0.9  # of the prior deviation left: nothing was learned
 
 
 def doubts(data: xr.Dataset) -> list[str]:
@@ -30,8 +33,9 @@ def doubts(data: xr.Dataset) -> list[str]:
     last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
     bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
     ended more than one deviation away from where it has to end. Guards had to give up samples or to
-    restart. With a fixed gain an estimate wanders, in the last half of a run, by more than 0.3 of
-    what it has learned. Something jumped.
+    restart, or to hold unknowns that nothing excited. With a fixed gain an estimate wanders, in the
+    last half of a run, by more than 0.3 of what it has learned. In more than 0.03 of the samples
+    a bank believes that unknowns drift. Something jumped.
     """
     if not data.sizes["time"]:
         return []
@@ -39,18 +43,24 @@ def doubts(data: xr.Dataset) -> list[str]:
         *_model_error(data),
         *_replays(data),
         *_unknowns(data),
-        *_guards(data),
+        *([*_rests(data), *_lost(data)] if "residual" in data else _guards(data)),
+        *_drifts(data),
         *_gain(data),
         *_jumps(data),
     ]
 
 
+def unexplained(data: xr.Dataset) -> bool:
+    """Return whether a run says that its model does not explain the data: see `doubts`."""
+    if "innovation_ratio" not in data or not data.sizes["time"]:
+        return False
+    return bool(data["innovation_ratio"].values[-1] > MODEL_ERROR)
+
+
 def _model_error(data: xr.Dataset) -> list[str]:
-    if "innovation_ratio" not in data:
+    if not unexplained(data):
         return []
     ratio = float(data["innovation_ratio"].values[-1])
-    if not ratio > MODEL_ERROR:
-        return []
     found = [
         "The model does not explain the data: the sensors miss what is expected of them by "
         f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
@@ -67,6 +77,8 @@ def _model_error(data: xr.Dataset) -> list[str]:
         if abs(mean) > OFFSET * float(np.sqrt((late**2).mean())):
             side = "above" if mean > 0 else "below"
             off.append(f"{name} reads {abs(mean):.2g} {unit}".rstrip() + f" {side} it")
+    if len(off) > MOST_SENSORS:
+        off = [*off[:MOST_SENSORS], f"{len(off) - MOST_SENSORS} more read too much or too little"]
     if off:
         found.append(
             f"{'; '.join(off)} nearly all the time: give these sensors an unknown offset, or a "
@@ -105,7 +117,7 @@ def _unknowns(data: xr.Dataset) -> list[str]:
                     f"{label} ends at its bound {value:g}: the bound decides, not the data."
                 )
         prior = float(attrs.get("prior_std", math.nan))
-        if std > HARDLY * prior:
+        if std > FLAT * prior:
             found.append(
                 f"{label}: the data have told hardly anything; its deviation is still about "
                 "that of the prior."
@@ -168,6 +180,52 @@ def _guards(data: xr.Dataset) -> list[str]:
             "values and their units."
         )
     return found
+
+
+def _rests(data: xr.Dataset) -> list[str]:
+    """Return when the gradient law has held q."""
+    if "at_rest" not in data:
+        return []
+    held = data["at_rest"].values == 1.0
+    begin = np.flatnonzero(held & ~np.append(False, held[:-1]))
+    if held[-1]:
+        at = when(data, float(data["time"][begin[-1]]))
+        found = f"Nothing but noise excited the unknowns from {at} on: they were held"
+        earlier = len(begin) - 1
+        return [f"{found}, as {earlier} times before." if earlier else f"{found}."]
+    last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
+    return [
+        f"Nothing but noise excited the unknowns in {held.sum()} samples, last at {last}: they "
+        "were held then."
+    ]
+
+
+def _lost(data: xr.Dataset) -> list[str]:
+    """Return where a gradient law could not learn from a sample, because no step converged."""
+    if "held" not in data:
+        return []
+    held = data["held"].values == 1.0
+    last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
+    return [
+        f"In {held.sum()} samples, last at {last}, no step converged with the unknowns: they were "
+        "held, and the state went on. Look at sensors and noise level then."
+    ]
+
+
+def _drifts(data: xr.Dataset) -> list[str]:
+    """Return whether a bank has believed for long that unknowns drift: nobody has said so."""
+    if "drifting" not in data:
+        return []
+    drifting = data["drifting"].values > BELIEVED
+    if not drifting.mean() > DRIFTING:
+        return []
+    last = when(data, float(data["time"][np.flatnonzero(drifting)[-1]]))
+    return [
+        f"In {drifting.sum()} samples, last at {last}, the data spoke for unknowns that drift, "
+        "which also a model with errors looks like. If they cannot, do not trust these estimates: "
+        "take kind = 'sensitivity' with replay = true, or mend the model; if they can, give them "
+        "an evolution."
+    ]
 
 
 def _gain(data: xr.Dataset) -> list[str]:

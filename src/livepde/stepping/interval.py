@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -53,6 +53,11 @@ class Interval:
     def end(self) -> Moment:
         """Time and inputs at the end."""
         return Moment(self.t1, Inputs(self.inputs1))
+
+    @property
+    def silent(self) -> Interval:
+        """The same without a measurement at the end."""
+        return replace(self, z1=np.full_like(self.z1, np.nan))
 
     def divided(self, count: int) -> list[Interval]:
         """Return the interval as equal parts, in time order."""

@@ -1,0 +1,157 @@
+"""When nothing excites the unknowns any more, and noise goes on: `GradientLaw` holds q.
+
+The law multiplies r by A(w), w = u_alpha + P u. At rest A(w) is noise, the same as in r, so that
+their product has a mean, and q drifts with it, the faster the larger the gain. Noise is independent
+from sample to sample, and an excitation that is resolved in time is not: with the vector a_k of
+(A(w_k) e, p) for a few fixed e and p, the mean of
+
+    (a_k, a_{k-1}) / (|a_k| |a_{k-1}|)
+
+is about 1 for an excitation, and 0 for noise. For a process faster than the samples it may be 0,
+too; but then |a|^2 is as large as ever, whereas at rest it has fallen to that of the noise. Only
+both together are taken for a rest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import LawError
+from livepde.fem import Moment
+from livepde.linalg import Array
+from livepde.model import Model, h1_form, mass_form
+from livepde.observation import Split
+from livepde.spaces import HilbertSpace
+
+__all__ = ["Excitation", "Probes", "Rest"]
+
+PROBES = 16  # pairs of random functions: their products scatter by a quarter
+
+
+@dataclass(frozen=True)
+class Rest:
+    """When `GradientLaw` with a fixed gain holds q: nothing excites it any more but noise.
+
+    A step holds q, and u goes on, if up to the sample before, in fading means, what excites q was
+    correlated from sample to sample by less than `correlation`, and its mean square was less than
+    `energy` of the largest that was correlated. An unknown that moves by itself (evolution=) goes
+    on by that. Note: "at_rest".
+
+    Noise that is itself correlated in time, as behind a stream stage that averages, is no noise
+    here; where it is a third of the excitation or more, rests are not told from it.
+
+    Parameters
+    ----------
+    window
+        Samples that the means remember, >= 1.
+    correlation
+        Least correlation of an excitation, in (0, 1).
+    energy
+        Share of the largest mean square to which a rest has fallen, in (0, 1).
+    """
+
+    window: float = 30.0
+    correlation: float = 0.5
+    energy: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.window) and self.window >= 1):
+            raise LawError(f"Rest: window must be a number >= 1; got {self.window}.")
+        for name in ("correlation", "energy"):
+            value = getattr(self, name)
+            if not 0 < value < 1:
+                raise LawError(f"Rest: {name} must lie between 0 and 1; got {value}.")
+
+    def holds(self, excitation: Excitation) -> bool:
+        """Return true at a rest."""
+        return (
+            excitation.correlation < self.correlation
+            and excitation.energy < self.energy * excitation.largest
+        )
+
+    def add(self, excitation: Excitation, a: Array) -> Excitation:
+        """Return the excitation after a sample in which the probes see a."""
+        size = float(a @ a)
+        scale = math.sqrt(size * excitation.size)
+        share = 1.0 / self.window
+        product = float(a @ excitation.last)
+        correlation = excitation.correlation
+        if scale > 0.0:
+            correlation += share * (product / scale - correlation)
+        energy = excitation.energy + share * (size - excitation.energy)
+        correlated = excitation.correlated + share * (product - excitation.correlated)
+        largest = max(excitation.largest, correlated)
+        return Excitation(a, size, correlation, energy, correlated, largest)
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """How far what excites q is more than noise.
+
+    Attributes
+    ----------
+    last, size
+        What the probes have seen in the last sample, shape (PROBES,), and its square.
+    correlation, energy, correlated
+        Fading means: of the correlation of successive samples, of the square, and of the product
+        with the sample before, in which noise and outliers have little part.
+    largest
+        The largest `correlated`.
+    """
+
+    last: Array
+    size: float
+    correlation: float
+    energy: float
+    correlated: float
+    largest: float
+
+    @classmethod
+    def none(cls) -> Excitation:
+        """Return the value before any sample."""
+        return cls(np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+class Probes:
+    """(A(w) e_k, p_k) for fixed random pairs: e_k in the unit balls of Q, p_k = R p_k.
+
+    p_k minimises a Dirichlet integral under a white load, among what R leaves as it is: what is
+    rough in w, as noise is, does not outweigh the rest then.
+    """
+
+    def __init__(self, model: Model, split: Split) -> None:
+        self.form = model.form_A
+        rng = np.random.default_rng(0)
+        extent = float(np.ptp(model.mesh.p, axis=1).max())
+        mass = model.bilinear(mass_form)
+        smooth = mass + extent**2 * (model.bilinear(h1_form) - mass)
+        parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
+        space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
+        root = np.sqrt(mass.diagonal())[:, None]
+        white = root * rng.standard_normal((model.X.dim, PROBES))
+        self.p = split.R @ space.riesz(split.R.T @ white)
+        self.e = model.Q.riesz(rng.standard_normal((model.Q.dim, PROBES)))
+        for part in (item.part for item in model.latent.parts.values()):
+            for e in self.e.T:
+                alone = np.zeros_like(e)
+                alone[part] = e[part]
+                size = float(alone @ model.Q.dual(alone))
+                e[part] /= np.sqrt(size) if size > 0.0 else 1.0
+        vq, qu = self.form.tensor("v", "q"), self.form.tensor("q", "u")
+        self.fixed: Array | None = None
+        if vq is not None and qu is not None:
+            pattern = self.form.pattern("q", "u")
+            rows = [pattern.matrix(qu @ p).T @ e for p, e in zip(self.p.T, self.e.T, strict=True)]
+            self.fixed = np.array(rows)
+
+    def __call__(self, w: Array, q: Array, moment: Moment) -> Array:
+        """Return what the pairs see, shape (PROBES,)."""
+        if self.fixed is not None:
+            return self.fixed @ w
+        A = self.form.matrix("v", "q", moment, u=w, q=q)
+        seen: Array = ((A @ self.e) * self.p).sum(axis=0)
+        return seen
