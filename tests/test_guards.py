@@ -11,7 +11,8 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.guards import Past, Samples, Scale
+from livepde.laws.guards import Scale
+from livepde.laws.past import Past, Samples
 from livepde.laws.rest import Excitation, Probes
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts

@@ -13,8 +13,8 @@ from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.filter import Filter
-from livepde.laws.guards import Past, Samples
 from livepde.laws.jumps import Jumps, Watch
+from livepde.laws.past import Past, Samples
 from livepde.laws.sensitivity import Replay, SensitivityLaw, SensitivityState
 from livepde.linalg import Array, IntArray
 from livepde.stepping import ForwardStage, Interval

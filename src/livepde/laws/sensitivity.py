@@ -11,9 +11,10 @@ from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.consistency import Consistency
 from livepde.laws.filter import Filter, Point, reduction
-from livepde.laws.guards import Guards, Past, Samples, Scale
+from livepde.laws.guards import Guards, Scale
 from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.level import NoiseLevel
+from livepde.laws.past import Past, Samples
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage, Interval
 
