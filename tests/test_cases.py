@@ -16,7 +16,7 @@ from livepde.cases.preview import Preview, preview
 from livepde.cases.settings import parse, to_toml
 from livepde.cases.template import write_template
 from livepde.cases.units import convert
-from livepde.runs import checks_of, measures, tables
+from livepde.runs import checks_of, drive, measures, tables
 from livepde.streams import Twin
 
 SHIPPED = Path(__file__).resolve().parents[1] / "cases"
@@ -40,9 +40,10 @@ def rod(tmp_path):
 
 def result_of(path, **options):
     prepared = cases.load(path, **options).prepare()
-    data = prepared.identifier.run(prepared.stream, fields_every=50).to_xarray()
-    data.attrs |= prepared.attributes
-    return prepared, data
+    run = drive(prepared.identifier, prepared.stream, fields_every=50, journal=prepared.journal())
+    if run.error:
+        raise run.error
+    return prepared, run.result.to_xarray()
 
 
 # --- units -----------------------------------------------------------------------------------
@@ -992,7 +993,6 @@ REFERENCE = ("[expect]", '[reference]\nalpha = "0.97 cm^2/s"\nsource = "made up"
 
 def described(path):
     prepared, data = result_of(path)
-    prepared.describe(data)
     return prepared.case, data
 
 

@@ -19,10 +19,11 @@ import pytest
 import xarray as xr
 
 import livepde as lp
-from livepde.result import Result
+from livepde.result import layout_of
 from livepde.runs.journal import Event, Journal
 from livepde.runs.live import Backlog, Gathered, Live, Samples
 from livepde.runs.monitor import Metrics, Monitor
+from livepde.runs.web import Address
 from livepde.streams.intake import Intake, Policy
 from livepde.streams.sources import Follow, Rows, json_row
 from livepde.streams.table import Clock, Column
@@ -53,8 +54,8 @@ def rows(count: int):
 
 def journal(path: Path) -> Journal:
     who = identifier()
-    result = Result.empty(who.model, who.observed, who.withheld)
-    return Journal.create(path, ("a", "b", "left"), result.layout)
+    layout = layout_of(who.model, who.observed, who.withheld)
+    return Journal.create(path, ("a", "b", "left"), layout)
 
 
 def live(folder: Path, source=None, **options) -> Live:
@@ -263,7 +264,7 @@ def test_health_and_metrics(tmp_path):
 
     metrics = Metrics(["a", "b"])
     run = live(tmp_path, Rows(rows(5)), sinks=[metrics])
-    monitor = Monitor("127.0.0.1", 0, lambda: run.health, metrics)
+    monitor = Monitor(Address(), lambda: run.health, metrics)
     run.run()
     assert json.loads(ask("/health")) == {
         "ok": True,
@@ -281,5 +282,5 @@ def test_health_and_metrics(tmp_path):
     with pytest.raises(urllib.error.HTTPError, match="404"):
         ask("/")
     with pytest.raises(lp.RunError, match="choose another port"):
-        Monitor("127.0.0.1", monitor.port, dict, metrics)
+        Monitor(Address(port=monitor.port), dict, metrics)
     monitor.close()

@@ -308,7 +308,7 @@ class Identifier:
         fields_every
             Keep the fields of every so many samples (scalars and innovations of all).
         """
-        result = Result.empty(self.model, self.observed, self.withheld, fields_every)
+        result = Result(self.model, self.observed, self.withheld, fields_every)
         for item in _watched(stream, progress, total):
             sample = item if isinstance(item, Sample) else Sample(*item)
             result.add(self.step(sample.t, sample.z, sample.inputs))

@@ -7,7 +7,7 @@ layout of plain values. So a run can be read without its model, and while it goe
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -86,6 +86,9 @@ class Layout:
         Units of time and innovations.
     coordinates
         Axis -> coordinates of the vertices.
+    cells
+        Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an
+        interval none, its vertices are in order.
     sensors, withheld
         Names; `withheld` is None if no sensor is.
     numbers
@@ -94,11 +97,16 @@ class Layout:
         Unknown or component of the state -> unit.
     scalars, fields, state
         Labels of scalar unknowns, names of unknown fields and of variables of the state.
+    length_unit
+        Unit of coordinates.
+    attrs
+        Attributes of the dataset: title, origin (the date of t = 0), equation.
     """
 
     time_unit: str
     sensor_unit: str
     coordinates: Mapping[str, Sequence[float]]
+    cells: Mapping[str, Sequence[Sequence[int]]]
     sensors: Sequence[str]
     withheld: Sequence[str] | None
     numbers: Mapping[str, Mapping[str, Any]]
@@ -106,6 +114,8 @@ class Layout:
     scalars: Sequence[str]
     fields: Sequence[str]
     state: Sequence[str]
+    length_unit: str = ""
+    attrs: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout as JSON can hold it."""
@@ -126,9 +136,14 @@ class Layout:
                 "snapshot": np.array([t for t, _ in kept]),
                 "sensor": list(self.sensors),
                 "withheld": list(self.withheld or ()),
-                **{axis: ("vertex", np.array(x)) for axis, x in self.coordinates.items()},
+                **{
+                    axis: ("vertex", np.array(x), {"units": self.length_unit})
+                    for axis, x in self.coordinates.items()
+                },
             }
         )
+        for kind, corners in self.cells.items():
+            data[kind] = (("cell", "corner"), np.array(corners, dtype=np.int32))
         numbers = np.reshape([row.numbers for row in records], (len(records), len(self.numbers)))
         for (name, attrs), values in zip(self.numbers.items(), numbers.T, strict=True):
             data[name] = ("time", values, dict(attrs))
@@ -144,6 +159,7 @@ class Layout:
         for name in dict.fromkeys(key for row in records for key in row.notes):
             key = f"note_{name}" if name in data else name  # an unknown may have the same name
             data[key] = ("time", np.array([row.notes.get(name, np.nan) for row in records]))
+        data.attrs.update(self.attrs)
         data.attrs["fields"] = " ".join(self.fields)
         data.attrs["scalars"] = "\n".join(self.scalars)
         data.attrs["state"] = " ".join(self.state)

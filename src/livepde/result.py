@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,14 +11,14 @@ import xarray as xr
 
 from livepde import plots
 from livepde.errors import ConfigurationError
-from livepde.fem import FieldBlock, FunctionSpace
+from livepde.fem import FieldBlock, FunctionSpace, cells
 from livepde.laws import Belief, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import STATUS_CODES, Layout, Record, Records, Snapshot
 
-__all__ = ["Estimate", "Result"]
+__all__ = ["Estimate", "Result", "layout_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +128,8 @@ class Result:
     ----------
     records
         Where to keep them; default a new list.
+    layout
+        What the numbers of records mean; default what model and sensors say.
     """
 
     def __init__(
@@ -136,8 +137,9 @@ class Result:
         model: Model,
         observed: Observed,
         withheld: Observed | None,
-        fields_every: int,
+        fields_every: int = 1,
         records: Records | None = None,
+        layout: Layout | None = None,
     ) -> None:
         self.model = model
         self.observed = observed
@@ -145,49 +147,11 @@ class Result:
         self.fields_every = fields_every
         self.last: Estimate | None = None
         self.records: Records = [] if records is None else records
+        self.layout = layout or layout_of(model, observed, withheld)
         self._count = len(self.records)
-
-    @classmethod
-    def empty(
-        cls, model: Model, observed: Observed, withheld: Observed | None, fields_every: int = 1
-    ) -> Result:
-        """Return a result without estimates."""
-        return cls(model, observed, withheld, fields_every)
 
     def __len__(self) -> int:
         return self._count
-
-    @cached_property
-    def layout(self) -> Layout:
-        """What the numbers of the records mean."""
-        model = self.model
-        numbers: dict[str, dict[str, Any]] = {}
-        for label in model.parameter_space.labels:
-            unknown = _unknown(model.parameter_space, label)
-            unit: dict[str, Any] = {"units": unknown.unit}
-            numbers |= {label: {**unit, **_prior(unknown)}, f"{label}_std": unit}
-            numbers |= dict.fromkeys(_ends(label, unknown, 0.0, 0.0), unit)
-            numbers[f"{label}_left"] = {"long_name": "share of the prior deviation"}
-        points = model.mesh.p[:, self._order]
-        components = model.state_space.fields.items()
-        return Layout(
-            time_unit=model.time_unit,
-            sensor_unit=self.observed.observation.unit,
-            coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
-            sensors=list(self.observed.names),
-            withheld=None if self.withheld is None else list(self.withheld.names),
-            numbers=numbers,
-            units=self._units(),
-            scalars=list(model.parameter_space.labels),
-            fields=list(model.parameter_space.fields),
-            state=[key for name, block in components for key in _variables(name, block)],
-        )
-
-    @cached_property
-    def _order(self) -> Any:
-        """In which order vertices are kept: along an interval, else as the mesh has them."""
-        points = self.model.mesh.p
-        return np.argsort(points[0]) if len(points) == 1 else slice(None)
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
@@ -221,7 +185,8 @@ class Result:
             if len(left):
                 told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
         profiles = self._profiles(estimate).items()
-        ordered = {name: values[self._order] for name, values in profiles}
+        order = _order(self.model)
+        ordered = {name: values[order] for name, values in profiles}
         return Snapshot(ordered, told, _correlation(estimate))
 
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
@@ -260,13 +225,6 @@ class Result:
             records[-1] = replace(records[-1], snapshot=self.snapshot(self.last))
         return self.layout.dataset(records)
 
-    def _units(self) -> dict[str, str]:
-        unknowns = {**self.model.state_space.unknowns, **self.model.parameter_space.unknowns}
-        found = {name: unknown.unit for name, unknown in unknowns.items()}
-        for name, block in self.model.state_space.fields.items():
-            found |= dict.fromkeys(_variables(name, block), found[name])
-        return found
-
     def table(self) -> dict[str, dict[str, float]]:
         """Return the last estimates and the root mean square errors of all sensors.
 
@@ -277,6 +235,46 @@ class Result:
     def plot(self, **options: Any) -> Any:
         """Draw the run and return the figure; needs the extra `plots`."""
         return plots.overview(self.to_xarray(), **options)
+
+
+def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> Layout:
+    """Return what the numbers of the records of a run mean."""
+    numbers: dict[str, dict[str, Any]] = {}
+    for label in model.parameter_space.labels:
+        unknown = _unknown(model.parameter_space, label)
+        unit: dict[str, Any] = {"units": unknown.unit}
+        numbers |= {label: {**unit, **_prior(unknown)}, f"{label}_std": unit}
+        numbers |= dict.fromkeys(_ends(label, unknown, 0.0, 0.0), unit)
+        numbers[f"{label}_left"] = {"long_name": "share of the prior deviation"}
+    points = model.mesh.p[:, _order(model)]
+    components = model.state_space.fields.items()
+    return Layout(
+        time_unit=model.time_unit,
+        sensor_unit=observed.observation.unit,
+        coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
+        cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
+        sensors=list(observed.names),
+        withheld=None if withheld is None else list(withheld.names),
+        numbers=numbers,
+        units=_units(model),
+        scalars=list(model.parameter_space.labels),
+        fields=list(model.parameter_space.fields),
+        state=[key for name, block in components for key in _variables(name, block)],
+    )
+
+
+def _order(model: Model) -> Any:
+    """In which order vertices are kept: along an interval, else as the mesh has them."""
+    points = model.mesh.p
+    return np.argsort(points[0]) if len(points) == 1 else slice(None)
+
+
+def _units(model: Model) -> dict[str, str]:
+    unknowns = {**model.state_space.unknowns, **model.parameter_space.unknowns}
+    found = {name: unknown.unit for name, unknown in unknowns.items()}
+    for name, block in model.state_space.fields.items():
+        found |= dict.fromkeys(_variables(name, block), found[name])
+    return found
 
 
 def _variables(name: str, block: FieldBlock) -> list[str]:

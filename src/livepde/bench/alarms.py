@@ -420,9 +420,8 @@ def _case(name: str, settings: Mapping[str, Any]) -> bool:
     if path is None:
         raise LivepdeError(f"there is no case {name}.toml beside the other cases.")
     prepared = load(path, settings=settings).prepare()
-    data = drive(prepared.identifier, prepared.stream).result.to_xarray()
-    prepared.describe(data)
-    return unexplained(data)
+    run = drive(prepared.identifier, prepared.stream, journal=prepared.journal())
+    return unexplained(run.result.to_xarray())
 
 
 def _jumps(found: Mapping[str, Sequence[Told]]) -> Table:

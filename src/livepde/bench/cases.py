@@ -265,7 +265,9 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
     frozen = _Frozen()
     runs = [prepared.identifier, prepared.identifier_with(frozen)]
     every = prepared.case.fields_every
-    results = [Result.empty(one.model, one.observed, one.withheld, every) for one in runs]
+    results = [
+        Result(one.model, one.observed, one.withheld, every, layout=prepared.layout) for one in runs
+    ]
     seconds = 0.0
     for count, sample in enumerate(prepared.stream):
         start = perf_counter()
@@ -275,8 +277,6 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
         if count == WARM_UP:
             seconds = frozen.seconds = 0.0
     datasets = [result.to_xarray() for result in results]
-    for data in datasets:
-        prepared.describe(data)
     ratio = seconds / frozen.seconds if frozen.seconds else math.nan
     return datasets[0], datasets[1], ratio
 

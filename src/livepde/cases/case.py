@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from itertools import chain
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of
 from livepde.cases.equations import resolve
@@ -39,6 +38,9 @@ from livepde.laws import (
 )
 from livepde.model import Model
 from livepde.observation import Observation, Points
+from livepde.records import Layout
+from livepde.result import layout_of
+from livepde.runs import Journal
 from livepde.runs.outcome import Bound, Sense
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, Table
@@ -107,16 +109,25 @@ class Prepared:
             u = model.initial(self.u0, moment)
         return float(np.abs(u).mean()) or 1.0
 
-    def describe(self, data: xr.Dataset) -> None:
-        """Add to a run's dataset what its case knows: title, start, units of axes, references."""
-        data.attrs |= self.attributes
-        for axis in set("xyz") & set(data.coords):
-            data[axis].attrs["units"] = self.case.frame.equation.length_unit
-        for label, value in self.case.references.items():
-            if label in data:
-                data[label].attrs["reference"] = value
-        if self.case.source:
-            data.attrs["reference_source"] = self.case.source
+    @cached_property
+    def layout(self) -> Layout:
+        """What the records of a run mean: title, start, units and references are the case's."""
+        who = self.identifier
+        found = layout_of(who.model, who.observed, who.withheld)
+        references = {
+            label: {**found.numbers[label], "reference": value}
+            for label, value in self.case.references.items()
+        }
+        return replace(
+            found,
+            numbers={**found.numbers, **references},
+            length_unit=self.case.frame.equation.length_unit,
+            attrs=self.attributes,
+        )
+
+    def journal(self, path: Path | None = None) -> Journal:
+        """Return a new journal for a run of this case; without a path in memory."""
+        return Journal.create(path, self.identifier.channels, self.layout)
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -127,6 +138,8 @@ class Prepared:
             found["assimilate_from"] = self.assimilate_from
         if self.origin is not None:
             found["origin"] = self.origin.isoformat(sep=" ")
+        if self.case.source:
+            found["reference_source"] = self.case.source
         return found
 
 

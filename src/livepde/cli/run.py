@@ -85,7 +85,6 @@ def run(
         journal=journal,
     )
     dataset = driven.result.to_xarray()
-    prepared.describe(dataset)
     checks = checks_of(loaded.expected, dataset)
     notes = [*loaded.notes, *doubts(dataset)]
     if len(driven.result):
@@ -125,7 +124,7 @@ def _opened(
     loaded: Case, prepared: Prepared, out: Path | None, settings: Sequence[str], resume: bool
 ) -> tuple[Path, RunWriter, Journal]:
     """Return the run directory, its writer and its journal, new or to go on with."""
-    from livepde.runs import Journal, RunWriter, free_path, journal_of
+    from livepde.runs import Journal, RunWriter, free_path
 
     command = ["livepde", *sys.argv[1:]]
     folder = out or free_path(Path("runs") / loaded.name)
@@ -145,7 +144,7 @@ def _opened(
         settings=settings,
         original=loaded.original,
     )
-    return folder, writer, journal_of(prepared.identifier, path)
+    return folder, writer, prepared.journal(path)
 
 
 def _traded(prepared: Prepared) -> list[str]:

@@ -20,7 +20,17 @@ from livepde.fem.fields import (
 )
 from livepde.fem.forms import Form
 from livepde.fem.latent import Composed, Latent, LatentPart, compose
-from livepde.fem.meshes import box, grid, hermite, linear, quadratic, read_mesh, rectangle, smooth
+from livepde.fem.meshes import (
+    box,
+    cells,
+    grid,
+    hermite,
+    linear,
+    quadratic,
+    read_mesh,
+    rectangle,
+    smooth,
+)
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
@@ -55,6 +65,7 @@ __all__ = [
     "Unknown",
     "absolute",
     "box",
+    "cells",
     "compose",
     "ddot",
     "div",

@@ -40,7 +40,17 @@ from livepde.errors import SpaceError
 from livepde.fem.fields import Predicate
 from livepde.linalg import Array
 
-__all__ = ["box", "grid", "hermite", "linear", "quadratic", "read_mesh", "rectangle", "smooth"]
+__all__ = [
+    "box",
+    "cells",
+    "grid",
+    "hermite",
+    "linear",
+    "quadratic",
+    "read_mesh",
+    "rectangle",
+    "smooth",
+]
 
 LINEAR: dict[Any, Any] = {
     MeshLine: ElementLineP1,
@@ -259,3 +269,23 @@ def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
             f"put the mesh into the {('x axis', 'xy plane', '')[mesh.dim() - 1]}."
         )
     return mesh
+
+
+# scikit-fem numbers the corners of a hexahedron in its own way.
+KINDS: dict[Any, tuple[str, list[int]]] = {
+    MeshTri: ("triangle", [0, 1, 2]),
+    MeshQuad: ("quad", [0, 1, 2, 3]),
+    MeshTet: ("tetra", [0, 1, 2, 3]),
+    MeshHex: ("hexahedron", [0, 3, 6, 2, 1, 5, 7, 4]),
+}
+
+
+def cells(mesh: Mesh) -> dict[str, Any]:
+    """Return the kind of the cells as meshio names it -> vertices of each, shape (cells, corners).
+
+    Empty for an interval, whose vertices are enough.
+    """
+    for kind, (name, corners) in KINDS.items():
+        if isinstance(mesh, kind):
+            return {name: mesh.t[corners].T}
+    return {}

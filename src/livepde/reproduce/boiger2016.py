@@ -168,7 +168,7 @@ def ensemble(
     twin, model = case.twin, case.twin.model
     R, exact = twin.observed.split().R, np.array(twin.states)
     energies, errors, sizes, failed = [], [], [], 0
-    result = Result.empty(model, twin.observed, None)
+    result = Result(model, twin.observed, None)
     numbers = watched(seeds, len(seeds), f"{kind} noise, {level:.2%}") if progress else seeds
     for number in numbers:
         identifier = Identifier(model, twin.observation, law, q0=0.0, u0=case.start)

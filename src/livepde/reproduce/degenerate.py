@@ -126,7 +126,7 @@ def identify(process: Process, nu: float, what: str = "", progress: bool = False
     )
     identifier = Identifier(model, sensors, law, q0=0.0, u0=lambda x: u_true(x, 0.0))
     P = identifier.observed.split().P
-    result = Result.empty(model, identifier.observed, None, max(1, process.steps // 100))
+    result = Result(model, identifier.observed, None, max(1, process.steps // 100))
     rows: list[tuple[float, float, float, float]] = []
     for k, sample in enumerate(watched(twin, len(twin), what) if progress else twin):
         estimate = identifier.step(sample.t, sample.z)

@@ -94,7 +94,7 @@ class Track:
 
 def track(identifier: Identifier, twin: Twin, what: str, progress: bool = False) -> Track:
     """Run an identifier on the samples of a twin and compare each estimate with the truth."""
-    result = Result.empty(identifier.model, identifier.observed, None)
+    result = Result(identifier.model, identifier.observed, None)
     samples = watched(twin, len(twin), what) if progress else twin
     times, errors, divided = [], [], 0
     for sample in samples:

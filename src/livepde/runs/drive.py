@@ -12,7 +12,7 @@ from types import FrameType
 
 from livepde.errors import DataError
 from livepde.identifier import Identifier, Sample
-from livepde.result import Result
+from livepde.result import Result, layout_of
 from livepde.runs.journal import Journal
 from livepde.runs.live import Live, Samples
 
@@ -109,5 +109,5 @@ def drive(
 
 def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
     """Return a new journal for what an identifier takes and finds; without a path in memory."""
-    result = Result.empty(identifier.model, identifier.observed, identifier.withheld)
-    return Journal.create(path, identifier.channels, result.layout)
+    layout = layout_of(identifier.model, identifier.observed, identifier.withheld)
+    return Journal.create(path, identifier.channels, layout)

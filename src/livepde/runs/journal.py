@@ -258,6 +258,12 @@ class Journal:
         return int(self._one("SELECT COALESCE(MAX(id), 0) FROM samples"))
 
     @property
+    def first(self) -> Taken | None:
+        """The first accepted sample, which describes the start; None before any."""
+        row = self._execute("SELECT id, t, channels FROM samples ORDER BY id LIMIT 1").fetchone()
+        return None if row is None else self._taken(*row)
+
+    @property
     def last(self) -> float:
         """Time of the last accepted sample, -inf before any."""
         found = self._execute("SELECT t FROM samples ORDER BY id DESC LIMIT 1").fetchone()
@@ -292,23 +298,32 @@ class Journal:
             if row is None:
                 return
             self._current = int(row[0])
-            values = np.frombuffer(row[2]).tolist()
-            yield Taken(self._current, float(row[1]), dict(zip(self.channels, values, strict=True)))
+            yield self._taken(*row)
+
+    def _taken(self, number: int, t: float, channels: bytes) -> Taken:
+        values = np.frombuffer(channels).tolist()
+        return Taken(number, t, dict(zip(self.channels, values, strict=True)))
 
     def __len__(self) -> int:
         return int(self._one("SELECT COUNT(*) FROM estimates"))
 
     def __iter__(self) -> Iterator[Record]:
+        return (record for _, record in self.after(0))
+
+    def after(self, number: int) -> Iterator[tuple[int, Record]]:
+        """Iterate over the estimates of the samples after one, with their numbers."""
         layout = self.layout
         cuts = np.cumsum([len(layout.numbers), len(layout.sensors)])
         rows = self._execute(
-            "SELECT t, status, steps, numbers, notes, content "
-            "FROM estimates LEFT JOIN fields USING (id) ORDER BY id"
+            "SELECT id, t, status, steps, numbers, notes, content "
+            "FROM estimates LEFT JOIN fields USING (id) WHERE id > ? ORDER BY id",
+            number,
         )
-        for t, status, steps, numbers, notes, content in rows:
+        for sample, t, status, steps, numbers, notes, content in rows:
             values, innovation, error = np.split(np.frombuffer(numbers), cuts)
             snapshot = None if content is None else _unpacked(content)
-            yield Record(t, values, innovation, error, status, steps, json.loads(notes), snapshot)
+            told = json.loads(notes)
+            yield sample, Record(t, values, innovation, error, status, steps, told, snapshot)
 
     @property
     def events(self) -> list[Event]:
@@ -327,10 +342,14 @@ class Journal:
     def thin(self, before: float, every: int) -> None:
         """Keep one in `every` estimates, and no samples or fields, from before a time.
 
-        What is needed to go on after a crash is kept.
+        What is needed to go on after a crash is kept: the first sample, and those that are not yet
+        in a checkpoint.
         """
         safe = int(self._one("SELECT COALESCE(MIN(id), 0) FROM checkpoints"))
-        self._execute("DELETE FROM samples WHERE t < ? AND id < ?", before, safe)
+        first = "SELECT MIN(id) FROM samples"
+        self._execute(
+            f"DELETE FROM samples WHERE t < ? AND id < ? AND id > ({first})", before, safe
+        )
         self._execute(
             "DELETE FROM fields WHERE id IN (SELECT id FROM estimates WHERE t < ?)", before
         )

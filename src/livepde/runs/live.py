@@ -271,27 +271,27 @@ class Live:
         self._heard = clock()
         self._waiting: deque[Ready] = deque()
         self._steps = 0
-        self.result = Result(
-            identifier.model, identifier.observed, identifier.withheld, fields_every, journal
-        )
+        self.fields_every = fields_every
+        self.result = self._read()
 
     def resume(self) -> int:
         """Take again what the journal holds after its last checkpoint; return how many samples."""
         state = self.journal.rewind()
         if state is not None:
             self.identifier.restore(state, str(self.journal.path))
-        self.result = Result(
-            self.identifier.model,
-            self.identifier.observed,
-            self.identifier.withheld,
-            self.result.fields_every,
-            self.journal,
-        )
+        self.result = self._read()
         again = 0
         for taken in self.journal.samples():
             self._step(taken, again=True)
             again += 1
         return again
+
+    def _read(self) -> Result:
+        """Return the result of what the journal holds."""
+        who, kept = self.identifier, self.journal
+        return Result(
+            who.model, who.observed, who.withheld, self.fields_every, kept, layout=kept.layout
+        )
 
     def run(self) -> None:
         """Go on until the source ends or `stopping` is set; what was taken is kept then."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from livepde.errors import RunError
 from livepde.result import Estimate
+from livepde.runs.web import Address, Server
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIEnvironment
@@ -70,18 +69,13 @@ class Metrics:
         """Nothing is held."""
 
 
-class _Quiet(WSGIRequestHandler):
-    def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing of each request."""
-
-
 class Monitor:
-    """Serves /health and /metrics from a thread.
+    """Serves /health and /metrics from threads of its own.
 
     Parameters
     ----------
-    host, port
-        Where to listen; port 0: a free one, then in `port`.
+    address
+        Where to listen.
     health
         Returns what /health says as JSON; "ok" in it decides between the codes 200 and 503.
     metrics
@@ -94,20 +88,15 @@ class Monitor:
     """
 
     def __init__(
-        self, host: str, port: int, health: Callable[[], Mapping[str, Any]], metrics: Metrics
+        self, address: Address, health: Callable[[], Mapping[str, Any]], metrics: Metrics
     ) -> None:
         from prometheus_client import make_wsgi_app
 
         self._health = health
         self._metrics = make_wsgi_app(metrics.registry)
-        try:
-            self._server = make_server(host, port, self._answer, WSGIServer, _Quiet)
-        except OSError as error:
-            raise RunError(
-                f"Cannot listen on {host}:{port}: {error.strerror or error}; choose another port."
-            ) from error
-        self.port = int(self._server.server_port)
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        self._server = Server(self._answer, address)
+        self.url = self._server.url
+        self.port = self._server.port
 
     def _answer(self, environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:
         path = environ.get("PATH_INFO", "/")
@@ -126,5 +115,4 @@ class Monitor:
 
     def close(self) -> None:
         """Stop listening."""
-        self._server.shutdown()
-        self._server.server_close()
+        self._server.close()

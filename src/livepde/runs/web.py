@@ -1,0 +1,167 @@
+"""Pages and endpoints of a run: served on this machine only, or to whoever knows a token."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+import socket
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, quote
+
+from livepde.errors import RunError
+
+if TYPE_CHECKING:
+    from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
+
+__all__ = ["Address", "Server"]
+
+COOKIE = "livepde_token"
+THREADS = 4
+
+
+def _loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where to listen, and who may ask.
+
+    Parameters
+    ----------
+    host, port
+        Where; port 0: a free one.
+    token
+        What a visitor has to know: `?token=...` once, or the header `Authorization: Bearer ...`.
+        On this machine (a loopback address) none is asked for unless one is given; anywhere else
+        one is made if none is given.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    token: str = field(default="", repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.token and not _loopback(self.host):
+            object.__setattr__(self, "token", secrets.token_urlsafe(24))
+
+    @classmethod
+    def read(cls, text: str, port: int, token: str = "") -> Address:
+        """Return the address that a user wrote: HOST, HOST:PORT, PORT or nothing at all."""
+        host, _, number = text.rpartition(":") if ":" in text else ("", "", text)
+        if number and not number.isdigit():
+            host, number = text, ""
+        if number and int(number) > 65535:
+            raise RunError(f"'{text}' is no address: a port is a number up to 65535.")
+        return cls(host or cls.host, int(number) if number else port, token)
+
+
+class Server:
+    """A WSGI application, served from threads of its own.
+
+    Parameters
+    ----------
+    application, address
+        What is served where.
+
+    Raises
+    ------
+    RunError
+        The port is taken, or what serves it is not installed.
+    """
+
+    def __init__(self, application: WSGIApplication, address: Address) -> None:
+        try:
+            from cheroot.wsgi import Server as Cheroot
+        except ImportError:
+            raise RunError("Serving needs cheroot: pip install 'livepde[service]'.") from None
+        place = (address.host, address.port)
+        self._server: Any = Cheroot(place, _guarded(application, address), numthreads=THREADS)
+        try:
+            socket.create_server(place).close()  # cheroot leaves a socket open if it cannot listen
+            self._server.prepare()
+        except OSError as error:
+            reason = error.strerror or error
+            raise RunError(
+                f"Cannot listen on {address.host}:{address.port}: {reason}; choose another port."
+            ) from error
+        self.port = int(self._server.bind_addr[1])
+        host = f"[{address.host}]" if ":" in address.host else address.host
+        self.url = f"http://{host}:{self.port}/"
+        if address.token:
+            self.url += f"?token={quote(address.token)}"
+        self._thread = threading.Thread(target=self._server.serve, daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Serve until it is closed."""
+        self._thread.join()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._server.stop()
+        self._thread.join()
+
+
+def _guarded(application: WSGIApplication, address: Address) -> WSGIApplication:
+    """Return an application that answers only who may ask."""
+
+    def answer(environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:
+        if not address.token:
+            # A page elsewhere must not reach this machine under a name of its own.
+            if _loopback(_host(environ)):
+                return application(environ, start)
+            return _refused(start, "this page is for this machine only: ask for localhost")
+        given = parse_qs(environ.get("QUERY_STRING", "")).get("token", [""])[0]
+        if _same(given, address.token):
+            return application(environ, _remembering(start, given))
+        if any(_same(known, address.token) for known in _known(environ)):
+            return application(environ, start)
+        return _refused(start, "add ?token=... as it was printed where this was started")
+
+    return answer
+
+
+def _host(environ: WSGIEnvironment) -> str:
+    host = str(environ.get("HTTP_HOST") or environ.get("SERVER_NAME", ""))
+    if host.startswith("["):
+        return host.partition("]")[0].strip("[")
+    return host.partition(":")[0]
+
+
+def _known(environ: WSGIEnvironment) -> list[str]:
+    """Return the tokens that a visitor has sent with the request."""
+    found = [str(environ.get("HTTP_AUTHORIZATION", "")).removeprefix("Bearer ").strip()]
+    try:
+        cookie = SimpleCookie(str(environ.get("HTTP_COOKIE", "")))
+    except CookieError:
+        return found
+    return found + [morsel.value for name, morsel in cookie.items() if name == COOKIE]
+
+
+def _same(given: str, token: str) -> bool:
+    return bool(given) and hmac.compare_digest(given.encode(), token.encode())
+
+
+def _remembering(start: StartResponse, token: str) -> Any:
+    cookie = f"{COOKIE}={token}; HttpOnly; SameSite=Strict; Path=/"
+
+    def begin(status: str, headers: list[tuple[str, str]], *rest: Any) -> Callable[[bytes], object]:
+        return start(status, [*headers, ("Set-Cookie", cookie)], *rest)
+
+    return begin
+
+
+def _refused(start: StartResponse, why: str) -> Iterable[bytes]:
+    start("403 Forbidden", [("Content-Type", "text/plain")])
+    return [f"{why}\n".encode()]
