@@ -24,7 +24,7 @@ from livepde.runs.journal import Event, Journal
 from livepde.runs.live import Backlog, Gathered, Live, Samples
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
-from livepde.streams.intake import Intake, Policy
+from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Follow, Rows, json_row
 from livepde.streams.table import Clock, Column
 
@@ -178,13 +178,16 @@ def test_one_writer_many_readers(tmp_path):
 def test_rows_out_of_order_are_put_in_order_within_the_wait():
     intake = Intake(COLUMNS, CLOCK, Policy(wait=1.0))
     order = [0.0, 0.4, 0.2, 0.6, 2.0, 0.5, 3.5]
-    found = []
+    found, remarks, spent = [], [], []
     for t in order:
-        ready, _ = intake.take({"t": t, "a": t, "b": 0, "left": 0})
-        found += [sample.t for sample in ready]
-    found += [sample.t for sample in intake.flush()]
+        outcome = intake.take({"t": t, "a": t, "b": 0, "left": 0}, token=t)
+        found += [sample.t for sample in outcome.ready]
+        remarks += [(remark.kind, remark.channel) for remark in outcome.remarks]
+        spent += outcome.spent
+    found += [sample.t for sample in intake.flush().ready]
     assert found == [0.0, 0.2, 0.4, 0.6, 2.0, 3.5]
-    assert intake.counts == {("late", name): 1 for name in COLUMNS}
+    assert remarks == [("disordered", ""), *(("late", name) for name in COLUMNS)]
+    assert spent == [0.5]
 
 
 def test_channels_that_come_one_by_one_make_one_sample():
@@ -192,9 +195,9 @@ def test_channels_that_come_one_by_one_make_one_sample():
     taken = []
     for k in range(3):
         for shift, name in ((0.0, "a"), (0.01, "b"), (0.02, "left")):
-            ready, refused = intake.take({"t": k + shift, name: float(k)})
-            taken += ready
-            assert not refused
+            outcome = intake.take({"t": k + shift, name: float(k)})
+            taken += outcome.ready
+            assert not outcome.remarks
     assert [(s.t, len(s.values)) for s in taken] == [(0.0, 3), (1.0, 3), (2.0, 3)]
 
 
@@ -202,9 +205,9 @@ def test_channels_that_come_one_by_one_make_one_sample():
 def test_a_second_value_is_counted(repeated, value):
     intake = Intake(COLUMNS, CLOCK, Policy(repeated=repeated))
     intake.take({"t": 0.0, "a": 1.0})
-    _, (refused,) = intake.take({"t": 0.0, "a": 2.0})
-    assert refused.kind == "repeated"
-    (sample,) = intake.flush()
+    (remark,) = intake.take({"t": 0.0, "a": 2.0}).remarks
+    assert remark.kind == "repeated"
+    (sample,) = intake.flush().ready
     assert sample.values == {"a": value}
 
 
@@ -212,9 +215,37 @@ def test_a_clock_that_leaps_does_not_make_the_rest_late():
     intake = Intake(COLUMNS, CLOCK, Policy(leap=10.0))
     kinds = []
     for t in (0.0, 1.0, 1e9, 2.0, 500.0, 501.0, 502.0):
-        kinds += [r.kind for r in intake.take({"t": t, "a": 0.0, "b": 0.0, "left": 0.0})[1]]
+        outcome = intake.take({"t": t, "a": 0.0, "b": 0.0, "left": 0.0})
+        kinds += [remark.kind for remark in outcome.remarks]
     assert kinds == ["leap", "leap"]
-    assert intake.take({"t": 503.0, "a": 0.0, "b": 0.0, "left": 0.0})[0][0].t == 503.0
+    (sample,) = intake.take({"t": 503.0, "a": 0.0, "b": 0.0, "left": 0.0}).ready
+    assert sample.t == 503.0
+
+
+def test_each_channel_has_habits_of_its_own():
+    habits = {"a": Habit(valid=(0.0, 1.0)), "b": Habit(wait=5.0), "left": Habit(skip=True)}
+    intake = Intake(COLUMNS, CLOCK, Policy(channels=habits))
+    found, kinds = [], []
+    for row in (
+        {"t": 0.0, "a": 2.0, "b": 0.1, "left": 1.0},  # not valid
+        {"t": 1.0, "a": 0.5, "left": 1.0},  # b comes later
+        {"t": 2.0, "a": 0.5, "b": 0.2, "left": None},  # left out
+        {"t": 1.0, "b": 0.3},
+        {"t": 3.0, "a": 0.5, "left": 1.0},  # b never comes
+        {"t": 9.0, "a": 0.5, "b": 0.4, "left": 1.0},
+    ):
+        outcome = intake.take(row, row["t"])
+        found += [(sample.t, sample.values.get("b")) for sample in outcome.ready]
+        kinds += [(remark.kind, remark.channel) for remark in outcome.remarks]
+    assert found == [(0.0, 0.1), (1.0, 0.3), (3.0, None), (9.0, 0.4)]
+    assert kinds == [
+        ("invalid", "a"),
+        ("missing", "a"),
+        ("disordered", ""),
+        ("missing", "left"),
+        ("skipped", "left"),
+        ("missing", "b"),
+    ]
 
 
 @pytest.mark.parametrize("overflow", ["merge", "drop"])
@@ -235,7 +266,8 @@ def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
     run = live(tmp_path, Rows(mixed))
     run.run()
     assert len(run.journal) == 200
-    assert sum(run.journal.counts.values()) == 200
+    assert run.journal.counts == {("malformed", ""): 150, ("malformed", "a"): 50}
+    assert [event.kind for event in run.journal.events] == ["malformed", "malformed"]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "nan", "1" * 2_000_000, "[" * 100_000])

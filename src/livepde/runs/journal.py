@@ -225,6 +225,10 @@ class Journal:
         )
         self._run(self._db.commit)
 
+    def commit(self) -> None:
+        """Show readers what was written since the last sample was accepted."""
+        self._run(self._db.commit)
+
     def note(self, event: Event) -> None:
         """Keep an event."""
         self._execute(

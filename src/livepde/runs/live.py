@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import threading
 import time
 from collections import deque
@@ -11,17 +13,19 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from livepde.errors import DataError
+from livepde.errors import DataError, LivepdeError
 from livepde.identifier import Identifier, Sample
 from livepde.result import Estimate, Result
 from livepde.runs.journal import Event, Journal, Taken
-from livepde.streams.intake import Intake, Ready, Refused
+from livepde.streams.intake import Intake, Outcome, Ready, Remark
 from livepde.streams.sources import Row, Source
 
-__all__ = ["Backlog", "Feed", "Gathered", "Live", "Samples", "Sink"]
+__all__ = ["Backlog", "Feed", "Gathered", "Live", "Paced", "Retention", "Samples", "Sink"]
 
 CHECKPOINT = 256  # samples between two checkpoints
 LOOK = 0.5  # seconds between two looks at whether to stop
+HARMLESS = frozenset({"heard", "missing", "disordered", "outside"})
+LOG = logging.getLogger("livepde.run")
 
 
 class Feed(Protocol):
@@ -37,8 +41,8 @@ class Feed(Protocol):
     def heard(self) -> bool:
         """Return whether anything has come since this was asked last, be it of no use."""
 
-    def refused(self) -> Sequence[Refused]:
-        """Return what has come since this was asked last and is not used."""
+    def remarks(self) -> Sequence[Remark]:
+        """Return what has been worth counting since this was asked last."""
 
     def position(self, waiting: Sequence[Ready]) -> str:
         """Return from where to go on if these samples are still to be taken."""
@@ -63,7 +67,7 @@ class Gathered:
         self.source = source
         self.intake = intake
         self._heard = False
-        self._refused: list[Refused] = []
+        self._remarks: list[Remark] = []
         self._flushed = False
 
     @property
@@ -77,31 +81,30 @@ class Gathered:
         self._heard |= bool(rows)
         found: list[Ready] = []
         for row in rows:
-            found += self._taken(row)
+            found += self._used(self._outcome(row))
         if self.source.done and not self._flushed:
             self._flushed = True
-            found += self.intake.flush()
+            found += self._used(self.intake.flush())
         return found
 
-    def _taken(self, row: Row) -> list[Ready]:
-        ready: list[Ready] = []
-        refused = [Refused("malformed", "", row.broken)]
-        if not row.broken:
-            ready, refused = self.intake.take(row.values, row.token)
-        self._refused += refused
-        waiting = [*self.intake.waiting, *(t for one in ready for t in one.tokens)]
-        if refused and row.token not in waiting:
-            self.source.acknowledge([row.token])  # it is not needed again
-        return ready
+    def _outcome(self, row: Row) -> Outcome:
+        if row.broken:
+            return Outcome(remarks=[Remark("malformed", "", row.broken)], spent=[row.token])
+        return self.intake.take(row.values, row.token)
+
+    def _used(self, outcome: Outcome) -> list[Ready]:
+        self._remarks += outcome.remarks
+        self.source.acknowledge(outcome.spent)
+        return outcome.ready
 
     def heard(self) -> bool:
         """Return whether a row has come since this was asked last."""
         heard, self._heard = self._heard, False
         return heard
 
-    def refused(self) -> Sequence[Refused]:
-        """Return the rows and values that are not used."""
-        found, self._refused = self._refused, []
+    def remarks(self) -> Sequence[Remark]:
+        """Return what was refused, missing or out of order."""
+        found, self._remarks = self._remarks, []
         return found
 
     def position(self, waiting: Sequence[Ready]) -> str:
@@ -162,7 +165,7 @@ class Samples:
         """Samples that are there are never silent."""
         return True
 
-    def refused(self) -> Sequence[Refused]:
+    def remarks(self) -> Sequence[Remark]:
         """Nothing is refused: what is wrong raises."""
         return ()
 
@@ -175,6 +178,77 @@ class Samples:
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+class Paced:
+    """Samples of the past, replayed at the pace of their times.
+
+    Parameters
+    ----------
+    feed
+        Where they come from.
+    pace
+        Model time that passes in one second.
+    clock, sleep
+        Seconds that pass, and how to let them pass.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        pace: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.feed = feed
+        self.pace = pace
+        self._clock = clock
+        self._sleep = sleep
+        self._held: deque[Ready] = deque()
+        self._begun: tuple[float, float] | None = None
+
+    @property
+    def done(self) -> bool:
+        """True when the last sample is out."""
+        return self.feed.done and not self._held
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the samples whose time has come."""
+        if not self._held:
+            self._held.extend(self.feed.poll(wait))
+        if not self._held:
+            return []
+        now, first = self._clock(), self._held[0].t
+        begun = self._begun or (now, first)
+        self._begun = begun
+        due = begun[0] + (first - begun[1]) / self.pace
+        if due > now:
+            self._sleep(min(wait, due - now))
+        passed = begun[1] + (self._clock() - begun[0]) * self.pace
+        found = []
+        while self._held and self._held[0].t <= passed:
+            found.append(self._held.popleft())
+        return found
+
+    def heard(self) -> bool:
+        """A replay is heard as long as it holds samples."""
+        return self.feed.heard() or bool(self._held)
+
+    def remarks(self) -> Sequence[Remark]:
+        """Return what was worth counting."""
+        return self.feed.remarks()
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """Return from where to go on if these samples, and those held, are still to be taken."""
+        return self.feed.position([*waiting, *self._held])
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Tell the feed."""
+        self.feed.acknowledge(ready)
+
+    def close(self) -> None:
+        """Close the feed."""
+        self.feed.close()
 
 
 class Sink(Protocol):
@@ -194,8 +268,9 @@ class Backlog:
     Parameters
     ----------
     overflow
-        "queue": all wait; "merge": those beyond `length` become one sample, with the mean of each
-        channel at the last time; "drop": the oldest are left out. Both are counted.
+        "queue": all wait, those beyond `length` where they come from; "merge": those beyond it
+        become one sample, with the mean of each channel at the last time; "drop": the oldest are
+        left out. What is merged or left out is counted.
     length
         Samples that may wait.
     """
@@ -212,6 +287,26 @@ class Backlog:
         if self.overflow == "merge":
             waiting.appendleft(_merged([*oldest, waiting.popleft()]))
         return oldest
+
+    def has_room(self, waiting: deque[Ready]) -> bool:
+        """Return whether more should be taken from the source."""
+        return self.overflow != "queue" or len(waiting) < self.length
+
+
+@dataclass(frozen=True)
+class Retention:
+    """How much of the past a journal keeps.
+
+    Parameters
+    ----------
+    span
+        Model time for which all is kept.
+    every
+        Of older estimates one in so many is kept, of older samples and fields none.
+    """
+
+    span: float = math.inf
+    every: int = 1
 
 
 def _merged(samples: Sequence[Ready]) -> Ready:
@@ -237,11 +332,17 @@ class Live:
         Fields of every so many samples are kept.
     backlog
         What happens when samples come faster than steps.
+    retention
+        How much of the past is kept.
     silence
         Seconds without a row after which the source is said to be silent.
     strict
         A sample that the identifier cannot use ends the run with its `DataError`; otherwise it is
         an event.
+    begun
+        Samples that the feed has brought already.
+    clock
+        Seconds that pass.
     """
 
     def __init__(
@@ -253,15 +354,18 @@ class Live:
         sinks: Sequence[Sink] = (),
         fields_every: int = 1,
         backlog: Backlog | None = None,
-        silence: float = np.inf,
+        retention: Retention | None = None,
+        silence: float = math.inf,
         strict: bool = False,
+        begun: Iterable[Ready] = (),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
         self.feed = feed
         self.journal = journal
-        self.sinks = sinks
+        self.sinks = list(sinks)
         self.backlog = backlog or Backlog()
+        self.retention = retention or Retention()
         self.silence = silence
         self.strict = strict
         self.silent = False
@@ -269,7 +373,8 @@ class Live:
         self.busy = False  # a step is taken
         self._clock = clock
         self._heard = clock()
-        self._waiting: deque[Ready] = deque()
+        self._waiting = deque(begun)
+        self._remarked: set[tuple[str, str]] = set()
         self._steps = 0
         self.fields_every = fields_every
         self.result = self._read()
@@ -284,6 +389,8 @@ class Live:
         for taken in self.journal.samples():
             self._step(taken, again=True)
             again += 1
+        if again and self.result.last is not None:
+            self._put(self.result.last)
         return again
 
     def _read(self) -> Result:
@@ -304,20 +411,39 @@ class Live:
 
     def _run(self) -> None:
         while not self.stopping.is_set():
-            self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
-            self._watch(self.feed.heard())
-            for item in self.feed.refused():
-                self.journal.count(item.kind, item.channel)
-            relieved = self.backlog.relieved(self._waiting)
-            if relieved:
-                self.journal.count(self.backlog.overflow, "", len(relieved))
-            if self.backlog.overflow == "drop":
-                for ready in relieved:
-                    self.feed.acknowledge(ready)
+            if not self._waiting:
+                self.journal.commit()  # who reads the journal sees all before it is waited for more
+            if self.backlog.has_room(self._waiting):
+                self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
+                self._watch(self.feed.heard())
+                self._count(self.feed.remarks())
+            self._relieve()
             if self._waiting:
                 self._take(self._waiting.popleft())
             elif self.feed.done:
                 break
+
+    def _relieve(self) -> None:
+        relieved = self.backlog.relieved(self._waiting)
+        if relieved:
+            self.journal.count(self.backlog.overflow, "", len(relieved))
+        if self.backlog.overflow == "drop":
+            for ready in relieved:
+                self.feed.acknowledge(ready)
+
+    def _count(self, remarks: Sequence[Remark]) -> None:
+        """Count remarks; the first of each kind and channel is an event, with its words."""
+        for remark in remarks:
+            self.journal.count(remark.kind, remark.channel)
+            if (remark.kind, remark.channel) not in self._remarked:
+                self._remarked.add((remark.kind, remark.channel))
+                self._tell(remark.kind, remark.message, remark.channel)
+
+    def _tell(self, kind: str, message: str, channel: str = "") -> None:
+        event = Event(self.identifier.t, kind, channel, message)
+        self.journal.note(event)
+        level = logging.INFO if kind in HARMLESS else logging.WARNING
+        LOG.log(level, "%s%s: %s", kind, f" ({channel})" if channel else "", message)
 
     @property
     def health(self) -> dict[str, Any]:
@@ -347,7 +473,7 @@ class Live:
             self.journal.withdraw()
             if self.strict:
                 raise
-            self.journal.note(Event(taken.t, "refused", "", str(error)))
+            self._tell("refused", str(error))
         finally:
             self.busy = False
 
@@ -355,22 +481,30 @@ class Live:
         estimate = self.identifier.step(taken.t, taken.values)
         self.result.add(estimate)
         if not again:
-            for sink in self.sinks:
-                sink.put(estimate)
-        if not estimate.status.ok:
-            self.journal.note(Event(taken.t, estimate.status.code, "", str(estimate.status)))
+            self._put(estimate)
+            if not estimate.status.ok:
+                self._tell(estimate.status.code, str(estimate.status))
         self._steps += 1
         if self._steps % CHECKPOINT == 0:
             self.journal.checkpoint(self.identifier.dump())
+            if math.isfinite(self.retention.span):
+                self.journal.thin(estimate.t - self.retention.span, self.retention.every)
+
+    def _put(self, estimate: Estimate) -> None:
+        """Hand an estimate to all sinks; one that fails is given up, the run goes on."""
+        for sink in list(self.sinks):
+            try:
+                sink.put(estimate)
+            except (OSError, LivepdeError) as error:
+                self.sinks.remove(sink)
+                self._tell("sink", f"{type(sink).__name__} is given up: {error}")
 
     def _watch(self, heard: bool) -> None:
         now = self._clock()
         if heard:
             if self.silent:
-                text = f"the source is heard again after {now - self._heard:.0f} s"
-                self.journal.note(Event(self.identifier.t, "heard", "", text))
+                self._tell("heard", f"the source is heard again after {now - self._heard:.0f} s")
             self._heard, self.silent = now, False
         elif not self.silent and now - self._heard > self.silence:
             self.silent = True
-            text = f"nothing from the source for {now - self._heard:.0f} s"
-            self.journal.note(Event(self.identifier.t, "silent", "", text))
+            self._tell("silent", f"nothing from the source for {now - self._heard:.0f} s")

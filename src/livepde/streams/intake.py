@@ -8,8 +8,7 @@ so long rows may come in any order.
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -17,12 +16,35 @@ from typing import Any, Literal
 from livepde.errors import DataError
 from livepde.streams.table import Clock, Column, channel_value, row_time
 
-__all__ = ["Intake", "Policy", "Ready", "Refused"]
+__all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark"]
+
+
+@dataclass(frozen=True)
+class Habit:
+    """What becomes of one channel.
+
+    Parameters
+    ----------
+    wait
+        A sample without this channel waits so long for it, if that is longer than `Policy.wait`.
+    repeated
+        Which value counts that comes twice for one moment; default that of the policy.
+    valid
+        Values outside are not used, as if they had not come.
+    skip
+        A sample without this channel is left out, instead of going on with the last value of an
+        input or without that sensor.
+    """
+
+    wait: float = 0.0
+    repeated: Literal["first", "last"] | None = None
+    valid: tuple[float, float] = (-math.inf, math.inf)
+    skip: bool = False
 
 
 @dataclass(frozen=True)
 class Policy:
-    """What becomes of rows that do not come one by one in order.
+    """What becomes of rows that do not come one by one, in order and complete.
 
     Parameters
     ----------
@@ -35,31 +57,48 @@ class Policy:
         agrees with it: a broken clock must not make all that follows too late.
     repeated
         Which value of a channel counts that comes twice for one moment.
+    channels
+        Channel -> what is special about it.
     """
 
     wait: float = 0.0
     tolerance: float = 0.0
     leap: float = math.inf
     repeated: Literal["first", "last"] = "first"
+    channels: Mapping[str, Habit] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("wait", "tolerance"):
-            value = getattr(self, name)
+        waits = {f"wait of '{name}'": habit.wait for name, habit in self.channels.items()}
+        for name, value in {"wait": self.wait, "tolerance": self.tolerance, **waits}.items():
             if not (math.isfinite(value) and value >= 0):
                 raise DataError(f"intake: {name} must be a time >= 0; got {value}.")
-        if self.repeated not in ("first", "last"):
-            raise DataError(f"intake: repeated must be first or last; got {self.repeated!r}.")
+        for choice in (self.repeated, *(habit.repeated for habit in self.channels.values())):
+            if choice not in ("first", "last", None):
+                raise DataError(f"intake: repeated must be first or last; got {choice!r}.")
+
+    def keeps(self, channel: str) -> Literal["first", "last"]:
+        """Return which of two values of a channel counts."""
+        return self.habit(channel).repeated or self.repeated
+
+    def habit(self, channel: str) -> Habit:
+        """Return what is special about a channel."""
+        return self.channels.get(channel, PLAIN)
+
+
+PLAIN = Habit()
 
 
 @dataclass(frozen=True)
-class Refused:
-    """A value or row that is not used.
+class Remark:
+    """Something about a row, a value or a sample that is worth counting.
 
     Attributes
     ----------
     kind
-        "malformed" (not what it should be), "late", "leap" (a time too far ahead), "repeated",
-        "outside" (not between start and stop).
+        Not used: "malformed" (not what it should be), "invalid" (a value outside of what is
+        valid), "late", "leap" (a time too far ahead), "repeated", "outside" (not between start and
+        stop), "skipped" (a sample without what it must have). Used all the same: "disordered" (came
+        after a later one), "missing" (a sample without this channel).
     channel
         Of the value; '' for a whole row.
     message
@@ -86,6 +125,19 @@ class Ready:
     t: float
     values: dict[str, float]
     tokens: tuple[Any, ...]
+
+
+@dataclass
+class Outcome:
+    """What has become of a row: samples that are ready, remarks, tokens that are done with."""
+
+    ready: list[Ready] = field(default_factory=list)
+    remarks: list[Remark] = field(default_factory=list)
+    spent: list[Any] = field(default_factory=list)
+
+    def remark(self, kind: str, channel: str, message: str) -> None:
+        """Add a remark."""
+        self.remarks.append(Remark(kind, channel, message))
 
 
 @dataclass
@@ -128,7 +180,6 @@ class Intake:
         self.policy = policy or Policy()
         self.missing = frozenset(float(number) for number in missing)
         self.origin = origin
-        self.counts: Counter[tuple[str, str]] = Counter()
         self._last = last
         self._newest = last
         self._doubted = math.inf
@@ -146,43 +197,67 @@ class Intake:
         """Tokens of the rows that are in no sample yet."""
         return [token for sample in self._open.values() for token in sample.tokens]
 
-    def take(self, row: Mapping[str, Any], token: Any = None) -> tuple[list[Ready], list[Refused]]:
-        """Take a row; return the samples that are ready now, and what was refused."""
-        refused: list[Refused] = []
+    def take(self, row: Mapping[str, Any], token: Any = None) -> Outcome:
+        """Take a row; return what becomes of it and of those before it."""
+        found = Outcome()
         try:
             t = self._time(row)
         except DataError as error:
-            return [], self._counted([Refused("malformed", "", str(error))])
-        if t is None:
-            return [], self._counted([Refused("outside", "", "not between start and stop")])
-        if self._leaps(t):
-            text = f"t = {t:g} is far ahead of the newest row at {self._newest:g}"
-            return [], self._counted([Refused("leap", "", text)])
+            found.remark("malformed", "", str(error))
+        else:
+            if t is None:
+                found.remark("outside", "", "not between start and stop")
+            elif self._leaps(t):
+                text = f"t = {t:g} is far ahead of the newest row at {self._newest:g}"
+                found.remark("leap", "", text)
+            elif self._placed(t, row, token, found):
+                self._release(found)
+                return found
+        found.spent.append(token)
+        self._release(found)
+        return found
+
+    def flush(self) -> Outcome:
+        """Release all samples that are still open: nothing more will come."""
+        found = Outcome()
+        self._newest = math.inf
+        self._release(found)
+        return found
+
+    def _placed(self, t: float, row: Mapping[str, Any], token: Any, found: Outcome) -> bool:
+        """Return whether a row became part of a sample."""
+        values = self._values(row, found)
+        moment = self._moment(t)
+        if moment is None:
+            text = f"t = {t:g} is not later than the last sample at {self._last:g}"
+            for channel in values:
+                found.remark("late", channel, text)
+        elif values:
+            if t < self._newest - self.policy.tolerance:
+                text = f"t = {t:g} came after {self._newest:g}"
+                found.remark("disordered", "", text)
+            self._add(moment, values, token, found)
+        self._newest = max(self._newest, t)
+        return moment is not None and bool(values)
+
+    def _values(self, row: Mapping[str, Any], found: Outcome) -> dict[str, float]:
+        """Return the values of a row that can be used."""
         values: dict[str, float] = {}
         for channel, column in self.columns.items():
             if not all(name in row for name in column.names):
                 continue
             try:
-                values[channel] = channel_value(column, row, self.missing)
+                value = channel_value(column, row, self.missing)
             except DataError as error:
-                refused.append(Refused("malformed", channel, str(error)))
-        moment = self._moment(t)
-        if moment is None:
-            text = f"t = {t:g} is not later than the last sample at {self._last:g}"
-            refused += [Refused("late", channel, text) for channel in values]
-        elif values:
-            self._add(moment, values, token, refused)
-        self._newest = max(self._newest, t)
-        return list(self._ready()), self._counted(refused)
-
-    def flush(self) -> list[Ready]:
-        """Return all samples that are still open: nothing more will come."""
-        self._newest = math.inf
-        return list(self._ready())
-
-    def _counted(self, refused: list[Refused]) -> list[Refused]:
-        self.counts.update((item.kind, item.channel) for item in refused)
-        return refused
+                found.remark("malformed", channel, str(error))
+                continue
+            low, high = self.policy.habit(channel).valid
+            if value < low or value > high:
+                text = f"{value:g} is not between {low:g} and {high:g}"
+                found.remark("invalid", channel, text)
+                value = math.nan
+            values[channel] = value
+        return values
 
     def _time(self, row: Mapping[str, Any]) -> float | None:
         """Return the time of a row, None if it is outside of what is used."""
@@ -191,7 +266,7 @@ class Intake:
         if not low <= t <= high:
             return None
         if self.origin is None:
-            self.origin = t / self.clock.second if dates else 0.0
+            self.origin = _microseconds(t / self.clock.second) if dates else 0.0
         return t - self.origin * self.clock.second if dates else t
 
     def _leaps(self, t: float) -> bool:
@@ -210,26 +285,45 @@ class Intake:
             return min(near, key=lambda s: abs(s - t))
         return t if t > self._last + self.policy.tolerance else None
 
-    def _add(
-        self, moment: float, values: Mapping[str, float], token: Any, refused: list[Refused]
-    ) -> None:
+    def _add(self, moment: float, values: Mapping[str, float], token: Any, found: Outcome) -> None:
         sample = self._open.setdefault(moment, _Open())
         sample.tokens.append(token)
         for channel, value in values.items():
             known = sample.values.get(channel, math.nan)
-            if not math.isnan(known):
+            if not (math.isnan(known) or math.isnan(value)):
                 text = f"a second value for t = {moment:g}: {value:g} after {known:g}"
-                refused.append(Refused("repeated", channel, text))
-                if self.policy.repeated == "first":
+                found.remark("repeated", channel, text)
+                if self.policy.keeps(channel) == "first":
                     continue
-            sample.values[channel] = value
+            if math.isnan(known) or not math.isnan(value):
+                sample.values[channel] = value
 
-    def _ready(self) -> Iterator[Ready]:
+    def _release(self, found: Outcome) -> None:
+        """Let go, in order, of the samples that are complete or have waited long enough."""
         for t in sorted(self._open):
-            complete = self.policy.wait == 0.0 and len(self._open[t].values) == len(self.columns)
-            passed = t + self.policy.tolerance + self.policy.wait < self._newest
-            if not (passed or complete):
+            if not self._ripe(t):
                 return
             sample = self._open.pop(t)
             self._last = t
-            yield Ready(t, sample.values, tuple(sample.tokens))
+            lacking = [c for c in self.columns if math.isnan(sample.values.get(c, math.nan))]
+            for channel in lacking:
+                found.remark("missing", channel, f"no value for t = {t:g}")
+            needed = [channel for channel in lacking if self.policy.habit(channel).skip]
+            if needed:
+                found.remark("skipped", needed[0], f"t = {t:g} is left out")
+                found.spent += sample.tokens
+            else:
+                found.ready.append(Ready(t, sample.values, tuple(sample.tokens)))
+
+    def _ripe(self, t: float) -> bool:
+        """Return whether nothing that a sample may wait for can still come."""
+        absent = [channel for channel in self.columns if channel not in self._open[t].values]
+        if self.policy.wait == 0.0 and not absent:
+            return True
+        waits = [self.policy.wait, *(self.policy.habit(channel).wait for channel in absent)]
+        return t + self.policy.tolerance + max(waits) < self._newest
+
+
+def _microseconds(stamp: float) -> float:
+    """Return seconds since 1970 as a date has them, so that a date gives the same again."""
+    return datetime.fromtimestamp(stamp, UTC).timestamp()
