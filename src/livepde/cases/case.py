@@ -278,6 +278,11 @@ class Case:
             raise self.frame.error("channels", text)
         return observation
 
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors that are assimilated."""
+        return tuple(self.frame.roles("sensor"))
+
     @cached_property
     def withheld(self) -> Observation | None:
         """What is scored only."""
@@ -395,6 +400,31 @@ class Case:
         stream = data if isinstance(data, Table) else chain([first], samples)
         prepared = Prepared(self, first, stream, start, data.origin)
         _ = prepared.identifier  # raises what does not fit together
+        return prepared
+
+    @property
+    def live(self) -> bool:
+        """Whether the case's own source goes on: a file that grows, a broker, a server."""
+        return self.frame.spec.data.live
+
+    def begin(self, first: Sample, origin: datetime | None = None) -> Prepared:
+        """Return an identifier for a process of which the first sample has come.
+
+        Parameters
+        ----------
+        first
+            Describes the start.
+        origin
+            The date of t = 0, if times are dates.
+
+        Raises
+        ------
+        DataError
+            The sample lacks what is needed to begin.
+        """
+        start = assimilation_start(self.frame, self.clock, origin)
+        prepared = Prepared(self, first, (), start, origin)
+        prepared.identifier_with(self.law).step(first.t, first.z)  # raises what is missing
         return prepared
 
 

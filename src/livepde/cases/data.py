@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
 
-__all__ = ["assimilation_start", "clock_of", "read_data", "reader_of"]
+__all__ = ["assimilation_start", "clock_of", "data_file", "read_data", "reader_of"]
 
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
@@ -30,7 +31,17 @@ def clock_of(frame: Frame) -> Clock:
     rule = conversion(data.time_unit or unit, unit, frame.where("data.time_unit"))
     second = conversion("s", unit, frame.where("data.time")).factor if unit else 1.0
     start, stop = _instant(frame, data.start, "start"), _instant(frame, data.stop, "stop")
-    return Clock(data.time, rule.factor, start, stop, second)
+    return Clock(data.time, rule.factor, start, stop, second, _zone(frame))
+
+
+def _zone(frame: Frame) -> tzinfo:
+    """Return the zone of dates that name none."""
+    name = frame.spec.data.zone
+    try:
+        return ZoneInfo(name)
+    except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
+        text = f"there is no time zone '{name}'; expected a name as Europe/Berlin."
+        raise frame.error("data.zone", text) from None
 
 
 def _instant(frame: Frame, value: Any, key: str) -> Any:
@@ -52,7 +63,7 @@ def read_data(
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
     if source is None and frame.reader is not None:
         return _from_reader(frame, frame.reader, columns, clock)
-    path = Path(source) if source is not None else _data_file(frame)
+    path = Path(source) if source is not None else data_file(frame)
     if path.suffix in (".jsonl", ".ndjson"):
         return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
     return read_csv(
@@ -109,7 +120,7 @@ def _unset(folder: Path | None) -> str:
     return "" if folder else remedy
 
 
-def _data_file(frame: Frame) -> Path:
+def data_file(frame: Frame) -> Path:
     """Return the data file; relative names start at the case file."""
     given = frame.spec.data.file
     if given is None:
@@ -117,7 +128,7 @@ def _data_file(frame: Frame) -> Path:
     if VARIABLE in given:
         given = given.replace(VARIABLE, str(_data_folder(frame)))
     path = frame.path.parent / Path(given).expanduser()
-    if not path.is_file():
+    if not path.is_file() and not frame.spec.data.follow:
         raise frame.error("data.file", f"there is no file '{path}'.")
     return path
 
@@ -155,15 +166,8 @@ def assimilation_start(frame: Frame, clock: Clock, origin: datetime | None) -> f
     if origin is None:
         text = f"got the date {value}; the times of the data are numbers."
         raise frame.error("data.assimilate_from", text)
-    moment = value
-    if isinstance(value, str):
-        try:
-            moment = datetime.fromisoformat(value.strip())
-        except ValueError:
-            text = f"got '{value}'; expected a date as 2025-04-01 12:00."
-            raise frame.error("data.assimilate_from", text) from None
-    if isinstance(moment, date) and not isinstance(moment, datetime):
-        moment = datetime(moment.year, moment.month, moment.day)
-    if moment.tzinfo is not None:
-        moment = moment.astimezone(UTC).replace(tzinfo=None)
-    return float((moment - origin).total_seconds() * clock.second)
+    stamp = clock.stamp(value)
+    if stamp is None:
+        text = f"got '{value}'; expected a date as 2025-04-01 12:00."
+        raise frame.error("data.assimilate_from", text)
+    return (stamp - origin.replace(tzinfo=UTC).timestamp()) * clock.second

@@ -127,15 +127,54 @@ class MeshSpec(Spec):
         return self
 
 
+class BrokerSpec(Spec):
+    """How to reach a message broker (MQTT)."""
+
+    host: Name = "localhost"
+    port: Annotated[int, Field(gt=0, lt=65536)] = 1883
+    client_id: Name | None = None
+    username: Name | None = None
+    password_env: Name | None = None
+    tls: StrictBool = False
+    session: Quantity = "7 d"
+
+
+class MqttSpec(BrokerSpec):
+    """Topics whose messages are rows, and topics whose messages are numbers of one column."""
+
+    rows: tuple[Name, ...] = ()
+    columns: dict[Name, Name] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _some_topic(self) -> MqttSpec:
+        if not self.rows and not self.columns:
+            raise ValueError("expected rows = [topics], or columns = { topic = column }")
+        return self
+
+
+class OpcuaSpec(Spec):
+    """Nodes of an OPC UA server."""
+
+    url: Name
+    columns: dict[Name, Name] = Field(min_length=1)
+    interval: Quantity = "1 s"
+    username: Name | None = None
+    password_env: Name | None = None
+
+
 class DataSpec(Spec):
-    """The data file and its time column, or a function that reads them."""
+    """Where rows come from, and how their times are read."""
 
     file: Name | None = None
+    follow: StrictBool = False
+    mqtt: MqttSpec | None = None
+    opcua: OpcuaSpec | None = None
     separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
     reader: Name | None = None
     options: dict[Identifier, Any] = Field(default_factory=dict)
     time: Name = "time"
     time_unit: str | None = None
+    zone: Name = "UTC"
     start: Instant | None = None
     stop: Instant | None = None
     assimilate_from: Instant | None = None
@@ -148,9 +187,31 @@ class DataSpec(Spec):
             raise ValueError("time is missing: the name of the column of times")
         if self.reader is None and self.options:
             raise ValueError("options belong to a reader")
-        if self.reader is not None and self.file is not None:
-            raise ValueError("file and reader are two sources: keep one")
+        sources = [n for n in ("file", "reader", "mqtt", "opcua") if getattr(self, n) is not None]
+        if len(sources) > 1:
+            raise ValueError(f"{' and '.join(sources)} are {len(sources)} sources: keep one")
+        if self.follow and self.file is None:
+            raise ValueError("follow belongs to a file that grows")
+        if self.live and self.every > 1:
+            raise ValueError("every belongs to data that are there, not to a source that goes on")
         return self
+
+    @property
+    def live(self) -> bool:
+        """Whether the source goes on."""
+        return self.follow or self.mqtt is not None or self.opcua is not None
+
+
+class IntakeSpec(Spec):
+    """What becomes of rows that are late, doubled, broken or too fast."""
+
+    wait: Quantity = 0.0
+    tolerance: Quantity = 0.0
+    leap: Quantity | None = None
+    repeated: Literal["first", "last"] = "first"
+    overflow: Literal["queue", "merge", "drop"] = "queue"
+    queue: PositiveInt = 1000
+    silence: Quantity | None = None
 
 
 class EvolutionSpec(Spec):
@@ -218,6 +279,10 @@ class ChannelSpec(Spec):
     offset: Quantity | None = None
     gain: PositiveFloat | None = None
     correlated: CorrelatedSpec | None = None
+    wait: Quantity | None = None
+    repeated: Literal["first", "last"] | None = None
+    valid: Pair | None = None
+    missing: Literal["hold", "skip"] = "hold"
 
     @model_validator(mode="after")
     def _consistent(self) -> ChannelSpec:
@@ -325,10 +390,25 @@ class StepsSpec(Spec):
     scheme: Literal["implicit-euler", "alexander2"] = "implicit-euler"
 
 
+class PublishSpec(BrokerSpec):
+    """Where estimates are published."""
+
+    topic: Name
+
+
 class OutputSpec(Spec):
-    """What is kept of a run."""
+    """What is kept of a run, and where else estimates go."""
 
     fields_every: PositiveInt = 24
+    retain: Quantity | None = None
+    thin: PositiveInt = 1
+    mqtt: PublishSpec | None = None
+
+    @model_validator(mode="after")
+    def _thins_the_past(self) -> OutputSpec:
+        if self.thin > 1 and self.retain is None:
+            raise ValueError("thin belongs to retain = the time for which all is kept")
+        return self
 
 
 Expected: TypeAlias = Annotated[
@@ -359,6 +439,7 @@ class CaseSpec(Spec):
     options: dict[Identifier, StrictBool | Quantity] = Field(default_factory=dict)
     boundary: dict[Name, Quantity] = Field(default_factory=dict)
     data: DataSpec
+    intake: IntakeSpec = Field(default_factory=IntakeSpec)
     unknowns: dict[Identifier, UnknownSpec] = Field(min_length=1)
     channels: dict[Name, ChannelSpec] = Field(min_length=1)
     law: Law

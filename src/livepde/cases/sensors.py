@@ -13,6 +13,7 @@ from livepde.cases.process import sides_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
+from livepde.errors import MissingInputError
 from livepde.identifier import Sample
 from livepde.observation import (
     Averages,
@@ -242,10 +243,9 @@ def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
             pairs.append((_position(frame, mesh, name, channel), values[name]))
     present = sorted(pair for pair in pairs if np.isfinite(pair[1]))
     if not present:
-        raise frame.error(
-            "initial",
-            "'interpolate' found no sensor or boundary with a value in the first sample; start "
-            "later, or give a number.",
+        raise MissingInputError(
+            f"{frame.where('initial')}: 'interpolate' found no sensor or boundary with a value in "
+            "the first sample; start later, or give a number."
         )
     at, level = zip(*present, strict=True)
     return lambda x: np.interp(x[0], at, level)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +15,7 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
+from livepde.cli.live import Beside, beside
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
@@ -31,10 +36,19 @@ from livepde.cli.printing import (
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    import xarray as xr
+
     from livepde.cases import Case, Prepared
-    from livepde.runs import Journal, RunWriter
+    from livepde.runs import Check, Driven, RunWriter, Table
 
 __all__ = ["run"]
+
+
+class LogKind(StrEnum):
+    """How a log is written."""
+
+    text = "text"
+    json = "json"
 
 
 def run(
@@ -42,49 +56,192 @@ def run(
     data: Annotated[
         str | None,
         typer.Option(
-            help="Other data than the case names: a .csv or .jsonl file, or - for JSON lines "
-            "from standard input.",
+            help="Other data than the case names: a .csv, .jsonl or .parquet file, or - for JSON "
+            "lines from standard input.",
             show_default=False,
         ),
     ] = None,
     out: OutOption = None,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on with the run in --out, as if it had never stopped."),
+        typer.Option(
+            "--resume",
+            help="Go on with the run in --out as if it had never stopped; begin it if there is "
+            "none.",
+        ),
     ] = False,
+    realtime: Annotated[
+        bool,
+        typer.Option(
+            "--realtime",
+            help="Run beside the process: late, broken and missing rows are counted and do not end "
+            "the run; a finished file is replayed. Cases with a source that goes on do so anyway.",
+        ),
+    ] = False,
+    speed: Annotated[
+        float,
+        typer.Option(
+            help="With --realtime: how many times faster than it happened a file is replayed; inf "
+            "for as fast as it goes.",
+            min=0.0,
+        ),
+    ] = 1.0,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve /health and /metrics (Prometheus) there while the run goes on.",
+            show_default=False,
+        ),
+    ] = None,
+    watch: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[HOST:]PORT",
+            help="Serve the live page there while the run goes on.",
+            show_default=False,
+        ),
+    ] = None,
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="LIVEPDE_TOKEN",
+            help="What visitors of --listen and --watch have to know.",
+            show_default=False,
+        ),
+    ] = "",
+    estimates: Annotated[
+        bool,
+        typer.Option(
+            "--estimates", help="Print each estimate as a line of JSON to standard output."
+        ),
+    ] = False,
+    log: Annotated[LogKind, typer.Option(help="How a live run writes its log.")] = LogKind.text,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
 ) -> None:
     """Identify: take every sample of a case, and write a run directory.
 
-    Ctrl-C ends a run early; what it has is written.
+    Ctrl-C or SIGTERM ends a run early; what it has is written.
 
     Example:  livepde run mycase/case.toml
-    Live:     logger | livepde run mycase/case.toml --data -
-    Resume:   livepde run mycase/case.toml --out runs/mycase --resume
+    Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
+    Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
-    from livepde.runs import checks_of, doubts, drive, tables
-    from livepde.streams import Table as Samples
+    from livepde.runs import free_path
+    from livepde.runs.logs import configure
 
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
+    live = realtime or (loaded.live and data is None)
+    only = {"--listen": listen, "--watch": watch, "--estimates": estimates}
+    _refuse(out, resume, live, only, as_json)
+    folder = out or free_path(Path("runs") / loaded.name)
+    write = partial(_writer, loaded, folder, settings or (), resume)
+    with ExitStack() as stack:
+        if live:
+            configure(log.value)
+            goes_on = source is sys.stdin or (loaded.live and data is None)
+            pace = math.inf if goes_on else speed
+            how = Beside(source, pace, listen, watch, token, estimates)
+            writer, taken = beside(loaded, how, folder, write, stack)
+        else:
+            writer, taken = _batch(loaded, source, folder, write, stack, quiet=as_json)
+        if taken is None:
+            writer.finish(status="interrupted", notes=["Ended before the first sample."])
+            raise typer.Exit(INTERRUPTED)
+        prepared, driven = taken
+        dataset, shown, checks, notes = _concluded(loaded, prepared, driven, writer)
+    if driven.error is not None:
+        raise driven.error
+    if as_json:
+        print_json(shown, checks, notes, run=str(folder), status=driven.status, dataset=dataset)
+    elif not estimates:
+        console = terminal()
+        console.print(f"[bold]{escape(loaded.title)}[/]  {len(driven.result)} samples")
+        show(console, shown, checks, notes)
+        console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+    if driven.status == "interrupted" and not live:
+        raise typer.Exit(INTERRUPTED)
+    if as_json and not all(item.ok for item in checks):
+        raise typer.Exit(CHECK_FAILED)
+
+
+def _refuse(
+    out: Path | None, resume: bool, live: bool, beside_only: Mapping[str, object], as_json: bool
+) -> None:
+    """Refuse options that do not belong together, before anything is read."""
+    from livepde.runs import refuse_taken
+
     if resume and out is None:
         raise ConfigurationError("--resume needs --out: the folder of the run to go on with.")
     if out is not None and out.exists() and not resume:
-        _must_be_empty(out)
+        refuse_taken(out)
+    for name, given in beside_only.items():
+        if given and not live:
+            raise ConfigurationError(f"{name} belongs to a run beside a process: add --realtime.")
+    if as_json and beside_only["--estimates"]:
+        raise ConfigurationError("--json and --estimates both print to standard output: keep one.")
+
+
+def _writer(loaded: Case, folder: Path, settings: Sequence[str], resume: bool) -> RunWriter:
+    """Return the writer of the run directory, new or to go on with."""
+    from livepde.runs import RunWriter
+
+    command = ["livepde", *sys.argv[1:]]
+    if resume and folder.exists() and any(folder.iterdir()):
+        return RunWriter.reopen(
+            folder, version=__version__, command=command, case=loaded.text, settings=settings
+        )
+    return RunWriter.create(
+        folder,
+        version=__version__,
+        command=command,
+        title=loaded.title,
+        case=loaded.text,
+        settings=settings,
+        original=loaded.original,
+    )
+
+
+def _batch(
+    loaded: Case,
+    source: str | Iterable[str] | None,
+    folder: Path,
+    write: Callable[[], RunWriter],
+    stack: ExitStack,
+    *,
+    quiet: bool,
+) -> tuple[RunWriter, tuple[Prepared, Driven]]:
+    """Take data that are there; what is wrong with them ends the run."""
+    from livepde.runs import JOURNAL, Journal, drive
+    from livepde.streams import Table as Samples
+
     prepared = loaded.prepare(source)
-    folder, writer, journal = _opened(loaded, prepared, out, settings or (), resume)
+    writer, path = write(), folder / JOURNAL
+    journal = Journal.open(path, write=True) if path.exists() else prepared.journal(path)
+    stack.enter_context(journal)
     total = len(prepared.stream) if isinstance(prepared.stream, Samples) else None
     driven = drive(
         prepared.identifier,
         prepared.stream,
-        progress=not as_json,
+        progress=not quiet,
         total=total,
         fields_every=loaded.fields_every,
         journal=journal,
     )
+    return writer, (prepared, driven)
+
+
+def _concluded(
+    loaded: Case, prepared: Prepared, driven: Driven, writer: RunWriter
+) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
+    """Write what a run gave; return its dataset, tables, checks and notes."""
+    from livepde.runs import arrivals, checks_of, doubts, tables
+
     dataset = driven.result.to_xarray()
+    shown = [*tables(dataset), *arrivals(driven.journal)]
     checks = checks_of(loaded.expected, dataset)
     notes = [*loaded.notes, *doubts(dataset)]
     if len(driven.result):
@@ -93,7 +250,6 @@ def run(
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
         notes.append(f"Stopped after {len(driven.result)} samples: {driven.error}")
-    shown = tables(dataset)
     err = terminal(err=True)
     writer.finish(
         status=driven.status,
@@ -104,47 +260,7 @@ def run(
         notes=notes,
         figures=figures_of(dataset, loaded.title) if can_draw(err) else {},
     )
-    journal.close()
-    if driven.error is not None:
-        raise driven.error
-    if as_json:
-        print_json(shown, checks, notes, run=str(folder), status=driven.status, dataset=dataset)
-    else:
-        console = terminal()
-        console.print(f"[bold]{escape(loaded.title)}[/]  {len(driven.result)} samples")
-        show(console, shown, checks, notes)
-        console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
-    if driven.status == "interrupted":
-        raise typer.Exit(INTERRUPTED)
-    if as_json and not all(item.ok for item in checks):
-        raise typer.Exit(CHECK_FAILED)
-
-
-def _opened(
-    loaded: Case, prepared: Prepared, out: Path | None, settings: Sequence[str], resume: bool
-) -> tuple[Path, RunWriter, Journal]:
-    """Return the run directory, its writer and its journal, new or to go on with."""
-    from livepde.runs import Journal, RunWriter, free_path
-
-    command = ["livepde", *sys.argv[1:]]
-    folder = out or free_path(Path("runs") / loaded.name)
-    path = folder / "journal.sqlite"
-    if resume:
-        journal = Journal.open(path, write=True)
-        writer = RunWriter.reopen(
-            folder, version=__version__, command=command, case=loaded.text, settings=settings
-        )
-        return folder, writer, journal
-    writer = RunWriter.create(
-        folder,
-        version=__version__,
-        command=command,
-        title=loaded.title,
-        case=loaded.text,
-        settings=settings,
-        original=loaded.original,
-    )
-    return folder, writer, prepared.journal(path)
+    return dataset, shown, checks, notes
 
 
 def _traded(prepared: Prepared) -> list[str]:
@@ -156,10 +272,3 @@ def _traded(prepared: Prepared) -> list[str]:
         return []
     belief = prepared.identifier.latent_belief()
     return identifiability(prepared.case.model, belief).sentences
-
-
-def _must_be_empty(folder: Path) -> None:
-    """Refuse a taken folder before data are read."""
-    from livepde.runs import refuse_taken
-
-    refuse_taken(folder)

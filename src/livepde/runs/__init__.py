@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from livepde.runs.directory import Run, RunWriter, free_path, refuse_taken
+from livepde.runs.directory import JOURNAL, Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
 from livepde.runs.doubts import doubts, unexplained
-from livepde.runs.drive import Driven, conduct, drive, journal_of
+from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.runs.summary import Jump, checks_of, jumps, measures, tables
+from livepde.runs.summary import Jump, arrivals, checks_of, jumps, measures, tables
 
 __all__ = [
+    "JOURNAL",
     "Check",
     "Driven",
     "Journal",
@@ -19,6 +20,7 @@ __all__ = [
     "Run",
     "RunWriter",
     "Table",
+    "arrivals",
     "checks_of",
     "conduct",
     "doubts",
@@ -29,6 +31,7 @@ __all__ = [
     "measures",
     "open",
     "refuse_taken",
+    "stopped_by_signals",
     "tables",
     "unexplained",
 ]

@@ -141,7 +141,8 @@ class RunWriter:
             There is no such run, or it was of another case.
         """
         run = open_run(path)
-        if not (path / CASE).is_file() or not (path / JOURNAL).is_file():
+        begun = (path / JOURNAL).is_file() or not (path / ESTIMATES).exists()
+        if not (path / CASE).is_file() or not begun:
             raise RunError(f"{path} has no case and journal: it cannot be resumed.")
         same = (path / CASE).read_text(encoding="utf-8") == case
         if not same or run.settings != list(settings):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from livepde.result import Result, layout_of
 from livepde.runs.journal import Journal
 from livepde.runs.live import Live, Samples
 
-__all__ = ["Driven", "conduct", "drive", "journal_of"]
+__all__ = ["Driven", "conduct", "drive", "journal_of", "stopped_by_signals"]
 
 
 @dataclass
@@ -27,6 +27,8 @@ class Driven:
     ----------
     result
         Estimates so far.
+    journal
+        Where they are kept.
     status
         "finished", "interrupted" (Ctrl-C) or "failed" (a sample that cannot be used).
     error
@@ -34,21 +36,28 @@ class Driven:
     """
 
     result: Result
+    journal: Journal
     status: str = "finished"
     error: DataError | None = None
 
 
 @contextmanager
-def _stopped_by_signals(live: Live) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end a run between two samples; a second one ends it at once."""
+def stopped_by_signals(stopping: threading.Event, busy: Callable[[], bool]) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM set an event; where nothing is busy, or the second time, end at once.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        To end at once.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if live.stopping.is_set() or not live.busy:
+        if stopping.is_set() or not busy():
             raise KeyboardInterrupt
-        live.stopping.set()
+        stopping.set()
 
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -58,10 +67,16 @@ def _stopped_by_signals(live: Live) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def conduct(live: Live) -> Driven:
-    """Let a run go on until its source or a signal ends it; what it has is kept in any case."""
-    driven = Driven(live.result)
-    with _stopped_by_signals(live):
+def conduct(live: Live, *, patient: bool = False) -> Driven:
+    """Let a run go on until its source or a signal ends it; what it has is kept in any case.
+
+    Parameters
+    ----------
+    patient
+        The source never blocks for long: a signal is heard when it has answered.
+    """
+    driven = Driven(live.result, live.journal)
+    with stopped_by_signals(live.stopping, lambda: patient or live.busy):
         try:
             live.run()
             if live.stopping.is_set():

@@ -13,6 +13,7 @@ import xarray as xr
 
 from livepde.diagnostics.identifiability import TRADED, Known
 from livepde.plots import interval_95
+from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
 __all__ = [
@@ -317,3 +318,11 @@ def _jumped(data: xr.Dataset) -> Table:
             for label, (before, after, std) in jump.moved.items()
         ] or [(at, "–", "–", "–")]
     return Table("Jumps", ("when", "unknown", "before", "since then"), rows)
+
+
+def arrivals(journal: Journal) -> list[Table]:
+    """Return the table of rows and values that were refused, missing or out of order, if any."""
+    rows = [(kind, channel or "(row)", n) for (kind, channel), n in journal.counts.items()]
+    if not rows:
+        return []
+    return [Table("Irregular rows", ("what", "channel", "number"), rows)]

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, tzinfo
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -61,6 +61,8 @@ class Clock:
         a date.
     second
         One second in the model's unit of time.
+    zone
+        Of dates that name none.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Clock:
     start: Instant | None = None
     stop: Instant | None = None
     second: float = 1.0
+    zone: tzinfo = UTC
 
     def bounds(self, dates: bool, where: str) -> tuple[float, float]:
         """Return start and stop in model time (dates: since 1970)."""
@@ -80,9 +83,22 @@ class Clock:
                 high += 86399.999 * self.second  # a day includes its hours
         return low, high
 
+    def stamp(self, value: Any) -> float | None:
+        """Return seconds since 1970 of a date or a date as text, None if it is neither."""
+        try:
+            if isinstance(value, str):
+                value = datetime.fromisoformat(value.strip())
+            if isinstance(value, date) and not isinstance(value, datetime):
+                value = datetime(value.year, value.month, value.day)
+            if not isinstance(value, datetime):
+                return None
+            return (value if value.tzinfo else value.replace(tzinfo=self.zone)).timestamp()
+        except (ValueError, OverflowError):
+            return None
+
     def _bound(self, value: Instant, dates: bool, what: str) -> float:
         if dates:
-            stamp = _stamp(value)
+            stamp = self.stamp(value)
             if stamp is None:
                 raise SampleError(f"{what}: got {value!r}; the times are dates, as 2025-04-01.")
             return stamp * self.second
@@ -414,7 +430,7 @@ def _number(value: Any, where: str) -> float:
         if isinstance(value, bool):
             raise TypeError
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SampleError(
             f"{where}: got {value!r}; expected a number (leave it empty if it is missing)."
         ) from None
@@ -447,7 +463,7 @@ def _times(cells: list[Any], clock: Clock, where: Callable[[int], str]) -> tuple
     dates = isinstance(first, date) or (isinstance(first, str) and not _is_number(first))
     times = np.empty(len(cells))
     for k, cell in enumerate(cells):
-        value = _stamp(cell) if dates else _float(cell)
+        value = clock.stamp(cell) if dates else _float(cell)
         if value is None or not math.isfinite(value):
             raise SampleError(
                 f"{where(k)} '{clock.name}': got {cell!r}; expected "
@@ -460,26 +476,12 @@ def _times(cells: list[Any], clock: Clock, where: Callable[[int], str]) -> tuple
 def _float(cell: Any) -> float | None:
     try:
         return None if isinstance(cell, bool) else float(cell)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
 
 
 def _is_number(cell: str) -> bool:
     return _float(cell) is not None
-
-
-def _stamp(value: Any) -> float | None:
-    """Return seconds since 1970 of a date; times without a zone are taken as they are."""
-    if isinstance(value, str):
-        try:
-            value = datetime.fromisoformat(value.strip())
-        except ValueError:
-            return None
-    if isinstance(value, date) and not isinstance(value, datetime):
-        value = datetime(value.year, value.month, value.day)
-    if not isinstance(value, datetime):
-        return None
-    return (value if value.tzinfo else value.replace(tzinfo=UTC)).timestamp()
 
 
 def _whole_day(value: Any) -> bool:

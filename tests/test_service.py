@@ -1,0 +1,282 @@
+"""`livepde run` beside a process, as a service would start and stop it."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import bad, call
+from test_mqtt import MOSQUITTO, server  # noqa: F401 (a fixture)
+
+import livepde as lp
+from livepde import cases, runs
+from livepde.cases.live import Wiring
+from livepde.runs import JOURNAL, Journal
+from livepde.runs.live import Paced, Samples
+
+CASE = """
+title = "A rod beside its process"
+equation = "heat"
+initial = "interpolate"
+
+[mesh]
+from = "0 m"
+to = "1 m"
+cells = 20
+
+[data]
+{data}
+time = "time"
+
+[intake]
+{intake}
+
+[unknowns.alpha]
+prior = "2e-5 m^2/s"
+std = "1e-5 m^2/s"
+bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
+
+[channels]
+left = {{ role = "boundary", column = "left", at = "left", unit = "degC" }}
+T_3 = {{ role = "sensor", column = "T_3", at = "0.3 m", unit = "degC"{habit} }}
+T_6 = {{ role = "sensor", column = "T_6", at = "0.6 m", unit = "degC" }}
+
+[boundary]
+right = "20 degC"
+
+[law]
+kind = "sensitivity"
+noise = "0.2 K"
+
+[output]
+fields_every = 20
+"""
+HEADER = "time,left,T_3,T_6\n"
+START = datetime(2026, 11, 21)
+
+
+def row(k: int) -> dict[str, object]:
+    left = 20.0 + 10.0 * math.sin(0.05 * k) ** 2
+    values = {"left": left, "T_3": 20.0 + 0.4 * (left - 20.0), "T_6": 20.0 + 0.1 * (left - 20.0)}
+    return {"time": str(START + timedelta(minutes=k)), **values}
+
+
+def table(*chosen: dict[str, object]) -> str:
+    return "".join(",".join(str(cell) for cell in one.values()) + "\n" for one in chosen)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def case(data='file = "rows.csv"\nfollow = true', intake="", habit="") -> str:
+    Path("case.toml").write_text(CASE.format(data=data, intake=intake, habit=habit))
+    return "case.toml"
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "livepde", "run", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def until(what, process: subprocess.Popen[str], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            raise AssertionError(process.communicate())
+        time.sleep(0.02)
+
+
+def estimates(folder: str) -> int:
+    path = Path(folder) / JOURNAL
+    if not path.exists():
+        return 0
+    try:
+        with Journal.open(path) as journal:
+            return len(journal)
+    except lp.RunError:  # it is being made
+        return 0
+
+
+def stopped(process: subprocess.Popen[str], how: signal.Signals = signal.SIGTERM) -> str:
+    process.send_signal(how)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    return output
+
+
+def test_it_follows_a_file_stops_gracefully_and_goes_on(here):
+    whole = [row(k) for k in range(60)]
+    Path("rows.csv").write_text(HEADER + table(*whole))
+    code, _ = call("run", case('file = "rows.csv"'), "--out", "batch")
+    assert code == 0
+    expected = runs.open("batch").dataset
+
+    Path("rows.csv").unlink()
+    first = start(case(), "--out", "live", "--resume")
+    Path("rows.csv").write_text(HEADER + table(*whole[:25]) + "2026-11-21 00:25")
+    until(lambda: estimates("live") == 25, first)
+    assert runs.open("live").status == "running"
+    assert runs.open("live").dataset.sizes["time"] == 25
+    stopped(first)
+    assert runs.open("live").status == "interrupted"
+
+    Path("rows.csv").write_text(HEADER + table(*whole))
+    second = start("case.toml", "--out", "live", "--resume")
+    until(lambda: estimates("live") == 60, second)
+    stopped(second, signal.SIGINT)
+    found = runs.open("live").dataset
+    for name in ("alpha", "alpha_std", "innovation", "time"):
+        assert np.array_equal(found[name], expected[name])
+    assert found.attrs["origin"] == "2026-11-21 00:00:00"
+    assert len(runs.open("live").record["resumed"]) == 1
+
+
+def test_what_a_process_sends_does_not_end_a_run(here):
+    rows = [json.dumps(row(k)) for k in range(12)]
+    rows[4:4] = ["{", '{"time": "soon"}', '{"time": "2026-11-21 00:02", "T_3": 21.5}', "[1]"]
+    rows[9] = json.dumps({**row(5), "T_3": 85.0})
+    habit = ', valid = ["-20 degC", "60 degC"]'
+    text = case('file = "rows.csv"', habit=habit)
+    code, output = call(
+        "run", text, "--realtime", "--data", "-", "--out", "run", stdin="\n".join(rows)
+    )
+    assert code == 0
+    assert "Irregular rows" in output
+    with Journal.open(Path("run") / JOURNAL) as journal:
+        assert len(journal) == 12
+        assert journal.counts == {
+            ("invalid", "T_3"): 1,
+            ("late", "T_3"): 1,
+            ("malformed", ""): 3,
+            ("missing", "T_3"): 1,
+        }
+        assert "85 is not between -20 and 60" in [event.message for event in journal.events]
+
+
+def test_it_begins_with_the_first_sample_that_has_what_is_needed(here):
+    lines = [json.dumps({"time": "2026-11-20 23:00", "T_3": 20.0, "left": None, "T_6": None})]
+    lines += [json.dumps(row(k)) for k in range(5)]
+    code, _ = call(
+        "run", case(), "--realtime", "--data", "-", "--out", "run", stdin="\n".join(lines)
+    )
+    assert code == 0
+    assert runs.open("run").dataset.sizes["time"] == 5
+    with pytest.raises(lp.DataError, match="'left'"):
+        call("run", "case.toml", "--realtime", "--data", "-", "--out", "none", stdin=lines[0])
+    with pytest.raises(lp.DataError, match="no sample came"):
+        call("run", "case.toml", "--realtime", "--data", "-", "--out", "void", stdin="")
+
+
+def test_estimates_as_lines_of_json(here):
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(4))))
+    arguments = ("--realtime", "--speed", "inf", "--estimates", "--out", "run")
+    code, output = call("run", case('file = "rows.csv"'), *arguments)
+    assert code == 0
+    found = [json.loads(line) for line in output.splitlines() if line.startswith("{")]
+    assert [line["t"] for line in found] == [0.0, 60.0, 120.0, 180.0]
+    assert found[-1]["alpha"] == float(runs.open("run").dataset["alpha"][-1])
+
+
+def test_a_finished_file_is_replayed_at_its_pace():
+    now, slept = [100.0], []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        now[0] += seconds
+
+    samples = [lp.Sample(float(t), {"a": 0.0}) for t in (0, 60, 120, 300)]
+    feed = Paced(Samples(samples), 60.0, lambda: now[0], sleep)
+    seen = []
+    while not feed.done:
+        seen += [(ready.t, now[0] - 100.0) for ready in feed.poll(0.5)]
+    assert seen == [(0.0, 0.0), (60.0, 1.0), (120.0, 2.0), (300.0, 5.0)]
+    assert max(slept) <= 0.5
+
+
+@pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
+def test_from_a_broker_and_back(here, server):  # noqa: F811
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion
+
+    data = (
+        f'mqtt = {{ port = {server.port}, rows = ["rod/rows"], columns = {{ "rod/T_6" = "T_6" }} }}'
+    )
+    text = case(data, intake='tolerance = "1 s"')
+    output = f'\nmqtt = {{ port = {server.port}, topic = "rod/estimate" }}\n'
+    Path(text).write_text(Path(text).read_text() + output)
+    heard = []
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.on_message = lambda c, u, message: heard.append(json.loads(message.payload))
+    client.connect("127.0.0.1", server.port)
+    client.subscribe("rod/estimate")
+    client.loop_start()
+    process = start(text, "--out", "run", "--log", "json")
+    until(lambda: Path("run/run.json").exists(), process)
+    for k in range(10):
+        values = row(k)
+        last = {"time": values["time"], "value": values.pop("T_6")}
+        client.publish("rod/rows", json.dumps(values), qos=1)
+        client.publish("rod/T_6", json.dumps(last), qos=1)
+    until(lambda: len(heard) == 10, process)
+    stopped(process)
+    client.loop_stop()
+    found = runs.open("run").dataset
+    assert [one["alpha"] for one in heard] == found["alpha"].values.tolist()
+    assert np.isfinite(found["innovation"].sel(sensor="T_6")[1:]).all()
+
+
+def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(3))))
+    for zone, origin in (("UTC", "2026-11-21 00:00:00"), ("Europe/Berlin", "2026-11-20 23:00:00")):
+        text = case(f'file = "rows.csv"\nzone = "{zone}"')
+        assert str(cases.load(text).prepare().origin) == origin
+        wiring = Wiring(cases.load(text))
+        (_, *_) = wiring.feed.poll(0.0)
+        assert str(wiring.origin) == origin
+
+
+@pytest.mark.parametrize(
+    ("data", "intake", "habit", "text"),
+    [
+        ('file = "rows.csv"\nzone = "Mars"', "", "", "data.zone: there is no time zone 'Mars'"),
+        ("mqtt = {}", "", "", "expected rows = [topics], or columns"),
+        ('follow = true\nmqtt = { rows = ["a"] }', "", "", "follow belongs to a file"),
+        ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are 2 sources"),
+        ('file = "rows.csv"\nfollow = true\nevery = 2', "", "", "every belongs to data that are"),
+        ('file = "rows.csv"', 'wait = "-1 s"', "", "wait must be a time >= 0"),
+        ('file = "rows.csv"', 'wait = "1 m"', "", "intake.wait: 'm' cannot be converted to 's'"),
+        ('file = "rows.csv"', "queue = 0", "", "queue"),
+        ('file = "rows.csv"', "", ', valid = ["1 degC", "0 degC"]', "the lower one first"),
+        ('file = "rows.csv"', "", ', missing = "guess"', "expected one of hold, skip"),
+    ],
+)
+def test_a_wiring_that_makes_no_sense_says_so(here, data, intake, habit, text):
+    Path("rows.csv").write_text(HEADER + table(row(0)))
+    message = bad("run", case(data, intake, habit), "--realtime", "--out", "run")
+    assert text in message
+    assert not Path("run").exists()
+
+
+@pytest.mark.parametrize("option", [("--listen", "9100"), ("--watch", "8050"), ("--estimates",)])
+def test_what_belongs_to_a_live_run(here, option):
+    Path("rows.csv").write_text(HEADER + table(row(0)))
+    assert "add --realtime" in bad("run", case('file = "rows.csv"'), *option)
+
+
+def test_a_password_comes_from_the_environment(here, monkeypatch):
+    text = case('mqtt = { rows = ["a"], username = "me", password_env = "ROD_PASSWORD" }')
+    monkeypatch.delenv("ROD_PASSWORD", raising=False)
+    assert "the environment variable ROD_PASSWORD is not set" in bad("run", text)
