@@ -254,7 +254,7 @@ def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
         ('file = "rows.csv"\nzone = "Mars"', "", "", "data.zone: there is no time zone 'Mars'"),
         ("mqtt = {}", "", "", "expected rows = [topics], or columns"),
         ('follow = true\nmqtt = { rows = ["a"] }', "", "", "follow belongs to a file"),
-        ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are 2 sources"),
+        ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are two sources"),
         ('file = "rows.csv"\nfollow = true\nevery = 2', "", "", "every belongs to data that are"),
         ('file = "rows.csv"', 'wait = "-1 s"', "", "wait must be a time >= 0"),
         ('file = "rows.csv"', 'wait = "1 m"', "", "intake.wait: 'm' cannot be converted to 's'"),
