@@ -166,6 +166,23 @@ def test_what_a_process_sends_does_not_end_a_run(here):
         assert "85 is not between -20 and 60" in [event.message for event in journal.events]
 
 
+def test_what_is_not_valid_is_counted_in_files_too(here):
+    rows = [row(k) for k in range(12)]
+    rows[4]["T_3"], rows[7]["left"] = 85.0, ""
+    Path("rows.csv").write_text(HEADER + table(*rows))
+    text = case('file = "rows.csv"', habit=', valid = ["-20 degC", "60 degC"]')
+    path = Path(text)
+    path.write_text(path.read_text().replace('at = "left"', 'at = "left", missing = "skip"'))
+    for more in ((), ("--realtime", "--speed", "inf")):
+        folder = f"run{len(more)}"
+        assert call("run", text, "--out", folder, *more)[0] == 0
+        with Journal.open(Path(folder) / JOURNAL) as journal:
+            assert len(journal) == 11
+            assert journal.counts[("invalid", "T_3")] == 1
+            assert journal.counts[("skipped", "left")] == 1
+    assert np.array_equal(runs.open("run0").dataset["alpha"], runs.open("run3").dataset["alpha"])
+
+
 def test_it_begins_with_the_first_sample_that_has_what_is_needed(here):
     lines = [json.dumps({"time": "2026-11-20 23:00", "T_3": 20.0, "left": None, "T_6": None})]
     lines += [json.dumps(row(k)) for k in range(5)]
