@@ -84,6 +84,13 @@ def listen(source, count: int) -> list:
     return found
 
 
+def polled(source) -> None:
+    """Poll until something is raised."""
+    until = time.monotonic() + 30.0
+    while time.monotonic() < until:
+        source.poll(0.2)
+
+
 def publish(server: Server, messages, topic: str = "rod") -> None:
     client = Broker("127.0.0.1", server.port).client("-plant")
     Broker("127.0.0.1", server.port, "plant").connect(client)
@@ -299,10 +306,8 @@ def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch
     assert not run.journal.counts
     stuck = Gathered(heard, Intake(COLUMNS, Clock("t"), Policy(wait=1e6), origin=0.0))
     publish(server, messages)
-    deadline = time.monotonic() + 30.0
     with pytest.raises(lp.DataError, match="messages wait for later ones"):
-        while time.monotonic() < deadline:
-            stuck.poll(0.2)
+        polled(stuck)
     heard.close()
 
 
@@ -321,8 +326,7 @@ def test_two_runs_need_two_names(server, caplog):
     reason = ReasonCode(PacketTypes.DISCONNECT, "Session taken over")
     first._client.on_disconnect(first._client, None, None, reason, None)  # others say it
     with pytest.raises(lp.DataError, match="another client has taken the session 'livepde'"):
-        for _ in range(50):
-            first.poll(0.2)
+        polled(first)
     first.close()
 
 

@@ -387,13 +387,12 @@ class MqttSource(_Peer):
         """Tell the broker which messages it may forget; while it is away, when it is back."""
         with self._lock:
             for token in tokens:
-                if token is None or self._deliveries.get(token.number) is not token:
+                known = None if token is None else self._deliveries.get(token.number)
+                if known is None or known is not token or known.safe:
                     continue
-                if token.safe:
-                    continue
-                token.safe = True
-                if token.connection == self._connection:
-                    self._confirm(token)
+                known.safe = True
+                if known.connection == self._connection:
+                    self._confirm(known)
 
     def close(self) -> None:
         """Disconnect; the broker keeps what comes from now on."""
