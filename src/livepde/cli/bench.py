@@ -141,6 +141,17 @@ def peers(
 
 
 @bench.command()
+def journal(as_json: JsonOption = False) -> None:
+    """Measure what the journal costs: its share of a step of the soil case.
+
+    Example:  livepde bench journal --json
+    """
+    from livepde.bench.journal import journal as benchmark
+
+    report_outcome(benchmark(), ["livepde", "bench", "journal"], as_json)
+
+
+@bench.command()
 def soak(
     steps: Annotated[int, typer.Option(min=1, help="How many steps.")] = 1_000_000,
     as_json: JsonOption = False,
