@@ -147,6 +147,8 @@ class Result:
         Where to keep them; default a new list.
     layout
         What the numbers of records mean; default what model and sensors say.
+    count
+        Estimates that there were before, of which not all need be kept; default all records.
     """
 
     def __init__(
@@ -157,6 +159,7 @@ class Result:
         fields_every: int = 1,
         records: Records | None = None,
         layout: Layout | None = None,
+        count: int | None = None,
     ) -> None:
         self.model = model
         self.observed = observed
@@ -165,7 +168,7 @@ class Result:
         self.last: Estimate | None = None
         self.records: Records = [] if records is None else records
         self.layout = layout or layout_of(model, observed, withheld)
-        self._count = len(self.records)
+        self._count = len(self.records) if count is None else count
 
     def __len__(self) -> int:
         return self._count
