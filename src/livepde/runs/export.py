@@ -84,13 +84,14 @@ def udunits(unit: str) -> str:
     from pint.util import to_units_container
 
     try:
-        parts = to_units_container(_registry().parse_units(unit))
+        found = to_units_container(_registry().parse_units(unit))
     except NOT_A_UNIT:
         return unit
-    if not all(float(power).is_integer() for power in parts.values()):
+    parts = {name: float(str(power)) for name, power in found.items()}
+    if not all(power.is_integer() for power in parts.values()):
         return unit
     words = []
-    for name, power in sorted(parts.items(), key=lambda part: part[1] < 0):
+    for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
         symbol = _registry().get_symbol(name)
         symbol = SYMBOLS.get(symbol, symbol.replace("µ", "u"))
         words.append(symbol if power == 1 else f"{symbol}{int(power)}")
@@ -141,7 +142,7 @@ def cf(
         beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
         if beside:
             found[name].attrs["ancillary_variables"] = " ".join(beside)
-    for name in ("time", "snapshot"):
+    for name in {"time", "snapshot"} & set(names):
         _date(found[name], data)
     found.attrs = {key: plain(value) for key, value in data.attrs.items()}
     lists = {key: str(data.attrs.get(key, "")).split() for key in ("fields", "state")}
@@ -360,7 +361,7 @@ def _csv(run: Run, path: Path, at: float | None) -> None:
 def _series(run: Run, path: Path, at: float | None) -> None:
     """Write the fields of all times as XDMF, with their numbers in an HDF5 file beside it."""
     _need("meshio", "h5py")
-    import h5py
+    import h5py  # type: ignore[import-untyped]
     from meshio.xdmf import TimeSeriesWriter
 
     class Writer(TimeSeriesWriter):  # type: ignore[misc]
@@ -389,10 +390,8 @@ def _vtk(run: Run, path: Path, at: float | None) -> None:
 
 
 def _with_fields(run: Run) -> xr.Dataset:
-    if not run.dataset.sizes["snapshot"]:
-        raise RunError(
-            f"{run.path} holds no fields yet: they come with the samples that keep some."
-        )
+    if not run.dataset.sizes.get("snapshot"):
+        raise RunError(f"{run.path} holds no fields: there is nothing to draw.")
     return run.dataset
 
 
