@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,12 +38,6 @@ __all__ = [
 ]
 
 CONVENTIONS = "CF-1.11"
-TOPOLOGY = {  # kind of cell -> dimension of the mesh, and what UGRID calls such a cell
-    "triangle": (2, "face"),
-    "quad": (2, "face"),
-    "tetra": (3, "volume"),
-    "hexahedron": (3, "volume"),
-}
 BESIDE = {  # end of a name -> what such a variable says of the one without it
     "_std": "standard deviation of {}",
     "_low": "lower end of the 95 % interval of {}",
@@ -66,9 +61,37 @@ DIFFERENCES = ("innovation", "withheld_error")
 # CF: an axis Z is vertical, and must say whether it grows up or down, which a mesh does not know.
 AXES = {"time": "T", "snapshot": "T", "x": "X", "y": "Y"}
 CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
-SYMBOLS = {"°C": "degC", "°F": "degF", "Δ°C": "K", "Δ°F": "degR", "Ω": "ohm", "µm": "um"}
+SYMBOLS = {"°C": "degC", "°F": "degF", "Δ°C": "K", "Δ°F": "degR", "Ω": "ohm"}
 SCALES = ("degC", "degF")  # their zero is not zero
 NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of cell.
+
+    Attributes
+    ----------
+    dimension, role
+        Of the mesh, and what UGRID calls such a cell.
+    edges
+        Corners to which the edges lead from the first one, in an order that turns right-handed.
+    turned
+        The corners of a cell that turns the other way, in the right order.
+    """
+
+    dimension: int
+    role: str
+    edges: tuple[int, ...]
+    turned: tuple[int, ...]
+
+
+KINDS = {
+    "triangle": Kind(2, "face", (1, 2), (0, 2, 1)),
+    "quad": Kind(2, "face", (1, 3), (0, 3, 2, 1)),
+    "tetra": Kind(3, "volume", (1, 2, 3), (0, 2, 1, 3)),
+    "hexahedron": Kind(3, "volume", (1, 3, 4), (4, 5, 6, 7, 0, 1, 2, 3)),
+}
 
 
 # --- names and units -----------------------------------------------------------------------------
@@ -151,9 +174,8 @@ def cf(
     found.attrs |= {"Conventions": CONVENTIONS, "source": source, "history": history}
     found.attrs["title"] = str(data.attrs.get("title", "")) or title
     found = found.rename({old: new for old, new in names.items() if old != new})
-    for kind in TOPOLOGY:
-        if kind in found:
-            _add_topology(found, kind)
+    for kind in _kinds(found):
+        _add_topology(found, kind)
     return found
 
 
@@ -174,7 +196,7 @@ def _names(wanted: Iterable[str]) -> dict[str, str]:
     """Return name -> one of letters, digits and underscores that no other has."""
     found: dict[str, str] = {}
     for name in wanted:
-        stem = re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_")
+        stem = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
         stem = stem if stem[:1].isalpha() else f"v{stem}"
         free, number = stem, 2
         while free in found.values():
@@ -214,12 +236,29 @@ def _date(time: xr.DataArray, data: xr.Dataset) -> None:
         time.attrs |= {"units": f"{CLOCKS[unit]} since {origin}", "calendar": "standard"}
 
 
+def _kinds(data: xr.Dataset) -> list[str]:
+    return [kind for kind in KINDS if kind in data and data[kind].dims == ("cell", "corner")]
+
+
+def _oriented(data: xr.Dataset, kind: str) -> Any:
+    """Return the corners of each cell so that all turn the same way: others count on that."""
+    corners = np.array(data[kind].values)
+    about = KINDS[kind]
+    axes = "xyz"[: about.dimension]
+    points = np.column_stack([data[axis].values for axis in axes])
+    edges = [points[corners[:, k]] - points[corners[:, 0]] for k in about.edges]
+    wrong = np.linalg.det(np.stack(edges, axis=1)) < 0.0
+    corners[wrong] = corners[wrong][:, about.turned]
+    return corners
+
+
 def _add_topology(data: xr.Dataset, kind: str) -> None:
     """Say how vertices and cells are a mesh, after UGRID."""
-    dimension, cell = TOPOLOGY[kind]
+    dimension, cell = KINDS[kind].dimension, KINDS[kind].role
     name = next(free for free in ("mesh", "mesh_topology") if free not in data)
     corners = f"{cell}_node_connectivity"
     axes = [axis for axis in "xyz" if axis in data.coords]
+    data[kind].values = _oriented(data, kind)
     data[kind].attrs |= {"cf_role": corners, "start_index": np.int32(0)}
     data[kind].attrs["long_name"] = f"vertices of each {kind}"
     for variable in data.data_vars.values():
@@ -344,7 +383,7 @@ def _csv(run: Run, path: Path, at: float | None) -> None:
     dates = instants(data, times)
     if dates is not None:
         columns["date"] = dates
-    for name in ("time", *map(str, data.data_vars)):
+    for name in ("time", *sorted(map(str, data.data_vars), key=DIFFERENCES.__contains__)):
         variable = data[name]
         unit = udunits(str(variable.attrs.get("units", "")))
         end = "" if unit == "1" else f" [{unit}]"
@@ -399,7 +438,7 @@ def _mesh(data: xr.Dataset) -> tuple[Any, list[tuple[str, Any]]]:
     """Return points, shape (vertices, 3), and cells; those of an interval join its neighbours."""
     count = data.sizes["vertex"]
     axes = [data[axis].values if axis in data.coords else np.zeros(count) for axis in "xyz"]
-    cells = [(kind, data[kind].values) for kind in TOPOLOGY if kind in data]
+    cells = [(kind, _oriented(data, kind)) for kind in _kinds(data)]
     order = np.arange(count, dtype=np.int32)
     return np.column_stack(axes), cells or [("line", np.column_stack([order[:-1], order[1:]]))]
 
