@@ -24,6 +24,7 @@ from livepde.runs import jumps
 from livepde.runs.summary import SECONDS, scalars, shown
 
 __all__ = [
+    "CONFIG",
     "SECTIONS",
     "Panel",
     "at_time",
@@ -48,9 +49,17 @@ SECTIONS = {
 }
 MOST_POINTS = 2000  # of a line
 MOST_LINES = 7  # in one panel; more sensors are drawn as one line with their range
+DECADES = 100.0  # from which ratio on a scale is logarithmic
+FINE = 0.2  # share of a mesh's lines on each side that may lie far out
+OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to begin there
 FAR = 1e11  # seconds from the origin beyond which times are numbers
 INK, GRID = "#1f2933", "#e4e7eb"
 HEIGHT = 320
+CONFIG = {
+    "displaylogo": False,
+    "responsive": True,
+    "modeBarButtonsToRemove": ["lasso2d", "select2d"],
+}
 SURE, FLAT = 0.1, 0.9  # shares of the prior deviation: pinned, told hardly anything
 
 
@@ -253,8 +262,15 @@ def _upright(figure: go.Figure, t: Any, name: str, colour: str, dash: str, *, le
     )
 
 
-def _band(figure: go.Figure, x: Any, low: Array, high: Array, colour: str, name: str) -> None:
-    """Draw a band, and say its ends on hover."""
+def _band(
+    figure: go.Figure,
+    x: Any,
+    low: Array,
+    high: Array,
+    colour: str,
+    name: str,
+    opacity: float = 0.2,
+) -> None:
     shared: dict[str, Any] = {
         "mode": "lines",
         "line": {"width": 0, "color": colour},
@@ -263,19 +279,22 @@ def _band(figure: go.Figure, x: Any, low: Array, high: Array, colour: str, name:
     }
     figure.add_scatter(x=x, y=low, name="from", hoverinfo="skip", **shared)
     figure.add_scatter(
-        x=x, y=high, fill="tonexty", fillcolor=_rgba(colour, 0.18), hoverinfo="skip", **shared
+        x=x, y=high, fill="tonexty", fillcolor=_rgba(colour, opacity), hoverinfo="skip", **shared
     )
 
 
-def _range(parts: Sequence[Array]) -> list[float] | None:
-    """Return the range of an axis that shows all finite values."""
-    values = np.concatenate([np.ravel(part) for part in parts]) if parts else np.empty(0)
+def _show(figure: go.Figure, parts: Sequence[Array]) -> None:
+    """Let the axis show all finite values; positive ones over decades on a logarithmic scale."""
+    values = np.concatenate([np.ravel(part) for part in parts])
     values = values[np.isfinite(values)]
     if not len(values):
-        return None
+        return
     low, high = float(values.min()), float(values.max())
+    if low > 0.0 and high > DECADES * low:
+        low, high = math.log10(low), math.log10(high)
+        figure.update_layout(yaxis_type="log")
     margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
-    return [low - margin, high + margin]
+    figure.update_layout(yaxis_range=[low - margin, high + margin])
 
 
 # --- unknown numbers ------------------------------------------------------------------------------
@@ -305,8 +324,9 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
     figure, axis = _over_time(data, _pretty(data, labels[0]), at)
     t = axis.values(data["time"].values)
     # The prior's band would flatten everything that follows.
-    late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
+    late = slice(max(len(t) // 2, scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
+    opacity = 0.2 if len(labels) <= 2 else 0.1
     for k, label in enumerate(labels):
         colour = PALETTE[k % len(PALETTE)]
         value = data[label].values
@@ -315,7 +335,7 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
         if np.isfinite(low[late]).any():
             reach += [low[late], high[late]]
             if len(labels) <= MOST_LINES:
-                _band(figure, t, low, high, colour, label)
+                _band(figure, t, low, high, colour, label, opacity)
         half = np.nan_to_num(np.maximum(high - value, value - low), nan=0.0)
         figure.add_scatter(
             x=t,
@@ -341,8 +361,7 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
                 showlegend=k == 0,
                 hovertemplate="%{y:.4g}",
             )
-    reached = _range(reach)
-    figure.update_layout(yaxis_range=reached)
+    _show(figure, reach)
     _mark_failures(figure, data, axis)
     return figure
 
@@ -398,6 +417,8 @@ def _field_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
             continue
         draw = field_solid if "z" in data.coords else field_map
         about = f"{what}, estimate at {when}."
+        if draw is field_map and _zoomed(data):
+            about += " Shown is where the mesh is fine; double-click shows all."
         if draw is field_solid:
             about += (
                 " Surface and three cuts through the middle: drag to turn, scroll to come near."
@@ -408,6 +429,11 @@ def _field_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
             figure = draw(data, f"{name}_std", at)
             found.append(Panel(f"field:{name}_std", "fields", f"{name}, how sure", about, figure))
     return found
+
+
+def _zoomed(data: xr.Dataset) -> bool:
+    drawn = cuts.plane_map(data)
+    return _fine(drawn.x) is not None or _fine(drawn.y) is not None
 
 
 def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
@@ -438,7 +464,8 @@ def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Fi
         name="estimate",
         hovertemplate="%{y:.4g}",
     )
-    figure.update_layout(yaxis_range=_range(reach), showlegend=k > 0)
+    _show(figure, reach)
+    figure.update_layout(showlegend=k > 0)
     return figure
 
 
@@ -459,7 +486,14 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
     figure.update_layout(hovermode="closest", yaxis={"scaleanchor": "x", "constrain": "domain"})
     figure.update_xaxes(constrain="domain", showgrid=False, zeroline=False)
     figure.update_yaxes(showgrid=False, zeroline=False)
+    figure.update_layout(xaxis_range=_fine(drawn.x), yaxis_range=_fine(drawn.y))
     return figure
+
+
+def _fine(lines: Array) -> list[float] | None:
+    """Return where a mesh is fine, if its domain goes on far beyond."""
+    low, high = np.quantile(lines, [FINE, 1.0 - FINE]).tolist()
+    return [low, high] if np.ptp(lines) > OUT * (high - low) else None
 
 
 def field_solid(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
