@@ -21,7 +21,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["NORMAL_95", "ensemble", "figure", "history", "interval_95", "overview", "profiles"]
+__all__ = [
+    "GREY",
+    "NORMAL_95",
+    "PALETTE",
+    "ensemble",
+    "figure",
+    "history",
+    "interval_95",
+    "labelled",
+    "overview",
+    "profiles",
+    "scored_from",
+    "time_scale",
+]
 
 # Okabe and Ito (2008): told apart with every common kind of colour blindness. Yellow is left out:
 # it cannot be seen on white.
@@ -81,13 +94,14 @@ def _panel(ax: Axes | None) -> Axes:
     return figure()[1][0] if ax is None else ax
 
 
-def _labelled(name: str, unit: str) -> str:
+def labelled(name: str, unit: str) -> str:
+    """Return the label of an axis."""
     for plain, pretty in (("degC", "°C"), ("**", "^"), ("^2", "²"), ("^3", "³")):
         unit = unit.replace(plain, pretty)
     return f"{name} [{unit}]" if unit and unit != "1" else name
 
 
-def _clock(data: xr.Dataset) -> tuple[float, str]:
+def time_scale(data: xr.Dataset) -> tuple[float, str]:
     """Return factor and unit in which times are shown: a month in seconds tells nobody anything."""
     unit = str(data["time"].attrs.get("units", ""))
     if unit in ("s", "second", "seconds") and data.sizes["time"]:
@@ -177,7 +191,7 @@ def profiles(
         raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
     ax = _panel(ax)
     chosen = _snapshots(data, times)
-    factor, unit = _clock(data)
+    factor, unit = time_scale(data)
     x = data["x"].values
     if observed is not None:
         ax.axvspan(*observed, color=GREY, alpha=0.12, linewidth=0, label="observed")
@@ -205,8 +219,8 @@ def profiles(
         ax.plot(x, truth, color="black", linewidth=2.0, zorder=1.5, label="exact")
     elif truth is not None:
         ax.plot([], [], color=GREY, linewidth=1.0, label="exact")
-    ax.set_xlabel(_labelled("x", str(data["x"].attrs.get("units", ""))))
-    ax.set_ylabel(_labelled(name, str(data[name].attrs.get("units", ""))))
+    ax.set_xlabel(labelled("x", str(data["x"].attrs.get("units", ""))))
+    ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
     ax.margins(x=0.02)
     return _finish(ax, legend=legend, outside=True)
 
@@ -337,11 +351,11 @@ def _scalars(data: xr.Dataset) -> dict[str, list[str]]:
 
 def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
     """Draw one unknown over time with its 95 % band; its regions together."""
-    factor, clock = _clock(data)
+    factor, clock = time_scale(data)
     t = data["time"].values / factor
     unit = str(data[labels[0]].attrs.get("units", ""))
     # The prior's band would flatten everything that follows.
-    late = slice(max(len(t) // 10, _scored_from(data) + len(t) // 20), None)
+    late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
     for k, label in enumerate(labels):
         value = data[label].values
@@ -366,15 +380,15 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
         ax.set_ylim(finite.min() - margin, finite.max() + margin)
     _mark_failures(data, ax)
     _mark_jumps(data, ax)
-    ax.set_xlabel(_labelled("t", clock))
-    ax.set_ylabel(_labelled(name, unit))
+    ax.set_xlabel(labelled("t", clock))
+    ax.set_ylabel(labelled(name, unit))
     ax.set_title(f"{name}: estimate and 95 % band" if len(reach) > len(labels) else name)
     return _finish(ax)
 
 
 def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
     """Mark samples whose step failed."""
-    failed = data["time"].values[data["status"].values != 0] / _clock(data)[0]
+    failed = data["time"].values[data["status"].values != 0] / time_scale(data)[0]
     if len(failed):
         ax.plot(
             failed,
@@ -390,7 +404,7 @@ def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
     """Draw a line at each alarm of the test for jumps."""
     if "jump" not in data or data["jump"].dims != ("time",):
         return
-    times = data["time"].values[data["jump"].values > 0.0] / _clock(data)[0]
+    times = data["time"].values[data["jump"].values > 0.0] / time_scale(data)[0]
     for k, t in enumerate(times):
         label = f"jump at {t:.4g}" if len(times) == 1 else f"{len(times)} jumps"
         if k:
@@ -422,7 +436,7 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
         triangles = Triangulation(x, y, data["triangle"].values)
     else:
         triangles = Triangulation(x, y)
-    factor, unit = _clock(data)
+    factor, unit = time_scale(data)
     spread = name.endswith("_std")
     drawn = ax.tripcolor(
         triangles,
@@ -430,7 +444,7 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
         shading="gouraud",
         cmap="cividis" if spread else "viridis",
     )
-    what = _labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
+    what = labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
     ax.figure.colorbar(drawn, ax=ax, label=f"standard deviation of {what}" if spread else what)
     when = f"t = {data['snapshot'].values[-1] / factor:.4g} {unit}".rstrip()
     whose = f"{'deviation of ' if spread else ''}{name.removesuffix('_std')}"
@@ -444,25 +458,25 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 
 def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     """Draw smallest, median and largest value of a field in space over time."""
-    factor, unit = _clock(data)
+    factor, unit = time_scale(data)
     t, values = data["snapshot"].values / factor, data[name].values
     ax.fill_between(
         t, values.min(axis=1), values.max(axis=1), color=PALETTE[0], alpha=0.2, label="range"
     )
     ax.plot(t, np.median(values, axis=1), color=PALETTE[0], label="median")
-    ax.set_xlabel(_labelled("t", unit))
-    ax.set_ylabel(_labelled(name, str(data[name].attrs.get("units", ""))))
+    ax.set_xlabel(labelled("t", unit))
+    ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
     ax.set_title(f"{name} in space")
     return _finish(ax)
 
 
 def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, ax: Axes) -> Axes:
     """Draw measured minus expected of each channel, with its root mean square error."""
-    factor, clock = _clock(data)
+    factor, clock = time_scale(data)
     t = data["time"].values / factor
     errors = data[variable].transpose("time", dimension).values
     names = [str(name) for name in data[dimension].values]
-    first = _scored_from(data)
+    first = scored_from(data)
     ax.axhline(0.0, color="black", linewidth=0.8)
     if first:
         ax.axvline(t[first], color=GREY, linestyle=":", label="assimilated from here")
@@ -491,13 +505,13 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         ax.plot(
             t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors[first:]):.3g}"
         )
-    ax.set_xlabel(_labelled("t", clock))
-    ax.set_ylabel(_labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
+    ax.set_xlabel(labelled("t", clock))
+    ax.set_ylabel(labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
     ax.set_title(what)
     return _finish(ax)
 
 
-def _scored_from(data: xr.Dataset) -> int:
+def scored_from(data: xr.Dataset) -> int:
     """Return the first sample that was assimilated: what comes before is not scored."""
     start = data.attrs.get("assimilate_from")
     if start is None:

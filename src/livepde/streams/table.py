@@ -24,6 +24,7 @@ __all__ = [
     "JsonLines",
     "Table",
     "channel_value",
+    "check_columns",
     "read_csv",
     "read_json_lines",
     "row_time",
@@ -184,7 +185,7 @@ def read_csv(
     try:
         header = list(pd.read_csv(path, nrows=0, skipinitialspace=True, sep=separator).columns)
         _check_separator(path, header, separator)
-        _check_columns(str(path), needed, header)
+        check_columns(str(path), needed, header)
         _check_widths(path, len(header), separator)
         frame = pd.read_csv(
             path,
@@ -247,7 +248,7 @@ def tabulated(
     if not moments:
         raise SampleError(f"{where}: holds no samples.")
     needed = [name for column in columns.values() for name in column.names]
-    _check_columns(where, needed, list(values))
+    check_columns(where, needed, list(values))
     found, dates = _times(moments, clock, lambda k: f"{where}, sample {k}, times")
 
     def numbers(name: str, use: Any) -> Array:
@@ -404,7 +405,8 @@ def channel_value(
     return column.factor * sum(numbers) / len(numbers) + column.offset
 
 
-def _check_columns(where: str, needed: Iterable[str], known: list[str]) -> None:
+def check_columns(where: str, needed: Iterable[str], known: list[str]) -> None:
+    """Raise `SampleError` with a hint if a column is not there."""
     for name in needed:
         if name not in known:
             raise SampleError(f"{where}: there is no column '{name}'{_hint(name, known)}")

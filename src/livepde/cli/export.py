@@ -1,0 +1,92 @@
+"""Write a run in the formats of other programs."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from livepde.cli.printing import terminal
+from livepde.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+__all__ = ["export"]
+
+REPORT = ".html"
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")],
+    targets: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="TARGET...",
+            help="Files to write: .nc, .zarr, .csv, .xdmf, .vtu, .vtk or .html.",
+            show_default=False,
+        ),
+    ],
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="Of .vtu and .vtk: the time of the fields, as 3600, '1 h' or a date. "
+            "Default: the last.",
+            show_default=False,
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+) -> None:
+    """Write a run, also one that still goes on, in formats that other programs open.
+
+    Example:  livepde export runs/mycase mycase.nc mycase.csv mycase.html
+    ParaView: livepde export runs/mycase mycase.xdmf
+    """
+    from livepde import runs
+    from livepde.runs.export import FORMATS, refuse_file
+    from livepde.runs.export import export as write
+
+    opened = runs.open(folder)
+    known = [*FORMATS, REPORT]
+    for target in targets:
+        if target.suffix.lower() not in known:
+            raise ConfigurationError(
+                f"{target}: there is no format '{target.suffix}'; expected one of "
+                f"{', '.join(known)}."
+            )
+        refuse_file(target, force)
+    moment = None if at is None else _moment(at, opened.dataset)
+    for target in targets:
+        if target.suffix.lower() == REPORT:
+            from livepde.dashboard.report import write_report
+
+            write_report(opened, target, force=force)
+        else:
+            write(opened, target, at=moment, force=force)
+        terminal().print(escape(f"Written: {target}"), soft_wrap=True)
+
+
+def _moment(text: str, data: Dataset) -> float:
+    """Return a time of the command line in the run's unit."""
+    from livepde.cases.units import convert
+    from livepde.runs.export import instants
+    from livepde.runs.summary import SECONDS
+
+    unit = str(data["time"].attrs.get("units", ""))
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    zero = instants(data, [0.0])
+    try:
+        date = datetime.fromisoformat(text)
+    except ValueError:
+        return convert(text, unit, "--at")
+    if zero is None:
+        raise ConfigurationError(f"--at: got the date {text}, but the run's times have no date.")
+    if date.tzinfo is not None:
+        date = date.astimezone(UTC).replace(tzinfo=None)
+    return float((date - zero[0]).total_seconds()) / SECONDS[unit]

@@ -1,0 +1,469 @@
+"""A run in the formats of other programs: netCDF, Zarr, CSV, XDMF and VTK.
+
+Inside, a dataset has the names and units of the model. Outside it follows the CF conventions:
+units that UDUNITS reads, times with their date, what belongs to what; and UGRID for the mesh.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from tokenize import TokenError
+from typing import Any, TypeAlias
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from livepde.errors import ConfigurationError, RunError
+from livepde.plots import interval_95
+from livepde.records import STATUS_CODES
+from livepde.runs.directory import Run, plain, write_dataset
+from livepde.runs.summary import SECONDS, scalars
+
+__all__ = [
+    "AT_ONE_TIME",
+    "FORMATS",
+    "cf",
+    "export",
+    "instants",
+    "into_place",
+    "refuse_file",
+    "udunits",
+]
+
+CONVENTIONS = "CF-1.11"
+BESIDE = {  # end of a name -> what such a variable says of the one without it
+    "_std": "standard deviation of {}",
+    "_low": "lower end of the 95 % interval of {}",
+    "_high": "upper end of the 95 % interval of {}",
+    "_left": "share of the prior deviation of {} that is left",
+    "_modes": "number of modes of {} that the data have told of",
+}
+LONG_NAMES = {
+    "snapshot": "time of the fields",
+    "x": "x of the vertices",
+    "y": "y of the vertices",
+    "z": "z of the vertices",
+    "sensor": "assimilated channel",
+    "withheld": "withheld channel",
+    "innovation": "measured minus expected, one step ahead",
+    "withheld_error": "measured minus expected of withheld channels, one step ahead",
+    "status": "how the step went",
+    "correlation": "correlation of the last estimates",
+}
+DIFFERENCES = ("innovation", "withheld_error")
+# CF: an axis Z is vertical, and must say whether it grows up or down, which a mesh does not know.
+AXES = {"time": "T", "snapshot": "T", "x": "X", "y": "Y"}
+CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
+SYMBOLS = {"°C": "degC", "°F": "degF", "Δ°C": "K", "Δ°F": "degR", "Ω": "ohm"}
+SCALES = ("degC", "degF")  # their zero is not zero
+NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of cell.
+
+    Attributes
+    ----------
+    dimension, role
+        Of the mesh, and what UGRID calls such a cell.
+    edges
+        Corners to which the edges lead from the first one, in an order that turns right-handed.
+    turned
+        The corners of a cell that turns the other way, in the right order.
+    """
+
+    dimension: int
+    role: str
+    edges: tuple[int, ...]
+    turned: tuple[int, ...]
+
+
+KINDS = {
+    "triangle": Kind(2, "face", (1, 2), (0, 2, 1)),
+    "quad": Kind(2, "face", (1, 3), (0, 3, 2, 1)),
+    "tetra": Kind(3, "volume", (1, 2, 3), (0, 2, 1, 3)),
+    "hexahedron": Kind(3, "volume", (1, 3, 4), (4, 5, 6, 7, 0, 1, 2, 3)),
+}
+
+
+# --- names and units -----------------------------------------------------------------------------
+
+
+@cache
+def udunits(unit: str) -> str:
+    """Return a unit as UDUNITS writes it; one that is not known, or has roots, as it is.
+
+    >>> udunits("m^2/s"), udunits("J/(m^3 K)"), udunits("degC"), udunits("")
+    ('m2 s-1', 'J m-3 K-1', 'degC', '1')
+    """
+    from pint.util import to_units_container
+
+    try:
+        found = to_units_container(_registry().parse_units(unit))
+    except NOT_A_UNIT:
+        return unit
+    parts = {name: float(str(power)) for name, power in found.items()}
+    if not all(power.is_integer() for power in parts.values()):
+        return unit
+    words = []
+    for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
+        symbol = _registry().get_symbol(name)
+        symbol = SYMBOLS.get(symbol, symbol.replace("µ", "u"))
+        words.append(symbol if power == 1 else f"{symbol}{int(power)}")
+    return " ".join(words) or "1"
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def instants(data: xr.Dataset, times: Any) -> Any:
+    """Return times of a run as dates (a pandas index); None if it has none."""
+    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
+    if origin is None or unit not in SECONDS:
+        return None
+    seconds = np.asarray(times, dtype=float) * SECONDS[unit]
+    return pd.Timestamp(str(origin)) + pd.to_timedelta(seconds, unit="s")
+
+
+def cf(
+    data: xr.Dataset, *, title: str = "", source: str = "livepde", history: str = ""
+) -> xr.Dataset:
+    """Return a run's dataset with names, units and relations after the CF conventions.
+
+    Parameters
+    ----------
+    data
+        As `Result.to_xarray` gives it.
+    title, source, history
+        Global attributes; a title that the dataset has comes first.
+
+    Returns
+    -------
+    Dataset
+        `time` and `snapshot` count from a date where the run has one, so that xarray opens them as
+        dates; units are as UDUNITS reads them; names consist of letters, digits and underscores,
+        and `long_name` holds what they stand for; deviations and ends of intervals are
+        `ancillary_variables`; a mesh in two or three dimensions follows UGRID. Of standard names
+        only those of the times: the others are of sea and air.
+    """
+    found = _bounded(data)
+    names = _names(str(name) for name in found.variables)
+    for name in names:
+        _describe(found, name)
+        beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
+        if beside:
+            found[name].attrs["ancillary_variables"] = " ".join(beside)
+    for name in {"time", "snapshot"} & set(names):
+        _date(found[name], data)
+    found.attrs = {key: plain(value) for key, value in data.attrs.items()}
+    lists = {key: str(data.attrs.get(key, "")).split() for key in ("fields", "state")}
+    for key, some in {"scalars": scalars(data), **lists}.items():
+        found.attrs[key] = " ".join(names[name] for name in some if name in names)
+    found.attrs |= {"Conventions": CONVENTIONS, "source": source, "history": history}
+    found.attrs["title"] = str(data.attrs.get("title", "")) or title
+    found = found.rename({old: new for old, new in names.items() if old != new})
+    for kind in _kinds(found):
+        _add_topology(found, kind)
+    return found
+
+
+def _bounded(data: xr.Dataset) -> xr.Dataset:
+    """Return a copy with the ends of the 95 % interval of every number beside its deviation."""
+    found = {}
+    for name, variable in data.data_vars.items():
+        found[name] = variable.copy(deep=False)
+        label = str(name).removesuffix("_std")
+        if label != name and label in scalars(data) and f"{label}_low" not in data:
+            unit = {"units": variable.attrs.get("units", "")}
+            for end, values in zip(("_low", "_high"), interval_95(data, label), strict=True):
+                found[f"{label}{end}"] = xr.DataArray(values, dims="time", attrs=unit)
+    return xr.Dataset(found, data.coords, data.attrs)
+
+
+def _names(wanted: Iterable[str]) -> dict[str, str]:
+    """Return name -> one of letters, digits and underscores that no other has."""
+    found: dict[str, str] = {}
+    for name in wanted:
+        stem = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+        stem = stem if stem[:1].isalpha() else f"v{stem}"
+        free, number = stem, 2
+        while free in found.values():
+            free, number = f"{stem}_{number}", number + 1
+        found[name] = free
+    return found
+
+
+def _describe(data: xr.Dataset, name: str) -> None:
+    """Say what a variable is, and in which unit."""
+    variable = data[name]
+    attrs = variable.attrs
+    attrs.setdefault("long_name", LONG_NAMES.get(name, name))
+    for end, text in BESIDE.items():
+        base = name.removesuffix(end)
+        if base != name and base in data:
+            attrs["long_name"] = text.format(base)
+            attrs.setdefault("units", "")
+    if name in AXES:
+        attrs["axis"] = AXES[name]
+    if name in data.coords:
+        variable.encoding["_FillValue"] = None  # a coordinate is never missing
+    if "units" in attrs:
+        attrs["units"] = unit = udunits(str(attrs["units"]))
+        if unit in SCALES:
+            apart = name.endswith("_std") or name in DIFFERENCES
+            attrs["units_metadata"] = f"temperature: {'difference' if apart else 'on_scale'}"
+    if "flag_values" in attrs:
+        attrs["flag_values"] = np.array(attrs["flag_values"], dtype=variable.dtype)
+
+
+def _date(time: xr.DataArray, data: xr.Dataset) -> None:
+    """Give a time its unit, since a date if the run has one."""
+    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
+    time.attrs |= {"standard_name": "time", "units": udunits(unit)}
+    if origin is not None and unit in CLOCKS:
+        time.attrs |= {"units": f"{CLOCKS[unit]} since {origin}", "calendar": "standard"}
+
+
+def _kinds(data: xr.Dataset) -> list[str]:
+    return [kind for kind in KINDS if kind in data and data[kind].dims == ("cell", "corner")]
+
+
+def _oriented(data: xr.Dataset, kind: str) -> Any:
+    """Return the corners of each cell so that all turn the same way: others count on that."""
+    corners = np.array(data[kind].values)
+    about = KINDS[kind]
+    axes = "xyz"[: about.dimension]
+    points = np.column_stack([data[axis].values for axis in axes])
+    edges = [points[corners[:, k]] - points[corners[:, 0]] for k in about.edges]
+    wrong = np.linalg.det(np.stack(edges, axis=1)) < 0.0
+    corners[wrong] = corners[wrong][:, about.turned]
+    return corners
+
+
+def _add_topology(data: xr.Dataset, kind: str) -> None:
+    """Say how vertices and cells are a mesh, after UGRID."""
+    dimension, cell = KINDS[kind].dimension, KINDS[kind].role
+    name = next(free for free in ("mesh", "mesh_topology") if free not in data)
+    corners = f"{cell}_node_connectivity"
+    axes = [axis for axis in "xyz" if axis in data.coords]
+    data[kind].values = _oriented(data, kind)
+    data[kind].attrs |= {"cf_role": corners, "start_index": np.int32(0)}
+    data[kind].attrs["long_name"] = f"vertices of each {kind}"
+    for variable in data.data_vars.values():
+        if variable.dims[-1:] == ("vertex",):
+            variable.attrs |= {"mesh": name, "location": "node"}
+    about = {
+        "cf_role": "mesh_topology",
+        "long_name": "mesh",
+        "topology_dimension": np.int32(dimension),
+        "node_coordinates": " ".join(axes),
+        corners: kind,
+    }
+    if dimension == 2:
+        about["face_dimension"] = "cell"
+    data[name] = ((), np.int32(0), about)
+    data.attrs["Conventions"] = f"{CONVENTIONS} UGRID-1.0"
+
+
+# --- files ---------------------------------------------------------------------------------------
+
+
+def export(run: Run, target: Path, *, at: float | None = None, force: bool = False) -> None:
+    """Write a run in the format that the ending of a file names: see `FORMATS`.
+
+    Of a run that still goes on, what it has until now. The file appears whole or not at all.
+
+    Parameters
+    ----------
+    at
+        For formats of one time (`AT_ONE_TIME`): the fields nearest to this time; default the last.
+    force
+        Write over what is there.
+
+    Raises
+    ------
+    RunError
+        The target exists; it cannot be written; there is nothing to write.
+    ConfigurationError
+        There is no such format, or it needs a package that is not installed.
+    """
+    write = FORMATS.get(target.suffix.lower())
+    if write is None:
+        raise ConfigurationError(
+            f"{target}: there is no format '{target.suffix}'; expected one of {', '.join(FORMATS)}."
+        )
+    if at is not None and target.suffix.lower() not in AT_ONE_TIME:
+        raise ConfigurationError(
+            f"{target}: holds all times; a time is chosen for {' and '.join(AT_ONE_TIME)}."
+        )
+    if not run.dataset.sizes["time"]:
+        raise RunError(f"{run.path} holds no estimates yet: there is nothing to export.")
+    into_place(target, lambda path: write(run, path, at), force=force)
+
+
+def into_place(target: Path, write: Callable[[Path], None], *, force: bool = False) -> None:
+    """Write a file, or a folder, beside where it goes, and move it there when it is whole.
+
+    Parameters
+    ----------
+    write
+        Is called with a path of the same name; files beside that come along.
+
+    Raises
+    ------
+    RunError
+        Something is there already and `force` is not set; it cannot be written.
+    """
+    try:
+        refuse_file(target, force)
+        with TemporaryDirectory(dir=target.parent, prefix=".livepde-") as folder:
+            write(Path(folder) / target.name)
+            made = sorted(Path(folder).iterdir())
+            for path in made:
+                refuse_file(target.parent / path.name, force)
+            for path in made:
+                place = target.parent / path.name
+                if place.is_dir():
+                    shutil.rmtree(place)
+                path.replace(place)
+    except RunError:
+        raise
+    except OSError as error:
+        raise RunError(f"{target} cannot be written: {error.strerror or error}.") from error
+
+
+def refuse_file(target: Path, force: bool) -> None:
+    """Raise `RunError` if there is something, unless it may go; a folder only as a Zarr store."""
+    if not target.exists():
+        return
+    if target.is_dir() and not {".zgroup", "zarr.json"} & {path.name for path in target.iterdir()}:
+        raise RunError(f"{target} is a folder: name a file.")
+    if not force:
+        raise RunError(f"{target} exists: name another file, or add --force to write over it.")
+
+
+def _conventional(run: Run) -> xr.Dataset:
+    record = run.record
+    command = " ".join(str(word) for word in record.get("command", []))
+    return cf(
+        run.dataset,
+        title=run.title,
+        source=f"livepde {record.get('livepde', '')}".strip(),
+        history=f"{record.get('started', '')} {command}".strip(),
+    )
+
+
+def _netcdf(run: Run, path: Path, at: float | None) -> None:
+    write_dataset(_conventional(run), path)
+
+
+def _zarr(run: Run, path: Path, at: float | None) -> None:
+    _need("zarr")
+    # The second format has text of fixed length, which the third has not settled yet.
+    _conventional(run).to_zarr(path, zarr_format=2, consolidated=True)
+
+
+def _csv(run: Run, path: Path, at: float | None) -> None:
+    """Write what is over time, one row for each sample; units stand in the header."""
+    data = _bounded(run.dataset)
+    times = data["time"].values
+    columns: dict[str, Any] = {}
+    dates = instants(data, times)
+    if dates is not None:
+        columns["date"] = dates
+    for name in ("time", *sorted(map(str, data.data_vars), key=DIFFERENCES.__contains__)):
+        variable = data[name]
+        unit = udunits(str(variable.attrs.get("units", "")))
+        end = "" if unit == "1" else f" [{unit}]"
+        if name == "status":
+            columns[name] = np.array(STATUS_CODES)[variable.values]
+        elif variable.dims == ("time",):
+            columns[f"{name}{end}"] = variable.values
+        elif variable.dims[:1] == ("time",):
+            for k, label in enumerate(variable[variable.dims[1]].values):
+                columns[f"{name}:{label}{end}"] = variable.values[:, k]
+    pd.DataFrame(columns).to_csv(path, index=False)
+
+
+def _series(run: Run, path: Path, at: float | None) -> None:
+    """Write the fields of all times as XDMF, with their numbers in an HDF5 file beside it."""
+    _need("meshio", "h5py")
+    import h5py  # type: ignore[import-untyped]
+    from meshio.xdmf import TimeSeriesWriter
+
+    class Writer(TimeSeriesWriter):  # type: ignore[misc]
+        """Keeps the HDF5 file beside the XDMF file, not in the current folder."""
+
+        def __enter__(self) -> Any:
+            self.h5_filename = str(self.filename.with_suffix(".h5"))
+            self.h5_file = h5py.File(self.h5_filename, "w")
+            return self
+
+    data = _with_fields(run)
+    with Writer(path) as writer:
+        writer.write_points_cells(*_mesh(data))
+        for k, t in enumerate(data["snapshot"].values.tolist()):
+            writer.write_data(t, point_data=_fields(data, k))
+
+
+def _vtk(run: Run, path: Path, at: float | None) -> None:
+    """Write the fields of one time."""
+    _need("meshio")
+    import meshio
+
+    data = _with_fields(run)
+    k = -1 if at is None else int(np.abs(data["snapshot"].values - at).argmin())
+    meshio.write(path, meshio.Mesh(*_mesh(data), point_data=_fields(data, k)))
+
+
+def _with_fields(run: Run) -> xr.Dataset:
+    if not run.dataset.sizes.get("snapshot"):
+        raise RunError(f"{run.path} holds no fields: there is nothing to draw.")
+    return run.dataset
+
+
+def _mesh(data: xr.Dataset) -> tuple[Any, list[tuple[str, Any]]]:
+    """Return points, shape (vertices, 3), and cells; those of an interval join its neighbours."""
+    count = data.sizes["vertex"]
+    axes = [data[axis].values if axis in data.coords else np.zeros(count) for axis in "xyz"]
+    cells = [(kind, _oriented(data, kind)) for kind in _kinds(data)]
+    order = np.arange(count, dtype=np.int32)
+    return np.column_stack(axes), cells or [("line", np.column_stack([order[:-1], order[1:]]))]
+
+
+def _fields(data: xr.Dataset, k: int) -> dict[str, Any]:
+    """Return the values at the vertices of one snapshot."""
+    names = _names(str(n) for n, v in data.data_vars.items() if v.dims == ("snapshot", "vertex"))
+    return {free: data[name].values[k] for name, free in names.items()}
+
+
+def _need(*packages: str) -> None:
+    import importlib.util
+
+    for name in packages:
+        if importlib.util.find_spec(name) is None:
+            raise ConfigurationError(f"this format needs {name}: pip install 'livepde[formats]'.")
+
+
+Writer: TypeAlias = Callable[[Run, Path, float | None], None]
+FORMATS: dict[str, Writer] = {
+    ".nc": _netcdf,
+    ".zarr": _zarr,
+    ".csv": _csv,
+    ".xdmf": _series,
+    ".vtu": _vtk,
+    ".vtk": _vtk,
+}
+AT_ONE_TIME = (".vtu", ".vtk")

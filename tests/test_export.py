@@ -1,0 +1,427 @@
+"""Runs in formats of other programs, read back with their readers."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+
+import meshio
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from meshio.xdmf import TimeSeriesReader
+from skfem import MeshHex, MeshTri
+from typer.testing import CliRunner
+
+import livepde as lp
+from livepde import cli, runs
+from livepde.errors import ConfigurationError, LivepdeError, RunError
+from livepde.models import heat
+from livepde.plots import interval_95
+from livepde.result import layout_of
+from livepde.runs import RunWriter, drive, tables
+from livepde.runs.export import cf, export, udunits
+from livepde.runs.journal import Journal
+
+ORIGIN = "2025-04-01 06:00:00"
+SAMPLES = 6
+
+
+def unit_mesh(mesh):
+    return mesh.with_boundaries({"left": lambda p: np.isclose(p[0], 0.0)})
+
+
+MESHES = {
+    "line": lambda: lp.interval(0.0, 1.0, 4),
+    "triangle": lambda: unit_mesh(MeshTri().refined(2)),
+    "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 2)),
+    "tetra": lambda: lp.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (2, 1, 1)),
+    "hexahedron": lambda: unit_mesh(MeshHex().refined(1)),
+}
+
+
+def identifier(kind: str = "line", field: bool = False) -> lp.Identifier:
+    mesh = MESHES[kind]()
+    halves = {"near side": lambda x: x[0] < 0.5, "far": lambda x: x[0] >= 0.5}
+    alpha = lp.Piecewise(halves, 0.1, 0.05, unit="m^2/s", transform="log")
+    if field:
+        alpha = lp.Field(mesh, lp.linear(mesh), prior=0.1, unit="m^2/s")
+    loss = lp.Scalar(0.2, 0.1, unit="1/s")
+    points = [0.6, 0.3] if mesh.dim() == 1 else [(x, *[0.4] * (mesh.dim() - 1)) for x in (0.6, 0.3)]
+    return lp.Identifier(
+        heat(mesh, alpha, {"left": lp.Channel("T0")}, loss=loss),
+        lp.Points({"a": points[0]}, noise=0.1, unit="degC"),
+        lp.SensitivityLaw(),
+        withheld=lp.Points({"b, inside": points[1]}),
+    )
+
+
+def samples(count: int = SAMPLES):
+    values = {"T0": 1.0, "ambient": 0.0, "b, inside": 0.5}
+    return [lp.Sample(60.0 * t, {**values, "a": 0.1 * t}) for t in range(count)]
+
+
+def described(who: lp.Identifier, **attrs):
+    layout = layout_of(who.model, who.observed, who.withheld)
+    return replace(layout, length_unit="m", attrs={"title": "A rod", "equation": "u_t", **attrs})
+
+
+def journal(path, who, **attrs) -> Journal:
+    return Journal.create(path, who.channels, described(who, **attrs))
+
+
+def made(folder, kind: str = "line", count: int = SAMPLES, **attrs) -> runs.Run:
+    """Return a finished run on a mesh of some kind."""
+    who = identifier(kind)
+    command = ["livepde", "run", "rod.toml"]
+    writer = RunWriter.create(folder, version="1.2", command=command, title="A rod")
+    with journal(folder / "journal.sqlite", who, **attrs) as kept:
+        driven = drive(who, samples(count), journal=kept, fields_every=2)
+        assert driven.error is None
+        data = driven.result.to_xarray()
+    writer.finish(status="finished", dataset=data, shown=tables(data))
+    return runs.open(folder)
+
+
+@pytest.fixture
+def rod(tmp_path) -> runs.Run:
+    return made(tmp_path / "rod", origin=ORIGIN)
+
+
+def call(*arguments) -> tuple[int, str]:
+    result = CliRunner().invoke(cli.app, [str(item) for item in arguments])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.output
+
+
+# --- names and units -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("unit", "expected"),
+    [
+        ("m^2/s", "m2 s-1"),
+        ("W/(m K)", "W m-1 K-1"),
+        ("degC", "degC"),
+        ("W/m^2/degC", "W m-2 K-1"),
+        ("1/mm^2", "mm-2"),
+        ("um", "um"),
+        ("%", "%"),
+        ("", "1"),
+        ("m^0.5", "m^0.5"),  # UDUNITS has no roots
+        ("cells per well", "cells per well"),
+        ("3 m", "3 m"),
+    ],
+)
+def test_units_are_those_of_udunits(unit, expected):
+    assert udunits(unit) == expected
+
+
+def test_every_name_is_one_of_cf_and_tells_its_own(rod):
+    found = cf(rod.dataset)
+    assert all(str(name).isidentifier() and str(name).isascii() for name in found.variables)
+    assert found["alpha_near_side"].attrs["long_name"] == "alpha[near side]"
+    assert found.attrs["scalars"].split() == ["alpha_near_side", "alpha_far", "loss"]
+    assert found.attrs["state"] == "u"
+    assert np.array_equal(found["alpha_far"], rod.dataset["alpha[far]"])
+
+
+def test_names_that_would_be_the_same_are_told_apart():
+    time = ("time", [0.0])
+    data = xr.Dataset({"k[a b]": time, "k[a_b]": time, "κ": time, "2k": time}, {"time": [0.0]})
+    found = cf(data)
+    assert set(found.data_vars) == {"k_a_b", "k_a_b_2", "v", "v2k"}
+    assert found["v"].attrs["long_name"] == "κ"
+
+
+def test_what_belongs_to_a_number(rod):
+    found = cf(rod.dataset)
+    beside = found["loss"].attrs["ancillary_variables"].split()
+    assert beside == ["loss_std", "loss_low", "loss_high", "loss_left"]
+    low, high = interval_95(rod.dataset, "loss")
+    assert np.array_equal(found["loss_low"], low)
+    assert np.array_equal(found["loss_high"], high)
+    assert found["loss_std"].attrs["long_name"] == "standard deviation of loss"
+    assert found["loss_low"].attrs["units"] == "s-1"
+    assert found["loss_left"].attrs["units"] == "1"
+    assert found["u"].attrs["ancillary_variables"] == "u_std"
+    assert all(name in found for name in beside)
+
+
+def test_temperatures_and_their_differences(rod):
+    found = cf(rod.dataset)
+    assert found["u"].attrs["units_metadata"] == "temperature: on_scale"
+    for name in ("u_std", "innovation", "withheld_error"):
+        assert found[name].attrs["units_metadata"] == "temperature: difference"
+    assert "units_metadata" not in found["loss"].attrs
+
+
+def test_the_dataset_itself_is_not_changed(rod):
+    before = rod.dataset.copy(deep=True)
+    cf(rod.dataset)
+    xr.testing.assert_identical(rod.dataset, before)
+
+
+# --- files that xarray opens -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", [".nc", ".zarr"])
+def test_xarray_opens_times_as_dates(rod, tmp_path, ending):
+    target = tmp_path / f"rod{ending}"
+    export(rod, target)
+    options = {"engine": "scipy"} if ending == ".nc" else {"engine": "zarr"}
+    with xr.open_dataset(target, **options) as found:
+        found.load()
+    assert found["time"].values[1] == np.datetime64("2025-04-01T06:01:00")
+    assert found["snapshot"].values[-1] == np.datetime64("2025-04-01T06:05:00")
+    assert found["time"].attrs["standard_name"] == "time"
+    assert found.attrs["Conventions"] == "CF-1.11"
+    assert found.attrs["title"] == "A rod"
+    assert found.attrs["source"] == "livepde 1.2"
+    assert found.attrs["history"].endswith("livepde run rod.toml")
+    assert list(found["sensor"].values) == ["a"]
+    assert list(found["withheld"].values) == ["b, inside"]
+    assert np.array_equal(found["u"], rod.dataset["u"])
+    assert found["u"].dims == ("snapshot", "vertex")
+    assert found["x"].dims == ("vertex",)
+    assert found["status"].attrs["flag_meanings"].split()[0] == "ok"
+    flags = np.asarray(found["status"].attrs["flag_values"])
+    assert flags.tolist() == list(range(len(found["status"].attrs["flag_meanings"].split())))
+
+
+def test_without_dates_times_are_numbers_with_a_unit(tmp_path):
+    rod = made(tmp_path / "rod")
+    export(rod, tmp_path / "rod.nc")
+    with xr.open_dataset(tmp_path / "rod.nc", engine="scipy") as found:
+        assert found["time"].values.tolist() == [60.0 * k for k in range(SAMPLES)]
+        assert found["time"].attrs["units"] == "s"
+        assert found["snapshot"].attrs["units"] == "s"
+
+
+def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
+    export(rod, tmp_path / "rod.nc")
+    with xr.open_dataset(tmp_path / "rod.nc", engine="scipy", decode_cf=False) as found:
+        assert found["u"].attrs["coordinates"] == "x"
+        assert found["time"].attrs["units"] == f"seconds since {ORIGIN}"
+        assert "_FillValue" not in found["time"].attrs
+        assert found["status"].attrs["flag_values"].dtype.kind == found["status"].dtype.kind
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MESHES if kind != "line"])
+def test_a_mesh_after_ugrid(tmp_path, kind):
+    export(made(tmp_path / "run", kind), tmp_path / "run.nc")
+    with xr.open_dataset(tmp_path / "run.nc", engine="scipy") as found:
+        found.load()
+    assert found.attrs["Conventions"] == "CF-1.11 UGRID-1.0"
+    mesh = found["mesh"].attrs
+    assert mesh["cf_role"] == "mesh_topology"
+    dimension = mesh["topology_dimension"]
+    assert dimension == {"triangle": 2, "quad": 2, "tetra": 3, "hexahedron": 3}[kind]
+    role = "face_node_connectivity" if dimension == 2 else "volume_node_connectivity"
+    corners = found[mesh[role]]
+    assert corners.attrs["cf_role"] == role
+    assert corners.attrs["start_index"] == corners.values.min() == 0
+    points = [found[name].values for name in mesh["node_coordinates"].split()]
+    assert len(points) == dimension
+    assert corners.values.max() == len(points[0]) - 1
+    assert found["u"].attrs["mesh"] == "mesh"
+    assert found["u"].attrs["location"] == "node"
+    assert volume(np.column_stack(points), kind, corners.values) == pytest.approx(1.0)
+
+
+def volume(points, kind, corners) -> float:
+    """Return the size of a mesh whose cells turn one way; of boxes by the edges at a corner."""
+    ends = {"triangle": (1, 2), "quad": (1, 3), "tetra": (1, 2, 3), "hexahedron": (1, 3, 4)}[kind]
+    share = {"triangle": 0.5, "quad": 1.0, "tetra": 1.0 / 6.0, "hexahedron": 1.0}[kind]
+    edges = np.stack([points[corners[:, k]] - points[corners[:, 0]] for k in ends], axis=1)
+    return share * float(np.linalg.det(edges).sum())
+
+
+# --- tables ----------------------------------------------------------------------------------
+
+
+def test_pandas_opens_what_is_over_time(rod, tmp_path):
+    export(rod, tmp_path / "rod.csv")
+    found = pd.read_csv(tmp_path / "rod.csv", parse_dates=["date"])
+    data = rod.dataset
+    assert found["date"].iloc[1] == pd.Timestamp("2025-04-01 06:01")
+    assert np.array_equal(found["time [s]"], data["time"])
+    for name in ("", "_std", "_low", "_high"):
+        assert f"alpha[near side]{name} [m2 s-1]" in found
+    assert np.array_equal(found["loss [s-1]"], data["loss"])
+    low, _ = interval_95(data, "loss")
+    assert np.array_equal(found["loss_low [s-1]"], low)
+    assert np.array_equal(found["innovation:a [degC]"], data["innovation"][:, 0])
+    assert np.array_equal(found["withheld_error:b, inside [degC]"], data["withheld_error"][:, 0])
+    assert found["status"].tolist() == ["ok"] * SAMPLES
+    assert len(found) == SAMPLES
+
+
+def test_a_table_without_dates(tmp_path):
+    export(made(tmp_path / "rod"), tmp_path / "rod.csv")
+    assert pd.read_csv(tmp_path / "rod.csv").columns[0] == "time [s]"
+
+
+# --- fields on their mesh --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    run = made(tmp_path / "run", kind)
+    export(run, tmp_path / "run.xdmf")
+    assert not list(elsewhere.iterdir())
+    data = run.dataset
+    with TimeSeriesReader(tmp_path / "run.xdmf") as reader:
+        points, cells = reader.read_points_cells()
+        assert reader.num_steps == data.sizes["snapshot"] == 4
+        for k in range(reader.num_steps):
+            t, fields, _ = reader.read_data(k)
+            assert t == data["snapshot"].values[k]
+            assert np.array_equal(fields["u"], data["u"].values[k])
+            assert np.array_equal(fields["u_std"], data["u_std"].values[k])
+    assert [block.type for block in cells] == [kind]
+    assert np.array_equal(points[:, 0], data["x"])
+    if kind != "line":
+        dimension = 2 if kind in ("triangle", "quad") else 3
+        assert volume(points[:, :dimension], kind, cells[0].data) == pytest.approx(1.0)
+    else:
+        lengths = np.diff(points[cells[0].data][:, :, 0], axis=1)
+        assert lengths.sum() == pytest.approx(1.0)
+        assert (lengths > 0.0).all()
+
+
+@pytest.mark.parametrize("ending", [".vtu", ".vtk"])
+@pytest.mark.parametrize("kind", MESHES)
+def test_vtk_holds_one_time(tmp_path, kind, ending):
+    run = made(tmp_path / "run", kind)
+    export(run, tmp_path / f"last{ending}")
+    export(run, tmp_path / f"early{ending}", at=110.0)
+    for name, k in (("last", -1), ("early", 1)):
+        found = meshio.read(tmp_path / f"{name}{ending}")
+        assert np.array_equal(found.point_data["u"], run.dataset["u"].values[k])
+        assert [block.type for block in found.cells] == [kind]
+        assert np.array_equal(found.points[:, 0], run.dataset["x"])
+
+
+def test_unknown_fields_are_on_the_mesh_too(tmp_path):
+    writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
+    data = drive(identifier(field=True), samples()).result.to_xarray()
+    writer.finish(status="finished", dataset=data)
+    export(runs.open(tmp_path / "run"), tmp_path / "run.vtu")
+    found = meshio.read(tmp_path / "run.vtu")
+    assert {"u", "u_std", "alpha", "alpha_std"} <= set(found.point_data)
+
+
+# --- a run that goes on ----------------------------------------------------------------------
+
+
+def test_a_run_that_goes_on_is_exported_as_far_as_it_is(tmp_path):
+    folder, who = tmp_path / "rod", identifier()
+    RunWriter.create(folder, version="1", command=["livepde"], title="A rod")
+    with journal(folder / "journal.sqlite", who, origin=ORIGIN) as kept:
+        drive(who, samples(), journal=kept)
+        kept.checkpoint(b"")  # commits
+        for ending in (".nc", ".csv", ".xdmf", ".vtu"):
+            export(runs.open(folder), tmp_path / f"rod{ending}")
+        assert kept.accepted == SAMPLES
+    assert len(pd.read_csv(tmp_path / "rod.csv")) == SAMPLES
+
+
+def test_a_run_without_estimates_has_nothing_to_export(tmp_path):
+    folder, who = tmp_path / "rod", identifier()
+    RunWriter.create(folder, version="1", command=["livepde"], title="A rod")
+    with journal(folder / "journal.sqlite", who), pytest.raises(RunError, match="no estimates yet"):
+        export(runs.open(folder), tmp_path / "rod.nc")
+
+
+# --- the command -----------------------------------------------------------------------------
+
+
+def test_the_command_writes_several(rod, tmp_path):
+    targets = [tmp_path / name for name in ("a.nc", "a.CSV", "a.xdmf", "a.zarr")]
+    code, output = call("export", rod.path, *targets)
+    assert code == 0
+    for target in targets:
+        assert target.exists()
+        assert str(target) in output
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.parametrize("name", ["a.nc", "a.csv", "a.xdmf", "a.vtu", "a.zarr"])
+def test_nothing_is_written_over_unasked(rod, tmp_path, name):
+    target = tmp_path / name
+    export(rod, target)
+    other = made(tmp_path / "other", count=3)
+    with pytest.raises(RunError, match=f"{name} exists: name another file, or add --force"):
+        call("export", other.path, tmp_path / "new.csv", target)
+    assert not (tmp_path / "new.csv").exists()
+    assert call("export", other.path, target, "--force")[0] == 0
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+    if name == "a.zarr":
+        assert xr.open_dataset(target, engine="zarr").sizes["time"] == 3
+
+
+def test_the_file_beside_xdmf_is_not_written_over_either(rod, tmp_path):
+    (tmp_path / "a.h5").write_text("mine")
+    with pytest.raises(RunError, match=r"a\.h5 exists"):
+        export(rod, tmp_path / "a.xdmf")
+    assert (tmp_path / "a.h5").read_text() == "mine"
+    assert not (tmp_path / "a.xdmf").exists()
+
+
+def test_a_folder_that_is_no_store_stays(rod, tmp_path):
+    mine = tmp_path / "mine.zarr"
+    mine.mkdir()
+    (mine / "notes").write_text("mine")
+    with pytest.raises(RunError, match="is a folder"):
+        export(rod, mine, force=True)
+    assert (mine / "notes").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["a.xlsx"], r"there is no format '\.xlsx'; expected one of \.nc, "),
+        (["nowhere/a.nc"], "cannot be written: No such file or directory"),
+        (["a.nc", "--at", "60"], r"holds all times; a time is chosen for \.vtu and \.vtk"),
+        (["a.vtu", "--at", "noon"], "--at: got 'noon'"),
+        (["a.vtu", "--at", "3 m"], "--at: 'm' cannot be converted to 's'"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_sentence(rod, tmp_path, arguments, said):
+    first, *more = arguments
+    with pytest.raises(LivepdeError, match=said):
+        call("export", rod.path, tmp_path / first, *more)
+    assert [path.name for path in tmp_path.iterdir()] == ["rod"]
+
+
+@pytest.mark.parametrize("moment", ["110", "1.9 min", "2025-04-01 06:02", "2025-04-01T08:02+02:00"])
+def test_a_moment_is_a_number_a_quantity_or_a_date(rod, tmp_path, moment):
+    assert call("export", rod.path, tmp_path / "a.vtu", "--at", moment)[0] == 0
+    found = meshio.read(tmp_path / "a.vtu")
+    assert np.array_equal(found.point_data["u"], rod.dataset["u"].values[1])
+
+
+def test_a_date_needs_dates(tmp_path):
+    run = made(tmp_path / "rod")
+    with pytest.raises(ConfigurationError, match="the run's times have no date"):
+        call("export", run.path, tmp_path / "a.vtu", "--at", "2025-04-01")
+
+
+@pytest.mark.parametrize(
+    ("name", "package"), [("a.zarr", "zarr"), ("a.xdmf", "h5py"), ("a.vtu", "meshio")]
+)
+def test_a_missing_package_is_named_with_its_extra(rod, tmp_path, monkeypatch, name, package):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda wanted: None if wanted == package else find(wanted)
+    )
+    said = rf"needs {package}: pip install 'livepde\[formats\]'"
+    with pytest.raises(ConfigurationError, match=said):
+        export(rod, tmp_path / name)
+    assert not (tmp_path / name).exists()
