@@ -183,6 +183,20 @@ def test_what_is_not_valid_is_counted_in_files_too(here):
     assert np.array_equal(runs.open("run0").dataset["alpha"], runs.open("run3").dataset["alpha"])
 
 
+def test_parquet_files_are_read_as_others(here):
+    import pandas as pd
+
+    rows = [row(k) for k in range(12)]
+    Path("rows.csv").write_text(HEADER + table(*rows))
+    pd.DataFrame(rows).assign(time=lambda d: pd.to_datetime(d["time"])).to_parquet("rows.parquet")
+    assert call("run", case('file = "rows.csv"'), "--out", "csv")[0] == 0
+    for folder, more in (("batch", ()), ("live", ("--realtime", "--speed", "inf"))):
+        assert call("run", "case.toml", "--data", "rows.parquet", "--out", folder, *more)[0] == 0
+        found = runs.open(folder).dataset
+        assert np.array_equal(found["alpha"], runs.open("csv").dataset["alpha"])
+        assert found.attrs["origin"] == "2026-11-21 00:00:00"
+
+
 def test_it_begins_with_the_first_sample_that_has_what_is_needed(here):
     lines = [json.dumps({"time": "2026-11-20 23:00", "T_3": 20.0, "left": None, "T_6": None})]
     lines += [json.dumps(row(k)) for k in range(5)]
@@ -204,7 +218,7 @@ def test_estimates_as_lines_of_json(here):
     assert code == 0
     found = [json.loads(line) for line in output.splitlines() if line.startswith("{")]
     assert [line["t"] for line in found] == [0.0, 60.0, 120.0, 180.0]
-    assert found[-1]["alpha"] == float(runs.open("run").dataset["alpha"][-1])
+    assert found[-1]["unknowns"]["alpha"]["value"] == float(runs.open("run").dataset["alpha"][-1])
 
 
 def test_a_finished_file_is_replayed_at_its_pace():
@@ -251,7 +265,7 @@ def test_from_a_broker_and_back(here, server):  # noqa: F811
     stopped(process)
     client.loop_stop()
     found = runs.open("run").dataset
-    assert [one["alpha"] for one in heard] == found["alpha"].values.tolist()
+    assert [one["unknowns"]["alpha"]["value"] for one in heard] == found["alpha"].values.tolist()
     assert np.isfinite(found["innovation"].sel(sensor="T_6")[1:]).all()
 
 

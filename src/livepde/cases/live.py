@@ -109,9 +109,9 @@ class Wiring:
                 spec.opcua.url,
                 spec.opcua.columns,
                 spec.time,
-                frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
-                spec.opcua.username,
-                _password(frame, spec.opcua.password_env, "data.opcua"),
+                interval=frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
+                username=spec.opcua.username,
+                password=_password(frame, spec.opcua.password_env, "data.opcua"),
             )
         path = Path(data) if data is not None else data_file(frame)
         follow = spec.follow and data is None
@@ -148,6 +148,7 @@ def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
         username=spec.username,
         password=_password(frame, spec.password_env, key),
         tls=spec.tls,
+        ca_file=spec.ca_file,
         session=round(frame.positive(spec.session, "s", f"{key}.session")),
     )
 

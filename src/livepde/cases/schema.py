@@ -136,6 +136,7 @@ class BrokerSpec(Spec):
     username: Name | None = None
     password_env: Name | None = None
     tls: StrictBool = False
+    ca_file: Name | None = None
     session: Quantity = "7 d"
 
 
