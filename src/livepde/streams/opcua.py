@@ -117,7 +117,7 @@ class OpcuaSource:
             self._wait = min(2.0 * self._wait, LONGEST_WAIT)
 
     async def _listen(self) -> None:
-        from asyncua.client import Client
+        from asyncua.client.client import Client
 
         client = Client(self._url, timeout=PATIENCE)
         username, password = self._user
