@@ -25,6 +25,7 @@ __all__ = ["Backlog", "Feed", "Gathered", "Live", "Paced", "Retention", "Samples
 
 CHECKPOINT = 256  # samples between two checkpoints
 LOOK = 0.5  # seconds between two looks at whether to stop
+LONGEST = 500  # characters of an event
 HARMLESS = frozenset({"heard", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
 
@@ -459,6 +460,8 @@ class Live:
                 self._tell(remark.kind, remark.message, remark.channel)
 
     def _tell(self, kind: str, message: str, channel: str = "") -> None:
+        if len(message) > LONGEST:  # it may repeat what has come
+            message = message[:LONGEST] + "..."
         event = Event(self.identifier.t, kind, channel, message)
         self.journal.note(event)
         level = logging.INFO if kind in HARMLESS else logging.WARNING

@@ -137,6 +137,7 @@ class Monitor:
         self._metrics = make_wsgi_app(metrics.registry)
         self._server = Server(self._answer, address)
         self.url = self._server.url
+        self.shown = self._server.shown
         self.port = self._server.port
 
     def _answer(self, environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:

@@ -70,6 +70,8 @@ class OpcuaSource:
             import asyncua  # noqa: F401
         except ImportError:
             raise DataError("OPC UA needs asyncua: pip install 'livepde[opcua]'.") from None
+        if "@" in url:
+            raise DataError("OPC UA: a url with a password is written down: use username instead.")
         if not interval > 0.0:
             raise DataError(f"OPC UA: interval must be a time > 0; got {interval}.")
         self.dropped = 0
