@@ -11,6 +11,7 @@ are right. Each is counted with a reason, and what is right arrives.
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
@@ -31,16 +32,27 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from livepde.errors import RunError
+from livepde.bench.cases import find_cases
+from livepde.cases import Case, load
+from livepde.cases.data import data_file
+from livepde.cases.live import Wiring
+from livepde.errors import LivepdeError, RunError
+from livepde.identifier import Sample
 from livepde.progress import watched
 from livepde.records import Record
 from livepde.runs import JOURNAL, Check, Journal, Outcome, Table
+from livepde.runs.live import Gathered, Live
+from livepde.streams.intake import Intake, Ready
+from livepde.streams.intake import Outcome as RowOutcome
+from livepde.streams.sources import Row as SourceRow
+from livepde.streams.sources import Source
 
 __all__ = ["PARTS", "faults"]
 
 KILLS, SAMPLES, MALFORMED = 200, 2000, 100_000
 PATIENCE = 120.0  # seconds after which a run that does not go on is given up
 STRIDE = 0.25  # seconds after a sign of life within which a kill falls
+LONG_ONES = 0.02  # share of the lines of 2 MB that are written
 LEAD = (50, 400)  # rows that are there before they are asked for
 SILENCE = 1.0  # seconds after which a source is said to be silent
 BROKER = "/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin:/opt/homebrew/sbin"
@@ -590,8 +602,289 @@ def _outages(plan: _Plan) -> Outcome:
     return Outcome(tables=[table], checks=[noticed, *damage.checks("outages")])
 
 
+# --- rows that are broken ------------------------------------------------------------------------
+
+
+def _malformed(plan: _Plan) -> Outcome:
+    rng = np.random.default_rng(plan.seed)
+    tables, checks = [], []
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "case.toml").write_text(CASE.format(source="", silence=SILENCE))
+        rod = load(folder / "case.toml")
+        rows = _rows(min(plan.samples, 1000))
+        feeds = {
+            "generated, JSON": (rod, rows, "rows.jsonl"),
+            "generated, CSV": (rod, rows, "rows.csv"),
+        }
+        soil = _soil()
+        if soil is not None:
+            feeds["soil, CSV"] = (soil[0], soil[1], "soil.csv")
+            feeds["soil, JSON"] = (soil[0], soil[1], "soil.jsonl")
+        sent, each = 0, math.ceil(plan.malformed / len(feeds))
+        for title, (case, chosen, file) in feeds.items():
+            fed = _fed(case, chosen, folder / file, each, rng)
+            tables.append(fed.table(title))
+            checks += fed.checks(title)
+            sent += fed.sent.total()
+    return Outcome(
+        tables=tables, checks=[Check("broken rows", sent, plan.malformed, ">="), *checks]
+    )
+
+
+def _messages(plan: _Plan) -> Outcome:
+    """Send broken messages to the real command, between right ones."""
+    rng = np.random.default_rng(plan.seed)
+    rows, count = _rows(min(plan.samples, 600)), max(plan.malformed // 20, 1)
+    damage = _Damage()
+    with TemporaryDirectory() as name, ExitStack() as stack:
+        folders = {key: Path(name) / key for key in ("broker", "calm", "mqtt")}
+        for folder in folders.values():
+            folder.mkdir()
+        expected, _ = _undisturbed(folders["calm"], rows)
+        broker = Mosquitto(folders["broker"])
+        stack.callback(broker.stop)
+        topic = _Topic(broker, rows, "rod")
+        stack.callback(topic.close)
+        run = stack.enter_context(_running(folders["mqtt"], topic.source))
+        run.start()
+        per_row = np.bincount(rng.integers(0, len(rows), count), minlength=len(rows))
+        for k, times in enumerate(per_row.tolist()):
+            topic.supply(k + 1)
+            for _ in range(times):
+                _, line = _broken(JSON | BYTES, rows[k], _json_line, rng)
+                topic.send(line).wait_for_publish(PATIENCE)
+        run.end(len(rows))
+        found = _Found.of(run.out)
+    damage.compare(found, expected)
+    reasons = ", ".join(f"{kind} {number}" for kind, number in sorted(found.counts.items()))
+    table = Table(
+        f"Broken messages between {len(rows)} right ones, from a broker to livepde run",
+        ("sent", "reasons", "lost", "doubled", "different"),
+        [(count, reasons, damage.lost, damage.doubled, damage.different)],
+    )
+    counted = Check("broken messages: counted", found.counts.total(), count, ">=")
+    return Outcome(tables=[table], checks=[counted, *damage.checks("broken messages")])
+
+
+def _soil() -> tuple[Case, list[dict[str, Any]]] | None:
+    """Return the soil case and its real rows, if they are here."""
+    try:
+        path = next(path for path in find_cases() if path.stem == "soil_uniform")
+        case = load(path, settings={"intake.leap": "10 d"})
+        with data_file(case.frame).open(newline="", encoding="utf-8") as file:
+            rows = [dict(row) for row in csv.DictReader(file)]
+        return case, [row for row in rows if row[case.clock.name] >= str(case.clock.start)]
+    except (StopIteration, LivepdeError, OSError):
+        return None
+
+
+class _Audited(Gathered):
+    """Remembers what became of each row, by the place where its line begins."""
+
+    def __init__(self, source: Source, intake: Intake) -> None:
+        super().__init__(source, intake)
+        self.reasons: dict[int, set[str]] = {}
+
+    def _outcome(self, row: SourceRow) -> RowOutcome:
+        found = super()._outcome(row)
+        self.reasons[row.token[0]] = {remark.kind for remark in found.remarks}
+        return found
+
+
+@dataclass(frozen=True)
+class _Fed:
+    """What became of a file with broken rows between the right ones."""
+
+    sent: Counter[str]
+    reasons: Counter[str]
+    silent: int
+    right: int
+    arrived: int
+    different: int
+
+    def table(self, title: str) -> Table:
+        """Return what was sent and what was said of it."""
+        rows = [("sent", kind, number) for kind, number in sorted(self.sent.items())]
+        rows += [("counted", kind, number) for kind, number in sorted(self.reasons.items())]
+        rows += [("right rows", "sent", self.right), ("right rows", "arrived", self.arrived)]
+        return Table(f"Broken rows, {title}", ("", "kind", "number"), rows)
+
+    def checks(self, title: str) -> list[Check]:
+        """Every broken row has a reason, every right one arrives, nothing else does."""
+        return [
+            Check(f"{title}: broken rows without a reason", self.silent, 0, "<="),
+            Check(f"{title}: right rows that are missing", self.right - self.arrived, 0, "<="),
+            Check(f"{title}: estimates that differ in a bit", self.different, 0, "<="),
+        ]
+
+
+def _fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.Generator) -> _Fed:
+    """Feed right rows with so many broken ones between them, and the right ones alone."""
+    write = _json_line if path.suffix == ".jsonl" else _csv_line
+    head = b"" if path.suffix == ".jsonl" else ",".join(rows[0]).encode() + b"\n"
+    clean = path.with_stem("clean")
+    clean.write_bytes(head + b"".join(write(row) + b"\n" for row in rows))
+    expected, _ = _taken(case, clean)
+    breaks = (JSON if path.suffix == ".jsonl" else CSV) | BYTES
+    sent, broken = Counter[str](), set[int]()
+    per_row = np.bincount(rng.integers(0, len(rows), count), minlength=len(rows))
+    with path.open("wb") as file:
+        file.write(head)
+        for row, times in zip(rows, per_row.tolist(), strict=True):
+            file.write(write(row) + b"\n")
+            for _ in range(times):
+                kind, line = _broken(breaks, row, write, rng)
+                sent[kind] += 1
+                broken.add(file.tell())
+                file.write(line + b"\n")
+    found, reasons = _taken(case, path)
+    told = Counter(kind for place in broken for kind in sorted(reasons.get(place, ()))[:1])
+    return _Fed(
+        sent,
+        told,
+        sum(not reasons.get(place) for place in broken),
+        len(expected),
+        len(found),
+        sum(not _same(one, other) for one, other in zip(found, expected, strict=False)),
+    )
+
+
+def _broken(
+    breaks: Mapping[str, Break],
+    row: Row,
+    write: Callable[[Row], bytes],
+    rng: np.random.Generator,
+) -> tuple[str, bytes]:
+    """Return a kind and one line of it, which is never blank; the very long are rare."""
+    kind = _one_of([*breaks])(rng)
+    if kind == "very long" and rng.random() > LONG_ONES:
+        kind = "truncated"
+    line = breaks[kind](row, write, rng).replace(b"\n", b"?")
+    return kind, line if line.strip() else b"?"
+
+
+def _taken(case: Case, path: Path) -> tuple[list[Record], dict[int, set[str]]]:
+    """Return what a live run of a file finds, and what it said of each line."""
+    wiring = Wiring(case, str(path))
+    if not isinstance(wiring.feed, Gathered):
+        raise RunError(f"bench faults: {path.name} is not read row by row.")
+    feed = _Audited(wiring.feed.source, wiring.feed.intake)
+    begun: list[Ready] = []
+    while not begun:
+        begun += feed.poll(0.0)
+    prepared = case.begin(Sample(begun[0].t, begun[0].values), wiring.origin)
+    with prepared.journal() as journal:
+        Live(prepared.identifier, feed, journal, fields_every=100, begun=begun).run()
+        return list(journal), feed.reasons
+
+
+def _json_line(row: Row) -> bytes:
+    return json.dumps(dict(row)).encode()
+
+
+def _csv_line(row: Row) -> bytes:
+    return ",".join(map(str, row.values())).encode()
+
+
+Break: TypeAlias = Callable[[Row, Callable[[Row], bytes], np.random.Generator], bytes]
+
+
+def _one_of(options: Sequence[Any]) -> Callable[[np.random.Generator], Any]:
+    return lambda rng: options[int(rng.integers(len(options)))]
+
+
+def _value(*options: Any) -> Break:
+    """Put something else where a number should be: in one column, or in all."""
+    choose = _one_of(options)
+
+    def broken(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
+        _, *names = row
+        chosen = names if rng.random() < 0.3 else [_one_of(names)(rng)]
+        return write({**row, **{name: choose(rng) for name in chosen}})
+
+    return broken
+
+
+def _time(*options: Any) -> Break:
+    """Put something else where the time should be."""
+    choose = _one_of(options)
+
+    def broken(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
+        return write({**row, next(iter(row)): choose(rng)})
+
+    return broken
+
+
+def _ahead(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
+    """A clock that is wrong by a hundred to some thousand years."""
+    name = next(iter(row))
+    moment = datetime.fromisoformat(row[name])
+    years = float(10.0 ** rng.uniform(2.0, 3.8))
+    return write({**row, name: str(moment + timedelta(days=365.0 * years))})
+
+
+def _truncated(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
+    text = write(row)
+    return text[: int(rng.integers(1, len(text)))]
+
+
+def _spoilt(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
+    """Invalid UTF-8 somewhere."""
+    text = write(row)
+    k = int(rng.integers(0, len(text)))
+    wrong: bytes = _one_of((b"\xff", b"\xc3\x28", b"\xed\xa0\x80", b"\xfe"))(rng)
+    return text[:k] + wrong + text[k:]
+
+
+def _noise(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
+    return rng.bytes(int(rng.integers(1, 300)))
+
+
+def _long(row: Row, write: Callable[[Row], bytes], rng: np.random.Generator) -> bytes:
+    return write({**row, [*row][-1]: "9" * 2_000_000})
+
+
+BYTES: dict[str, Break] = {
+    "truncated": _truncated,
+    "invalid UTF-8": _spoilt,
+    "binary": _noise,
+    "very long": _long,
+    "text": _value("warm", "?", "nan K", "1,5", "--", "None of it", "0x1F", "1e", "[]"),
+    "unit": _value("12.5 K", "3 m/s", "20 degC", "1e-3bar"),
+    "infinite": _value("inf", "-Infinity", "1e400", "9" * 400),
+    "time": _time("", "?", "now", "2026-13-45 00:00", "25:61", "nan", "inf", "2026-01-01T"),
+    "far ahead": _ahead,
+    "long ago": _time("1970-01-01", "0001-01-01 00:00:00", "1999-12-31 23:59:59+14:00"),
+}
+CSV: dict[str, Break] = {
+    "too many fields": lambda row, write, rng: write(row) + b"," * int(rng.integers(1, 50)) + b"1",
+    "other separator": lambda row, write, rng: write(row).replace(b",", b";"),
+    "quotes": lambda row, write, rng: write(row).replace(b",", b',"', int(rng.integers(1, 4))),
+    "zero bytes": lambda row, write, rng: write(row).replace(b",", b"\0,"),
+    "nested": _value('"{""a"": [1, {""b"": 2}]}"'),
+}
+JSON: dict[str, Break] = {
+    "types": _value([], {}, True, False, [1.5], {"value": 1.5}, [[[]]]),
+    "huge": _value(10**400, -(10**4000), int("9" * 4200)),
+    "time types": _time(None, True, [], {}, 1e300, -5.0, 10**400, ["2026-01-01"]),
+    "no time": lambda row, write, rng: write(dict([*row.items()][1:])),
+    "no values": lambda row, write, rng: write(dict([*row.items()][:1])),
+    "not finite": lambda row, write, rng: write(row).replace(b": ", b': -Infinity, "x": ', 9),
+    "duplicate keys": lambda row, write, rng: write(row)[:-1] + b", " + write(row)[1:],
+    "nested object": lambda row, write, rng: write({"row": dict(row)}),
+    "deep": lambda row, write, rng: _one_of((b"[", b'{"a":'))(rng) * int(rng.integers(1, 5000)),
+    "no object": lambda row, write, rng: _one_of((b"[]", b"1", b"null", b'"a"', b"{}", b"NaN"))(
+        rng
+    ),
+    "surrogates": lambda row, write, rng: write({**row, [*row][-1]: "\ud800", "\udfff": 1}),
+}
+
+
 PARTS: Mapping[str, Callable[[_Plan], Outcome]] = {
     "file": _kills_of_files,
     "mqtt": _kills_of_topics,
     "restart": _outages,
+    "malformed": _malformed,
+    "messages": _messages,
 }

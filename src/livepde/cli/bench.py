@@ -148,7 +148,9 @@ def faults(
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="Only this: file, mqtt, restart or malformed. Repeat it for more."),
+        typer.Option(
+            help="Only this: file, mqtt, restart, malformed or messages. Repeat it for more."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
