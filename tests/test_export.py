@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -18,6 +19,7 @@ import xarray as xr
 from meshio.xdmf import TimeSeriesReader
 from selenium import webdriver
 from selenium.webdriver.common.by import By
+from selenium.webdriver.support.wait import WebDriverWait
 from skfem import MeshHex, MeshTri
 from typer.testing import CliRunner
 
@@ -486,8 +488,14 @@ def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
     browser.get((tmp_path / "run.html").as_uri())
     places = browser.find_elements(By.CSS_SELECTOR, "[data-figure]")
     assert len(places) >= 5
-    drawn = browser.find_elements(By.CSS_SELECTOR, "[data-figure].js-plotly-plot .main-svg")
-    assert len(drawn) >= len(places)
+    for place in places:
+        WebDriverWait(browser, 60).until(
+            lambda _, p=place: p.find_elements(By.CLASS_NAME, "main-svg")
+        )
+    buttons = browser.find_elements(By.CLASS_NAME, "modebar-btn")
+    titles = {button.get_attribute("data-title") for button in buttons}
+    assert "Download plot as a PNG" in titles
+    assert not [title for title in titles if re.search("share|cloud|edit", title, re.IGNORECASE)]
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     asked = [
         message["params"]["request"]["url"].partition(":")[0]

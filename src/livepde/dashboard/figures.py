@@ -57,6 +57,8 @@ INK, GRID = "#1f2933", "#e4e7eb"
 HEIGHT = 320
 CONFIG = {
     "displaylogo": False,
+    "showSendToCloud": False,  # nothing leaves this machine
+    "plotlyServerURL": "",
     "responsive": True,
     "modeBarButtonsToRemove": ["lasso2d", "select2d"],
 }
