@@ -120,9 +120,10 @@ def call(*arguments) -> tuple[int, str]:
         ("um", "um"),
         ("%", "%"),
         ("", "1"),
-        ("m^0.5", "m^0.5"),  # UDUNITS has no roots
-        ("cells per well", "cells per well"),
-        ("3 m", "3 m"),
+        ("1/year", "year-1"),  # "a" is an are
+        ("m^0.5", None),  # there are no roots
+        ("cells per well", None),
+        ("3 m", None),
     ],
 )
 def test_units_are_those_of_udunits(unit, expected):
@@ -144,6 +145,13 @@ def test_names_that_would_be_the_same_are_told_apart():
     found = cf(data)
     assert set(found.data_vars) == {"k_a_b", "k_a_b_2", "v", "v2k"}
     assert found["v"].attrs["long_name"] == "κ"
+
+
+def test_a_unit_that_udunits_has_not_is_said_in_words(tmp_path):
+    data = xr.Dataset({"k": ("time", [1.0], {"units": "m^0.5"})}, {"time": [0.0]}, {"scalars": "k"})
+    found = cf(data)["k"].attrs
+    assert found["comment"] == "unit: m^0.5"
+    assert "units" not in found
 
 
 def test_what_belongs_to_a_number(rod):
@@ -416,6 +424,21 @@ def test_a_report_says_what_there_is_to_say(tmp_path):
         call("export", run.path, tmp_path / "run.html")
 
 
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [(0.05, "Nothing speaks against the estimates"), (0.5, "A number is not as it was expected")],
+)
+def test_a_report_says_first_whether_anything_is_wrong(tmp_path, value, said):
+    writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
+    data = drive(identifier(), samples()).result.to_xarray()
+    checks = [Check("error", value, 0.1, "<=")]
+    writer.finish(status="finished", dataset=data, checks=checks)
+    write_report(runs.open(tmp_path / "run"), tmp_path / "run.html")
+    page = Page(tmp_path / "run.html")
+    assert said in page.text
+    assert ("FAILED" in page.text) == (value > 0.1)
+
+
 def test_a_report_fetches_nothing(tmp_path):
     run = watched_run(tmp_path / "run")
     write_report(run, tmp_path / "run.html")
@@ -508,6 +531,12 @@ def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
 
 
 # --- the command -----------------------------------------------------------------------------
+
+
+def test_help_teaches():
+    code, output = call("export", "--help")
+    assert code == 0
+    assert "Example:" in output
 
 
 def test_the_command_writes_several(rod, tmp_path):

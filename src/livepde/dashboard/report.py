@@ -79,6 +79,7 @@ def page_of(run: Run) -> str:
         samples=data.sizes["time"],
         span=[axis.text(float(data["time"][k])) for k in (0, -1)],
         notes=runs.doubts(data) if run.status == "running" else run.notes,
+        fine=all(check.ok for check in run.checks),
         tables=[_shown(table) for table in runs.tables(data)],
         checks=[_checked(check) for check in run.checks],
         sections={
