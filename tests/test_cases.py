@@ -475,7 +475,7 @@ def test_interpolation_needs_a_value_in_the_first_sample(rod):
     lines = (path.parent / "rod.csv").read_text().splitlines()
     lines[1] = "0,,,,,"
     (path.parent / "rod.csv").write_text("\n".join(lines))
-    with pytest.raises(lp.CaseError, match="found no sensor or boundary"):
+    with pytest.raises(lp.DataError, match="found no sensor or boundary"):
         cases.load(path).prepare()
 
 

@@ -223,8 +223,12 @@ def test_a_clock_that_leaps_does_not_make_the_rest_late():
 
 
 def test_each_channel_has_habits_of_its_own():
-    habits = {"a": Habit(valid=(0.0, 1.0)), "b": Habit(wait=5.0), "left": Habit(skip=True)}
-    intake = Intake(COLUMNS, CLOCK, Policy(channels=habits))
+    columns = {
+        "a": Column(("a",), valid=(0.0, 1.0)),
+        "b": Column(("b",)),
+        "left": Column(("left",), needed=True),
+    }
+    intake = Intake(columns, CLOCK, Policy(channels={"b": Habit(wait=5.0)}))
     found, kinds = [], []
     for row in (
         {"t": 0.0, "a": 2.0, "b": 0.1, "left": 1.0},  # not valid

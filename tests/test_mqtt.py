@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import json
+import logging
+import queue
 import shutil
 import socket
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
 
 import pytest
-from test_live import live, rows
+from test_live import COLUMNS, live, rows
 
 import livepde as lp
-from livepde.streams.mqtt import Broker, MqttSink, MqttSource
+from livepde.runs.live import Gathered
+from livepde.streams.intake import Intake, Policy
+from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
+from livepde.streams.sources import Rows
+from livepde.streams.table import Clock
 
 pytest.importorskip("paho.mqtt")
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
@@ -32,6 +39,7 @@ class Server:
             f"persistence_location {folder}/\nautosave_interval 1\nautosave_on_changes true\n"
             "max_queued_messages 0\nuser root\n"
         )
+        self.folder = folder
         self.start()
 
     def start(self) -> None:
@@ -61,9 +69,26 @@ def server(tmp_path):
     running.stop()
 
 
-def source(server: Server, topics=None) -> MqttSource:
-    broker = Broker("127.0.0.1", server.port)
+def source(server: Server, topics=None, **options) -> MqttSource:
+    broker = Broker("127.0.0.1", server.port, **options)
     return MqttSource(broker, topics or {"rod": None}, "t")
+
+
+def listen(source, count: int) -> list:
+    """Return so many rows, and what else has come with them."""
+    found = []
+    until = time.monotonic() + 30.0
+    while len(found) < count and time.monotonic() < until:
+        found += source.poll(0.2)
+    assert len(found) >= count
+    return found
+
+
+def polled(source) -> None:
+    """Poll until something is raised."""
+    until = time.monotonic() + 30.0
+    while time.monotonic() < until:
+        source.poll(0.2)
 
 
 def publish(server: Server, messages, topic: str = "rod") -> None:
@@ -121,11 +146,7 @@ def test_numbers_with_topics_of_their_own(server):
     heard = source(server, {"plant/a": "a", "plant/+/level": "b"})
     publish(server, ["1.5", '{"value": 2.5, "t": 7}', "warm"], "plant/a")
     publish(server, ["3"], "plant/x/level")
-    found = []
-    for _ in range(20):
-        found += heard.poll(0.2)
-        if len(found) == 4:
-            break
+    found = listen(heard, 4)
     heard.close()
     assert found[0].values["a"] == 1.5
     assert found[1].values == {"t": 7, "a": 2.5}
@@ -133,27 +154,262 @@ def test_numbers_with_topics_of_their_own(server):
     assert found[3].values["b"] == 3
 
 
-def test_estimates_are_published(server, tmp_path):
-    heard = source(server, {"rod/out": None, "rod/out/k": "k"})
-    publisher = MqttSink(Broker("127.0.0.1", server.port, "sink"), "rod/out")
-    run = live(tmp_path, source_of_rows(), sinks=[publisher])
+def estimates(tmp_path, count: int) -> list:
+    """Return so many estimates of a run."""
+
+    class Kept(list):
+        put = list.append
+
+        def close(self):
+            pass
+
+    kept = Kept()
+    run = live(tmp_path, Rows(rows(count)), sinks=[kept])
     run.run()
+    run.journal.close()
+    return kept
+
+
+def sink(server: Server, **options) -> MqttSink:
+    return MqttSink(Broker("127.0.0.1", server.port, "sink"), "rod/out", **options)
+
+
+def test_estimates_are_published(server, tmp_path):
+    found = estimates(tmp_path, 5)
+    heard = source(server, {"rod/out": None, "rod/out/unknowns/+": "k", "rod/out/status": "on"})
+    publisher = sink(server)
+    for estimate in found:
+        publisher.put(estimate)
     publisher.close()
-    found = []
-    for _ in range(50):
-        found += heard.poll(0.2)
-        if len(found) == 10:
-            break
+    came = [row.values for row in listen(heard, 12) if not row.broken]
     heard.close()
-    objects = [row.values for row in found if "innovation" in row.values]
+    objects = [row for row in came if "innovation" in row]
     assert [row["t"] for row in objects] == pytest.approx([0.1 * k for k in range(5)])
-    assert objects[-1]["k"] == run.result.last.parameters["k"][0]
+    k = found[-1].parameters["k"]
+    assert objects[-1]["unknowns"] == {"k": {"value": k[0], "std": k[1]}}
+    assert [row["k"] for row in came if "k" in row][-1] == k[0]
 
 
-def source_of_rows():
-    from livepde.streams.sources import Rows
+def test_estimates_wait_for_the_broker_and_the_oldest_give_way(server, tmp_path, caplog):
+    found = estimates(tmp_path, 60)
+    heard = source(server, {"rod/out": None})
+    publisher = sink(server, keep=5)
+    server.stop()
+    for estimate in found:
+        publisher.put(estimate)
+    assert publisher.dropped >= 30
+    assert caplog.text.count("old estimates are not sent") == 1
+    server.start()
+    came = listen(heard, 60 - publisher.dropped)
+    publisher.close()
+    heard.close()
+    times = [row.values["t"] for row in came]
+    assert times == sorted(set(times))
+    assert times[-5:] == [estimate.t for estimate in found[-5:]]
 
-    return Rows(rows(5))
+
+def test_a_sink_can_be_closed_while_the_broker_is_away(server, tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 0.5)
+    publisher = sink(server)
+    server.stop()
+    for estimate in estimates(tmp_path, 40):
+        publisher.put(estimate)
+    publisher.close()
+    assert "did not take all estimates" in caplog.text
+    assert not publisher._sender.is_alive()
+    server.start()
+
+
+CHILD = """
+import sys
+from livepde.streams.mqtt import Broker, MqttSink
+MqttSink(Broker("127.0.0.1", int(sys.argv[1]), "sink"), "rod/out")
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_the_status_says_whether_the_run_is_there(server):
+    told: queue.Queue[str] = queue.Queue()
+    broker = Broker("127.0.0.1", server.port, "watchdog")
+    watchdog = broker.client()
+    watchdog.on_connect = lambda client, *_: client.subscribe("rod/out/status")
+    watchdog.on_message = lambda client, _, message: told.put(message.payload.decode())
+    broker.connect(watchdog)
+    publisher = sink(server)
+    assert told.get(timeout=30) == "running"
+    publisher.close()
+    assert told.get(timeout=30) == "offline"
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(server.port)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    with child:
+        assert child.stdout.readline() == b"ready\n"
+        assert told.get(timeout=30) == "running"
+        child.kill()
+        assert told.get(timeout=30) == "offline"
+    watchdog.disconnect()
+    watchdog.loop_stop()
+
+
+def test_a_broker_that_restarts_is_not_seen_in_the_rows(server):
+    heard = source(server)
+    publish(server, [{"t": k} for k in range(30)])
+    came = listen(heard, 30)
+    heard.acknowledge([row.token for row in came[:5]])
+    server.stop()
+    heard.acknowledge([row.token for row in came[5:10]])  # to be said when it is back
+    server.start()
+    publish(server, [{"t": 30}])
+    came += listen(heard, 1)
+    assert [row.values["t"] for row in came] == list(range(31))
+    heard.acknowledge([row.token for row in came[10:20]])
+    time.sleep(1.0)  # the broker saves what it has heard
+    heard.close()
+    again = source(server)
+    assert [row.values["t"] for row in listen(again, 11)] == list(range(20, 31))
+    again.close()
+
+
+def test_an_acknowledgement_is_never_that_of_another_message(server):
+    heard = source(server)
+    publish(server, [{"t": 0}, {"t": 1}])
+    old = listen(heard, 2)
+    server.stop()
+    (server.folder / "mosquitto.db").unlink()  # the broker forgets sessions and counts anew
+    server.start()
+    connected = heard._connection
+    while heard._client.is_connected() is False or connected != heard._connection:
+        time.sleep(0.05)
+    time.sleep(1.0)
+    publish(server, [{"t": 2}, {"t": 3}])
+    new = listen(heard, 2)
+    assert [row.token.number for row in new] == [row.token.number for row in old]
+    heard.acknowledge([row.token for row in old])
+    time.sleep(1.0)
+    heard.close()
+    again = source(server)
+    assert [row.values["t"] for row in listen(again, 2)] == [2, 3]
+    again.close()
+
+
+def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch):
+    monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 2.0)
+    messages = list(rows(60))
+    heard = source(server, ahead=5)
+    publish(server, messages)
+    run = live(tmp_path, heard)  # samples wait for steps: the broker waits too
+    until(run, 60)
+    assert len(run.journal) == 60
+    assert not run.journal.counts
+    stuck = Gathered(heard, Intake(COLUMNS, Clock("t"), Policy(wait=1e6), origin=0.0))
+    publish(server, messages)
+    with pytest.raises(lp.DataError, match="messages wait for later ones"):
+        polled(stuck)
+    heard.close()
+
+
+def test_two_runs_need_two_names(server, caplog):
+    first = source(server)
+    second = source(server)  # some brokers hang up without a word
+    publish(server, [{"t": 1}])
+    until = time.monotonic() + 30.0
+    while "another client the same client_id" not in caplog.text and time.monotonic() < until:
+        time.sleep(0.1)
+    assert "another client the same client_id" in caplog.text
+    second.close()
+    from paho.mqtt.packettypes import PacketTypes
+    from paho.mqtt.reasoncodes import ReasonCode
+
+    reason = ReasonCode(PacketTypes.DISCONNECT, "Session taken over")
+    first._client.on_disconnect(first._client, None, None, reason, None)  # others say it
+    with pytest.raises(lp.DataError, match="another client has taken the session 'livepde'"):
+        polled(first)
+    first.close()
+
+
+def test_a_broker_that_refuses_later_is_heard_of(server, caplog):
+    caplog.set_level(logging.INFO, "livepde.mqtt")
+    heard = source(server)
+    server.stop()
+    settings = server.config.read_text()
+    server.config.write_text(settings.replace("allow_anonymous true", "allow_anonymous false"))
+    server.start()
+    until = time.monotonic() + 30.0
+    while "refuses: Not authorized" not in caplog.text and time.monotonic() < until:
+        time.sleep(0.1)
+    assert "lost: " in caplog.text
+    assert "refuses: Not authorized" in caplog.text
+    with pytest.raises(lp.DataError, match="Not authorized"):
+        source(server, client_id="another")
+    server.stop()
+    server.config.write_text(settings)
+    server.start()
+    publish(server, [{"t": 1}])
+    assert listen(heard, 1)
+    assert "again" in caplog.text
+    heard.close()
+
+
+def test_topics_with_both_wildcards_and_numbers_of_unknown_age(server):
+    retained = Broker("127.0.0.1", server.port, "retained")
+    client = retained.client()
+    retained.connect(client)
+    client.publish("plant/x/a/b", "2.5", qos=1, retain=True).wait_for_publish(10)
+    client.publish("plant/y/a/b", '{"value": 3, "t": 5}', qos=1, retain=True).wait_for_publish(10)
+    client.disconnect()
+    client.loop_stop()
+    heard = source(server, {"plant/+/a/#": "a", "+/level": "b"})
+    old = {row.broken: row.values for row in listen(heard, 2)}
+    assert old == {"kept by the broker without a time": {}, "": {"t": 5, "a": 3}}
+    publish(server, ["4"], "plant/z/a/c/d")
+    publish(server, ["5"], "tank/level")
+    values = [row.values for row in listen(heard, 2)]
+    heard.close()
+    assert values[0]["a"] == 4
+    assert values[1]["b"] == 5
+    assert all("T" in row["t"] for row in values)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "overlap"),
+    [
+        ("a/b", "a/b/c", False),
+        ("a/+", "a/b", True),
+        ("+/b", "a/+", True),
+        ("a/+/c", "a/b/d", False),
+        ("a/#", "a", True),
+        ("#", "b/c", True),
+        ("a/+/#", "a", False),
+        ("x/#", "y/#", False),
+    ],
+)
+def test_topics_that_bring_a_message_twice(one, other, overlap):
+    if not overlap:
+        _check_overlap(one, other)
+        _check_overlap(other, one)
+        return
+    for topics in ({one: None, other: "a"}, {other: "a", one: None}):
+        with pytest.raises(lp.DataError, match="some messages twice"):
+            MqttSource(Broker(), topics, "t")
+
+
+@pytest.mark.parametrize("topic", ["", "a/#/b", "a+/b", "a/b#"])
+def test_topics_that_no_broker_takes(topic):
+    with pytest.raises(lp.DataError, match="got the topic"):
+        MqttSource(Broker(), {topic: None}, "t")
+
+
+def test_what_cannot_be_reached_is_one_sentence(server, tmp_path):
+    with pytest.raises(lp.DataError, match=r"ca_file .*none.pem cannot be used"):
+        source(server, ca_file=str(tmp_path / "none.pem"))
+    with pytest.raises(lp.DataError, match="topic 'a/\\+' to publish to"):
+        MqttSink(Broker("127.0.0.1", server.port), "a/+")
+    with pytest.raises(lp.DataError, match="ahead must be"):
+        Broker(ahead=70000)
+    assert "secret" not in repr(Broker(username="u", password="secret"))
 
 
 def test_a_broker_that_is_not_there_is_one_sentence():

@@ -166,6 +166,37 @@ def test_what_a_process_sends_does_not_end_a_run(here):
         assert "85 is not between -20 and 60" in [event.message for event in journal.events]
 
 
+def test_what_is_not_valid_is_counted_in_files_too(here):
+    rows = [row(k) for k in range(12)]
+    rows[4]["T_3"], rows[7]["left"] = 85.0, ""
+    Path("rows.csv").write_text(HEADER + table(*rows))
+    text = case('file = "rows.csv"', habit=', valid = ["-20 degC", "60 degC"]')
+    path = Path(text)
+    path.write_text(path.read_text().replace('at = "left"', 'at = "left", missing = "skip"'))
+    for more in ((), ("--realtime", "--speed", "inf")):
+        folder = f"run{len(more)}"
+        assert call("run", text, "--out", folder, *more)[0] == 0
+        with Journal.open(Path(folder) / JOURNAL) as journal:
+            assert len(journal) == 11
+            assert journal.counts[("invalid", "T_3")] == 1
+            assert journal.counts[("skipped", "left")] == 1
+    assert np.array_equal(runs.open("run0").dataset["alpha"], runs.open("run3").dataset["alpha"])
+
+
+def test_parquet_files_are_read_as_others(here):
+    import pandas as pd
+
+    rows = [row(k) for k in range(12)]
+    Path("rows.csv").write_text(HEADER + table(*rows))
+    pd.DataFrame(rows).assign(time=lambda d: pd.to_datetime(d["time"])).to_parquet("rows.parquet")
+    assert call("run", case('file = "rows.csv"'), "--out", "csv")[0] == 0
+    for folder, more in (("batch", ()), ("live", ("--realtime", "--speed", "inf"))):
+        assert call("run", "case.toml", "--data", "rows.parquet", "--out", folder, *more)[0] == 0
+        found = runs.open(folder).dataset
+        assert np.array_equal(found["alpha"], runs.open("csv").dataset["alpha"])
+        assert found.attrs["origin"] == "2026-11-21 00:00:00"
+
+
 def test_it_begins_with_the_first_sample_that_has_what_is_needed(here):
     lines = [json.dumps({"time": "2026-11-20 23:00", "T_3": 20.0, "left": None, "T_6": None})]
     lines += [json.dumps(row(k)) for k in range(5)]
@@ -187,7 +218,7 @@ def test_estimates_as_lines_of_json(here):
     assert code == 0
     found = [json.loads(line) for line in output.splitlines() if line.startswith("{")]
     assert [line["t"] for line in found] == [0.0, 60.0, 120.0, 180.0]
-    assert found[-1]["alpha"] == float(runs.open("run").dataset["alpha"][-1])
+    assert found[-1]["unknowns"]["alpha"]["value"] == float(runs.open("run").dataset["alpha"][-1])
 
 
 def test_a_finished_file_is_replayed_at_its_pace():
@@ -234,7 +265,7 @@ def test_from_a_broker_and_back(here, server):  # noqa: F811
     stopped(process)
     client.loop_stop()
     found = runs.open("run").dataset
-    assert [one["alpha"] for one in heard] == found["alpha"].values.tolist()
+    assert [one["unknowns"]["alpha"]["value"] for one in heard] == found["alpha"].values.tolist()
     assert np.isfinite(found["innovation"].sel(sensor="T_6")[1:]).all()
 
 
@@ -254,7 +285,7 @@ def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
         ('file = "rows.csv"\nzone = "Mars"', "", "", "data.zone: there is no time zone 'Mars'"),
         ("mqtt = {}", "", "", "expected rows = [topics], or columns"),
         ('follow = true\nmqtt = { rows = ["a"] }', "", "", "follow belongs to a file"),
-        ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are 2 sources"),
+        ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are two sources"),
         ('file = "rows.csv"\nfollow = true\nevery = 2', "", "", "every belongs to data that are"),
         ('file = "rows.csv"', 'wait = "-1 s"', "", "wait must be a time >= 0"),
         ('file = "rows.csv"', 'wait = "1 m"', "", "intake.wait: 'm' cannot be converted to 's'"),

@@ -6,7 +6,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,21 @@ from livepde.errors import RunError
 from livepde.linalg import Array
 
 __all__ = ["flatten", "packed", "read", "rebuild", "unpacked", "write"]
+
+# What an archive that is none, is damaged, or was made to do harm, makes of reading it.
+DAMAGE = (
+    EOFError,
+    LookupError,
+    MemoryError,
+    NotImplementedError,
+    OSError,
+    OverflowError,
+    RecursionError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    zipfile.BadZipFile,
+)
 
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
@@ -79,13 +94,21 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
     """Return header and leaves of an archive; `where` names it in messages."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            _refuse_bombs(archive.zip.infolist(), len(content))
             leaves = {name: archive[name] for name in archive.files}
-        header: dict[str, Any] = json.loads(str(leaves.pop("header")))
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        header: dict[str, Any] = dict(json.loads(str(leaves.pop("header"))))
+    except DAMAGE as error:
         raise RunError(
             f"{where} is not a checkpoint of livepde, or it is damaged: {error}."
         ) from error
     return header, leaves
+
+
+def _refuse_bombs(members: Iterable[zipfile.ZipInfo], size: int) -> None:
+    """Refuse an archive that would become larger than it is: `packed` compresses nothing."""
+    for member in members:
+        if member.compress_type != zipfile.ZIP_STORED or member.file_size > size:
+            raise ValueError(f"{member.filename} is compressed")
 
 
 def write(path: str | os.PathLike[str], content: bytes) -> None:

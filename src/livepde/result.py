@@ -80,6 +80,23 @@ class Estimate:
             for label, k in self.space.labels.items()
         }
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return time, status, unknown numbers and innovations as JSON can hold them.
+
+        {"t", "status", "unknowns": {label: {"value", "std"}}, "innovation": [...]}; None stands
+        where there is no number.
+        """
+        unknowns = {
+            label: {"value": _number(value), "std": _number(std)}
+            for label, (value, std) in self.parameters.items()
+        }
+        return {
+            "t": self.t,
+            "status": self.status.code,
+            "unknowns": unknowns,
+            "innovation": [_number(value) for value in self.innovation.tolist()],
+        }
+
     def interval(self, name: str, level: float = 0.95) -> tuple[Any, Any]:
         """Return the ends of the central interval that holds an unknown with probability `level`.
 
@@ -130,6 +147,8 @@ class Result:
         Where to keep them; default a new list.
     layout
         What the numbers of records mean; default what model and sensors say.
+    count
+        Estimates that there were before, of which not all need be kept; default all records.
     """
 
     def __init__(
@@ -140,6 +159,7 @@ class Result:
         fields_every: int = 1,
         records: Records | None = None,
         layout: Layout | None = None,
+        count: int | None = None,
     ) -> None:
         self.model = model
         self.observed = observed
@@ -148,7 +168,7 @@ class Result:
         self.last: Estimate | None = None
         self.records: Records = [] if records is None else records
         self.layout = layout or layout_of(model, observed, withheld)
-        self._count = len(self.records)
+        self._count = len(self.records) if count is None else count
 
     def __len__(self) -> int:
         return self._count
@@ -235,6 +255,11 @@ class Result:
     def plot(self, **options: Any) -> Any:
         """Draw the run and return the figure; needs the extra `plots`."""
         return plots.overview(self.to_xarray(), **options)
+
+
+def _number(value: float) -> float | None:
+    """Return a number that JSON can hold."""
+    return value if np.isfinite(value) else None
 
 
 def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> Layout:

@@ -66,6 +66,10 @@ def read_data(
     path = Path(source) if source is not None else data_file(frame)
     if path.suffix in (".jsonl", ".ndjson"):
         return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
+    if path.suffix == ".parquet":
+        from livepde.streams.parquet import read_parquet
+
+        return read_parquet(path, columns, clock, every=spec.every, missing=spec.missing)
     return read_csv(
         path,
         columns,

@@ -21,7 +21,7 @@ from livepde.streams.sources import Follow, Lines, Source
 if TYPE_CHECKING:
     from livepde.streams.mqtt import Broker
 
-__all__ = ["Wiring"]
+__all__ = ["Wiring", "policy_of", "source_text"]
 
 
 class Wiring:
@@ -57,7 +57,7 @@ class Wiring:
         self.frame = frame = case.frame
         # Before anything is connected: a case that is wrong says so at once.
         self.backlog, self.retention, self.silence = _limits(frame)
-        self._policy = _policy(frame)
+        self._policy = policy_of(frame)
         self._journal = journal
         self._origin: datetime | None = None
         self._intake: Intake | None = None
@@ -109,9 +109,9 @@ class Wiring:
                 spec.opcua.url,
                 spec.opcua.columns,
                 spec.time,
-                frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
-                spec.opcua.username,
-                _password(frame, spec.opcua.password_env, "data.opcua"),
+                interval=frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
+                username=spec.opcua.username,
+                password=_password(frame, spec.opcua.password_env, "data.opcua"),
             )
         path = Path(data) if data is not None else data_file(frame)
         follow = spec.follow and data is None
@@ -127,6 +127,17 @@ class Wiring:
         return [MqttSink(_broker(self.frame, spec, "output.mqtt"), spec.topic)]
 
 
+def source_text(frame: Frame) -> str:
+    """Return in words where the rows of a case come from."""
+    spec = frame.spec.data
+    if spec.mqtt is not None:
+        topics = ", ".join([*spec.mqtt.rows, *spec.mqtt.columns])
+        return f"{topics} of the broker at {spec.mqtt.host}:{spec.mqtt.port}"
+    if spec.opcua is not None:
+        return f"{len(spec.opcua.columns)} nodes of {spec.opcua.url}"
+    return str(spec.file or spec.reader)
+
+
 def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
     from livepde.streams.mqtt import Broker
 
@@ -137,6 +148,7 @@ def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
         username=spec.username,
         password=_password(frame, spec.password_env, key),
         tls=spec.tls,
+        ca_file=spec.ca_file,
         session=round(frame.positive(spec.session, "s", f"{key}.session")),
     )
 
@@ -163,7 +175,8 @@ def _limits(frame: Frame) -> tuple[Backlog, Retention, float]:
     return backlog, Retention(span, spec.output.thin), silence
 
 
-def _policy(frame: Frame) -> Policy:
+def policy_of(frame: Frame) -> Policy:
+    """Return what becomes of rows that do not come one by one, in order and complete."""
     spec, unit = frame.spec.intake, frame.equation.time_unit
 
     def duration(value: float | str, key: str) -> float:
@@ -171,12 +184,10 @@ def _policy(frame: Frame) -> Policy:
 
     habits = {}
     for name, channel in frame.spec.channels.items():
-        key, wait, valid = f"channels.{name}", 0.0, (-math.inf, math.inf)
+        wait = 0.0
         if channel.wait is not None:
-            wait = duration(channel.wait, f"{key}.wait")
-        if channel.valid is not None:
-            valid = frame.pair(channel.valid, frame.unit(name), f"{key}.valid")
-        habits[name] = Habit(wait, channel.repeated, valid, channel.missing == "skip")
+            wait = duration(channel.wait, f"channels.{name}.wait")
+        habits[name] = Habit(wait, channel.repeated)
     leap = math.inf
     if spec.leap is not None:
         leap = frame.positive(spec.leap, unit, "intake.leap")

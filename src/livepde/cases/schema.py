@@ -136,6 +136,7 @@ class BrokerSpec(Spec):
     username: Name | None = None
     password_env: Name | None = None
     tls: StrictBool = False
+    ca_file: Name | None = None
     session: Quantity = "7 d"
 
 
@@ -189,7 +190,7 @@ class DataSpec(Spec):
             raise ValueError("options belong to a reader")
         sources = [n for n in ("file", "reader", "mqtt", "opcua") if getattr(self, n) is not None]
         if len(sources) > 1:
-            raise ValueError(f"{' and '.join(sources)} are {len(sources)} sources: keep one")
+            raise ValueError(f"{sources[0]} and {sources[1]} are two sources: keep one")
         if self.follow and self.file is None:
             raise ValueError("follow belongs to a file that grows")
         if self.live and self.every > 1:

@@ -38,7 +38,11 @@ def columns_of(frame: Frame) -> dict[str, Column]:
     for name, channel in frame.spec.channels.items():
         unit = frame.unit(name)
         rule = conversion(channel.unit or unit, unit, frame.where(f"channels.{name}.unit"))
-        found[name] = Column(channel.sources, rule.factor, rule.offset)
+        valid = (-np.inf, np.inf)
+        if channel.valid is not None:
+            valid = frame.pair(channel.valid, unit, f"channels.{name}.valid")
+        needed = channel.missing == "skip"
+        found[name] = Column(channel.sources, rule.factor, rule.offset, valid, needed)
     return found
 
 

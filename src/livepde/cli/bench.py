@@ -140,6 +140,32 @@ def peers(
     report_outcome(outcome, _command("peers", only, level, seeds), as_json)
 
 
+@bench.command()
+def journal(as_json: JsonOption = False) -> None:
+    """Measure what the journal costs: its share of a step of the soil case.
+
+    Example:  livepde bench journal --json
+    """
+    from livepde.bench.journal import journal as benchmark
+
+    report_outcome(benchmark(), ["livepde", "bench", "journal"], as_json)
+
+
+@bench.command()
+def soak(
+    steps: Annotated[int, typer.Option(min=1, help="How many steps.")] = 1_000_000,
+    as_json: JsonOption = False,
+) -> None:
+    """Run for very long: memory, time of a step and the journal's size must not grow.
+
+    Example:  livepde bench soak --steps 100000 --json
+    """
+    from livepde.bench.soak import soak as benchmark
+
+    command = ["livepde", "bench", "soak", "--steps", str(steps)]
+    report_outcome(benchmark(steps, progress=True), command, as_json)
+
+
 def _problems(only: Sequence[str] | None) -> list[str]:
     from livepde.bench.problems import PROBLEMS
 

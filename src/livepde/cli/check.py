@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["check"]
 
+HELD = ("boundary", "input")  # roles of which a missing value is the last one
 MOST_CHANNELS = 40  # rows of the table of channels
 
 
@@ -49,8 +51,12 @@ def check(
     """
     console = terminal()
     loaded = load_case(case, allow_code, settings)
+    _show_model(console, loaded)
+    if loaded.live and data is None:
+        _show_wiring(console, loaded)
+        console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
+        return
     prepared = loaded.prepare(data)
-    _show_model(console, prepared)
     samples: Samples = prepared.stream  # type: ignore[assignment]
     if data is None or not data.endswith((".jsonl", ".ndjson")):
         _show_data(console, loaded, prepared, samples)
@@ -111,8 +117,37 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
     )
 
 
-def _show_model(console: Console, prepared: Prepared) -> None:
-    case, model = prepared.case, prepared.case.model
+def _show_wiring(console: Console, case: Case) -> None:
+    """Print where the samples of a process come from, and what becomes of them."""
+    from livepde.cases.live import policy_of, source_text
+    from livepde.runs import Table
+
+    policy, unit = policy_of(case.frame), case.frame.equation.time_unit
+    rows = []
+    for name, column in case.columns.items():
+        habit, spec = policy.habit(name), case.frame.spec.channels[name]
+        low, high = column.valid
+        rows.append(
+            (
+                name,
+                spec.role,
+                ", ".join(column.names),
+                "" if math.isinf(high - low) else f"{low:g} to {high:g} {case.frame.unit(name)}",
+                f"{max(policy.wait, habit.wait):g} {unit}".rstrip(),
+                policy.keeps(name),
+                "skip" if column.needed else "hold" if spec.role in HELD else "go on",
+            )
+        )
+    columns = ("channel", "role", "column", "valid", "waits", "of two", "missing")
+    print_table(console, Table(f"Channels from {source_text(case.frame)}", columns, rows))
+    console.print(
+        "Add --data FILE, a recording with the same columns, to see what its sensors can identify.",
+        soft_wrap=True,
+    )
+
+
+def _show_model(console: Console, case: Case) -> None:
+    model = case.model
     console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.frame.equation.formula)}")
     from livepde.linalg import analyse
 

@@ -220,14 +220,18 @@ def _batch(
 
     prepared = loaded.prepare(source)
     writer, path = write(), folder / JOURNAL
-    journal = Journal.open(path, write=True) if path.exists() else prepared.journal(path)
-    stack.enter_context(journal)
-    total = len(prepared.stream) if isinstance(prepared.stream, Samples) else None
+    table = prepared.stream if isinstance(prepared.stream, Samples) else None
+    if path.exists():
+        journal = stack.enter_context(Journal.open(path, write=True))
+    else:
+        journal = stack.enter_context(prepared.journal(path))
+        for (kind, channel), number in (table.remarks if table else {}).items():
+            journal.count(kind, channel, number)
     driven = drive(
         prepared.identifier,
         prepared.stream,
         progress=not quiet,
-        total=total,
+        total=len(table) if table else None,
         fields_every=loaded.fields_every,
         journal=journal,
     )

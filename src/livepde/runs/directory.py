@@ -241,7 +241,7 @@ class Run:
         journal = self.path / JOURNAL
         if self.status == "running" and journal.is_file():
             with Journal.open(journal) as kept:
-                return kept.layout.dataset(list(kept))
+                return kept.dataset()
         if not path.is_file():
             raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.")
         try:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -397,17 +398,31 @@ class Live:
         """Return the result of what the journal holds."""
         who, kept = self.identifier, self.journal
         return Result(
-            who.model, who.observed, who.withheld, self.fields_every, kept, layout=kept.layout
+            who.model,
+            who.observed,
+            who.withheld,
+            self.fields_every,
+            kept,
+            layout=kept.layout,
+            count=kept.estimated,
         )
 
     def run(self) -> None:
         """Go on until the source ends or `stopping` is set; what was taken is kept then."""
         try:
             self._run()
-        finally:
-            if self.result.last is not None:
-                self.journal.keep(self.result.snapshot(self.result.last))
-            self.journal.checkpoint(self.identifier.dump())
+        except BaseException:
+            with suppress(LivepdeError):  # what went wrong first is what is told
+                self._conclude()
+            raise
+        self._conclude()
+
+    def _conclude(self) -> None:
+        if self.journal.accepted > self.journal.estimated:
+            return  # stopped within a step: from the checkpoint before, it is taken again
+        if self.journal.estimated:
+            self.journal.keep(self.result.snapshot(self.identifier.estimate()))
+        self.journal.checkpoint(self.identifier.dump())
 
     def _run(self) -> None:
         while not self.stopping.is_set():
@@ -470,10 +485,11 @@ class Live:
         try:
             self._estimate(taken, again)
         except DataError as error:
+            if not self.strict:
+                self._tell("refused", str(error))
             self.journal.withdraw()
             if self.strict:
                 raise
-            self._tell("refused", str(error))
         finally:
             self.busy = False
 
@@ -482,8 +498,8 @@ class Live:
         self.result.add(estimate)
         if not again:
             self._put(estimate)
-            if not estimate.status.ok:
-                self._tell(estimate.status.code, str(estimate.status))
+        if not estimate.status.ok:
+            self._tell(estimate.status.code, str(estimate.status))
         self._steps += 1
         if self._steps % CHECKPOINT == 0:
             self.journal.checkpoint(self.identifier.dump())

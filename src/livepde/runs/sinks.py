@@ -6,7 +6,6 @@ import json
 from typing import TextIO
 
 from livepde.result import Estimate
-from livepde.streams.mqtt import numbers
 
 __all__ = ["JsonLinesSink"]
 
@@ -19,7 +18,7 @@ class JsonLinesSink:
 
     def put(self, estimate: Estimate) -> None:
         """Write one estimate."""
-        print(json.dumps(numbers(estimate)), file=self._stream, flush=True)
+        print(json.dumps(estimate.to_dict()), file=self._stream, flush=True)
 
     def close(self) -> None:
         """The stream belongs to who opened it."""

@@ -21,7 +21,7 @@ __all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark"]
 
 @dataclass(frozen=True)
 class Habit:
-    """What becomes of one channel.
+    """How one channel arrives.
 
     Parameters
     ----------
@@ -29,17 +29,10 @@ class Habit:
         A sample without this channel waits so long for it, if that is longer than `Policy.wait`.
     repeated
         Which value counts that comes twice for one moment; default that of the policy.
-    valid
-        Values outside are not used, as if they had not come.
-    skip
-        A sample without this channel is left out, instead of going on with the last value of an
-        input or without that sensor.
     """
 
     wait: float = 0.0
     repeated: Literal["first", "last"] | None = None
-    valid: tuple[float, float] = (-math.inf, math.inf)
-    skip: bool = False
 
 
 @dataclass(frozen=True)
@@ -251,7 +244,7 @@ class Intake:
             except DataError as error:
                 found.remark("malformed", channel, str(error))
                 continue
-            low, high = self.policy.habit(channel).valid
+            low, high = column.valid
             if value < low or value > high:
                 text = f"{value:g} is not between {low:g} and {high:g}"
                 found.remark("invalid", channel, text)
@@ -308,7 +301,7 @@ class Intake:
             lacking = [c for c in self.columns if math.isnan(sample.values.get(c, math.nan))]
             for channel in lacking:
                 found.remark("missing", channel, f"no value for t = {t:g}")
-            needed = [channel for channel in lacking if self.policy.habit(channel).skip]
+            needed = [channel for channel in lacking if self.columns[channel].needed]
             if needed:
                 found.remark("skipped", needed[0], f"t = {t:g} is left out")
                 found.spent += sample.tokens

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
+import logging
 import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import combinations, zip_longest
 from typing import TYPE_CHECKING, Any
 
 from livepde.errors import DataError
@@ -21,8 +23,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Broker", "MqttSink", "MqttSource"]
 
-INFLIGHT = 65535  # messages that may wait to be acknowledged
-PATIENCE = 10.0  # seconds for the first connection
+LARGEST = 16 * LONGEST  # bytes of a message; the broker keeps larger ones to itself
+UNCONFIRMED = 20  # messages of a sink that are on their way at a time
+PATIENCE = 10.0  # seconds for the first connection, and for the last messages
+CONFIRMED = 1000  # acknowledged messages that are known again if the broker did not hear it
+TAKEN_OVER = 142  # reason of a broker that has a newer client of the same name
+
+log = logging.getLogger("livepde.mqtt")
 
 
 @dataclass(frozen=True)
@@ -34,13 +41,19 @@ class Broker:
     host, port
         Where it listens.
     client_id
-        Name of the session: the broker keeps what comes while nobody listens under this name.
+        Name of the session: the broker keeps what comes while nobody listens under this name. Two
+        runs need two names.
     username, password
         If it asks for them; the password is never written anywhere.
     tls
         Encrypt, with the certificates that the system trusts.
+    ca_file
+        Encrypt, and trust the certificates of this file (PEM) only.
     session
         Seconds for which the broker keeps the session of a client that is away.
+    ahead
+        Messages that it may send before the first of them is acknowledged, at most 65535. A message
+        is acknowledged when its sample is in the journal.
     """
 
     host: str = "localhost"
@@ -49,7 +62,18 @@ class Broker:
     username: str | None = None
     password: str | None = field(default=None, repr=False)
     tls: bool = False
+    ca_file: str | None = None
     session: int = 7 * 86400
+    ahead: int = 65535
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.ahead <= 65535:
+            raise DataError(f"MQTT: ahead must be a number from 1 to 65535; got {self.ahead}.")
+
+    @property
+    def address(self) -> str:
+        """Host and port."""
+        return f"{self.host}:{self.port}"
 
     def client(self, suffix: str = "") -> Client:
         """Return a client that is not connected yet."""
@@ -66,8 +90,11 @@ class Broker:
         )
         if self.username is not None:
             client.username_pw_set(self.username, self.password)
-        if self.tls:
-            client.tls_set()
+        if self.tls or self.ca_file is not None:
+            try:
+                client.tls_set(self.ca_file)
+            except OSError as error:
+                raise DataError(f"MQTT: ca_file {self.ca_file} cannot be used: {error}.") from error
         client.reconnect_delay_set(1, 30)
         return client
 
@@ -78,20 +105,122 @@ class Broker:
 
         properties: Any = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = self.session
-        properties.ReceiveMaximum = INFLIGHT
+        properties.ReceiveMaximum = self.ahead
+        properties.MaximumPacketSize = LARGEST
         try:
             client.connect(self.host, self.port, clean_start=False, properties=properties)
         except (OSError, ValueError) as error:
-            raise DataError(f"MQTT: no broker at {self.host}:{self.port} ({error}).") from error
+            raise DataError(f"MQTT: no broker at {self.address} ({error}).") from error
         client.loop_start()
 
 
-class MqttSource:
+class _Peer:
+    """A client that comes back when the broker does; what happens to it is logged."""
+
+    def __init__(self, broker: Broker, suffix: str = "") -> None:
+        self._broker = broker
+        self._started = threading.Event()
+        self._since = 0.0
+        self._refusal = ""
+        self._client = broker.client(suffix)
+        self._client.on_connect = self._on_connect
+        self._client.on_disconnect = self._on_disconnect
+
+    def _start(self) -> None:
+        """Connect; raise if the broker does not want us."""
+        self._broker.connect(self._client)
+        if not self._started.wait(PATIENCE):
+            self._refusal = self._refusal or "it does not answer"
+        if self._refusal:
+            self._leave()
+            raise DataError(f"MQTT: the broker at {self._broker.address}: {self._refusal}.")
+
+    def _leave(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _refused(self, reason: str) -> None:
+        if self._started.is_set():
+            log.warning("the broker at %s refuses: %s", self._broker.address, reason)
+        else:
+            self._refusal = reason
+            self._started.set()
+
+    def _on_connect(
+        self, client: Client, userdata: Any, flags: Any, reason: Any, properties: Any
+    ) -> None:
+        if reason.is_failure:
+            self._refused(str(reason))
+            return
+        self._since = time.monotonic()
+        if self._started.is_set():
+            log.info("connected to the broker at %s again", self._broker.address)
+        self._connected(bool(flags.session_present))
+
+    def _on_disconnect(
+        self, client: Client, userdata: Any, flags: Any, reason: Any, properties: Any
+    ) -> None:
+        if reason.is_failure and self._started.is_set():
+            soon = time.monotonic() - self._since < PATIENCE
+            remedy = "; has another client the same client_id?" if soon else ""
+            text = "connection to the broker at %s lost: %s%s"
+            log.warning(text, self._broker.address, reason, remedy)
+        self._disconnected(int(reason.value))
+
+    def _connected(self, resumed: bool) -> None:
+        """Go on; `resumed` if the broker still knows the session."""
+        raise NotImplementedError
+
+    def _disconnected(self, reason: int) -> None:
+        """Hear that the connection is lost."""
+
+
+@dataclass(eq=False, slots=True)
+class _Delivery:
+    """A message that is to be acknowledged: its number, content, and on which connection it came.
+
+    The broker gives the numbers, and after a reconnect brings what was not acknowledged again under
+    the same ones. On another connection than that on which it came an acknowledgement would be that
+    of another message.
+    """
+
+    number: int
+    content: int
+    connection: int
+    safe: bool = False
+
+
+def _check_filter(topic: str) -> None:
+    """Refuse a topic to listen to that no broker takes."""
+    levels = topic.split("/")
+    signs = [level for level in levels if "+" in level or "#" in level]
+    alone = all(sign in ("+", "#") for sign in signs)
+    if not topic or "\0" in topic or not alone or "#" in levels[:-1]:
+        raise DataError(
+            f"MQTT: got the topic '{topic}'; '+' stands for one whole level, as in plant/+/level, "
+            "'#' for all that follow, at the end."
+        )
+
+
+def _check_overlap(one: str, other: str) -> None:
+    """Refuse two topics that bring some messages twice."""
+    for level, against in zip_longest(one.split("/"), other.split("/")):
+        if "#" in (level, against):
+            break
+        if level != against and (None in (level, against) or "+" not in (level, against)):
+            return
+    raise DataError(
+        f"MQTT: the topics '{one}' and '{other}' bring some messages twice: let each message "
+        "belong to one."
+    )
+
+
+class MqttSource(_Peer):
     """Rows from topics; what was not taken for good is brought again, also after a restart.
 
     A message is a row (a JSON object, column -> value), or for a topic with a column of its own a
-    number, alone or as {"value": 1.5, TIME: ...}; a number without a time has that of its arrival,
-    in seconds since 1970.
+    number, alone or as {"value": 1.5, TIME: ...}. A number without a time has that of its arrival;
+    one that the broker kept, or sends again, is refused then: nobody knows when it was measured.
 
     Parameters
     ----------
@@ -101,66 +230,112 @@ class MqttSource:
         Topic -> column of its numbers; None: its messages are rows. "+" and "#" as usual.
     time
         Name of the time column.
+
+    Attributes
+    ----------
+    dropped
+        Messages without acknowledgement (QoS 0) that came faster than they were taken.
     """
 
     def __init__(self, broker: Broker, topics: Mapping[str, str | None], time: str) -> None:
+        super().__init__(broker)
+        for topic in topics:
+            _check_filter(topic)
+        for one, other in combinations(topics, 2):
+            _check_overlap(one, other)
+        self.dropped = 0
         self._topics = dict(topics)
         self._time = time
         self._rows: queue.Queue[Row] = queue.Queue()
-        self._refused: list[str] = []
-        self._ready = threading.Event()
-        self._client = broker.client()
-        self._client.on_connect = self._connected
-        self._client.on_subscribe = self._subscribed
-        self._client.on_message = self._message
-        broker.connect(self._client)
-        if not self._ready.wait(PATIENCE) or self._refused:
-            self.close()
-            reason = self._refused[0] if self._refused else "it does not answer"
-            raise DataError(f"MQTT: the broker at {broker.host}:{broker.port}: {reason}.")
+        self._lock = threading.Lock()
+        self._deliveries: dict[int, _Delivery] = {}
+        self._confirmed: deque[_Delivery] = deque()
+        self._came = 0.0
+        self._connection = 0
+        self._taken_over = False
+        self._client.on_subscribe = self._on_subscribe
+        self._client.on_message = self._on_message
+        self._start()
 
-    def _connected(
-        self, client: Client, userdata: Any, flags: Any, reason: Any, properties: Any
-    ) -> None:
-        if reason.is_failure:
-            self._refused.append(str(reason))
-            self._ready.set()
-        else:
-            client.subscribe([(topic, 1) for topic in self._topics])
+    def _connected(self, resumed: bool) -> None:
+        if not resumed:
+            with self._lock:
+                self._deliveries.clear()
+                self._confirmed.clear()
+        self._client.subscribe([(topic, 1) for topic in self._topics])
 
-    def _subscribed(
+    def _disconnected(self, reason: int) -> None:
+        with self._lock:
+            self._connection += 1
+        if reason == TAKEN_OVER:
+            self._taken_over = True
+            self._client.disconnect()  # and do not take it back
+
+    def _on_subscribe(
         self, client: Client, userdata: Any, mid: int, reasons: Any, properties: Any
     ) -> None:
-        self._refused += [str(reason) for reason in reasons if reason.is_failure]
-        self._ready.set()
+        for topic, reason in zip(self._topics, reasons, strict=True):
+            if reason.is_failure:
+                self._refused(f"topic '{topic}': {reason}")
+        self._started.set()
 
-    def _message(self, client: Client, userdata: Any, message: Any) -> None:
-        token = (message.mid, message.qos)
-        column = self._column(message.topic)
+    def _on_message(self, client: Client, userdata: Any, message: Any) -> None:
+        payload = bytes(message.payload)
+        try:
+            topic = str(message.topic)
+        except UnicodeDecodeError:
+            topic = ""
+        with self._lock:
+            self._came = time.monotonic()
+            delivery = None
+            if message.qos:
+                content = hash((topic, payload))
+                known = self._deliveries.get(message.mid)
+                if message.dup and known is not None and known.content == content:
+                    self._renew(known)
+                    return
+                delivery = _Delivery(message.mid, content, self._connection)
+                self._deliveries[message.mid] = delivery
+            elif self._rows.qsize() >= self._broker.ahead:
+                self.dropped += 1
+                return
+            self._rows.put(self._row(topic, payload, delivery, message.dup or message.retain))
+
+    def _renew(self, known: _Delivery) -> None:
+        """Take note that a message has come again of which the row is under way or safe."""
+        known.connection = self._connection
+        if known.safe:
+            self._confirm(known)
+
+    def _confirm(self, delivery: _Delivery) -> None:
+        self._client.ack(delivery.number, 1)
+        self._confirmed.append(delivery)
+        if len(self._confirmed) > CONFIRMED:
+            oldest = self._confirmed.popleft()
+            if self._deliveries.get(oldest.number) is oldest:
+                del self._deliveries[oldest.number]
+
+    def _row(self, topic: str, payload: bytes, token: Any, old: bool) -> Row:
+        column = self._column(topic)
         if column is None:
-            self._rows.put(json_row(message.payload, token))
-        else:
-            self._rows.put(self._number(column, message.payload, token))
-
-    def _column(self, topic: str) -> str | None:
-        from paho.mqtt.client import topic_matches_sub
-
-        if topic in self._topics:
-            return self._topics[topic]
-        found = (c for t, c in self._topics.items() if topic_matches_sub(t, topic))
-        return next(found, None)
-
-    def _number(self, column: str, payload: bytes, token: Any) -> Row:
+            return json_row(payload, token)
         if len(payload) > LONGEST:
             return Row({}, token, f"longer than {LONGEST} characters")
         try:
             found = json.loads(payload)
         except (ValueError, RecursionError) as error:
             return Row({}, token, f"not a number ({type(error).__name__})")
-        if isinstance(found, dict):
-            moment = found.get(self._time, time.time())
-            return Row({self._time: moment, column: found.get("value")}, token)
-        return Row({self._time: time.time(), column: found}, token)
+        values = found if isinstance(found, dict) else {"value": found}
+        if self._time not in values and old:
+            return Row({}, token, "kept by the broker without a time")
+        moment = values.get(self._time, datetime.now(UTC).isoformat())
+        return Row({self._time: moment, column: values.get("value")}, token)
+
+    def _column(self, topic: str) -> str | None:
+        from paho.mqtt.client import topic_matches_sub
+
+        found = (c for t, c in self._topics.items() if topic_matches_sub(t, topic))
+        return next(found, None)
 
     @property
     def done(self) -> bool:
@@ -168,7 +343,14 @@ class MqttSource:
         return False
 
     def poll(self, wait: float) -> Sequence[Row]:
-        """Return the messages that have come."""
+        """Return the messages that have come.
+
+        Raises
+        ------
+        DataError
+            Another client has taken the session; or nothing can come any more, because as many
+            messages as the broker sends ahead wait for later ones.
+        """
         rows: list[Row] = []
         while len(rows) < BATCH:
             try:
@@ -176,63 +358,148 @@ class MqttSource:
             except queue.Empty:
                 break
             rows.append(row)
+        if wait and not rows:
+            self._check()
         return rows
+
+    def _check(self) -> None:
+        if self._taken_over:
+            raise DataError(
+                f"MQTT: another client has taken the session '{self._broker.client_id}': give each "
+                "run a client_id of its own."
+            )
+        with self._lock:
+            here = (d for d in self._deliveries.values() if d.connection == self._connection)
+            count = sum(not delivery.safe for delivery in here)
+            quiet = self._rows.empty() and time.monotonic() - self._came > PATIENCE
+            if count >= self._broker.ahead and quiet:
+                raise DataError(
+                    f"MQTT: {count} messages wait for later ones, and no more are sent "
+                    "before the first is acknowledged: make the intake's wait shorter, or send "
+                    "rows with several channels."
+                )
 
     def position(self, waiting: Iterable[Any]) -> str:
         """The broker remembers what was acknowledged."""
         return ""
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Tell the broker which messages it may forget."""
-        for mid, qos in tokens:
-            self._client.ack(mid, qos)
+        """Tell the broker which messages it may forget; while it is away, when it is back."""
+        with self._lock:
+            for token in tokens:
+                known = None if token is None else self._deliveries.get(token.number)
+                if known is None or known is not token or known.safe:
+                    continue
+                known.safe = True
+                if known.connection == self._connection:
+                    self._confirm(known)
 
     def close(self) -> None:
         """Disconnect; the broker keeps what comes from now on."""
-        self._client.disconnect()
-        self._client.loop_stop()
+        self._leave()
 
 
-class MqttSink:
+class MqttSink(_Peer):
     """Publishes estimates: one JSON object for each sample, and each number to a topic of its own.
+
+    Never waits for the broker: while it is away the newest estimates are kept and the others
+    counted.
 
     Parameters
     ----------
     broker, topic
-        Where to: TOPIC has the objects, TOPIC/LABEL the unknowns, retained.
+        Where to: TOPIC has the objects; TOPIC/unknowns/LABEL the unknowns; TOPIC/status "running",
+        or "offline" when the run has ended or cannot be reached. All but the first are retained.
+    keep
+        Estimates that may wait for the broker.
+
+    Attributes
+    ----------
+    dropped
+        Estimates that were not sent because newer ones came while the broker was away.
     """
 
-    def __init__(self, broker: Broker, topic: str) -> None:
+    def __init__(self, broker: Broker, topic: str, keep: int = 1000) -> None:
+        super().__init__(broker, "-out")
         self._topic = topic.rstrip("/")
-        self._sent: deque[Any] = deque()
-        self._client = broker.client("-out")
-        broker.connect(self._client)
+        if not self._topic or any(sign in self._topic for sign in "+#\0"):
+            raise DataError(f"MQTT: got the topic '{topic}' to publish to; it has no '+' and '#'.")
+        self.dropped = 0
+        self._waiting: deque[Estimate] = deque(maxlen=keep)
+        self._changed = threading.Condition()
+        self._announce = False
+        self._closing = False
+        self._given_up = threading.Event()
+        self._free = threading.Semaphore(UNCONFIRMED)
+        self._client.on_publish = self._on_publish
+        self._client.will_set(f"{self._topic}/status", "offline", 1, retain=True)
+        self._start()
+        self._sender = threading.Thread(target=self._send, daemon=True)
+        self._sender.start()
+
+    def _connected(self, resumed: bool) -> None:
+        with self._changed:
+            self._announce = True
+            self._changed.notify()
+        self._started.set()
 
     def put(self, estimate: Estimate) -> None:
-        """Publish an estimate."""
-        row = numbers(estimate)
-        while self._sent and self._sent[0].is_published():
-            self._sent.popleft()
-        self._publish(self._topic, row)
-        for label in estimate.parameters:
-            self._publish(f"{self._topic}/{label}", row[label], retain=True)
+        """Publish an estimate, as soon as the broker takes it."""
+        with self._changed:
+            if len(self._waiting) == self._waiting.maxlen:
+                self.dropped += 1
+                if self.dropped == 1:
+                    log.warning("the broker is away for too long: old estimates are not sent")
+            self._waiting.append(estimate)
+            self._changed.notify()
 
-    def _publish(self, topic: str, content: Any, retain: bool = False) -> None:
-        self._sent.append(self._client.publish(topic, json.dumps(content), qos=1, retain=retain))
+    def _send(self) -> None:
+        while not self._given_up.is_set():
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._announce or self._closing)
+                announce, self._announce = self._announce, False
+                estimate = self._waiting.popleft() if self._waiting else None
+                last = self._closing and not self._waiting
+            if announce:
+                self._publish("status", "running")
+            if estimate is not None:
+                self._publish_estimate(estimate)
+            if last:
+                self._publish("status", "offline")
+                return
+
+    def _publish_estimate(self, estimate: Estimate) -> None:
+        row = estimate.to_dict()
+        self._publish("", json.dumps(row), retain=False)
+        for label, known in row["unknowns"].items():
+            level = label.translate(str.maketrans("+#/", "___"))
+            self._publish(f"unknowns/{level}", json.dumps(known))
+
+    def _publish(self, below: str, content: str, *, retain: bool = True) -> None:
+        while not self._free.acquire(timeout=0.1):
+            if self._given_up.is_set():
+                return
+        topic = f"{self._topic}/{below}" if below else self._topic
+        self._client.publish(topic, content, qos=1, retain=retain)
+
+    def _on_publish(
+        self, client: Client, userdata: Any, mid: int, reason: Any, properties: Any
+    ) -> None:
+        if reason.is_failure:
+            log.warning("the broker at %s takes no estimate: %s", self._broker.address, reason)
+        self._free.release()
 
     def close(self) -> None:
         """Disconnect when all is sent, or the broker has not answered for some time."""
         until = time.monotonic() + PATIENCE
-        for message in self._sent:
-            message.wait_for_publish(max(until - time.monotonic(), 0.0))
-        self._client.disconnect()
-        self._client.loop_stop()
-
-
-def numbers(estimate: Estimate) -> dict[str, Any]:
-    """Return time, unknowns with deviations, status and innovations as JSON can hold them."""
-    row: dict[str, Any] = {"t": estimate.t, "status": estimate.status.code}
-    for label, (value, std) in estimate.parameters.items():
-        row |= {label: value, f"{label}_std": std if math.isfinite(std) else None}
-    row["innovation"] = [x if math.isfinite(x) else None for x in estimate.innovation.tolist()]
-    return row
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._sender.join(PATIENCE)
+        for _ in range(UNCONFIRMED):
+            if not self._free.acquire(timeout=max(until - time.monotonic(), 0.0)):
+                log.warning("the broker at %s did not take all estimates", self._broker.address)
+                break
+        self._given_up.set()
+        self._leave()
+        self._sender.join()

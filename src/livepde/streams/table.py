@@ -7,7 +7,7 @@ import difflib
 import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, tzinfo
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -40,11 +40,20 @@ class Column:
     """Where a channel comes from: value = factor * (mean of the columns) + offset.
 
     Several columns are averaged; where one of them is missing, so is the channel.
+
+    Attributes
+    ----------
+    valid
+        A value outside is missing.
+    needed
+        A sample without this channel is left out.
     """
 
     names: tuple[str, ...]
     factor: float = 1.0
     offset: float = 0.0
+    valid: tuple[float, float] = (-math.inf, math.inf)
+    needed: bool = False
 
 
 @dataclass(frozen=True)
@@ -122,12 +131,16 @@ class Table:
         Channels.
     origin
         The first sample's date, if times are dates.
+    remarks
+        (kind, channel) -> how many values were not valid ("invalid"), and samples left out because
+        a channel is missing that they need ("skipped").
     """
 
     t: Array
     values: Array
     names: tuple[str, ...]
     origin: datetime | None = None
+    remarks: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.t)
@@ -294,11 +307,23 @@ def _table(
         ]
         or [np.zeros((len(use), 0))]
     )
-    t, origin = times[use], None
+    remarks: dict[tuple[str, str], int] = {}
+    kept = np.full(len(use), True)
+    for k, (name, channel) in enumerate(columns.items()):
+        low, high = channel.valid
+        wrong = (values[:, k] < low) | (values[:, k] > high)
+        values[wrong, k] = np.nan
+        lacking = kept & np.isnan(values[:, k]) & channel.needed
+        kept &= ~lacking
+        remarks |= {("invalid", name): int(wrong.sum()), ("skipped", name): int(lacking.sum())}
+    if not kept.any():
+        raise DataError(f"{source}: no sample has all channels that it needs.")
+    t, values, origin = times[use][kept], values[kept], None
     if dates:
         origin = datetime.fromtimestamp(float(t[0]) / clock.second, UTC).replace(tzinfo=None)
         t = t - t[0]
-    return Table(t, values, tuple(columns), origin)
+    told = {key: number for key, number in remarks.items() if number}
+    return Table(t, values, tuple(columns), origin, told)
 
 
 class JsonLines:
@@ -351,7 +376,14 @@ class JsonLines:
                 channel: channel_value(column, row, self._missing, where)
                 for channel, column in self._columns.items()
             }
-            yield Sample(t - zero, values)
+            for channel, column in self._columns.items():
+                low, high = column.valid
+                if not low <= values[channel] <= high:
+                    values[channel] = math.nan
+            if not any(
+                math.isnan(values[c]) for c, column in self._columns.items() if column.needed
+            ):
+                yield Sample(t - zero, values)
 
 
 def row_time(row: Mapping[str, Any], clock: Clock, where: str = "row") -> tuple[float, bool]:
