@@ -305,7 +305,8 @@ def _unknown_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
             about = "Line: estimate. Band: holds the true value with 95 % probability."
         if any("reference" in data[label].attrs for label in labels):
             about += " Dashed: reference value."
-        found.append(Panel(f"unknown:{name}", "estimates", name, about, unknowns(data, labels, at)))
+        figure = unknowns(data, labels, at)
+        found.append(Panel(f"unknown:{name}", "estimates", f"Unknown {name}", about, figure))
     return found
 
 
