@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import math
 import re
 import shutil
 import sys
@@ -393,7 +392,7 @@ def watched_run(folder, title="A rod", status="finished"):
     with journal(folder / "journal.sqlite", who, origin=ORIGIN) as kept:
         data = drive(who, samples(), journal=kept).result.to_xarray()
         kept.note(Event(60.0, "silent", "a", f"nothing came: {title}"))
-        kept.note(Event(math.nan, "refused", "", "a row without a time"))
+        kept.note(Event(120.0, "jump", "", "something jumped"))
         kept.count("late", "a", 3)
         kept.checkpoint(b"")
     data.attrs["equation"] = title

@@ -6,10 +6,8 @@ The file holds all that it shows; its policy forbids a browser to ask anybody fo
 from __future__ import annotations
 
 import json
-import math
 import secrets
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from livepde import runs
 from livepde.errors import ConfigurationError, RunError
@@ -17,9 +15,6 @@ from livepde.runs import Check, Journal, Run, Table
 from livepde.runs.directory import CASE, JOURNAL, bound_text
 from livepde.runs.export import into_place
 from livepde.runs.journal import Event
-
-if TYPE_CHECKING:
-    from livepde.dashboard.figures import TimeAxis
 
 __all__ = ["page_of", "write_report"]
 
@@ -88,7 +83,7 @@ def page_of(run: Run) -> str:
         },
         newest=f"{min(len(events), MOST_EVENTS)} of {len(events)}, the newest first",
         events=[
-            (_when(axis, event.t), event.kind, event.channel or "–", event.message)
+            (axis.text(event.t), event.kind, event.channel or "–", event.message)
             for event in events[: -MOST_EVENTS - 1 : -1]
         ],
         counts=[(kind, channel or "–", number) for (kind, channel), number in counts.items()],
@@ -120,10 +115,6 @@ def _written(run: Run) -> str:
     record = run.record
     times = [f"{key} {record[key]}" for key in ("started", "ended") if key in record]
     return " · ".join([f"livepde {record.get('livepde', '')}".rstrip(), *times])
-
-
-def _when(axis: TimeAxis, t: float | None) -> str:
-    return "–" if t is None or not math.isfinite(t) else axis.text(t)
 
 
 def _journal(run: Run) -> tuple[list[Event], dict[tuple[str, str], int]]:
