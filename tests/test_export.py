@@ -217,6 +217,14 @@ def test_without_dates_times_are_numbers_with_a_unit(tmp_path):
         assert found["snapshot"].attrs["units"] == "s"
 
 
+def test_times_of_a_model_without_units_are_plain_numbers(tmp_path):
+    data = xr.Dataset({"k": ("time", [1.0, 2.0])}, {"time": [0.0, 0.5]}, {"origin": ORIGIN})
+    found = cf(data)
+    assert found["time"].attrs["units"] == "1"
+    assert "standard_name" not in found["time"].attrs
+    assert xr.decode_cf(found)["time"].values.tolist() == [0.0, 0.5]
+
+
 def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
     export(rod, tmp_path / "rod.nc")
     with xr.open_dataset(tmp_path / "rod.nc", engine="scipy", decode_cf=False) as found:

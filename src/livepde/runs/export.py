@@ -171,15 +171,16 @@ def cf(
     clock, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
     times = [found[name] for name in ("time", "snapshot") if name in found]
     for time in times:
-        time.attrs |= {"units": clock, "standard_name": "time"}
+        time.attrs |= {"units": clock} | ({"standard_name": "time"} if clock else {})
     for name in names:
         _describe(found, name)
         beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
         if beside:
             found[name].attrs["ancillary_variables"] = " ".join(beside)
     if origin is not None and clock in CLOCKS:
+        since = {"units": f"{CLOCKS[clock]} since {origin}", "calendar": "standard"}
         for time in times:
-            time.attrs |= {"units": f"{CLOCKS[clock]} since {origin}", "calendar": "standard"}
+            time.attrs |= since | {"units_metadata": "leap_seconds: none"}
     found.attrs = {key: plain(value) for key, value in data.attrs.items()}
     lists = {key: str(data.attrs.get(key, "")).split() for key in ("fields", "state")}
     for key, some in {"scalars": scalars(data), **lists}.items():
