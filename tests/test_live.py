@@ -58,11 +58,22 @@ def journal(path: Path) -> Journal:
     return Journal.create(path, ("a", "b", "left"), layout)
 
 
+OPENED: list = []
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    while OPENED:
+        OPENED.pop().close()
+
+
 def live(folder: Path, source=None, **options) -> Live:
     path = folder / "journal.sqlite"
     kept = Journal.open(path, write=True) if path.exists() else journal(path)
     if source is None:
         source = Follow(folder / "data.csv", position=kept.position)
+    OPENED.append(source)
     intake = Intake(COLUMNS, CLOCK, origin=0.0, last=kept.last)
     return Live(identifier(), Gathered(source, intake), kept, fields_every=10, **options)
 
@@ -277,6 +288,50 @@ def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
 @pytest.mark.parametrize("text", ["", "{", "[1]", "nan", "1" * 2_000_000, "[" * 100_000])
 def test_lines_that_are_no_rows(text):
     assert json_row(text).broken
+
+
+def followed(source: Follow) -> list[float]:
+    found = []
+    while rows := source.poll(0.0):
+        found += [float(row.values["t"]) for row in rows]
+    return found
+
+
+def test_a_file_that_is_rotated_is_read_to_its_end(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,a\n0,1\n1,1\n")
+    source = Follow(path, follow=True)
+    assert followed(source) == [0.0, 1.0]
+    with path.open("a") as file:
+        file.write("2,1\n3,1")  # the last line is not ended
+    path.rename(tmp_path / "log.1.csv")
+    assert followed(source) == [2.0]
+    path.write_text("\nt,a\n\n4,1\n")
+    assert followed(source) == [4.0]
+    path.write_text("t,a\n5,1\n")  # cut short
+    assert followed(source) == [5.0]
+    source.close()
+
+
+def test_a_position_is_of_one_file(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,a\n0,1\n1,1\n")
+    source = Follow(path, follow=True)
+    tokens = [row.token for row in source.poll(0.0)]
+    here, before = source.position([]), source.position(tokens[1:])
+    source.close()
+    with path.open("a") as file:
+        file.write("2,1\n")
+    for position, times in ((here, [2.0]), (before, [1.0, 2.0]), ("", [0.0, 1.0, 2.0])):
+        assert followed(Follow(path, position=position)) == times
+    path.write_text("t,a\n7,1\n8,1\n9,1\n")  # another file of the same name
+    assert followed(Follow(path, position=here)) == [7.0, 8.0, 9.0]
+
+
+def test_blank_lines_do_not_end_a_file(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("\n" * 500 + "t,a\n" + "\n" * 500 + "0,1\n")
+    assert followed(Follow(path)) == [0.0]
 
 
 def test_silence_is_noticed(tmp_path):

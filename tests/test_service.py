@@ -277,6 +277,7 @@ def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
         wiring = Wiring(cases.load(text))
         (_, *_) = wiring.feed.poll(0.0)
         assert str(wiring.origin) == origin
+        wiring.feed.close()
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import os
 import queue
 import threading
 import time
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ __all__ = ["Follow", "Lines", "Row", "Rows", "Source", "json_row"]
 
 LONGEST = 1_000_000  # characters of a line or message; longer ones are refused unread
 BATCH = 100  # rows that a poll brings at most
+HEAD = 4096  # bytes at the start of a file by which it is known again
 NAP = 0.05  # seconds between looks at a file that does not grow
 
 
@@ -82,8 +84,10 @@ def json_row(text: str | bytes, token: Any = None) -> Row:
 class Follow:
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
-    A line counts when it is ended. A file that has become shorter or was replaced is read from its
-    start: samples that are known are late then.
+    A line counts when it is ended. A file that is replaced by another (logs are rotated so) is read
+    to its end before the new one; one that has become shorter is read from its start: samples that
+    are known are late then. What still waited of a file that has lost its name is not found again
+    after a crash.
 
     Parameters
     ----------
@@ -94,7 +98,7 @@ class Follow:
     follow
         Wait for more at the end of the file.
     position
-        As `accepted` returned it.
+        As the method `position` returned it. In another file than that it was of, all is read.
     """
 
     def __init__(
@@ -109,10 +113,12 @@ class Follow:
         self.follow = follow
         self._separator = separator
         self._json = self.path.suffix in (".jsonl", ".ndjson")
+        self._resumed = tuple(map(int, position.split())) if position else None
+        self._file: io.BufferedReader | None = None
+        self._number = 0  # of the file: 1 for the first, 2 for that which replaced it
+        self._head = b""  # how the file begins, to know it again
         self._header: list[str] | None = None
         self._offset = 0
-        self._start = int(position) if position else 0
-        self._identity: tuple[int, int] | None = None
         self._ended = False
         if not follow and not self.path.is_file():
             raise DataError(f"there is no file {self.path}.")
@@ -126,55 +132,91 @@ class Follow:
         """Return the complete lines that are there."""
         until = time.monotonic() + wait
         while True:
-            rows = self._read()
+            try:
+                rows = self._read()
+            except OSError as error:
+                text = f"{self.path} cannot be read: {error.strerror or error}."
+                raise DataError(text) from error
             if rows or self._ended:
                 return rows
             if not self.follow:
                 self._ended = True
+                self.close()
                 return rows
             if time.monotonic() >= until:
                 return rows
             time.sleep(min(NAP, wait))
 
     def position(self, waiting: Iterable[Any]) -> str:
-        """Return the place of the first line that still waits, or of the next one."""
-        return str(min((start for start, _ in waiting), default=self._offset))
+        """Return the place of the first line that still waits, or of the next one, and the file."""
+        here = (start for number, start in waiting if number == self._number)
+        start = min(here, default=self._offset)
+        return f"{start} {zlib.crc32(self._head[:start])}"
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
         """A file does not need to hear it."""
 
     def close(self) -> None:
-        """Nothing is held open between polls."""
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
     def _read(self) -> list[Row]:
-        try:
-            with self.path.open("rb") as file:
-                status = os.fstat(file.fileno())
-                identity = (status.st_dev, status.st_ino)
-                if self._identity not in (None, identity) or status.st_size < self._offset:
-                    self._header, self._offset, self._start = None, 0, 0
-                self._identity = identity
-                return self._lines(file)
-        except FileNotFoundError:
+        if self._ended or (self._file is None and not self._opened()):
             return []
-        except OSError as error:
-            raise DataError(f"{self.path} cannot be read: {error.strerror or error}.") from error
+        rows = self._lines()
+        if not rows and self._replaced() and self._opened():
+            rows = self._lines()
+        return rows
 
-    def _lines(self, file: io.BufferedReader) -> list[Row]:
+    def _opened(self) -> bool:
+        """Open the file that is there now, at its start or where an earlier run has left it."""
+        try:
+            file = self.path.open("rb")
+        except FileNotFoundError:
+            return False
+        self.close()
+        self._file, self._header, self._head, self._offset = file, None, b"", 0
+        self._number += 1
+        start, known = self._resumed or (0, 0)
+        self._resumed = None
+        head = file.read(HEAD)
+        if start <= os.fstat(file.fileno()).st_size and zlib.crc32(head[:start]) == known:
+            if not self._json and start:
+                self._header = self._cells(head.splitlines()[0])
+            self._head, self._offset = head[:start], start
+        return True
+
+    def _replaced(self) -> bool:
+        """Return whether another file has the name now, or this one has become shorter."""
+        try:
+            named = self.path.stat()
+        except FileNotFoundError:
+            return False
+        if self._file is None:
+            return False
+        mine = os.fstat(self._file.fileno())
+        return (named.st_dev, named.st_ino) != (mine.st_dev, mine.st_ino) or (
+            named.st_size < self._offset
+        )
+
+    def _lines(self) -> list[Row]:
+        """Return the rows of the next lines that are ended."""
         rows: list[Row] = []
-        file.seek(self._offset)
+        if self._file is None:
+            return rows
+        self._file.seek(self._offset)
         while len(rows) < BATCH:
-            start = file.tell()
-            line = file.readline()
-            if not line.endswith(b"\n") and (self.follow or not line):
+            start = self._offset
+            line = self._file.readline()
+            if not line or (self.follow and not line.endswith(b"\n")):
                 break
-            self._offset = file.tell()
-            row = self._row(line, (start, self._offset))
-            if row is not None and start >= self._start:
+            self._offset = self._file.tell()
+            self._head += line[: HEAD - len(self._head)]
+            row = self._row(line, (self._number, start))
+            if row is not None:
                 rows.append(row)
-            elif start < self._start and self._header is not None:
-                file.seek(self._start)  # what was accepted before
-                self._offset = self._start
         return rows
 
     def _row(self, line: bytes, token: Any) -> Row | None:
@@ -183,17 +225,21 @@ class Follow:
         if self._json:
             return json_row(line, token)
         try:
-            text = line.decode("utf-8-sig")
-            cells = next(csv.reader([text], delimiter=self._separator, skipinitialspace=True), [])
+            cells = self._cells(line)
         except (UnicodeDecodeError, csv.Error) as error:
             return Row({}, token, f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
-            self._header = [cell.strip() for cell in cells]
+            self._header = cells
             return None
         if len(cells) > len(self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
             return Row({}, token, text)
         return Row(dict(zip(self._header, cells, strict=False)), token)
+
+    def _cells(self, line: bytes) -> list[str]:
+        text = line.decode("utf-8-sig")
+        found = csv.reader([text], delimiter=self._separator, skipinitialspace=True)
+        return [cell.strip() for cell in next(found, [])]
 
 
 class Lines:
