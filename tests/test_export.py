@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import re
+import shutil
+import sys
 from dataclasses import replace
+from html.parser import HTMLParser
 
 import meshio
 import numpy as np
@@ -11,18 +16,22 @@ import pandas as pd
 import pytest
 import xarray as xr
 from meshio.xdmf import TimeSeriesReader
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.wait import WebDriverWait
 from skfem import MeshHex, MeshTri
 from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cli, runs
+from livepde.dashboard.report import write_report
 from livepde.errors import ConfigurationError, LivepdeError, RunError
 from livepde.models import heat
 from livepde.plots import interval_95
 from livepde.result import layout_of
-from livepde.runs import RunWriter, drive, tables
+from livepde.runs import Check, RunWriter, drive, tables
 from livepde.runs.export import cf, export, udunits
-from livepde.runs.journal import Journal
+from livepde.runs.journal import Event, Journal
 
 ORIGIN = "2025-04-01 06:00:00"
 SAMPLES = 6
@@ -110,9 +119,10 @@ def call(*arguments) -> tuple[int, str]:
         ("um", "um"),
         ("%", "%"),
         ("", "1"),
-        ("m^0.5", "m^0.5"),  # UDUNITS has no roots
-        ("cells per well", "cells per well"),
-        ("3 m", "3 m"),
+        ("1/year", "year-1"),  # "a" is an are
+        ("m^0.5", None),  # there are no roots
+        ("cells per well", None),
+        ("3 m", None),
     ],
 )
 def test_units_are_those_of_udunits(unit, expected):
@@ -134,6 +144,13 @@ def test_names_that_would_be_the_same_are_told_apart():
     found = cf(data)
     assert set(found.data_vars) == {"k_a_b", "k_a_b_2", "v", "v2k"}
     assert found["v"].attrs["long_name"] == "κ"
+
+
+def test_a_unit_that_udunits_has_not_is_said_in_words(tmp_path):
+    data = xr.Dataset({"k": ("time", [1.0], {"units": "m^0.5"})}, {"time": [0.0]}, {"scalars": "k"})
+    found = cf(data)["k"].attrs
+    assert found["comment"] == "unit: m^0.5"
+    assert "units" not in found
 
 
 def test_what_belongs_to_a_number(rod):
@@ -198,6 +215,14 @@ def test_without_dates_times_are_numbers_with_a_unit(tmp_path):
         assert found["time"].values.tolist() == [60.0 * k for k in range(SAMPLES)]
         assert found["time"].attrs["units"] == "s"
         assert found["snapshot"].attrs["units"] == "s"
+
+
+def test_times_of_a_model_without_units_are_plain_numbers(tmp_path):
+    data = xr.Dataset({"k": ("time", [1.0, 2.0])}, {"time": [0.0, 0.5]}, {"origin": ORIGIN})
+    found = cf(data)
+    assert found["time"].attrs["units"] == "1"
+    assert "standard_name" not in found["time"].attrs
+    assert xr.decode_cf(found)["time"].values.tolist() == [0.0, 0.5]
 
 
 def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
@@ -339,7 +364,185 @@ def test_a_run_without_estimates_has_nothing_to_export(tmp_path):
         export(runs.open(folder), tmp_path / "rod.nc")
 
 
+# --- the report ------------------------------------------------------------------------------
+
+HOSTILE = '</script><img src="http://evil.example/x"><script>alert(1)</script>'
+
+
+class Page(HTMLParser):
+    """What a page would fetch, its scripts, and its text."""
+
+    FETCHING = ("src", "href", "srcset", "data", "poster", "action", "background", "xlink:href")
+
+    def __init__(self, path) -> None:
+        super().__init__()
+        self.fetched: list[str] = []
+        self.tags: list[str] = []
+        self.texts: list[str] = []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.fetched += [value for name, value in attrs if name in self.FETCHING]
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.texts)
+
+
+def watched_run(folder, title="A rod", status="finished"):
+    """Return a run with notes, checks, events and counts, under any title."""
+    who = identifier()
+    writer = RunWriter.create(folder, version="1.2", command=["livepde"], title=title, case=title)
+    with journal(folder / "journal.sqlite", who, origin=ORIGIN) as kept:
+        data = drive(who, samples(), journal=kept).result.to_xarray()
+        kept.note(Event(60.0, "silent", "a", f"nothing came: {title}"))
+        kept.note(Event(120.0, "jump", "", "something jumped"))
+        kept.count("late", "a", 3)
+        kept.checkpoint(b"")
+    data.attrs["equation"] = title
+    checks = [Check("error", 0.5, 0.1, "<="), Check("rmse", 0.5, 0.6, "<=")]
+    writer.finish(status=status, dataset=data, checks=checks, notes=[f"do not believe {title}"])
+    return runs.open(folder)
+
+
+def test_a_report_says_what_there_is_to_say(tmp_path):
+    run = watched_run(tmp_path / "run")
+    code, output = call("export", run.path, tmp_path / "run.html")
+    assert code == 0
+    assert str(tmp_path / "run.html") in output
+    page = Page(tmp_path / "run.html")
+    for said in (
+        "A rod – livepde",
+        "finished · 6 samples · 2025-04-01 06:00:00 to 2025-04-01 06:05:00",
+        "do not believe A rod",
+        "alpha[near side]",
+        "FAILED",
+        "nothing came: A rod",
+        "2025-04-01 06:01:00",
+        "late",
+        "livepde 1.2",
+    ):
+        assert said in page.text
+    with pytest.raises(RunError, match=r"run\.html exists"):
+        call("export", run.path, tmp_path / "run.html")
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [(0.05, "Nothing speaks against the estimates"), (0.5, "A number is not as it was expected")],
+)
+def test_a_report_says_first_whether_anything_is_wrong(tmp_path, value, said):
+    writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
+    data = drive(identifier(), samples()).result.to_xarray()
+    checks = [Check("error", value, 0.1, "<=")]
+    writer.finish(status="finished", dataset=data, checks=checks)
+    write_report(runs.open(tmp_path / "run"), tmp_path / "run.html")
+    page = Page(tmp_path / "run.html")
+    assert said in page.text
+    assert ("FAILED" in page.text) == (value > 0.1)
+
+
+def test_a_report_fetches_nothing(tmp_path):
+    run = watched_run(tmp_path / "run")
+    write_report(run, tmp_path / "run.html")
+    page = Page(tmp_path / "run.html")
+    assert page.fetched == []
+    assert not {"link", "iframe", "object", "embed", "base", "img"} & set(page.tags)
+    text = (tmp_path / "run.html").read_text(encoding="utf-8")
+    assert "default-src 'none'" in text
+    assert "url(" not in text.split("<style>")[1].split("</style>")[0]
+
+
+def test_titles_and_texts_are_shown_as_they_stand(tmp_path):
+    run = watched_run(tmp_path / "run", HOSTILE)
+    write_report(run, tmp_path / "run.html")
+    text = (tmp_path / "run.html").read_text(encoding="utf-8")
+    assert HOSTILE not in text
+    page = Page(tmp_path / "run.html")
+    assert page.fetched == []
+    assert "img" not in page.tags
+    assert page.tags.count("script") == 2
+    assert page.text.count(HOSTILE) >= 4  # heading, equation, note, event, case
+
+
+def test_names_in_figures_are_data(tmp_path):
+    """Names of channels come into a script."""
+    run = watched_run(tmp_path / "run")
+    run.dataset = run.dataset.assign_coords(sensor=[HOSTILE])
+    write_report(run, tmp_path / "run.html")
+    page = Page(tmp_path / "run.html")
+    assert page.tags.count("script") == 2
+    assert "img" not in page.tags
+
+
+def test_a_report_of_a_run_that_goes_on(tmp_path):
+    folder, who = tmp_path / "rod", identifier()
+    RunWriter.create(folder, version="1", command=["livepde"], title="A rod")
+    with journal(folder / "journal.sqlite", who) as kept:
+        drive(who, samples(), journal=kept)
+        kept.checkpoint(b"")
+        write_report(runs.open(folder), tmp_path / "rod.html")
+    page = Page(tmp_path / "rod.html")
+    assert "running · 6 samples · 0 s to 300 s" in page.text
+
+
+def test_a_report_needs_plotly(tmp_path, monkeypatch):
+    run = watched_run(tmp_path / "run")
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'livepde\[dashboard\]'"):
+        write_report(run, tmp_path / "run.html")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("no Chromium: install chromium and chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "ALL"})
+    with webdriver.Chrome(options, webdriver.ChromeService(driver)) as found:
+        yield found
+
+
+@pytest.mark.parametrize("kind", ["line", "triangle", "tetra"])
+def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
+    run = made(tmp_path / "run", kind, origin=ORIGIN)
+    write_report(run, tmp_path / "run.html")
+    browser.get((tmp_path / "run.html").as_uri())
+    places = browser.find_elements(By.CSS_SELECTOR, "[data-figure]")
+    assert len(places) >= 5
+    for place in places:
+        WebDriverWait(browser, 60).until(
+            lambda _, p=place: p.find_elements(By.CLASS_NAME, "main-svg")
+        )
+    buttons = browser.find_elements(By.CLASS_NAME, "modebar-btn")
+    titles = {button.get_attribute("data-title") for button in buttons}
+    assert not [title for title in titles if re.search("share|cloud|edit", title, re.IGNORECASE)]
+    messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    asked = [
+        message["params"]["request"]["url"].partition(":")[0]
+        for message in messages
+        if message["method"] == "Network.requestWillBeSent"
+    ]
+    assert "file" in asked
+    assert set(asked) <= {"file", "data", "blob"}
+    assert [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
 # --- the command -----------------------------------------------------------------------------
+
+
+def test_help_teaches():
+    code, output = call("export", "--help")
+    assert code == 0
+    assert "Example:" in output
 
 
 def test_the_command_writes_several(rod, tmp_path):

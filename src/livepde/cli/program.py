@@ -18,6 +18,7 @@ from livepde.cli.export import export
 from livepde.cli.printing import BAD_INPUT, terminal
 from livepde.cli.report import report
 from livepde.cli.run import run
+from livepde.cli.watch import watch
 from livepde.errors import LivepdeError
 
 __all__ = ["app", "main"]
@@ -33,7 +34,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, init, check, run, report, export, equations, reproduce):
+for command in (demo, init, check, run, watch, report, export, equations, reproduce):
     app.command()(command)
 app.add_typer(bench)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -42,8 +42,7 @@ __all__ = [
 ]
 
 SECTIONS = {
-    "unknowns": "Unknown numbers over time",
-    "fields": "Unknown fields and state",
+    "estimates": "Estimates",
     "sensors": "Sensors against the model",
     "told": "What the data have told",
 }
@@ -55,11 +54,7 @@ OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to b
 FAR = 1e11  # seconds from the origin beyond which times are numbers
 INK, GRID = "#1f2933", "#e4e7eb"
 HEIGHT = 320
-CONFIG = {
-    "displaylogo": False,
-    "responsive": True,
-    "modeBarButtonsToRemove": ["lasso2d", "select2d"],
-}
+CONFIG: Any = {"displayModeBar": False, "responsive": True}  # for Plotly
 SURE, FLAT = 0.1, 0.9  # shares of the prior deviation: pinned, told hardly anything
 
 
@@ -227,7 +222,9 @@ def _empty(xlabel: str = "", ylabel: str = "", height: int = HEIGHT) -> go.Figur
         uirevision="kept",  # zoom, camera and hidden lines survive an update
     )
     figure.update_xaxes(**axis, title={"text": _text(xlabel), "standoff": 6})
-    figure.update_yaxes(**axis, title={"text": _text(ylabel), "standoff": 8}, exponentformat="e")
+    figure.update_yaxes(
+        **axis, title={"text": _text(ylabel), "standoff": 8}, exponentformat="power"
+    )
     return figure
 
 
@@ -308,7 +305,8 @@ def _unknown_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
             about = "Line: estimate. Band: holds the true value with 95 % probability."
         if any("reference" in data[label].attrs for label in labels):
             about += " Dashed: reference value."
-        found.append(Panel(f"unknown:{name}", "unknowns", name, about, unknowns(data, labels, at)))
+        figure = unknowns(data, labels, at)
+        found.append(Panel(f"unknown:{name}", "estimates", f"Unknown {name}", about, figure))
     return found
 
 
@@ -398,37 +396,37 @@ def _mark_failures(figure: go.Figure, data: xr.Dataset, axis: TimeAxis) -> None:
 
 
 def _field_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
-    names = [*str(data.attrs.get("fields", "")).split(), *str(data.attrs.get("state", "")).split()]
-    unknown = set(str(data.attrs.get("fields", "")).split())
-    found = []
-    for name in names:
-        if name not in data or not data.sizes.get("snapshot"):
+    unknown, state = (str(data.attrs.get(key, "")).split() for key in ("fields", "state"))
+    found: list[Panel] = []
+    if not data.sizes.get("snapshot"):
+        return found
+    k = at_time(data, "snapshot", at)
+    when = when_axis(data).text(float(data["snapshot"].values[k]))
+    draw, hint = _drawn(data)
+    for name in [*unknown, *state]:
+        if name not in data:
             continue
-        k = at_time(data, "snapshot", at)
-        when = when_axis(data).text(float(data["snapshot"].values[k]))
-        what = "unknown field" if name in unknown else "state"
+        title = f"{'Unknown field' if name in unknown else 'State'} {name}"
         deviates = f"{name}_std" in data and bool(data[f"{name}_std"].values[k].any())
-        if "y" not in data.coords:
-            band = " Band: holds the true one with 95 % probability." if deviates else ""
-            about = f"{what}, estimate at {when}.{band} Grey: at the start."
-            found.append(
-                Panel(f"field:{name}", "fields", name, about, field_profile(data, name, at))
-            )
-            continue
-        draw = field_solid if "z" in data.coords else field_map
-        about = f"{what}, estimate at {when}."
-        if draw is field_map and _zoomed(data):
-            about += " Shown is where the mesh is fine; double-click shows all."
-        if draw is field_solid:
-            about += (
-                " Surface and three cuts through the middle: drag to turn, scroll to come near."
-            )
-        found.append(Panel(f"field:{name}", "fields", name, about, draw(data, name, at)))
-        if deviates and name in unknown:
-            about = f"Standard deviation of {name} at {when}: small where the data have told."
-            figure = draw(data, f"{name}_std", at)
-            found.append(Panel(f"field:{name}_std", "fields", f"{name}, how sure", about, figure))
+        about = f"Estimate at {when}.{hint}"
+        if draw is field_profile and deviates:
+            about += " Band: holds the true one with 95 % probability."
+        found.append(Panel(f"field:{name}", "estimates", title, about, draw(data, name, at)))
+        if draw is not field_profile and deviates and name in unknown:
+            about = f"Standard deviation at {when}: small where the data have told.{hint}"
+            spread = draw(data, f"{name}_std", at)
+            title = f"How sure: {name}"
+            found.append(Panel(f"field:{name}_std", "estimates", title, about, spread))
     return found
+
+
+def _drawn(data: xr.Dataset) -> tuple[Callable[..., go.Figure], str]:
+    """Return what draws a field, and how to read it."""
+    if "z" in data.coords:
+        return field_solid, " Surface and three cuts through the middle: drag to turn."
+    if "y" in data.coords:
+        return field_map, " Shown is where the mesh is fine: double-click for all." * _zoomed(data)
+    return field_profile, " Grey: at the start."
 
 
 def _zoomed(data: xr.Dataset) -> bool:
@@ -538,7 +536,7 @@ def _colours(name: str) -> str:
 
 def _bar(data: xr.Dataset, name: str) -> dict[str, Any]:
     title = {"text": _text(_pretty(data, name)), "side": "right"}
-    return {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "e"}
+    return {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "power"}
 
 
 # --- sensors --------------------------------------------------------------------------------------
@@ -553,12 +551,20 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, at: float |
         )
         if "residual" in data:
             about = "Measured minus what the model says after the step. Well if about zero."
-        return Panel(variable, "sensors", "Sensors: measured − expected", about, figure)
+        title = "Sensors: measured − expected"
+        return Panel(variable, "sensors", title, about + _crowd(data, dimension), figure)
     about = (
         "Measured minus estimated of channels that are withheld: the estimate never sees them, so "
         "they test it."
     )
+    about += _crowd(data, dimension)
     return Panel(variable, "sensors", "Withheld sensors: measured − estimated", about, figure)
+
+
+def _crowd(data: xr.Dataset, dimension: str) -> str:
+    """Return how many sensors are drawn as one."""
+    count = data.sizes[dimension]
+    return f" Line: root mean square of {count}; band: their range." if count > MOST_LINES else ""
 
 
 def residuals(
@@ -599,7 +605,7 @@ def residuals(
             y=np.sqrt(np.nanmean(errors**2, axis=1)),
             mode=mode,
             line={"color": PALETTE[0], "width": 1.8},
-            name=f"root mean square of {len(names)} sensors; band: their range",
+            name="root mean square",
             showlegend=True,
             hovertemplate="%{y:.3g}",
         )

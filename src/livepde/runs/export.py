@@ -61,7 +61,15 @@ DIFFERENCES = ("innovation", "withheld_error")
 # CF: an axis Z is vertical, and must say whether it grows up or down, which a mesh does not know.
 AXES = {"time": "T", "snapshot": "T", "x": "X", "y": "Y"}
 CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
-SYMBOLS = {"°C": "degC", "°F": "degF", "Δ°C": "K", "Δ°F": "degR", "Ω": "ohm"}
+SYMBOLS = {  # of pint -> of UDUNITS, where they differ
+    "°C": "degC",
+    "°F": "degF",
+    "Δ°C": "K",
+    "Δ°F": "degR",
+    "Ω": "ohm",
+    "a": "year",
+    "deg": "degree",
+}
 SCALES = ("degC", "degF")  # their zero is not zero
 NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
 
@@ -98,8 +106,8 @@ KINDS = {
 
 
 @cache
-def udunits(unit: str) -> str:
-    """Return a unit as UDUNITS writes it; one that is not known, or has roots, as it is.
+def udunits(unit: str) -> str | None:
+    """Return a unit as UDUNITS writes it; None for one that it has not, such as a root.
 
     >>> udunits("m^2/s"), udunits("J/(m^3 K)"), udunits("degC"), udunits("")
     ('m2 s-1', 'J m-3 K-1', 'degC', '1')
@@ -109,10 +117,10 @@ def udunits(unit: str) -> str:
     try:
         found = to_units_container(_registry().parse_units(unit))
     except NOT_A_UNIT:
-        return unit
+        return None
     parts = {name: float(str(power)) for name, power in found.items()}
     if not all(power.is_integer() for power in parts.values()):
-        return unit
+        return None
     words = []
     for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
         symbol = _registry().get_symbol(name)
@@ -160,13 +168,19 @@ def cf(
     """
     found = _bounded(data)
     names = _names(str(name) for name in found.variables)
+    clock, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
+    times = [found[name] for name in ("time", "snapshot") if name in found]
+    for time in times:
+        time.attrs |= {"units": clock} | ({"standard_name": "time"} if clock else {})
     for name in names:
         _describe(found, name)
         beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
         if beside:
             found[name].attrs["ancillary_variables"] = " ".join(beside)
-    for name in {"time", "snapshot"} & set(names):
-        _date(found[name], data)
+    if origin is not None and clock in CLOCKS:
+        since = {"units": f"{CLOCKS[clock]} since {origin}", "calendar": "standard"}
+        for time in times:
+            time.attrs |= since | {"units_metadata": "leap_seconds: none"}
     found.attrs = {key: plain(value) for key, value in data.attrs.items()}
     lists = {key: str(data.attrs.get(key, "")).split() for key in ("fields", "state")}
     for key, some in {"scalars": scalars(data), **lists}.items():
@@ -220,20 +234,14 @@ def _describe(data: xr.Dataset, name: str) -> None:
     if name in data.coords:
         variable.encoding["_FillValue"] = None  # a coordinate is never missing
     if "units" in attrs:
-        attrs["units"] = unit = udunits(str(attrs["units"]))
+        own = str(attrs.pop("units"))
+        unit = udunits(own)
+        attrs |= {"comment": f"unit: {own}"} if unit is None else {"units": unit}
         if unit in SCALES:
             apart = name.endswith("_std") or name in DIFFERENCES
             attrs["units_metadata"] = f"temperature: {'difference' if apart else 'on_scale'}"
     if "flag_values" in attrs:
         attrs["flag_values"] = np.array(attrs["flag_values"], dtype=variable.dtype)
-
-
-def _date(time: xr.DataArray, data: xr.Dataset) -> None:
-    """Give a time its unit, since a date if the run has one."""
-    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
-    time.attrs |= {"standard_name": "time", "units": udunits(unit)}
-    if origin is not None and unit in CLOCKS:
-        time.attrs |= {"units": f"{CLOCKS[unit]} since {origin}", "calendar": "standard"}
 
 
 def _kinds(data: xr.Dataset) -> list[str]:
@@ -255,7 +263,9 @@ def _oriented(data: xr.Dataset, kind: str) -> Any:
 def _add_topology(data: xr.Dataset, kind: str) -> None:
     """Say how vertices and cells are a mesh, after UGRID."""
     dimension, cell = KINDS[kind].dimension, KINDS[kind].role
-    name = next(free for free in ("mesh", "mesh_topology") if free not in data)
+    name = "mesh"
+    while name in data:
+        name += "_"
     corners = f"{cell}_node_connectivity"
     axes = [axis for axis in "xyz" if axis in data.coords]
     data[kind].values = _oriented(data, kind)
@@ -385,7 +395,8 @@ def _csv(run: Run, path: Path, at: float | None) -> None:
         columns["date"] = dates
     for name in ("time", *sorted(map(str, data.data_vars), key=DIFFERENCES.__contains__)):
         variable = data[name]
-        unit = udunits(str(variable.attrs.get("units", "")))
+        own = str(variable.attrs.get("units", ""))
+        unit = udunits(own) or own
         end = "" if unit == "1" else f" [{unit}]"
         if name == "status":
             columns[name] = np.array(STATUS_CODES)[variable.values]

@@ -1,0 +1,51 @@
+"""Look at a run in a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from livepde.cli.printing import terminal
+
+__all__ = ["watch"]
+
+PORT = 8050
+
+
+def watch(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")],
+    address: Annotated[
+        str,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Where to listen. Default: port 8050 of this machine, reachable from it only.",
+            show_default=False,
+        ),
+    ] = "",
+    token: Annotated[
+        str,
+        typer.Option(
+            help="What a visitor has to know. Asked for on any address but this machine's own: "
+            "then one is made if none is given.",
+            envvar="LIVEPDE_TOKEN",
+            show_default=False,
+        ),
+    ] = "",
+) -> None:
+    """Show a run in a browser, while it goes on and afterwards; Ctrl-C ends it.
+
+    Example:    livepde watch runs/mycase
+    Elsewhere:  livepde watch runs/mycase --address 0.0.0.0:8050
+    """
+    from livepde.dashboard import serve
+    from livepde.runs.web import Address
+
+    server = serve(folder, Address.read(address, PORT, token))
+    terminal().print(f"Open {escape(server.url)}  (Ctrl-C ends it)", soft_wrap=True)
+    try:
+        server.wait()
+    except KeyboardInterrupt:
+        server.close()

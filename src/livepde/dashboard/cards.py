@@ -1,0 +1,310 @@
+"""Parts of the page made of text: the headline, the verdict, cards of unknowns, tables.
+
+All text from files goes through Dash components as plain children, which show it as it stands.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import xarray as xr
+from dash import html
+
+from livepde.dashboard.figures import at_time, groups, when_axis
+from livepde.dashboard.view import Seen
+from livepde.diagnostics.identifiability import Known
+from livepde.plots import interval_95, labelled
+from livepde.records import STATUS_CODES
+from livepde.runs import unexplained
+from livepde.runs.directory import bound_text
+from livepde.runs.summary import digits, scalars, scored
+
+__all__ = ["cards", "chip", "facts", "pretty", "summary", "tables", "verdict"]
+
+Level = Literal["good", "info", "warn", "bad"]
+
+MOST_CARDS = 12
+MOST_ROWS = 100  # of a table
+LONG = 12  # rows from which a table is closed at first
+RAISED = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SIGNS: dict[Level, str] = {"good": "✓", "info": "i", "warn": "!", "bad": "✕"}
+STATUS: dict[str, tuple[Level, str]] = {
+    "waiting": ("info", "waiting for the first sample"),
+    "running": ("good", "running"),
+    "silent": ("bad", "source is silent"),
+    "stopped": ("bad", "stopped without an end"),
+    "finished": ("info", "finished"),
+    "interrupted": ("info", "interrupted by its user"),
+    "failed": ("bad", "failed"),
+    "unreadable": ("bad", "cannot be read"),
+}
+VERDICTS: dict[str, tuple[Level, str]] = {
+    "pinned": ("good", "well known"),
+    "partly": ("info", "partly known"),
+    "moves": ("info", "changes with time"),
+    "flat": ("warn", "hardly known yet"),
+    "at its bound": ("warn", "at its bound: the bound decides"),
+}
+
+
+def pretty(number: str) -> str:
+    """Return a number as people write it.
+
+    >>> pretty("4.97e-07"), pretty("2.5")
+    ('4.97·10⁻⁷', '2.5')
+    """
+    mantissa, e, power = number.partition("e")
+    return f"{mantissa}·10{str(int(power)).translate(RAISED)}" if e else mantissa
+
+
+def _between(low: str, high: str) -> str:
+    """Return an interval, with its power of ten only once."""
+    power, other = low.partition("e")[2], high.partition("e")[2]
+    return f"{pretty(low.partition('e')[0] if power == other else low)} to {pretty(high)}"
+
+
+def chip(seen: Seen) -> list[Any]:
+    """Return the status of a run."""
+    level, text = STATUS.get(seen.status, ("info", seen.status))
+    return [_sign(level), html.Span(text)]
+
+
+def facts(seen: Seen) -> str:
+    """Return how far a run is, in a line."""
+    parts = [f"{seen.samples} sample{'s' * (seen.samples != 1)}"]
+    if seen.dataset is not None and seen.dataset.sizes["time"]:
+        last = float(seen.dataset["time"][-1])
+        parts.append(f"newest at {when_axis(seen.dataset).text(last)}")
+    if seen.reading:
+        parts.append("still reading what was written before")
+    elif seen.ended:
+        parts.append(f"ended {seen.ended.replace('T', ' ').replace('+00:00', ' UTC')}")
+    elif seen.written:
+        parts.append(f"last written {_ago(time.time() - seen.written)}")
+    return " · ".join(parts)
+
+
+def _ago(seconds: float) -> str:
+    for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {name} ago"
+    return f"{max(seconds, 0.0):.0f} s ago"
+
+
+def summary(seen: Seen) -> str:
+    """Return what is estimated from what, in a sentence."""
+    data = seen.dataset
+    if data is None:
+        return "Nothing is estimated yet."
+    names = []
+    for name, labels in groups(data).items():
+        names.append(name if labels == [name] else f"{name} ({len(labels)} values)")
+    names += [f"{name} (field)" for name in str(data.attrs.get("fields", "")).split()]
+    sensors, withheld = (data.sizes.get(size, 0) for size in ("sensor", "withheld"))
+    found = f"Estimates {', '.join(names) or 'the state only'} from {sensors} sensor"
+    found += "s" * (sensors != 1)
+    if withheld:
+        found += f"; {withheld} more {'is' if withheld == 1 else 'are'} withheld to test it"
+    return f"{found}."
+
+
+def verdict(seen: Seen) -> list[Any]:
+    """Return whether anything is wrong: a sentence each, the gravest first."""
+    found: list[tuple[Level, str]] = []
+    if seen.problem:
+        found.append(("bad", seen.problem))
+    if seen.status == "stopped":
+        text = "The run did not end, but nobody writes it any more: it was killed. Go on with it"
+        found.append(("bad", f"{text}: livepde run CASE --out RUN --resume."))
+    if seen.status == "silent":
+        last = [event for event in seen.events if event.kind == "silent"][-1]
+        found.append(("bad", f"The source is silent: {last.message}."))
+    data = seen.dataset
+    if data is not None and data.sizes["time"]:
+        code = STATUS_CODES[int(data["status"].values[-1])]
+        if code != "ok":
+            text = f"The last step failed ({code.replace('_', ' ')})"
+            found.append(("bad", f"{text}: the estimate is that of the last good step."))
+    found += [("bad", f"Expected {c.name} {c.sense} {bound_text(c)}, but it is {c.value:.4g}.")
+              for c in seen.checks if not c.ok]  # fmt: skip
+    grave = data is not None and unexplained(data)
+    for k, sentence in enumerate(seen.doubts):
+        found.append(("bad" if grave and k == 0 else "warn", sentence))
+    if refused := sum(seen.counts.values()):
+        found.append(("info", f"{refused} rows or values were not used: see Events."))
+    if data is not None and not any(level in ("bad", "warn") for level, _ in found):
+        text = "Nothing looks wrong: steps converge, and nothing speaks against the estimates."
+        found.insert(0, ("good", text))
+    if seen.gap > 1 and seen.doubts and not seen.ended:
+        text = f"Looked at is one in {seen.gap} samples of this long run; counts are of those."
+        found.append(("info", text))
+    found += [("info", note) for note in seen.notes]
+    return [html.Li([_sign(level), html.Span(text)], className=level) for level, text in found]
+
+
+def _sign(level: Level) -> Any:
+    hidden: Any = {"aria-hidden": "true"}  # it only repeats what the text says
+    return html.Span(SIGNS[level], className=f"sign {level}", **hidden)
+
+
+# --- cards ---------------------------------------------------------------------------------------
+
+
+def cards(data: xr.Dataset | None, at: float | None) -> list[Any]:
+    """Return a card for each unknown with its value at a time."""
+    if data is None or not data.sizes["time"]:
+        return []
+    labels = scalars(data)
+    fields = [name for name in str(data.attrs.get("fields", "")).split() if name in data]
+    found = [_field_card(data, name, at) for name in fields]
+    k = at_time(data, "time", at)
+    found += [_card(data, label, k) for label in labels[: max(MOST_CARDS - len(fields), 0)]]
+    left = len(labels) + len(fields) - len(found)
+    if left > 0:
+        found.append(html.P(f"and {left} more: see below.", className="more"))
+    return found
+
+
+def _card(data: xr.Dataset, label: str, k: int) -> Any:
+    value, std = float(data[label].values[k]), float(data[f"{label}_std"].values[k])
+    unit = labelled("", str(data[label].attrs.get("units", ""))).strip(" []")
+    lines: list[Any] = []
+    if math.isfinite(std) and std > 0.0:
+        low, high = (digits(float(end[k]), std)[0] for end in interval_95(data, label))
+        lines.append(html.P(["95 % sure: ", html.Span(_between(low, high))], className="interval"))
+    else:
+        lines.append(html.P("no interval: the law has no covariance", className="interval"))
+    if "reference" in data[label].attrs:
+        reference = pretty(f"{float(data[label].attrs['reference']):.4g}")
+        lines.append(html.P(f"reference {reference}", className="interval"))
+    left = float(data[f"{label}_left"].values[k]) if f"{label}_left" in data else math.nan
+    if math.isfinite(left):
+        lines.append(_known(data, label, value, left))
+    number = pretty(digits(value, std)[0])
+    return html.Article(
+        [
+            html.H3(label),
+            html.P([number, html.Span(f" {unit}", className="unit")], className="value"),
+            *lines,
+        ],
+        className="card",
+    )
+
+
+def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
+    attrs = data[label].attrs
+    bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
+    moves = "prior_std" not in attrs
+    known = Known(label, left, bound=bounds[0] if bounds else math.nan, moves=moves)
+    state = "moves" if moves and known.verdict == "partly" else known.verdict
+    level, text = VERDICTS[state]
+    if state in ("partly", "pinned"):
+        text += f", {100 * left:.2g} % open"
+    return html.P([_sign(level), text], className="known")
+
+
+def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
+    k = at_time(data, "snapshot", at)
+    values = data[name].values[k]
+    unit = labelled("", str(data[name].attrs.get("units", ""))).strip(" []")
+    low, mean, high = (
+        pretty(f"{number:.3g}") for number in (values.min(), values.mean(), values.max())
+    )
+    lines = [html.P(f"field, mean {mean}", className="interval")]
+    if f"{name}_std" in data:
+        deviation = pretty(f"{float(np.mean(data[f'{name}_std'].values[k])):.2g}")
+        lines.append(html.P(f"mean deviation ± {deviation}", className="interval"))
+    if f"{name}_modes" in data:
+        modes = data[f"{name}_modes"]
+        count, some = int(modes.attrs["of"]), float(modes.values[k])
+        level: Level = "good" if some > 0.9 * count else "info" if some >= 1.0 else "warn"
+        text = f"{some:.1f} of {count} modes told by the data"
+        lines.append(html.P([_sign(level), text], className="known"))
+    return html.Article(
+        [
+            html.H3(name),
+            html.P(
+                [f"{low} to {high}", html.Span(f" {unit}", className="unit")],
+                className="value range",
+            ),
+            *lines,
+        ],
+        className="card",
+    )
+
+
+# --- tables --------------------------------------------------------------------------------------
+
+
+def tables(seen: Seen) -> dict[str, list[Any]]:
+    """Return what stands in tables: section -> components."""
+    found: dict[str, list[Any]] = {"sensors": [], "events": []}
+    data = seen.dataset
+    if data is not None and data.sizes["time"]:
+        found["sensors"] = [_sensor_table(data)]
+    if seen.events:
+        rows = [
+            (_when(data, event.t), event.kind, event.channel, event.message)
+            for event in reversed(seen.events)
+        ]
+        found["events"].append(_table("Events, the newest first", EVENTS, rows))
+    if seen.counts:
+        counts = [(kind, channel or "–", n) for (kind, channel), n in seen.counts.items()]
+        about = "Rows and values that were not used"
+        found["events"].append(_table(about, ("reason", "channel", "number"), counts))
+    if seen.checks:
+        checks = [
+            ("✓" if c.ok else "✕ failed", c.name, f"{c.value:.5g}", f"{c.sense} {bound_text(c)}")
+            for c in seen.checks
+        ]
+        columns = ("", "number", "value", "expected")
+        found["events"].append(_table("What was expected of this run", columns, checks))
+    if not found["events"]:
+        found["events"].append(html.P("Nothing has happened, and every row was used."))
+    return found
+
+
+EVENTS = ("when", "what", "channel", "in words")
+
+
+def _sensor_table(data: xr.Dataset) -> Any:
+    last: dict[str, float] = {}
+    for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+        if variable in data:
+            names = [str(name) for name in data[dimension].values]
+            last |= dict(zip(names, data[variable].values[-1].tolist(), strict=True))
+    rows = [
+        (
+            name,
+            "used" if role == "assimilated" else role,
+            f"{last[name]:+.3g}" if math.isfinite(last[name]) else "missing",
+            f"{float(errors.mean()):+.2g}" if len(errors) else "–",
+            f"{float(np.sqrt((errors**2).mean())):.3g}" if len(errors) else "–",
+        )
+        for name, (role, errors) in scored(data).items()
+    ]
+    unit = labelled("", str(data["innovation"].attrs.get("units", ""))).strip()
+    title = f"Measured minus expected {unit}".rstrip()
+    return _table(title, ("channel", "role", "last", "mean", "root mean square"), rows)
+
+
+def _when(data: xr.Dataset | None, t: float | None) -> str:
+    if data is None or t is None or not math.isfinite(t):
+        return "–"
+    return when_axis(data).text(t)
+
+
+def _table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> Any:
+    shown = list(rows)
+    body = [html.Tr([html.Td(str(cell)) for cell in row]) for row in shown[:MOST_ROWS]]
+    if len(shown) > MOST_ROWS:
+        body.append(html.Tr(html.Td(f"and {len(shown) - MOST_ROWS} more", colSpan=len(columns))))
+    head = html.Thead(html.Tr([html.Th(name, scope="col") for name in columns]))
+    table = html.Table([head, html.Tbody(body)])
+    return html.Details(
+        [html.Summary(title), table], open=len(shown) <= LONG, className="table-frame"
+    )

@@ -1,0 +1,252 @@
+"""The live page: a Dash application over the view of a run, served from this machine only."""
+
+from __future__ import annotations
+
+import html as markup
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import dash
+from dash import ALL, Input, Output, State, dcc, html, no_update
+
+from livepde import __version__
+from livepde.dashboard import cards
+from livepde.dashboard.figures import CONFIG, SECTIONS, Panel, panels, when_axis
+from livepde.dashboard.view import View
+
+if TYPE_CHECKING:
+    from flask import Response
+
+__all__ = ["page"]
+
+FAST, CATCHING_UP, SLOW = 2000, 300, 10_000  # milliseconds between two looks
+STOPS = 400  # of the slider
+OPEN = ("waiting", "running", "silent")  # a run in which something may happen soon
+
+
+def page(path: Path) -> dash.Dash:
+    """Return the page of a run.
+
+    Parameters
+    ----------
+    path
+        The run directory, finished or going on.
+
+    Raises
+    ------
+    RunError
+        There is no run.
+    """
+    view = View(path)
+    app = dash.Dash(
+        "livepde",
+        assets_folder=str(Path(__file__).with_name("assets")),
+        serve_locally=True,
+        title=markup.escape(f"{view.look().title} – livepde"),
+        update_title="",
+        meta_tags=[{"name": "viewport", "content": "width=device-width, initial-scale=1"}],
+    )
+    app.layout = _skeleton
+    _connect(app, view)
+    _harden(app)
+    return app
+
+
+def _skeleton() -> Any:
+    """Return the page before anything is known."""
+    sections = [
+        html.Section(
+            [
+                html.H2(title, id=f"title-{key}"),
+                html.Div(id=f"panels-{key}", className="panels"),
+                html.Div(id=f"tables-{key}"),
+            ],
+            id=f"section-{key}",
+            **_aria(labelledby=f"title-{key}"),
+        )
+        for key, title in {**SECTIONS, "events": "Events"}.items()
+    ]
+    return html.Main(
+        [
+            dcc.Interval(id="tick", interval=CATCHING_UP),
+            dcc.Store(id="news"),
+            dcc.Store(id="at"),
+            html.Header(
+                [
+                    html.H1(id="title"),
+                    html.Div(id="chip", role="status", className="chip"),
+                    html.P(id="summary"),
+                    html.P(id="facts"),
+                ]
+            ),
+            html.Ul(id="verdict", **_aria(label="Is anything wrong?")),
+            html.Div(id="cards", **_aria(label="Estimates")),
+            html.Div(
+                [
+                    html.Label("Look back", htmlFor="slider", id="slider-label"),
+                    dcc.Slider(
+                        id="slider",
+                        min=0,
+                        max=1,
+                        value=1,
+                        marks=None,
+                        updatemode="drag",
+                        allow_direct_input=False,
+                        disabled=True,
+                    ),
+                    html.Output(id="shown"),
+                    html.Button("Newest", id="newest", n_clicks=0),
+                ],
+                id="timebar",
+            ),
+            *sections,
+            html.Footer(f"livepde {__version__}"),
+        ]
+    )
+
+
+def _aria(**values: str) -> Any:
+    """Return attributes for those who listen to a page."""
+    return {f"aria-{name}": value for name, value in values.items()}
+
+
+def _connect(app: dash.Dash, view: View) -> None:
+    """Let the page look at the run, and draw when there is news or another time is asked for."""
+
+    @app.callback(
+        Output("news", "data"),
+        Output("tick", "interval"),
+        Output("title", "children"),
+        Output("chip", "children"),
+        Output("chip", "className"),
+        Output("summary", "children"),
+        Output("facts", "children"),
+        Input("tick", "n_intervals"),
+        State("news", "data"),
+    )
+    def look(_: int | None, known: int | None) -> tuple[Any, ...]:
+        seen = view.look()
+        level = cards.STATUS.get(seen.status, ("info", ""))[0]
+        pace = CATCHING_UP if seen.reading else FAST if seen.status in OPEN else SLOW
+        return (
+            no_update if known == seen.version else seen.version,
+            pace,
+            seen.title,
+            cards.chip(seen),
+            f"chip {level}",
+            cards.summary(seen),
+            cards.facts(seen),
+        )
+
+    @app.callback(
+        Output("at", "data"),
+        Output("slider", "min"),
+        Output("slider", "max"),
+        Output("slider", "step"),
+        Output("slider", "value"),
+        Output("slider", "disabled"),
+        Output("shown", "children"),
+        Input("news", "data"),
+        Input("slider", "value"),
+        Input("newest", "n_clicks"),
+        State("at", "data"),
+        prevent_initial_call=True,
+    )
+    def steer(_: int | None, wanted: float, __: int, before: float | None) -> tuple[Any, ...]:
+        data = view.look().dataset
+        if data is None or not data.sizes["time"]:
+            return None, 0, 1, 1, 1, True, ""
+        low, high = (float(data["time"].values[k]) for k in (0, -1))
+        step = (high - low) / STOPS or 1.0
+        at = before
+        if dash.ctx.triggered_id == "slider":
+            at = None if wanted >= high - step / 2 else wanted  # at the end it follows
+        elif dash.ctx.triggered_id == "newest":
+            at = None
+        moment = high if at is None else at
+        said = f"{'newest' if at is None else 'looking back'}: {when_axis(data).text(moment)}"
+        return at, low, high, step, moment, not high > low, said
+
+    @app.callback(
+        Output("verdict", "children"),
+        Output("cards", "children"),
+        Output("tables-sensors", "children"),
+        Output("tables-events", "children"),
+        Input("at", "data"),
+        prevent_initial_call=True,
+    )
+    def tell(at: float | None) -> tuple[Any, ...]:
+        seen = view.look()
+        tables = cards.tables(seen)
+        return (
+            cards.verdict(seen),
+            cards.cards(seen.dataset, at),
+            tables["sensors"],
+            tables["events"],
+        )
+
+    @app.callback(
+        *(Output(f"panels-{key}", "children") for key in SECTIONS),
+        *(Output(f"section-{key}", "hidden") for key in SECTIONS),
+        Output({"panel": ALL}, "figure"),
+        Output({"about": ALL}, "children"),
+        Input("at", "data"),
+        State({"panel": ALL}, "id"),
+        prevent_initial_call=True,
+    )
+    def draw(at: float | None, there: list[dict[str, str]]) -> tuple[Any, ...]:
+        data = view.look().dataset
+        drawn = {} if data is None else {panel.name: panel for panel in panels(data, at)}
+        names = [item["panel"] for item in there]
+        if names == [*drawn]:
+            kept = (no_update,) * (2 * len(SECTIONS))
+            return (*kept, [p.figure for p in drawn.values()], [p.about for p in drawn.values()])
+        found = [[p for p in drawn.values() if p.section == key] for key in SECTIONS]
+        still = [no_update] * len(names)
+        return (
+            *([_framed(p) for p in part] for part in found),
+            *(not p for p in found),
+            still,
+            still,
+        )
+
+
+def _framed(panel: Panel) -> Any:
+    """Return a figure with its title and what it shows in words."""
+    return html.Figure(
+        [
+            html.H3(panel.title),
+            html.Figcaption(panel.about, id={"about": panel.name}),
+            dcc.Graph(
+                id={"panel": panel.name},
+                figure=panel.figure,
+                config=CONFIG,
+                style={"height": panel.figure.layout.height},
+            ),
+        ],
+        className="panel",
+    )
+
+
+def _harden(app: dash.Dash) -> None:
+    """Tell browsers to load nothing from elsewhere, and to run no script but the page's own."""
+    scripts = " ".join(
+        f"'{found}'" if not found.startswith("'") else found for found in app.csp_hashes()
+    )
+    policy = "; ".join(
+        [
+            "default-src 'self'",
+            # Plotly compiles what it draws with WebGL.
+            f"script-src 'self' 'unsafe-eval' {scripts}",
+            "style-src 'self' 'unsafe-inline'",
+            "img-src 'self' data: blob:",
+            "frame-ancestors 'none'",
+        ]
+    )
+
+    @app.server.after_request  # type: ignore[untyped-decorator]
+    def add(answer: Response) -> Response:
+        answer.headers["Content-Security-Policy"] = policy
+        answer.headers["X-Content-Type-Options"] = "nosniff"
+        answer.headers["Referrer-Policy"] = "no-referrer"
+        return answer

@@ -1,0 +1,126 @@
+"""A run as one HTML file: sentences, tables and figures, to keep or to send.
+
+The file holds all that it shows; its policy forbids a browser to ask anybody for anything.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from pathlib import Path
+
+from livepde import runs
+from livepde.errors import ConfigurationError, RunError
+from livepde.runs import Check, Journal, Run, Table
+from livepde.runs.directory import CASE, JOURNAL, bound_text
+from livepde.runs.export import into_place
+from livepde.runs.journal import Event
+
+__all__ = ["page_of", "write_report"]
+
+TEMPLATE = "report.html"
+MOST_EVENTS = 500
+
+
+def write_report(run: Run, target: Path, *, force: bool = False) -> None:
+    """Write the report of a run, also of one that still goes on.
+
+    Parameters
+    ----------
+    force
+        Write over what is there.
+
+    Raises
+    ------
+    RunError
+        The target exists, or cannot be written; the run holds no estimates.
+    ConfigurationError
+        Plotly or Jinja2 is not installed.
+    """
+
+    def write(path: Path) -> None:
+        path.write_text(page_of(run), encoding="utf-8")
+
+    into_place(target, write, force=force)
+
+
+def page_of(run: Run) -> str:
+    """Return the report of a run as HTML; see `write_report`."""
+    try:
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+        from plotly.offline import get_plotlyjs
+    except ImportError:
+        raise ConfigurationError(
+            "A report as HTML needs Plotly and Jinja2: pip install 'livepde[dashboard]'."
+        ) from None
+    from livepde.dashboard.figures import CONFIG, SECTIONS, panels, when_axis
+
+    data = run.dataset
+    if not data.sizes["time"]:
+        raise RunError(f"{run.path} holds no estimates yet: there is nothing to report.")
+    axis, drawn = when_axis(data), panels(data)
+    events, counts = _journal(run)
+    case = run.path / CASE
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(TEMPLATE).render(
+        run=run,
+        equation=str(data.attrs.get("equation", "")),
+        samples=data.sizes["time"],
+        span=[axis.text(float(data["time"][k])) for k in (0, -1)],
+        notes=runs.doubts(data) if run.status == "running" else run.notes,
+        fine=all(check.ok for check in run.checks),
+        tables=[_shown(table) for table in runs.tables(data)],
+        checks=[_checked(check) for check in run.checks],
+        sections={
+            title: [panel for panel in drawn if panel.section == key]
+            for key, title in SECTIONS.items()
+        },
+        newest=f"{min(len(events), MOST_EVENTS)} of {len(events)}, the newest first",
+        events=[
+            (axis.text(event.t), event.kind, event.channel or "–", event.message)
+            for event in events[: -MOST_EVENTS - 1 : -1]
+        ],
+        counts=[(kind, channel or "–", number) for (kind, channel), number in counts.items()],
+        case=case.read_text(encoding="utf-8") if case.is_file() else "",
+        drawings={panel.name: json.loads(panel.figure.to_json()) for panel in drawn},
+        config=CONFIG,
+        written=_written(run),
+        plotly=get_plotlyjs(),
+        nonce=secrets.token_urlsafe(16),
+    )
+
+
+def _shown(table: Table) -> Table:
+    """Return a table with its numbers as text."""
+    rows = [
+        [f"{cell:.5g}" if isinstance(cell, float) else str(cell) for cell in row]
+        for row in table.rows
+    ]
+    return Table(table.title, table.columns, rows)
+
+
+def _checked(check: Check) -> tuple[str, ...]:
+    result = "ok" if check.ok else "FAILED"
+    return check.name, f"{check.value:.5g}", f"{check.sense} {bound_text(check)}", result
+
+
+def _written(run: Run) -> str:
+    """Return by which version, and when."""
+    record = run.record
+    times = [f"{key} {record[key]}" for key in ("started", "ended") if key in record]
+    return " · ".join([f"livepde {record.get('livepde', '')}".rstrip(), *times])
+
+
+def _journal(run: Run) -> tuple[list[Event], dict[tuple[str, str], int]]:
+    """Return what happened, and what was not used how often."""
+    path = run.path / JOURNAL
+    if not path.is_file():
+        return [], {}
+    with Journal.open(path) as journal:
+        return journal.events, journal.counts

@@ -1,0 +1,289 @@
+"""What a run directory shows now: read bit by bit while the run goes on, and afterwards."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+import xarray as xr
+from filelock import FileLock, Timeout
+
+from livepde import runs
+from livepde.errors import RunError
+from livepde.records import Layout, Record
+from livepde.runs import Check, Journal
+from livepde.runs.directory import JOURNAL
+from livepde.runs.journal import Event
+
+__all__ = ["Seen", "Spread", "View"]
+
+T = TypeVar("T")
+
+ROWS = 2000  # estimates that are kept to be drawn
+NOTABLE = 500  # failed steps and jumps that are kept beside them
+FIELDS = 400  # snapshots
+SHOWN = 500  # events
+BYTES = 64 * 2**20  # of snapshots
+AT_ONCE = 20_000  # estimates read in one go
+OFTEN = 0.5  # seconds within which a journal is not read again
+HEARING = ("silent", "heard")  # events of the source
+QUIET = 10.0  # seconds without news after which it is asked whether anyone still writes
+
+
+class Spread(Generic[T]):
+    """Items by number, at most so many, spread evenly; the first and the newest are among them.
+
+    Parameters
+    ----------
+    most
+        How many are kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self.gap = 1
+        self._items: dict[int, T] = {}
+        self._settled = 0  # the number up to which items stay
+
+    def add(self, number: int, item: T) -> None:
+        """Take one, with a number that is larger than those before, or the last one again."""
+        newest = next(reversed(self._items), number)
+        if newest > self._settled and newest != number:
+            if newest - self._settled < self.gap and len(self._items) > 1:
+                del self._items[newest]
+            else:
+                self._settled = newest
+        self._items[number] = item
+        if len(self._items) > self.most:
+            self._thin()
+
+    def _thin(self) -> None:
+        while len(self._items) > self.most:
+            self.gap *= 2
+            numbers = [*self._items]
+            kept, last = [], -self.gap
+            for number in numbers[:-1]:
+                if number - last >= self.gap:
+                    kept.append(number)
+                    last = number
+            self._settled = kept[-1]
+            self._items = {number: self._items[number] for number in [*kept, numbers[-1]]}
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[tuple[int, T]]:
+        return iter(self._items.items())
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What there is to see of a run.
+
+    Attributes
+    ----------
+    version
+        Another one means other content.
+    title, status
+        Of the run. Status is "waiting" (for the first sample), "running", "silent" (its source),
+        "stopped" (it did not end, but nobody writes any more), "finished", "interrupted" or
+        "failed"; "unreadable" with a sentence in `problem`.
+    dataset
+        Estimates, thinned; None before the first.
+    samples, gap
+        How many estimates there are, and that of these one in `gap` is in the dataset.
+    reading
+        True while there is more to read.
+    events, counts
+        Of the journal.
+    doubts, notes, checks
+        What speaks against the estimates; what the run said else; its checks.
+    written
+        Seconds since 1970 when something was written last.
+    ended
+        Date when the run ended, "" before.
+    """
+
+    version: int = 0
+    title: str = ""
+    status: str = "waiting"
+    dataset: xr.Dataset | None = None
+    samples: int = 0
+    gap: int = 1
+    reading: bool = False
+    events: Sequence[Event] = ()
+    counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    doubts: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    checks: Sequence[Check] = ()
+    written: float = 0.0
+    ended: str = ""
+    problem: str = ""
+
+
+class View:
+    """A run directory as it stands, for any number of visitors.
+
+    Memory and the work of a look are bounded, whatever the length of the run: of a journal only
+    what is new is read, and what is kept is thinned.
+
+    Parameters
+    ----------
+    path
+        The run directory.
+
+    Raises
+    ------
+    RunError
+        There is no run.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        self._looked = -np.inf
+        self._mark: object = None
+        self._failures = 0
+        self._begin(runs.open(path))
+        self._seen = Seen(title=runs.open(path).title)
+
+    def look(self) -> Seen:
+        """Return what there is to see now."""
+        with self._lock:
+            if time.monotonic() - self._looked < OFTEN and not self._seen.reading:
+                return self._seen
+            try:
+                self._seen = self._read()
+                self._failures = 0
+            except (RunError, ValueError, TypeError, KeyError, IndexError) as error:
+                self._failures += 1
+                if self._failures > 1:  # the first time it may be just being made
+                    self._seen = self._unreadable(error)
+            self._looked = time.monotonic()
+            return self._seen
+
+    def _unreadable(self, error: Exception) -> Seen:
+        said = str(error) if isinstance(error, RunError) else f"it is damaged ({error})."
+        problem = f"The run cannot be read: {said}"
+        self._mark = None
+        version = self._seen.version + (self._seen.problem != problem)
+        return replace(self._seen, version=version, status="unreadable", problem=problem)
+
+    def _begin(self, run: runs.Run) -> None:
+        self._started = run.record.get("started")
+        self._rows: Spread[Record] = Spread(ROWS)
+        self._notable: Spread[Record] = Spread(NOTABLE)
+        self._fields: Spread[Record] = Spread(FIELDS)
+        self._number = 0
+
+    def _read(self) -> Seen:
+        run = runs.open(self.path)
+        if run.record.get("started") != self._started:  # another run in the same place
+            self._begin(run)
+        journal = self.path / JOURNAL
+        live = journal.is_file()
+        written = _written(journal) if live else 0.0
+        status = self._status(run, journal if live else None, written)
+        mark = (written, status, str(run.record), self._number, self._seen.reading)
+        if mark == self._mark:
+            return self._seen
+        seen = replace(
+            self._seen,
+            version=self._seen.version + 1,
+            title=run.title,
+            status=status,
+            written=written,
+            ended=str(run.record.get("ended", "")) if run.status != "running" else "",
+            problem="",
+        )
+        seen = self._follow(seen, journal) if live else self._load(seen, run)
+        found = [] if seen.dataset is None else runs.doubts(seen.dataset)
+        ended = run.status != "running"
+        if ended and seen.gap > 1:  # what the run itself has said is of all its samples
+            found = run.notes if found else []
+        notes = [note for note in run.notes if note not in found] if ended else []
+        seen = replace(seen, doubts=found, notes=notes, checks=run.checks if ended else [])
+        self._mark = (written, status, str(run.record), self._number, seen.reading)
+        return seen
+
+    def _load(self, seen: Seen, run: runs.Run) -> Seen:
+        if run.status == "running":
+            return replace(seen, dataset=None)
+        data = run.dataset
+        return replace(seen, dataset=data, samples=data.sizes["time"])
+
+    def _follow(self, seen: Seen, path: Path) -> Seen:
+        with Journal.open(path) as journal:
+            # The last one again: its fields may have been kept after it.
+            new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]
+            layout, count = journal.layout, len(journal)
+            events, counts = journal.events, journal.counts
+        for number, record in new:
+            self._add(number, record)
+        status = seen.status
+        if status == "running" and not count:
+            status = "waiting"
+        elif status == "running" and [e.kind for e in events if e.kind in HEARING][-1:] == [
+            "silent"
+        ]:
+            status = "silent"
+        return replace(
+            seen,
+            status=status,
+            dataset=self._dataset(layout),
+            samples=count,
+            gap=self._rows.gap,
+            reading=len(new) == AT_ONCE,
+            events=events[-SHOWN:],
+            counts=counts,
+        )
+
+    def _add(self, number: int, record: Record) -> None:
+        self._number = number
+        if record.snapshot is not None:
+            size = 8 * sum(values.size for values in record.snapshot.profiles.values())
+            self._fields.most = max(2, min(FIELDS, BYTES // max(size, 1)))
+            self._fields.add(number, record)
+        plain = replace(record, snapshot=None)
+        if record.status or record.notes.get("jump", 0.0) > 0.0:
+            self._notable.add(number, plain)
+        self._rows.add(number, plain)
+
+    def _dataset(self, layout: Layout) -> xr.Dataset | None:
+        kept = {**dict(self._rows), **dict(self._notable), **dict(self._fields)}
+        if not kept:
+            return None
+        return layout.dataset([kept[number] for number in sorted(kept)])
+
+    def _status(self, run: runs.Run, journal: Path | None, written: float) -> str:
+        if run.status != "running":
+            return run.status
+        if journal is None:
+            return "waiting"
+        if time.time() - written > QUIET and not _in_use(journal):
+            return "stopped"
+        return "running"
+
+
+def _written(journal: Path) -> float:
+    """Return when a journal was written last."""
+    files = [journal, journal.with_name(journal.name + "-wal")]
+    return max(os.stat(file).st_mtime for file in files if file.exists())
+
+
+def _in_use(journal: Path) -> bool:
+    """Return whether a process holds a journal to write it."""
+    lock = FileLock(journal.with_name(journal.name + ".lock"))
+    try:
+        lock.acquire(timeout=0)
+    except (Timeout, OSError):
+        return True
+    lock.release()
+    return False
