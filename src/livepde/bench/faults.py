@@ -499,9 +499,10 @@ def _killed(
         here.mkdir()
         plant = plants(here, rows, plan.seed + damage.runs)
         with _running(here, plant.source) as run:
-            while run.look() < len(rows) and fallen.total() < plan.kills:
+            some = len(rows) - 1  # the last life of a run has something to do
+            while run.look() < some and fallen.total() < plan.kills:
                 moment = str(rng.choice([*MOMENTS], p=[*MOMENTS.values()]))
-                if _kill(run, plant, moment, start, rng):
+                if _kill(run, plant, some, moment, start, rng):
                     fallen[moment] += 1
                     next(bar, None)
             plant.supply(len(rows))
@@ -526,16 +527,18 @@ def _killed(
     return Outcome(tables=[table], checks=[enough, *damage.checks(name)])
 
 
-def _kill(run: _Run, plant: _Plant, moment: str, start: float, rng: np.random.Generator) -> bool:
+def _kill(
+    run: _Run, plant: _Plant, rows: int, moment: str, start: float, rng: np.random.Generator
+) -> bool:
     """Start a run and kill it at such a moment; return whether it was still there."""
     seen = run.look()
-    plant.supply(seen + int(rng.integers(*LEAD)))
+    plant.supply(min(seen + int(rng.integers(*LEAD)), rows))
     run.start()
     if moment == "start":  # also while it resumes
         time.sleep(float(rng.uniform(0.0, 1.2 * start)))
         return run.kill()
     _wait(lambda: not run.alive() or run.look() > seen, "a run does not go on")
-    plant.supply(run.look() + int(rng.integers(*LEAD)))
+    plant.supply(min(run.look() + int(rng.integers(*LEAD)), rows))
     until = time.monotonic() + float(rng.uniform(0.0, STRIDE))
     if moment == "write":  # while its log grows, if it does
         size = run.log_size

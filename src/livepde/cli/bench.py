@@ -149,7 +149,7 @@ def faults(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this: file, mqtt, restart, malformed or messages. Repeat it for more."
+            help="One of file, mqtt, restart, malformed, messages. Repeat it."
         ),
     ] = None,
     as_json: JsonOption = False,

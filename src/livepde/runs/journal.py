@@ -208,7 +208,7 @@ class Journal:
     def _read(self, command: str, *values: Any) -> list[Any]:
         try:
             return self._db.execute(command, values).fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter of a damaged file
             raise RunError(_told(self.path, error)) from error
 
     def _one(self, command: str, *values: Any) -> Any:
@@ -380,6 +380,8 @@ class Journal:
 
     def _taken(self, number: int, t: float, channels: bytes) -> Taken:
         with _sound(self.path):
+            if len(channels) != 8 * len(self.channels):
+                raise ValueError(f"sample {number} has not the size of the others")
             values = np.frombuffer(channels).tolist()
             return Taken(number, float(t), dict(zip(self.channels, values, strict=True)))
 
@@ -552,10 +554,10 @@ def _released(path: Path, lock: FileLock | None) -> Iterator[None]:
     """Let go of a journal that cannot be opened, and say why in one sentence."""
     try:
         yield
-    except (OSError, sqlite3.Error, RunError) as error:
+    except (OSError, sqlite3.Error, UnicodeDecodeError, RunError) as error:
         if lock is not None:
             lock.release()
-        if isinstance(error, sqlite3.Error):
+        if isinstance(error, sqlite3.Error | UnicodeDecodeError):
             raise RunError(_told(path, error)) from error
         if isinstance(error, OSError):
             raise RunError(f"{path} cannot be written: {error.strerror or error}.") from error
@@ -572,7 +574,7 @@ def _sound(path: Path) -> Iterator[None]:
         raise RunError(f"{path} is damaged ({reason[:200]}): {AGAIN}.") from error
 
 
-def _told(path: Path, error: sqlite3.Error) -> str:
-    code = getattr(error, "sqlite_errorcode", None) or 0
+def _told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     remedy = REMEDIES.get(code & 0xFF, "mend the folder, and go on with --resume")
     return f"{path}: {error}. What was written before is safe; {remedy}."

@@ -324,4 +324,7 @@ class Intake:
 
 def _microseconds(stamp: float) -> float:
     """Return seconds since 1970 as a date has them, so that a date gives the same again."""
-    return datetime.fromtimestamp(stamp, UTC).timestamp()
+    try:
+        return datetime.fromtimestamp(stamp, UTC).timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise SampleError("the first time is no date in UTC; its year must be 1 to 9999") from None

@@ -1,0 +1,686 @@
+"""The journal: what a kill, a full disk, a damaged or a hostile file make of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from test_live import CLOCK, COLUMNS, identifier, journal, live, rows, same, write
+
+import livepde as lp
+from livepde import checkpoint
+from livepde.records import Record
+from livepde.runs.journal import KEPT_EVENTS, Event, Journal
+from livepde.runs.live import CHECKPOINT, Live, Retention, Samples
+from livepde.streams.intake import Intake
+from livepde.streams.sources import Follow, Rows, json_row
+
+NAME = "journal.sqlite"
+
+
+def samples(count: int, after: float = -np.inf) -> Samples:
+    return Samples((lp.Sample(row.pop("t"), row) for row in rows(count)), after=after)
+
+
+def started(folder: Path, count: int, **options) -> Live:
+    path = folder / NAME
+    kept = Journal.open(path, write=True) if path.exists() else journal(path)
+    return Live(identifier(), samples(count, kept.last), kept, fields_every=10, **options)
+
+
+def finished(folder: Path, count: int = 30) -> Path:
+    run = started(folder, count)
+    run.run()
+    run.journal.close()
+    return folder / NAME
+
+
+def content(path: Path) -> dict[str, dict[int, tuple]]:
+    """Return all that a journal holds, row by row."""
+    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as raw:
+        tables = ("samples", "estimates", "fields", "events")
+        return {name: {r[0]: r for r in raw.execute(f"SELECT * FROM {name}")} for name in tables}
+
+
+# --- crashes -------------------------------------------------------------------------------------
+
+
+class Crash(Exception):
+    """As good as a kill, within the process."""
+
+
+class Breaks:
+    """A sink that breaks the run after so many estimates."""
+
+    def __init__(self, after: int) -> None:
+        self.left = after
+
+    def put(self, estimate) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise Crash
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("method", ["accept", "append", "checkpoint", "step"])
+def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(tmp_path, monkeypatch, method):
+    count = CHECKPOINT + 40
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir(), broken.mkdir()
+    finished(whole, count)
+    run = started(broken, count)
+    owner, calls = (run.identifier if method == "step" else run.journal), []
+    limit = 1 if method == "checkpoint" else CHECKPOINT + 5
+    real = getattr(owner, method)
+
+    def breaks(*arguments):
+        found = real(*arguments)
+        calls.append(1)
+        if len(calls) == limit:
+            raise Crash
+        return found
+
+    monkeypatch.setattr(owner, method, breaks)
+    with pytest.raises(Crash):
+        run.run()
+    run.journal.close()
+    again = started(broken, count)
+    again.resume()
+    again.run()
+    again.journal.close()
+    with Journal.open(whole / NAME) as one, Journal.open(broken / NAME) as other:
+        same(other, one)
+        assert other.accepted == count
+
+
+def test_what_is_found_again_does_not_change_what_is_there(tmp_path):
+    path = tmp_path / NAME
+    run = started(tmp_path, 60, sinks=[Breaks(37)])
+    with pytest.raises(Crash):
+        run.run()
+    run.journal.note(Event(1.0, "odd", "", "something"))
+    run.journal.close()
+    before = content(path)
+    run = started(tmp_path, 60)
+    run.resume()
+    run.journal.note(Event(1.0, "odd", "", "something"))
+    run.run()
+    run.journal.close()
+    after = content(path)
+    for table, kept in before.items():
+        if table == "fields":  # those of the last sample are there only while it is the last
+            kept = {key: row for key, row in kept.items() if not row[1]}
+        assert kept.items() <= after[table].items()
+    assert len(after["events"]) == 1
+    assert len(after["estimates"]) == 60
+
+
+def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    whole.mkdir(), stopped.mkdir()
+    finished(whole, 60)
+    finished(stopped, 37)
+    run = started(stopped, 60)
+    run.resume()
+    run.run()
+    run.journal.close()
+    run = started(stopped, 60)  # nothing is left to do
+    run.resume()
+    run.run()
+    run.journal.close()
+    with Journal.open(whole / NAME) as one, Journal.open(stopped / NAME) as other:
+        same(other, one)
+        assert list(other)[-1].snapshot is not None
+
+
+def test_an_event_of_a_refused_sample_comes_with_its_withdrawal(tmp_path):
+    feed = Rows([{"t": 0.0, "a": 1.0, "b": 1.0, "left": 1.0}, {"t": 0.1, "a": 1.0}])
+    run = live(tmp_path, feed)
+    run.journal.accept(-1.0, {"a": 1.0})  # left over: without input
+    run.resume()
+    run.run()
+    assert [event.kind for event in run.journal.events if event.kind == "refused"] == ["refused"]
+    assert run.journal.accepted == 2
+
+
+# --- a journal that cannot be written ------------------------------------------------------------
+
+
+def limit_pages(kept: Journal, more: int) -> None:
+    (pages,) = kept._db.execute("PRAGMA page_count").fetchone()
+    kept._db.execute(f"PRAGMA max_page_count = {pages + more}")
+
+
+def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
+    whole, full = tmp_path / "whole", tmp_path / "full"
+    whole.mkdir(), full.mkdir()
+    finished(whole, 600)
+    run = started(full, 600)
+    limit_pages(run.journal, 20)
+    with pytest.raises(lp.RunError, match=r"full.*What was written before is safe; make room"):
+        run.run()
+    with pytest.raises(lp.RunError, match="full"):  # it takes nothing more
+        run.journal.commit()
+    kept = len(run.journal)
+    run.journal.close()
+    assert 0 < kept < 600
+    with sqlite3.connect(full / NAME) as raw:
+        assert raw.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    again = started(full, 600)
+    again.resume()
+    again.run()
+    again.journal.close()
+    with Journal.open(whole / NAME) as one, Journal.open(full / NAME) as other:
+        same(other, one)
+        assert other.accepted == 600
+
+
+def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
+    run = started(tmp_path, 100)
+    limit_pages(run.journal, 10)
+    with pytest.raises(lp.RunError):
+        run.run()
+    run.journal._db.execute("PRAGMA max_page_count = 100000")  # room again, too late
+    with pytest.raises(lp.RunError, match="full"):
+        run.journal.checkpoint(run.identifier.dump())
+    run.journal.close()
+    with Journal.open(tmp_path / NAME) as kept:
+        assert kept.accepted == len(kept) + 1 or kept.accepted >= len(kept)
+        assert kept.estimated == len(kept)
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]),) * 2)
+sys.path.insert(0, sys.argv[2])
+import livepde
+from test_journal import started
+run = started(Path(sys.argv[1]), 400)
+run.resume()
+try:
+    run.run()
+except livepde.RunError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs limits of POSIX")
+def test_a_file_that_may_not_grow(tmp_path):
+    whole, full = tmp_path / "whole", tmp_path / "full"
+    whole.mkdir(), full.mkdir()
+    finished(whole, 400)
+    for size in (150_000, 300_000):
+        found = subprocess.run(
+            [sys.executable, "-c", FULL, str(full), str(Path(__file__).parent), str(size)],
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        assert not found.stderr
+        assert "make room" in found.stdout
+    again = started(full, 400)
+    again.resume()
+    again.run()
+    again.journal.close()
+    with Journal.open(whole / NAME) as one, Journal.open(full / NAME) as other:
+        same(other, one)
+
+
+def as_nobody(code: str, *arguments: object) -> str:
+    """Run code as a user who may write nothing here; return what it prints."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert not found.stderr
+    return found.stdout
+
+
+READ = """
+import os, sys
+from pathlib import Path
+import livepde, pydantic
+from livepde.runs import Journal
+with Journal.create(None, (), livepde.records.Layout("", "", {}, {}, [], None, {}, {}, [], [], [])):
+    pass
+if os.getuid() == 0:
+    os.setuid(65534)
+try:
+    with Journal.open(Path(sys.argv[1]), write=len(sys.argv) > 2) as kept:
+        print(len(kept), len(kept.dataset().time))
+except livepde.RunError as error:
+    print(error)
+"""
+
+
+@pytest.fixture
+def shared():
+    """A folder that everybody can read and only its owner write."""
+    import tempfile
+
+    folder = Path(tempfile.mkdtemp())  # tmp_path is for its owner only
+    folder.chmod(0o755)
+    yield folder
+    folder.chmod(0o755)
+    shutil.rmtree(folder)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs permissions of POSIX")
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_folder_that_may_only_be_read(shared, killed):
+    run = started(shared, 30)
+    run.run()
+    if killed:  # its write-ahead log stays
+        copy = shared / "copy"
+        copy.mkdir()
+        for path in shared.glob(f"{NAME}*"):
+            shutil.copy(path, copy / path.name)
+        run.journal.close()
+        shared = copy
+    else:
+        run.journal.close()
+    for path in shared.glob("*"):
+        path.chmod(0o644 if path.is_file() else 0o755)
+    shared.chmod(0o555)
+    assert as_nobody(READ, shared / NAME) == "30 30\n"
+    assert "cannot be written" in as_nobody(READ, shared / NAME, "write")
+    shared.chmod(0o755)
+
+
+def test_a_journal_appears_whole_or_not_at_all(tmp_path):
+    path = tmp_path / NAME
+    partial = tmp_path / f"{NAME}.partial"
+    partial.write_bytes(b"SQLite format 3\0 and then it was killed")
+    kept = journal(path)
+    assert not partial.exists()
+    kept.close()
+    with pytest.raises(lp.RunError, match="already; go on with it"):
+        journal(path)
+    Journal.open(path, write=True).close()  # the lock is free
+
+
+def test_two_writers(tmp_path):
+    first = journal(tmp_path / NAME)
+    with pytest.raises(lp.RunError, match="written by another process"):
+        Journal.open(tmp_path / NAME, write=True)
+    with pytest.raises(lp.RunError, match="written by another process"):
+        journal(tmp_path / NAME)
+    first.close()
+
+
+# --- files that are damaged, or made to do harm --------------------------------------------------
+
+
+def reads(path: Path) -> None:
+    """Read all of a journal, and go on with it."""
+    with Journal.open(path) as kept:
+        kept.dataset()
+        _ = kept.events, kept.counts, kept.position, kept.last, kept.first, len(kept)
+    with Journal.open(path, write=True) as kept:
+        Live(identifier(), samples(35, kept.last), kept).resume()
+
+
+def refused(path: Path, match: str = "damaged|not a journal|malformed|not a database") -> None:
+    """Reading ends in one sentence that names the file."""
+    with pytest.raises(lp.RunError, match=match) as caught:
+        reads(path)
+    text = str(caught.value)
+    assert str(path.parent) in text
+    assert "\n" not in text
+    assert len(text) < 700
+    for other in path.parent.glob(f"{path.name}-*"):
+        other.unlink()
+
+
+@pytest.mark.parametrize("keep", [0, 1, 50, 99, 4096, 5000, 20000])
+def test_a_file_that_was_cut_off(tmp_path, keep):
+    path = finished(tmp_path)
+    path.write_bytes(path.read_bytes()[:keep])
+    refused(path)
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    derandomize=True,
+)
+@given(seed=st.integers(0, 2**32), share=st.sampled_from([1e-5, 1e-4, 1e-3, 1e-2, 0.3]))
+def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, seed, share):
+    folder = tmp_path_factory.mktemp("bytes")
+    path = finished(folder, 12)
+    rng = np.random.default_rng(seed)
+    data = np.frombuffer(path.read_bytes(), dtype=np.uint8).copy()
+    where = rng.integers(0, len(data), max(int(share * len(data)), 1))
+    data[where] = rng.integers(0, 256, len(where))
+    path.write_bytes(data.tobytes())
+    with suppress(lp.LivepdeError):  # and nothing else
+        reads(path)
+    shutil.rmtree(folder)
+
+
+HOSTILE = [
+    "UPDATE meta SET value = '2' WHERE key = 'format'",
+    "DELETE FROM meta",
+    "UPDATE meta SET value = '[' || replace(hex(zeroblob(50000)), '00', '[')",
+    "UPDATE meta SET value = replace(hex(zeroblob(50000)), '00', '[') WHERE key = 'layout'",
+    "UPDATE meta SET value = '{}' WHERE key = 'layout'",
+    "UPDATE meta SET value = '7' WHERE key = 'channels'",
+    "UPDATE meta SET value = '[\"a\"]' WHERE key = 'channels'",
+    "UPDATE meta SET value = replace(value, '\"a\"', '3') WHERE key = 'layout'",
+    "UPDATE meta SET value = x'ff00' WHERE key = 'layout'",
+    "UPDATE samples SET t = 'late'",
+    "UPDATE samples SET channels = x'00'",
+    "UPDATE samples SET channels = 'text'",
+    "UPDATE samples SET channels = zeroblob(80000000) WHERE id = 1",
+    "UPDATE estimates SET numbers = x'0011'",
+    "UPDATE estimates SET numbers = zeroblob(8)",
+    "UPDATE estimates SET numbers = 5",
+    "UPDATE estimates SET notes = '[1]'",
+    'UPDATE estimates SET notes = \'{"a": "b"}\'',
+    "UPDATE estimates SET notes = '{\"a\": ' || hex(zeroblob(3000)) || '}'",
+    "UPDATE estimates SET notes = replace(hex(zeroblob(50000)), '00', '[')",
+    "UPDATE estimates SET t = 'x'",
+    "UPDATE estimates SET status = 99",
+    "UPDATE estimates SET status = 'ok'",
+    "UPDATE estimates SET steps = x'ff'",
+    "UPDATE fields SET content = x''",
+    "UPDATE fields SET content = 'text'",
+    "UPDATE fields SET content = '{}' || x'00'",
+    'UPDATE fields SET content = CAST(\'{"told": {}, "profiles": {"u": -1}}\' AS BLOB) || x\'00\'',
+    'UPDATE fields SET content = CAST(\'{"told":{},"profiles":{"u":1e99}}\' AS BLOB) || x\'00\'',
+    "UPDATE checkpoints SET state = 'text'",
+    "UPDATE checkpoints SET state = x'504b0304'",
+    "DROP TABLE samples",
+    "DROP TABLE fields; CREATE VIEW fields AS SELECT 1 AS id, 0 AS last, x'' AS content",
+    "DROP TABLE counts; CREATE VIEW counts AS WITH RECURSIVE n(number) AS (SELECT 1 UNION ALL "
+    "SELECT number + 1 FROM n) SELECT 'a' AS kind, 'b' AS channel, number FROM n",
+    "CREATE TRIGGER x AFTER INSERT ON samples BEGIN DELETE FROM estimates; END",
+    "ALTER TABLE samples ADD COLUMN more TEXT",
+]
+
+
+@pytest.mark.parametrize("command", HOSTILE)
+def test_a_file_made_to_do_harm_is_one_sentence(tmp_path, command):
+    path = finished(tmp_path)
+    with sqlite3.connect(path) as raw:
+        raw.executescript(command)
+    raw.close()
+    refused(path)
+
+
+def test_events_and_counts_of_wrong_types_are_one_sentence(tmp_path):
+    for command in (
+        "INSERT INTO events (t, kind, channel, message) VALUES ('x', 1, 2, 3)",
+        "INSERT INTO counts VALUES ('a', 'b', 'many')",
+    ):
+        (tmp_path / NAME).unlink(missing_ok=True)
+        path = finished(tmp_path)
+        with sqlite3.connect(path) as raw:
+            raw.execute(command)
+        raw.close()
+        refused(path)
+
+
+class Evil:
+    """What a pickle could do."""
+
+    def __reduce__(self):
+        return os.system, ("touch evil",)
+
+
+def archive(**leaves) -> bytes:
+    import io
+
+    found = io.BytesIO()
+    np.savez(found, **leaves)
+    return found.getvalue()
+
+
+@pytest.mark.parametrize("kind", ["pickle", "bomb", "header", "nested", "huge", "shapes"])
+def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    path = finished(tmp_path)
+    good = identifier()
+    good.step(0.0, {"a": 1.0, "b": 1.0, "left": 1.0})
+    header, leaves = checkpoint.unpacked(good.dump(), "here")
+    if kind == "pickle":
+        state = archive(header=np.array(Evil(), dtype=object))
+    elif kind == "bomb":
+        import io
+
+        found = io.BytesIO()
+        np.savez_compressed(found, header=json.dumps(header), zeros=np.zeros(10**7))
+        state = found.getvalue()
+    elif kind == "header":
+        state = archive(header="[1, 2]")
+    elif kind == "nested":
+        state = archive(header="[" * 100_000)
+    elif kind == "huge":
+        plain = archive(header=json.dumps(header), t=np.zeros(3))
+        state = plain.replace(b"(3,)", b"(3" + b"0" * 9 + b",)").replace(b" " * 9 + b"\n", b"\n")
+    else:
+        state = checkpoint.packed(header, {**leaves, "z": np.zeros((2, 2), dtype=complex)})
+        state = checkpoint.packed(header, {name: np.array("x") for name in leaves})
+    with sqlite3.connect(path) as raw:
+        raw.execute("UPDATE checkpoints SET state = ?", (state,))
+    raw.close()
+    with pytest.raises(lp.RunError) as caught:
+        reads(path)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "evil").exists()
+
+
+# --- readers -------------------------------------------------------------------------------------
+
+WRITER = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_journal import started
+run = started(Path(sys.argv[1]), 100_000)
+run.resume()
+run.run()
+"""
+
+
+def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(tmp_path):
+    path, seen = tmp_path / NAME, 0
+    for _ in range(3):
+        child = subprocess.Popen([sys.executable, "-c", WRITER, tmp_path, Path(__file__).parent])
+        goal = seen + 150
+        while child.poll() is None and seen < goal:
+            if path.exists():
+                with Journal.open(path) as kept:
+                    records = list(kept)
+                    assert all(isinstance(record, Record) for record in records)
+                    assert len(records) >= seen  # nothing that was there goes away
+                    seen = len(records)
+        child.kill()
+        child.wait()
+        with Journal.open(path) as kept:
+            assert len(list(kept)) >= seen
+    assert seen >= 450
+
+
+def test_an_open_reader_does_not_let_the_log_grow(tmp_path):
+    run = started(tmp_path, 3000)
+    with Journal.open(tmp_path / NAME) as reader:
+        slow = reader.after(0)
+        run.sinks.append(First(slow))
+        run.run()
+        assert (tmp_path / f"{NAME}-wal").stat().st_size < 8e6
+    run.journal.close()
+
+
+class First:
+    """A reader that looks at one estimate and never ends."""
+
+    def __init__(self, slow) -> None:
+        self.slow, self.begun = slow, False
+
+    def put(self, estimate) -> None:
+        if not self.begun and estimate.t > 0.5:
+            self.begun = next(self.slow) is not None
+
+    def close(self) -> None:
+        pass
+
+
+# --- retention -----------------------------------------------------------------------------------
+
+
+def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path):
+    count, retention = 4 * CHECKPOINT, Retention(10.0, 7)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir(), broken.mkdir()
+    run = started(whole, count, retention=retention)
+    run.run()
+    run.journal.close()
+    for after in (CHECKPOINT + 3, CHECKPOINT + 10, 2):
+        run = started(broken, count, retention=retention, sinks=[Breaks(after)])
+        run.resume()
+        with pytest.raises(Crash):
+            run._run()
+        run.journal.close()
+    run = started(broken, count, retention=retention)
+    run.resume()
+    run.run()
+    run.journal.thin(run.identifier.t - 10.0, 7)
+    run.journal.close()
+    with Journal.open(whole / NAME) as one, Journal.open(broken / NAME) as other:
+        assert other.accepted == one.accepted == count
+        assert other.first is not None
+        assert other.first.id == 1
+        old = [record.t for record in one if record.t < 30.0]
+        assert 0 < len(old) < 300 / 6
+        mine, yours = ({r.t: r for r in kept} for kept in (other, one))
+        shared = mine.keys() & yours.keys()
+        assert len(shared) > CHECKPOINT
+        for t in shared:
+            assert np.array_equal(mine[t].numbers, yours[t].numbers)
+            if t > count * 0.1 - 10.0:
+                assert (mine[t].snapshot is None) == (yours[t].snapshot is None)
+
+
+def test_thinning_while_somebody_iterates(tmp_path):
+    run = started(tmp_path, 3 * CHECKPOINT)
+    run.run()
+    seen = []
+    for number, record in run.journal.after(0):
+        if number == 10:
+            run.journal.thin(60.0, 5)
+        seen.append(record.t)
+    assert seen == sorted(set(seen))
+    assert seen[-1] == run.identifier.t
+    run.journal.close()
+
+
+def test_a_journal_that_is_thinned_stops_growing(tmp_path):
+    run = started(tmp_path, 1)
+    run.run()
+    kept, sizes = run.journal, []
+    record = next(iter(kept))
+    state = run.identifier.dump()
+    for k in range(1, 12001):
+        kept.accept(float(k), {"a": 1.0})
+        kept.append(record)
+        kept.note(Event(float(k), "odd", "", "x" * 10))
+        if k % 500 == 0:
+            kept.checkpoint(state)
+            kept.thin(k - 1000.0, 1000)
+            sizes.append((tmp_path / NAME).stat().st_size)
+    assert len(kept.events) == KEPT_EVENTS
+    assert sizes[-1] < 1.1 * sizes[-4]
+    kept.close()
+
+
+# --- rows of any kind ----------------------------------------------------------------------------
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),
+    max_leaves=8,
+)
+NUMBERS = st.floats() | st.integers() | st.sampled_from(["1", "1e999", "nan", "", "9" * 400, "1 K"])
+TIMES = st.one_of(
+    st.floats(),
+    st.datetimes().map(str),
+    st.sampled_from(["0001-01-01T00:00+23:59", "9999-12-31T23:59-23:59", "2026-02-30", "", "now"]),
+    st.integers(min_value=-(10**400), max_value=10**400),
+    VALUES,
+)
+ROWS = st.fixed_dictionaries(
+    {}, optional={"t": TIMES, "a": NUMBERS | VALUES, "b": NUMBERS | VALUES, "left": VALUES}
+) | st.dictionaries(st.text(max_size=5), VALUES, max_size=4)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(ROWS, max_size=20))
+def test_any_row_becomes_part_of_a_sample_or_has_a_reason(found):
+    intake = Intake(COLUMNS, CLOCK)
+    out = []
+    for token, row in enumerate(found):
+        outcome = intake.take(row, token)
+        used = token in intake.waiting or any(token in ready.tokens for ready in outcome.ready)
+        assert used or outcome.remarks
+        assert used or token in outcome.spent
+        out += outcome.ready
+    out += intake.flush().ready
+    times = [ready.t for ready in out]
+    assert times == sorted(set(times))
+    assert all(np.isfinite(t) for t in times)
+    assert all(not np.isinf(value) for ready in out for value in ready.values.values())
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200) | st.text(max_size=100) | ROWS.map(json.dumps))
+def test_any_line_of_json_is_a_row_or_says_why_not(line):
+    row = json_row(line)
+    assert row.broken or isinstance(row.values, dict)
+
+
+@settings(
+    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    lines=st.lists(st.binary(max_size=60), max_size=12), suffix=st.sampled_from(["csv", "jsonl"])
+)
+def test_any_line_of_a_file_is_a_row_or_says_why_not(tmp_path, lines, suffix):
+    lines = [line.replace(b"\n", b"?") for line in lines]
+    path = tmp_path / f"rows.{suffix}"
+    path.write_bytes(b"t,a,b,left\n" * (suffix == "csv") + b"".join(x + b"\n" for x in lines))
+    follow, found = Follow(path), []
+    while not follow.done:
+        found += follow.poll(0.0)
+    assert len(found) == sum(bool(line.strip()) for line in lines)
+    intake = Intake(COLUMNS, CLOCK)
+    for row in found:
+        if not row.broken:
+            intake.take(row.values, row.token)
+
+
+def test_right_lines_arrive_between_any_others(tmp_path):
+    write(tmp_path, 40)
+    path = tmp_path / "data.csv"
+    head, *right = path.read_bytes().splitlines()
+    rng = np.random.default_rng(3)
+    mixed = [head]
+    for line in right:
+        mixed += [line, rng.bytes(30).replace(b"\n", b"?"), line[:4], b"\xff" + line]
+    path.write_bytes(b"\n".join(mixed) + b"\n")
+    run = live(tmp_path)
+    run.run()
+    assert len(run.journal) == 40
+    run.journal.close()
