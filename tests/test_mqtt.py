@@ -11,6 +11,8 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -394,6 +396,62 @@ def test_topics_that_bring_a_message_twice(one, other, overlap):
     for topics in ({one: None, other: "a"}, {other: "a", one: None}):
         with pytest.raises(lp.DataError, match="some messages twice"):
             MqttSource(Broker(), topics, "t")
+
+
+def certificate(folder: Path) -> tuple[Path, Path]:
+    """Return a certificate of this machine, signed by itself, and its key."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import NameOID
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
+    now = datetime.now(UTC)
+    signed = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), critical=False)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    paths = folder / "certificate.pem", folder / "key.pem"
+    paths[0].write_bytes(signed.public_bytes(serialization.Encoding.PEM))
+    paths[1].write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        )
+    )
+    return paths
+
+
+# paho-mqtt leaves the socket of a failed handshake to the garbage collector.
+@pytest.mark.filterwarnings("ignore:.*ssl.SSLSocket:pytest.PytestUnraisableExceptionWarning")
+def test_a_connection_is_encrypted_with_a_certificate_of_ones_own(server, tmp_path):
+    pytest.importorskip("cryptography")
+    signed, key = certificate(server.folder)
+    server.stop()
+    text = server.config.read_text()
+    server.config.write_text(f"{text}certfile {signed}\nkeyfile {key}\n")
+    server.start()
+    broker = Broker("localhost", server.port, ca_file=str(signed))
+    heard = MqttSource(broker, {"rod": None}, "t")
+    client = replace(broker, client_id="plant").client()
+    replace(broker, client_id="plant").connect(client)
+    client.publish("rod", '{"t": 1}', qos=1).wait_for_publish(10)
+    assert listen(heard, 1)[0].values == {"t": 1}
+    heard.close()
+    client.disconnect()
+    client.loop_stop()
+    with pytest.raises(lp.DataError, match="certificate verify failed"):  # the system's do not know
+        MqttSource(Broker("localhost", server.port, tls=True), {"rod": None}, "t")
 
 
 @pytest.mark.parametrize("topic", ["", "a/#/b", "a+/b", "a/b#"])

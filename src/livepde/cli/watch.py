@@ -44,7 +44,7 @@ def watch(
     from livepde.runs.web import Address
 
     server = serve(folder, Address.read(address, PORT, token))
-    terminal().print(f"Open {escape(server.url)}  (Ctrl-C ends it)", soft_wrap=True)
+    terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)", soft_wrap=True)
     try:
         server.wait()
     except KeyboardInterrupt:

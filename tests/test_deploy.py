@@ -1,0 +1,87 @@
+"""The examples of a service: what they call exists, and does what it should."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from livepde.cli.program import app
+from livepde.runs.monitor import Metrics, Monitor
+from livepde.runs.web import Address
+
+DEPLOY = Path(__file__).parents[1] / "deploy"
+UNIT = DEPLOY / "livepde@.service"
+ANALYZE = shutil.which("systemd-analyze")
+
+
+def commands() -> list[list[str]]:
+    """Return what the unit, the image and the compose file tell livepde to do."""
+    (unit,) = re.findall("^ExecStart=(.*)$", UNIT.read_text(), re.MULTILINE)
+    (image,) = re.findall("^CMD (.*)$", (DEPLOY / "Containerfile").read_text(), re.MULTILINE)
+    (page,) = re.findall(r"^ +command: \[(.*)\]$", (DEPLOY / "compose.yaml").read_text(), re.M)
+    words = [word.strip().strip('"') for word in page.split(",")]
+    return [shlex.split(unit)[1:], json.loads(image), words]
+
+
+@pytest.mark.parametrize("command", commands(), ids=["unit", "image", "page"])
+def test_options_exist(command):
+    name, *words = command
+    told = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": "200"}).output
+    options = [word for word in words if word.startswith("--")]
+    assert options
+    for option in options:
+        assert option in told
+
+
+@pytest.mark.skipif(ANALYZE is None, reason="needs systemd-analyze")
+def test_the_unit_is_one(tmp_path):
+    program = tmp_path / "livepde"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    unit = tmp_path / "livepde@rod.service"
+    unit.write_text(UNIT.read_text().replace("/opt/livepde/bin/livepde", str(program)))
+    command = [str(ANALYZE), "verify", "--man=no", "--recursive-errors=no", str(unit)]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (found.returncode, found.stderr) == (0, "")
+    unit.write_text(unit.read_text().replace("ProtectClock=yes", "ProtectClock=maybe"))
+    found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert "Failed to parse boolean value, ignoring: maybe" in found.stderr
+
+
+def test_the_health_check_asks_the_run():
+    health = {"ok": True}
+    monitor = Monitor(Address(token="a-token-of-the-example"), lambda: health, Metrics([]))
+    (call,) = re.findall(r"^    CMD (\[.*\])$", (DEPLOY / "Containerfile").read_text(), re.M)
+    _, script, url = json.loads(call)
+    assert Path(script).name == "health.py"
+    url = url.replace("9100", str(monitor.port))
+
+    def ask(token: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(DEPLOY / "health.py"), url]
+        return subprocess.run(
+            command,
+            env={**os.environ, "LIVEPDE_TOKEN": token},
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+
+    well = ask("a-token-of-the-example")
+    assert (well.returncode, json.loads(well.stdout)) == (0, {"ok": True})
+    assert "403" in ask("another").stderr
+    health["ok"] = False
+    ill = ask("a-token-of-the-example")
+    assert ill.returncode == 1
+    assert "503" in ill.stderr
+    monitor.close()
+    assert ask("a-token-of-the-example").returncode == 1

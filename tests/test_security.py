@@ -1,0 +1,372 @@
+"""What comes from outside is read, never run; too large, refused; who asks must be allowed to."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import logging
+import pickle
+import socket
+import tomllib
+import urllib.error
+import urllib.request
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_live import identifier, live, rows
+from typer.testing import CliRunner
+
+import livepde as lp
+from livepde import cases, checkpoint, runs
+from livepde.cli.program import app
+from livepde.runs.monitor import Metrics, Monitor
+from livepde.runs.web import LONGEST_BODY, THREADS, Address, Server
+from livepde.streams.intake import Intake
+from livepde.streams.sources import LONGEST, Follow, Lines, Rows, json_row
+from livepde.streams.table import Clock, Column
+
+TOKEN = "long-enough-to-be-a-token"
+
+
+# --- nothing is run ------------------------------------------------------------------------------
+
+
+class Hostile:
+    """Pickled, it makes a file where it is read."""
+
+    def __init__(self, trace: Path) -> None:
+        self.trace = trace
+
+    def __reduce__(self):
+        return (Path.touch, (self.trace,))
+
+
+def test_the_hostile_object_would_be_run(tmp_path):
+    pickle.loads(pickle.dumps(Hostile(tmp_path / "trace")))
+    assert (tmp_path / "trace").exists()
+
+
+def test_a_checkpoint_is_not_unpickled(tmp_path):
+    trace, path = tmp_path / "trace", tmp_path / "checkpoint.npz"
+    who = identifier()
+    who.save(path)
+    leaves = dict(np.load(path))
+    leaves["z"] = np.array([Hostile(trace)], dtype=object)
+    np.savez(path, **leaves)
+    for content in (path.read_bytes(), pickle.dumps(Hostile(trace))):
+        path.write_bytes(content)
+        with pytest.raises(lp.RunError, match="not a checkpoint"):
+            who.load(path)
+    assert not trace.exists()
+
+
+def test_a_checkpoint_that_would_grow_is_refused():
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("header.npy", bytes(10_000_000))
+    with pytest.raises(lp.RunError, match="compressed"):
+        checkpoint.unpacked(content.getvalue(), "it")
+    content = io.BytesIO()
+    head = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000,), }"
+    with zipfile.ZipFile(content, "w") as archive:
+        text = head.ljust(117) + b"\n"
+        archive.writestr("header.npy", b"\x93NUMPY\x01\x00" + bytes([len(text), 0]) + text)
+    with pytest.raises(lp.RunError, match="not a checkpoint"):
+        checkpoint.unpacked(content.getvalue(), "it")
+
+
+def test_a_damaged_checkpoint_is_one_sentence():
+    whole = bytearray(identifier().dump())
+    rng = np.random.default_rng(0)
+    who, refused = identifier(), 0
+    for _ in range(300):
+        content = bytearray(whole)
+        for place in rng.integers(0, len(content), 3):
+            content[place] = rng.integers(0, 256)
+        if rng.random() < 0.3:
+            del content[int(rng.integers(0, len(content))) :]
+        try:
+            who.restore(bytes(content))
+        except lp.RunError:
+            refused += 1
+    assert refused > 250
+
+
+CODE = 'from pathlib import Path\nPath("trace").touch()\ndef equation(*_, **__): return None\n'
+
+
+@pytest.fixture
+def hostile(tmp_path, monkeypatch):
+    """A run directory that somebody else has made, with a case that names code."""
+    monkeypatch.chdir(tmp_path)
+    assert call("init", "mycase")[0] == 0
+    assert call("run", "mycase/case.toml", "--out", "run")[0] == 0
+    folder = tmp_path / "run"
+    text = (folder / "case.toml").read_text()
+    equation = tomllib.loads(text)["equation"]
+    (folder / "case.toml").write_text(text.replace(f'"{equation}"', '"evil.py:equation"'))
+    assert "evil.py" in (folder / "case.toml").read_text()
+    for place in (folder, tmp_path, tmp_path / "mycase"):
+        (place / "evil.py").write_text(CODE)
+    return folder
+
+
+def call(*arguments: str) -> tuple[int, str]:
+    """Return how a command ended, and what it said."""
+    result = CliRunner().invoke(app, list(arguments))
+    if isinstance(result.exception, lp.LivepdeError):
+        return 2, str(result.exception)
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    return result.exit_code, result.output
+
+
+def test_a_run_of_somebody_else_runs_nothing(hostile):
+    trace = Path("trace")
+    assert call("report", str(hostile))[0] == 0
+    code, text = call("report", str(hostile), "--theory")
+    assert code == 2
+    assert "add --allow-code" in text
+    code, text = call("run", str(hostile / "case.toml"), "--out", str(hostile), "--resume")
+    assert code == 2
+    assert "add --allow-code" in text
+    assert runs.open(hostile).dataset.sizes["time"] > 0
+    assert not trace.exists()
+    code, text = call("run", str(hostile / "case.toml"), "--out", "another", "--allow-code")
+    assert trace.exists()  # who allows it gets it
+
+
+def test_a_case_cannot_allow_its_own_code(hostile):
+    path = hostile / "case.toml"
+    path.write_text("allow_code = true\n" + path.read_text())
+    with pytest.raises(lp.CaseError, match="allow_code"):
+        cases.load(path)
+    assert not Path("trace").exists()
+
+
+# --- nothing is too large ------------------------------------------------------------------------
+
+
+def test_a_case_is_short(tmp_path):
+    path = tmp_path / "case.toml"
+    path.write_text("#" * 1_000_001)
+    with pytest.raises(lp.CaseError, match="longer than 1000000 bytes"):
+        cases.load(path)
+    path.write_text("a = " + "[" * 100_000)
+    with pytest.raises(lp.CaseError, match="not valid TOML"):
+        cases.load(path)
+
+
+def test_a_record_is_short(tmp_path):
+    path = tmp_path / "run.json"
+    path.write_text('{"format": 1, "title": "' + "x" * 10_000_000 + '"}')
+    with pytest.raises(lp.RunError, match="longer than"):
+        runs.open(tmp_path)
+    for text in (b"[" * 100_000, b"{", b"[]", b'{"format": "1"}', b"\xff"):
+        path.write_bytes(text)
+        with pytest.raises(lp.RunError, match=r"run\.json"):
+            runs.open(tmp_path)
+
+
+def test_long_lines_are_refused_and_the_next_one_is_read(tmp_path):
+    long = '{"t": 0, "a": "' + "x" * (2 * LONGEST) + '"}\n'
+    good = '{"t": 1, "a": 2}\n'
+    path = tmp_path / "data.jsonl"
+    path.write_text(long + good)
+    source = Follow(path)
+    first, second = source.poll(0.0)
+    assert "longer than" in first.broken
+    assert len(first.values) == 0
+    assert second.values == {"t": 1, "a": 2}
+    table = tmp_path / "data.csv"
+    table.write_text("t,a\n" + "1," * LONGEST + "\n3,4\n")
+    first, second = Follow(table).poll(0.0)
+    assert "longer than" in first.broken
+    assert second.values == {"t": "3", "a": "4"}
+    piped = Lines(io.TextIOWrapper(io.BytesIO((long + good).encode() + b"\xff\xfe\n" + b"5\n")))
+    rows = []
+    while not piped.done:
+        rows += piped.poll(5.0)
+    assert [row.values for row in rows if not row.broken] == [{"t": 1, "a": 2}]
+    assert sum("longer than" in row.broken for row in rows) >= 1
+    assert any("UnicodeDecodeError" in row.broken for row in rows)
+
+
+def test_a_long_message_is_refused():
+    assert "longer than" in json_row(b'{"t": "' + b"x" * 2_000_000 + b'"}').broken
+    assert json_row(b"[" * 100_000).broken
+
+
+def test_an_event_repeats_no_long_text(tmp_path):
+    row = {"t": "x" * 500_000, "a": 1.0}
+    run = live(tmp_path, Rows([row, *rows(2)]))
+    run.run()
+    (event,) = run.journal.events
+    assert event.kind == "malformed"
+    assert len(event.message) < 1000
+    run.journal.close()
+
+
+@pytest.mark.parametrize("value", [10**400, "9" * 5000, [1], {}, True, "2026-01-01T00:00:00+99:99"])
+def test_values_that_are_none(value):
+    intake = Intake({"a": Column(("a",))}, Clock("t"))
+    assert {r.kind for r in intake.take({"t": value, "a": 1.0}).remarks} == {"malformed"}
+    if not isinstance(value, str):
+        assert {r.kind for r in intake.take({"t": 1.0, "a": value}).remarks} >= {"malformed"}
+
+
+# --- who may ask ---------------------------------------------------------------------------------
+
+
+def hello(environ, start):
+    start("200 OK", [("Content-Type", "text/plain")])
+    return [b"hello"]
+
+
+@pytest.fixture
+def serving():
+    opened = []
+
+    def serve(**address) -> Server:
+        opened.append(Server(hello, Address(**address)))
+        return opened[-1]
+
+    yield serve
+    for server in opened:
+        server.close()
+
+
+def ask(server, path="/", **headers) -> tuple[int, str, http.client.HTTPMessage]:
+    """Return code, content and headers of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
+    connection.putrequest("GET", path, skip_host="Host" in headers)
+    for name, value in headers.items():
+        connection.putheader(name, value)
+    connection.endheaders()
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer.status, text, answer.headers
+
+
+def test_on_this_machine_only_its_own_names_are_answered(serving):
+    server = serving()
+    for host in ("localhost", "127.0.0.1", f"127.0.0.1:{server.port}", "[::1]", "127.9.9.9"):
+        assert ask(server, Host=host)[0] == 200
+    for host in ("rebound.example", "127.0.0.1.example", "localhost.example", "0.0.0.0", "", "::"):
+        assert ask(server, Host=host)[0] == 403
+
+
+def test_a_token_opens_once_and_a_cookie_from_then_on(serving):
+    server = serving(token=TOKEN)
+    assert ask(server)[0] == 403
+    assert ask(server, f"/?token={TOKEN[:-1]}")[0] == 403
+    assert ask(server, "/?token=")[0] == 403
+    assert ask(server, Authorization="Bearer ")[0] == 403
+    assert ask(server, Authorization=f"Bearer {TOKEN}x")[0] == 403
+    assert ask(server, Cookie="livepde_token=; livepde_token")[0] == 403
+    assert ask(server, Cookie=f"another={TOKEN}")[0] == 403
+    assert ask(server, Authorization=f"Bearer {TOKEN}")[0] == 200
+    code, _, headers = ask(server, f"/?token={TOKEN}", Host="anything.example")
+    assert code == 200
+    cookie = headers["Set-Cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    assert ask(server, Cookie=cookie.partition(";")[0])[0] == 200
+    assert headers["X-Frame-Options"] == "DENY"
+    assert headers["Referrer-Policy"] == "no-referrer"
+
+
+def test_no_token_is_repeated_to_who_does_not_know_it(serving):
+    server = serving(token=TOKEN)
+    _, text, headers = ask(server)
+    assert TOKEN not in text + str(headers)
+
+
+def test_elsewhere_a_token_is_made(serving):
+    one, other = Address("0.0.0.0"), Address("0.0.0.0")
+    assert len(one.token) >= 32
+    assert one.token != other.token
+    assert one.token not in repr(one)
+    server = serving(host="0.0.0.0")
+    assert ask(server)[0] == 403
+    with urllib.request.urlopen(server.url.replace("0.0.0.0", "127.0.0.1"), timeout=30) as answer:
+        assert answer.status == 200
+    assert server.shown == server.url  # nobody else can say it
+
+
+@pytest.mark.parametrize(
+    ("host", "token"),
+    [("0.0.0.0", "short"), ("127.0.0.1", "a b"), ("127.0.0.1", "a;b"), ("127.0.0.1", "a\nb: c")],
+)
+def test_tokens_that_are_none(host, token):
+    with pytest.raises(lp.RunError, match="token"):
+        Address(host, token=token)
+
+
+@pytest.fixture
+def logs():
+    """Leave logging as it was."""
+    root = logging.getLogger()
+    before, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = before
+    root.setLevel(level)
+    logging.getLogger("livepde").setLevel(logging.NOTSET)
+
+
+def test_a_given_token_is_shown_nowhere(serving, tmp_path, monkeypatch, logs):
+    server = serving(token=TOKEN)
+    assert TOKEN in server.url
+    assert TOKEN not in server.shown
+    monkeypatch.chdir(tmp_path)
+    call("init", "mycase")
+    monkeypatch.setattr("sys.argv", ["livepde", "run", "--token", TOKEN, f"--token={TOKEN}", "x"])
+    options = ("--realtime", "--speed", "inf", "--listen", "0", "--token", TOKEN, "--out", "run")
+    code, text = call("run", "mycase/case.toml", *options)
+    assert code == 0, text
+    assert "health and metrics at http://127.0.0.1" in text
+    assert TOKEN not in text
+    for path in Path("run").iterdir():
+        assert TOKEN.encode() not in path.read_bytes()
+    assert json.loads(Path("run/run.json").read_text())["command"][2:5] == [
+        "--token",
+        "...",
+        "--token=...",
+    ]
+
+
+def test_requests_that_are_too_long_are_refused(serving):
+    server = serving()
+    assert ask(server, "/" + "x" * 20_000)[0] == 414
+    assert ask(server, Long="x" * 20_000)[0] == 413
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
+    connection.putrequest("POST", "/")
+    connection.putheader("Content-Length", str(LONGEST_BODY + 1))
+    connection.endheaders()
+    assert connection.getresponse().status == 413
+    connection.close()
+    assert ask(server)[0] == 200
+
+
+def test_slow_visitors_do_not_keep_others_out(serving):
+    server = serving()
+    slow = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(THREADS - 1)]
+    for one in slow:
+        one.sendall(b"GET / HTTP/1.1\r\nHo")
+    assert ask(server)[0] == 200
+    for one in slow:
+        one.settimeout(60)
+        assert b"408" in one.recv(1000)  # they have had their time
+        one.close()
+
+
+def test_health_and_metrics_ask_for_the_token_too():
+    monitor = Monitor(Address(token=TOKEN), lambda: {"ok": True}, Metrics(["a"]))
+    for path in ("/health", "/metrics", "/none"):
+        assert ask(monitor, path)[0] == 403
+        assert ask(monitor, path, Authorization=f"Bearer {TOKEN}")[0] in (200, 404)
+    assert TOKEN not in monitor.shown
+    monitor.close()
