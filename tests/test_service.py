@@ -21,6 +21,7 @@ from livepde import cases, runs
 from livepde.cases.live import Wiring
 from livepde.runs import JOURNAL, Journal
 from livepde.runs.live import Paced, Samples
+from livepde.streams.sources import Rows
 
 CASE = """
 title = "A rod beside its process"
@@ -269,15 +270,27 @@ def test_from_a_broker_and_back(here, server):  # noqa: F811
     assert np.isfinite(found["innovation"].sel(sensor="T_6")[1:]).all()
 
 
+def test_a_source_of_ones_own(here):
+    with Wiring(cases.load(case()), Rows(row(k) for k in range(7)), path=here / "j.sqlite") as mine:
+        run = mine.live()
+        run.run()
+        assert len(run.result) == 7
+    with Wiring(
+        cases.load("case.toml"), Rows(row(k) for k in range(9)), path=here / "j.sqlite"
+    ) as mine:
+        run = mine.live()
+        run.run()
+        assert len(run.result) == 9
+        assert run.journal.counts[("late", "T_3")] == 7
+
+
 def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(3))))
     for zone, origin in (("UTC", "2026-11-21 00:00:00"), ("Europe/Berlin", "2026-11-20 23:00:00")):
         text = case(f'file = "rows.csv"\nzone = "{zone}"')
         assert str(cases.load(text).prepare().origin) == origin
-        wiring = Wiring(cases.load(text))
-        (_, *_) = wiring.feed.poll(0.0)
-        assert str(wiring.origin) == origin
-        wiring.feed.close()
+        with Wiring(cases.load(text)) as wiring:
+            assert wiring.live().journal.layout.attrs["origin"] == origin
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
 
 def _show_wiring(console: Console, case: Case) -> None:
     """Print where the samples of a process come from, and what becomes of them."""
-    from livepde.cases.live import policy_of, source_text
+    from livepde.cases.sources import policy_of, source_text
     from livepde.runs import Table
 
     policy, unit = policy_of(case.frame), case.frame.equation.time_unit

@@ -9,27 +9,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from livepde.errors import DataError
-
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
-    from livepde.cases.live import Wiring
     from livepde.result import Estimate
-    from livepde.runs import Driven, Journal, RunWriter
+    from livepde.runs import Driven, RunWriter
     from livepde.runs.live import Live, Sink
-    from livepde.streams.intake import Ready
 
 __all__ = ["Beside", "beside"]
 
 LOG = logging.getLogger("livepde.run")
 BEAT = 60.0  # seconds between two lines of the log that say how far a run is
-LOOK = 0.5  # seconds between two looks at whether to stop
 METRICS_PORT = 9100
 
 
@@ -77,70 +72,17 @@ def beside(
         Of the directory; the case and how far it came, None if it ended before the first sample.
     """
     from livepde.cases.live import Wiring
-    from livepde.runs import JOURNAL, Journal, conduct, stopped_by_signals
-    from livepde.runs.live import Live
+    from livepde.runs import JOURNAL, conduct, stopped_by_signals
 
-    path, journal = folder / JOURNAL, None
-    if path.exists():
-        journal = stack.enter_context(Journal.open(path, write=True))
-    wiring = Wiring(case, how.data, pace=how.speed, journal=journal)
-    stack.callback(wiring.feed.close)
-    writer, health = write(), _Health()
-    sinks = [*wiring.publishers(), *_observers(case, how, folder, stack, health)]
-    for sink in sinks:
-        stack.callback(sink.close)
-    stopping = threading.Event()
+    wiring = stack.enter_context(Wiring(case, how.data, path=folder / JOURNAL, pace=how.speed))
+    writer, health, stopping = write(), _Health(), threading.Event()
+    sinks = _observers(case, how, folder, stack, health)
     with stopped_by_signals(stopping, lambda: True):
-        begun = _begun(wiring, journal, stopping)
-    if begun is None:
+        live = wiring.live(sinks, stopping)
+    if live is None or wiring.prepared is None:
         return writer, None
-    prepared, waiting = begun
-    if journal is None:
-        journal = stack.enter_context(prepared.journal(path))
-    live = Live(
-        prepared.identifier,
-        wiring.feed,
-        journal,
-        sinks=sinks,
-        fields_every=case.fields_every,
-        backlog=wiring.backlog,
-        retention=wiring.retention,
-        silence=wiring.silence,
-        begun=waiting,
-    )
     health.live = live
-    again = live.resume()
-    if len(live.result):
-        LOG.info("goes on after %d samples, %d of them taken again", len(live.result), again)
-    return writer, (prepared, conduct(live, patient=True))
-
-
-def _begun(
-    wiring: Wiring, journal: Journal | None, stopping: threading.Event
-) -> tuple[Prepared, Sequence[Ready]] | None:
-    """Return the case as its first sample finds it, and the samples that wait."""
-    from livepde.identifier import Sample
-
-    if journal is not None and journal.first is not None:
-        first = journal.first
-        return wiring.case.begin(Sample(first.t, first.values), wiring.origin), ()
-    LOG.info("waits for the first sample")
-    why, told = DataError(f"{wiring.case.frame.path}: no sample came."), ""
-    while not (stopping.is_set() or wiring.feed.done):
-        found = list(wiring.feed.poll(LOOK))
-        while found:
-            values = dict.fromkeys(wiring.case.columns, math.nan) | found[0].values
-            try:
-                return wiring.case.begin(Sample(found[0].t, values), wiring.origin), found
-            except DataError as error:
-                why = error
-            if str(why) != told:
-                told = str(why)
-                LOG.warning("cannot begin yet: %s", why)
-            wiring.feed.acknowledge(found.pop(0))
-    if stopping.is_set():
-        return None
-    raise why
+    return writer, (wiring.prepared, conduct(live, patient=True))
 
 
 class _Health:

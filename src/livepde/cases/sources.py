@@ -1,0 +1,135 @@
+"""Where the rows of a case come from, what becomes of them, and where estimates go."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+from livepde.cases.data import data_file
+from livepde.cases.frame import Frame
+from livepde.cases.schema import BrokerSpec
+from livepde.runs.live import Backlog, Retention, Sink
+from livepde.streams.intake import Habit, Policy
+from livepde.streams.sources import Follow, Lines, Source
+
+if TYPE_CHECKING:
+    from livepde.streams.mqtt import Broker
+
+__all__ = ["Data", "limits_of", "policy_of", "publishers_of", "source_of", "source_text"]
+
+Data: TypeAlias = str | Iterable[str] | Source | None  # a file, lines of JSON, or the case's own
+
+
+def source_of(frame: Frame, data: Data, position: str) -> Source:
+    """Return where the rows of a case come from, from a position on."""
+    spec = frame.spec.data
+    if isinstance(data, Iterable) and not isinstance(data, str):
+        return Lines(data)
+    if data is not None and not isinstance(data, str):
+        return data
+    if data is None and spec.mqtt is not None:
+        from livepde.streams.mqtt import MqttSource
+
+        topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
+        return MqttSource(_broker(frame, spec.mqtt, "data.mqtt"), topics, spec.time)
+    if data is None and spec.opcua is not None:
+        from livepde.streams.opcua import OpcuaSource
+
+        return OpcuaSource(
+            spec.opcua.url,
+            spec.opcua.columns,
+            spec.time,
+            interval=frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
+            username=spec.opcua.username,
+            password=_password(frame, spec.opcua.password_env, "data.opcua"),
+        )
+    path = Path(data) if data is not None else data_file(frame)
+    follow = spec.follow and data is None
+    return Follow(path, separator=spec.separator, follow=follow, position=position)
+
+
+def publishers_of(frame: Frame) -> list[Sink]:
+    """Return the sinks that a case names."""
+    spec = frame.spec.output.mqtt
+    if spec is None:
+        return []
+    from livepde.streams.mqtt import MqttSink
+
+    return [MqttSink(_broker(frame, spec, "output.mqtt"), spec.topic)]
+
+
+def source_text(frame: Frame) -> str:
+    """Return in words where the rows of a case come from."""
+    spec = frame.spec.data
+    if spec.mqtt is not None:
+        topics = ", ".join([*spec.mqtt.rows, *spec.mqtt.columns])
+        return f"{topics} of the broker at {spec.mqtt.host}:{spec.mqtt.port}"
+    if spec.opcua is not None:
+        return f"{len(spec.opcua.columns)} nodes of {spec.opcua.url}"
+    return str(spec.file or spec.reader)
+
+
+def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
+    from livepde.streams.mqtt import Broker
+
+    return Broker(
+        host=spec.host,
+        port=spec.port,
+        client_id=spec.client_id or f"livepde-{frame.path.stem}",
+        username=spec.username,
+        password=_password(frame, spec.password_env, key),
+        tls=spec.tls,
+        ca_file=spec.ca_file,
+        session=round(frame.positive(spec.session, "s", f"{key}.session")),
+    )
+
+
+def _password(frame: Frame, variable: str | None, key: str) -> str | None:
+    if variable is None:
+        return None
+    if variable not in os.environ:
+        raise frame.error(
+            f"{key}.password_env", f"the environment variable {variable} is not set; set it."
+        )
+    return os.environ[variable]
+
+
+def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
+    """Return what waits, what is kept, and after how many seconds a source is silent."""
+    spec = frame.spec
+    span = math.inf
+    if spec.output.retain is not None:
+        span = frame.positive(spec.output.retain, frame.equation.time_unit, "output.retain")
+    silence = math.inf
+    if spec.intake.silence is not None:
+        silence = frame.positive(spec.intake.silence, "s", "intake.silence")
+    backlog = Backlog(spec.intake.overflow, spec.intake.queue)
+    return backlog, Retention(span, spec.output.thin), silence
+
+
+def policy_of(frame: Frame) -> Policy:
+    """Return what becomes of rows that do not come one by one, in order and complete."""
+    spec, unit = frame.spec.intake, frame.equation.time_unit
+
+    def duration(value: float | str, key: str) -> float:
+        return frame.convert(value, unit, key, difference=True)
+
+    habits = {}
+    for name, channel in frame.spec.channels.items():
+        wait = 0.0
+        if channel.wait is not None:
+            wait = duration(channel.wait, f"channels.{name}.wait")
+        habits[name] = Habit(wait, channel.repeated)
+    leap = math.inf
+    if spec.leap is not None:
+        leap = frame.positive(spec.leap, unit, "intake.leap")
+    return Policy(
+        wait=duration(spec.wait, "intake.wait"),
+        tolerance=duration(spec.tolerance, "intake.tolerance"),
+        leap=leap,
+        repeated=spec.repeated,
+        channels=habits,
+    )
