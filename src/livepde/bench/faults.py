@@ -35,7 +35,7 @@ import numpy as np
 from livepde.bench.cases import find_cases
 from livepde.cases import Case, load
 from livepde.cases.data import data_file
-from livepde.cases.live import Wiring
+from livepde.cases.sources import policy_of, source_of
 from livepde.errors import LivepdeError, RunError
 from livepde.identifier import Sample
 from livepde.progress import watched
@@ -769,14 +769,13 @@ def _broken(
 
 def _taken(case: Case, path: Path) -> tuple[list[Record], dict[int, set[str]]]:
     """Return what a live run of a file finds, and what it said of each line."""
-    wiring = Wiring(case, str(path))
-    if not isinstance(wiring.feed, Gathered):
-        raise RunError(f"bench faults: {path.name} is not read row by row.")
-    feed = _Audited(wiring.feed.source, wiring.feed.intake)
+    spec = case.frame.spec.data
+    intake = Intake(case.columns, case.clock, policy_of(case.frame), missing=spec.missing)
+    feed = _Audited(source_of(case.frame, str(path), ""), intake)
     begun: list[Ready] = []
     while not begun:
         begun += feed.poll(0.0)
-    prepared = case.begin(Sample(begun[0].t, begun[0].values), wiring.origin)
+    prepared = case.begin(Sample(begun[0].t, begun[0].values), intake.start)
     with prepared.journal() as journal:
         Live(prepared.identifier, feed, journal, fields_every=100, begun=begun).run()
         return list(journal), feed.reasons

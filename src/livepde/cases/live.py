@@ -171,10 +171,10 @@ class Wiring:
     def _fed(self, data: Data) -> Feed:
         case, journal, spec = self.case, self._journal, self.case.frame.spec.data
         last = -math.inf if journal is None else journal.last
-        file = spec.file if data is None else data
-        reader = data is None and case.frame.reader is not None
-        if reader or (isinstance(file, str) and file.endswith(".parquet")):
-            table = read_data(case.frame, case.columns, case.clock, file if data else None)
+        named = data if isinstance(data, str) else None
+        file = spec.file or "" if data is None else named or ""
+        if file.endswith(".parquet") or (data is None and case.frame.reader is not None):
+            table = read_data(case.frame, case.columns, case.clock, named)
             self._origin = table.origin
             return Samples(table, after=last)
         origin = None if journal is None else _seconds(journal.layout.attrs.get("origin"))

@@ -148,9 +148,7 @@ def faults(
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
-        typer.Option(
-            help="One of file, mqtt, restart, malformed, messages. Repeat it."
-        ),
+        typer.Option(help="One of file, mqtt, restart, malformed, messages. Repeat it."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -69,7 +69,7 @@ class Gathered:
         self.source = source
         self.intake = intake
         self._heard = False
-        self._remarks: list[Remark] = []
+        self._remarks: dict[tuple[str, str], Remark] = {}
         self._flushed = False
 
     @property
@@ -95,7 +95,12 @@ class Gathered:
         return self.intake.take(row.values, row.token)
 
     def _used(self, outcome: Outcome) -> list[Ready]:
-        self._remarks += outcome.remarks
+        for remark in outcome.remarks:
+            key = remark.kind, remark.channel
+            same = self._remarks.get(key)
+            if same is not None:
+                remark = replace(same, number=same.number + remark.number)
+            self._remarks[key] = remark
         self.source.acknowledge(outcome.spent)
         return outcome.ready
 
@@ -106,7 +111,8 @@ class Gathered:
 
     def remarks(self) -> Sequence[Remark]:
         """Return what was refused, missing or out of order."""
-        found, self._remarks = self._remarks, []
+        found = list(self._remarks.values())
+        self._remarks.clear()
         return found
 
     def position(self, waiting: Sequence[Ready]) -> str:
@@ -453,8 +459,8 @@ class Live:
     def _count(self, remarks: Sequence[Remark]) -> None:
         """Count remarks; the first of each kind and channel is an event, with its words."""
         for remark in remarks:
-            self._counts[remark.kind, remark.channel] += 1
-            self.journal.count(remark.kind, remark.channel)
+            self._counts[remark.kind, remark.channel] += remark.number
+            self.journal.count(remark.kind, remark.channel, remark.number)
             if (remark.kind, remark.channel) not in self._remarked:
                 self._remarked.add((remark.kind, remark.channel))
                 self._tell(remark.kind, remark.message, remark.channel)

@@ -95,12 +95,15 @@ class Remark:
     channel
         Of the value; '' for a whole row.
     message
-        In words.
+        In words; of several the first's.
+    number
+        How often.
     """
 
     kind: str
     channel: str
     message: str
+    number: int = 1
 
 
 @dataclass(frozen=True)
