@@ -12,6 +12,7 @@ import tomllib
 import urllib.error
 import urllib.request
 import zipfile
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -175,14 +176,15 @@ def test_long_lines_are_refused_and_the_next_one_is_read(tmp_path):
     good = '{"t": 1, "a": 2}\n'
     path = tmp_path / "data.jsonl"
     path.write_text(long + good)
-    source = Follow(path)
-    first, second = source.poll(0.0)
+    with closing(Follow(path)) as source:
+        first, second = source.poll(0.0)
     assert "longer than" in first.broken
     assert len(first.values) == 0
     assert second.values == {"t": 1, "a": 2}
     table = tmp_path / "data.csv"
     table.write_text("t,a\n" + "1," * LONGEST + "\n3,4\n")
-    first, second = Follow(table).poll(0.0)
+    with closing(Follow(table)) as source:
+        first, second = source.poll(0.0)
     assert "longer than" in first.broken
     assert second.values == {"t": "3", "a": "4"}
     piped = Lines(io.TextIOWrapper(io.BytesIO((long + good).encode() + b"\xff\xfe\n" + b"5\n")))
