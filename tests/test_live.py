@@ -354,20 +354,31 @@ def test_health_and_metrics(tmp_path):
             return answer.read().decode()
 
     metrics = Metrics(["a", "b"])
-    run = live(tmp_path, Rows(rows(5)), sinks=[metrics])
+    late = {"t": 0.0, "a": 0.0, "b": 0.0, "left": 0.0}
+    run = live(tmp_path, Rows([*rows(5), late]), sinks=[metrics])
     monitor = Monitor(Address(), lambda: run.health, metrics)
     run.run()
-    assert json.loads(ask("/health")) == {
+    health = json.loads(ask("/health"))
+    assert health.pop("seconds") > 0.0
+    assert health == {
         "ok": True,
         "t": 0.4,
         "samples": 5,
         "waiting": 0,
         "silent": False,
         "status": "ok",
+        "counts": [["late", "a", 1], ["late", "b", 1], ["late", "left", 1]],
     }
     value = run.result.last.parameters["k"][0]
     assert f'livepde_estimate{{unknown="k"}} {value!r}' in ask("/metrics")
+    told = ask("/metrics")
+    assert 'livepde_remarks_total{channel="a",kind="late"} 1.0' in told
+    assert "livepde_waiting_samples 0.0" in told
+    assert "livepde_silent 0.0" in told
+    assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
     run.silent = True
+    assert "livepde_silent 1.0" in ask("/metrics")
+    assert "livepde_ok 0.0" in ask("/metrics")
     with pytest.raises(urllib.error.HTTPError, match="503"):
         ask("/health")
     with pytest.raises(urllib.error.HTTPError, match="404"):

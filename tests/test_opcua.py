@@ -176,5 +176,5 @@ def test_what_cannot_be_reached_is_one_sentence(server):
     with pytest.raises(lp.DataError, match="interval must be"):
         OpcuaSource(server.url, COLUMNS, "t", interval=0.0)
     server.stop()
-    with pytest.raises(lp.DataError, match="opc.tcp://127.0.0.1.*failed"):
+    with pytest.raises(lp.DataError, match=r"opc.tcp://127.0.0.1.*failed"):
         source(server)

@@ -16,9 +16,9 @@ import numpy as np
 
 from livepde.bench.cases import find_cases
 from livepde.cases import load
+from livepde.errors import ConfigurationError
 from livepde.runs import Check, Outcome, Table
 from livepde.runs.live import Live, Samples
-from livepde.streams import Table as Rows
 
 __all__ = ["journal"]
 
@@ -54,7 +54,9 @@ class Stopwatch:
 
 def journal(folder: Path | None = None) -> Outcome:
     """Time journal and steps of the soil case; `folder`: where the cases are."""
-    (path,) = [path for path in find_cases(folder) if path.stem == CASE]
+    path = next((path for path in find_cases(folder) if path.stem == CASE), None)
+    if path is None:
+        raise ConfigurationError(f"bench journal times the case {CASE}.toml, which is not here.")
     runs = [_run(path) for _ in range(REPETITIONS)]
     ratios = [written.wall / stepped.wall for written, stepped, _, _ in runs]
     chosen = int(np.argsort(ratios)[len(ratios) // 2])
@@ -81,7 +83,6 @@ def _run(case: Path) -> tuple[Stopwatch, Stopwatch, int, int]:
     """Return what was spent on the journal and on steps, the samples, and bytes on disk."""
     loaded = load(case)
     prepared = loaded.prepare()
-    assert isinstance(prepared.stream, Rows)
     identifier = prepared.identifier
     written, stepped = Stopwatch(), Stopwatch()
     with TemporaryDirectory() as folder:

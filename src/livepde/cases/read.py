@@ -30,6 +30,8 @@ from livepde.errors import CaseError
 
 __all__ = ["did_you_mean", "read_spec", "read_text", "read_toml"]
 
+LONGEST = 1_000_000  # bytes of a case file
+
 EXPECTED = {
     "int_type": "a whole number",
     "int_parsing": "a whole number",
@@ -63,7 +65,11 @@ TABLES: dict[str, type[BaseModel]] = {
 def read_text(path: Path) -> str:
     """Return the text of a case file."""
     try:
-        return path.read_text(encoding="utf-8")
+        with path.open("rb") as file:
+            content = file.read(LONGEST + 1)
+        if len(content) > LONGEST:
+            raise CaseError(f"{path}: is longer than {LONGEST} bytes; data belong to a data file.")
+        return content.decode("utf-8").replace("\r\n", "\n")
     except FileNotFoundError:
         near = difflib.get_close_matches(path.name, _cases_in(path.parent), n=1)
         hint = f" Did you mean '{path.parent / near[0]}'?" if near else ""
@@ -82,7 +88,7 @@ def read_toml(text: str, where: str) -> dict[str, Any]:
     """Return the document of a case file; raises `CaseError`."""
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise CaseError(f"{where}: is not valid TOML: {error}.") from None
 
 

@@ -141,6 +141,35 @@ def peers(
 
 
 @bench.command()
+def faults(
+    kills: Annotated[int, typer.Option(min=1, help="Kills, with a file and with a broker.")] = 200,
+    samples: Annotated[int, typer.Option(min=10, help="Samples of a run that is killed.")] = 2000,
+    malformed: Annotated[int, typer.Option(min=1, help="Broken rows and messages.")] = 100_000,
+    seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this: file, mqtt, restart, malformed or messages. Repeat it for more."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Kill runs, take their sources away, feed them broken rows, and count what is lost.
+
+    Example:  livepde bench faults --kills 20 --only file
+    """
+    from livepde.bench.faults import PARTS
+    from livepde.bench.faults import faults as benchmark
+
+    for name in only or ():
+        named(name, PARTS, "part")
+    outcome = benchmark(kills, samples, malformed, seed, only or (), progress=True)
+    options = ["--kills", kills, "--samples", samples, "--malformed", malformed, "--seed", seed]
+    chosen = [word for name in only or () for word in ("--only", name)]
+    report_outcome(outcome, ["livepde", "bench", "faults", *map(str, options), *chosen], as_json)
+
+
+@bench.command()
 def journal(as_json: JsonOption = False) -> None:
     """Measure what the journal costs: its share of a step of the soil case.
 

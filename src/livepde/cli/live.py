@@ -189,7 +189,7 @@ def _observers(
         metrics = Metrics(case.sensors)
         monitor = Monitor(Address.read(how.listen, METRICS_PORT, how.token), health, metrics)
         stack.callback(monitor.close)
-        LOG.info("health and metrics at %s", monitor.url)
+        LOG.info("health and metrics at %s", monitor.shown)
         sinks.append(metrics)
     if how.page is not None:
         # A process of its own: drawing must not delay steps.

@@ -17,6 +17,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cached_property
@@ -46,6 +47,7 @@ FORMAT = 1
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
 JOURNAL = "journal.sqlite"
+LONGEST = 10_000_000  # bytes of a record
 
 
 def free_path(wanted: Path) -> Path:
@@ -112,7 +114,7 @@ class RunWriter:
                 "format": FORMAT,
                 "livepde": version,
                 "title": title,
-                "command": list(command),
+                "command": _without_token(command),
                 "started": _now(),
                 "status": "running",
             }
@@ -152,7 +154,7 @@ class RunWriter:
             )
         resumed = [*run.record.get("resumed", []), {"at": _now(), "livepde": version}]
         record = run.record | {"status": "running", "resumed": resumed}
-        writer = cls(path, record | {"command": run.record.get("command", list(command))})
+        writer = cls(path, {"command": _without_token(command)} | record)
         writer._save_record()
         return writer
 
@@ -305,12 +307,16 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     """
     folder = Path(path)
     try:
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        with (folder / RECORD).open("rb") as file:
+            text = file.read(LONGEST + 1)
+        if len(text) > LONGEST:
+            raise RunError(f"{folder / RECORD} is longer than {LONGEST} bytes.")
+        record = json.loads(text)
     except FileNotFoundError:
         raise RunError(
             f"{folder} holds no run (no {RECORD}); 'livepde run CASE --out {folder}' makes one."
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise RunError(f"{folder / RECORD} is not a record of this version of livepde.")
@@ -382,6 +388,15 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def _without_token(command: Sequence[str]) -> list[str]:
+    """Return a command as it may be written down."""
+    kept = [re.sub("^--token=.*", "--token=...", word) for word in command]
+    for k, word in enumerate(kept[:-1]):
+        if word == "--token":
+            kept[k + 1] = "..."
+    return kept
 
 
 def _now() -> str:

@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,6 +25,7 @@ __all__ = ["Backlog", "Feed", "Gathered", "Live", "Paced", "Retention", "Samples
 
 CHECKPOINT = 256  # samples between two checkpoints
 LOOK = 0.5  # seconds between two looks at whether to stop
+LONGEST = 500  # characters of an event
 HARMLESS = frozenset({"heard", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
 
@@ -375,8 +376,10 @@ class Live:
         self._clock = clock
         self._heard = clock()
         self._waiting = deque(begun)
+        self._counts = Counter(journal.counts)
         self._remarked: set[tuple[str, str]] = set()
         self._steps = 0
+        self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
 
@@ -441,6 +444,7 @@ class Live:
     def _relieve(self) -> None:
         relieved = self.backlog.relieved(self._waiting)
         if relieved:
+            self._counts[self.backlog.overflow, ""] += len(relieved)
             self.journal.count(self.backlog.overflow, "", len(relieved))
         if self.backlog.overflow == "drop":
             for ready in relieved:
@@ -449,16 +453,20 @@ class Live:
     def _count(self, remarks: Sequence[Remark]) -> None:
         """Count remarks; the first of each kind and channel is an event, with its words."""
         for remark in remarks:
+            self._counts[remark.kind, remark.channel] += 1
             self.journal.count(remark.kind, remark.channel)
             if (remark.kind, remark.channel) not in self._remarked:
                 self._remarked.add((remark.kind, remark.channel))
                 self._tell(remark.kind, remark.message, remark.channel)
 
     def _tell(self, kind: str, message: str, channel: str = "") -> None:
+        if len(message) > LONGEST:  # it may repeat what has come
+            message = message[:LONGEST] + "..."
         event = Event(self.identifier.t, kind, channel, message)
         self.journal.note(event)
         level = logging.INFO if kind in HARMLESS else logging.WARNING
-        LOG.log(level, "%s%s: %s", kind, f" ({channel})" if channel else "", message)
+        about = {"kind": kind, "channel": channel, "t": event.t}  # fields of a log in JSON
+        LOG.log(level, "%s%s: %s", kind, f" ({channel})" if channel else "", message, extra=about)
 
     @property
     def health(self) -> dict[str, Any]:
@@ -472,6 +480,8 @@ class Live:
             "waiting": len(self._waiting),
             "silent": self.silent,
             "status": "" if last is None else last.status.code,
+            "seconds": self._seconds,
+            "counts": [[*key, number] for key, number in sorted(self._counts.items())],
         }
 
     def _take(self, ready: Ready) -> None:
@@ -494,7 +504,9 @@ class Live:
             self.busy = False
 
     def _estimate(self, taken: Taken, again: bool) -> None:
+        begun = time.monotonic()
         estimate = self.identifier.step(taken.t, taken.values)
+        self._seconds += time.monotonic() - begun
         self.result.add(estimate)
         if not again:
             self._put(estimate)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from livepde.errors import RunError
@@ -13,6 +13,8 @@ from livepde.runs.web import Address, Server
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIEnvironment
 
+    from prometheus_client.core import Metric
+
 __all__ = ["Metrics", "Monitor"]
 
 
@@ -20,7 +22,9 @@ class Metrics:
     """Estimates as Prometheus metrics; a sink of a run.
 
     `livepde_estimate{unknown}`, `livepde_deviation{unknown}`, `livepde_innovation{sensor}`,
-    `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`.
+    `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`. A `Monitor` adds what its
+    run's health says: `livepde_ok`, `livepde_silent`, `livepde_waiting_samples`,
+    `livepde_step_seconds_total`, `livepde_remarks_total{kind, channel}`.
 
     Parameters
     ----------
@@ -38,18 +42,26 @@ class Metrics:
         self.registry = CollectorRegistry()
         self._sensors = tuple(sensors)
         self._estimate = Gauge(
-            "livepde_estimate", "Estimated unknown", ["unknown"], registry=self.registry
+            "livepde_estimate",
+            "Estimated unknown, in its unit",
+            ["unknown"],
+            registry=self.registry,
         )
         self._deviation = Gauge(
-            "livepde_deviation", "Standard deviation", ["unknown"], registry=self.registry
+            "livepde_deviation",
+            "Standard deviation of an unknown, in its unit",
+            ["unknown"],
+            registry=self.registry,
         )
         self._innovation = Gauge(
             "livepde_innovation",
-            "Measured minus expected of the last sample",
+            "Measured minus expected of the last sample, in the unit of the sensors",
             ["sensor"],
             registry=self.registry,
         )
-        self._time = Gauge("livepde_time", "Time of the last sample", registry=self.registry)
+        self._time = Gauge(
+            "livepde_time", "Time of the last sample, in the model's unit", registry=self.registry
+        )
         self._samples = Counter("livepde_samples", "Samples taken", registry=self.registry)
         self._failed = Counter("livepde_failed_steps", "Steps that failed", registry=self.registry)
 
@@ -67,6 +79,34 @@ class Metrics:
 
     def close(self) -> None:
         """Nothing is held."""
+
+
+class _Health:
+    """What the health of a run says, as metrics of the moment in which it is asked."""
+
+    def __init__(self, health: Callable[[], Mapping[str, Any]]) -> None:
+        self._health = health
+
+    def collect(self) -> Iterator[Metric]:
+        """Return the metrics."""
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+
+        found = self._health()
+        for name, key, text in (
+            ("ok", "ok", "1 while the source is heard and steps succeed"),
+            ("silent", "silent", "1 while nothing comes from the source"),
+            ("waiting_samples", "waiting", "Samples that wait for their step"),
+        ):
+            if key in found:
+                yield GaugeMetricFamily(f"livepde_{name}", text, float(found[key]))
+        if "seconds" in found:
+            text = "Seconds spent in steps"
+            yield CounterMetricFamily("livepde_step_seconds", text, found["seconds"])
+        text = "Rows, values and samples that were late, broken, missing, merged, ..."
+        remarks = CounterMetricFamily("livepde_remarks", text, labels=["kind", "channel"])
+        for kind, channel, number in found.get("counts", ()):
+            remarks.add_metric([kind, channel], number)
+        yield remarks
 
 
 class Monitor:
@@ -93,9 +133,11 @@ class Monitor:
         from prometheus_client import make_wsgi_app
 
         self._health = health
+        metrics.registry.register(_Health(health))
         self._metrics = make_wsgi_app(metrics.registry)
         self._server = Server(self._answer, address)
         self.url = self._server.url
+        self.shown = self._server.shown
         self.port = self._server.port
 
     def _answer(self, environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:

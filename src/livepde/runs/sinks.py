@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+from contextlib import suppress
 from typing import TextIO
 
 from livepde.result import Estimate
@@ -11,14 +13,32 @@ __all__ = ["JsonLinesSink"]
 
 
 class JsonLinesSink:
-    """Each estimate as a line of JSON."""
+    """Each estimate as a line of JSON, as `Estimate.to_dict` has it."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     def put(self, estimate: Estimate) -> None:
-        """Write one estimate."""
-        print(json.dumps(estimate.to_dict()), file=self._stream, flush=True)
+        """Write one estimate.
+
+        Raises
+        ------
+        OSError
+            Nobody reads the stream any more, or its disk is full.
+        """
+        line = json.dumps(estimate.to_dict(), allow_nan=False)
+        try:
+            print(line, file=self._stream, flush=True)
+        except OSError:
+            self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        """Let what the stream still holds go nowhere: it would fail again at the end."""
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        with suppress(OSError):
+            os.dup2(nowhere, self._stream.fileno())
+        os.close(nowhere)
 
     def close(self) -> None:
         """The stream belongs to who opened it."""

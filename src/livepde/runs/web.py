@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import re
 import secrets
 import socket
 import threading
@@ -11,7 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, quote
+from urllib.parse import parse_qs
 
 from livepde.errors import RunError
 
@@ -21,7 +22,16 @@ if TYPE_CHECKING:
 __all__ = ["Address", "Server"]
 
 COOKIE = "livepde_token"
-THREADS = 4
+THREADS = 16  # so many visitors may be slow at a time
+TIMEOUT = 5  # seconds that a visitor may be silent within a request
+LONGEST_HEADER = 16_384  # bytes
+LONGEST_BODY = 1_000_000  # bytes
+SHORTEST_TOKEN = 16  # characters, where anyone may try
+HEADERS = [
+    ("X-Content-Type-Options", "nosniff"),
+    ("X-Frame-Options", "DENY"),
+    ("Referrer-Policy", "no-referrer"),  # an address may hold a token
+]
 
 
 def _loopback(host: str) -> bool:
@@ -45,15 +55,30 @@ class Address:
         What a visitor has to know: `?token=...` once, or the header `Authorization: Bearer ...`.
         On this machine (a loopback address) none is asked for unless one is given; anywhere else
         one is made if none is given.
+
+    Raises
+    ------
+    RunError
+        A token that does not fit into an address, or is too short for the world outside.
     """
 
     host: str = "127.0.0.1"
     port: int = 0
     token: str = field(default="", repr=False)
+    made: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
-        if not self.token and not _loopback(self.host):
+        alone = _loopback(self.host)
+        if not self.token and not alone:
             object.__setattr__(self, "token", secrets.token_urlsafe(24))
+            object.__setattr__(self, "made", True)
+        if not re.fullmatch(r"[A-Za-z0-9._~-]*", self.token):
+            raise RunError("A token has letters, digits and '-', '_', '.', '~' only.")
+        if self.token and not alone and len(self.token) < SHORTEST_TOKEN:
+            raise RunError(
+                f"A token for visitors from elsewhere has at least {SHORTEST_TOKEN} characters; "
+                "without one a good one is made."
+            )
 
     @classmethod
     def read(cls, text: str, port: int, token: str = "") -> Address:
@@ -61,7 +86,7 @@ class Address:
         host, _, number = text.rpartition(":") if ":" in text else ("", "", text)
         if number and not number.isdigit():
             host, number = text, ""
-        if number and int(number) > 65535:
+        if number and (len(number) > 5 or int(number) > 65535):
             raise RunError(f"'{text}' is no address: a port is a number up to 65535.")
         return cls(host or cls.host, int(number) if number else port, token)
 
@@ -73,6 +98,14 @@ class Server:
     ----------
     application, address
         What is served where.
+
+    Attributes
+    ----------
+    url
+        Where it is found, with the token.
+    shown
+        What may be printed or logged: with the token only if it was made here, so that nobody else
+        can know it.
 
     Raises
     ------
@@ -87,6 +120,9 @@ class Server:
             raise RunError("Serving needs cheroot: pip install 'livepde[service]'.") from None
         place = (address.host, address.port)
         self._server: Any = Cheroot(place, _guarded(application, address), numthreads=THREADS)
+        self._server.timeout = TIMEOUT
+        self._server.max_request_header_size = LONGEST_HEADER
+        self._server.max_request_body_size = LONGEST_BODY
         try:
             socket.create_server(place).close()  # cheroot leaves a socket open if it cannot listen
             self._server.prepare()
@@ -97,9 +133,9 @@ class Server:
             ) from error
         self.port = int(self._server.bind_addr[1])
         host = f"[{address.host}]" if ":" in address.host else address.host
-        self.url = f"http://{host}:{self.port}/"
-        if address.token:
-            self.url += f"?token={quote(address.token)}"
+        plain = f"http://{host}:{self.port}/"
+        self.url = f"{plain}?token={address.token}" if address.token else plain
+        self.shown = self.url if address.made else plain
         self._thread = threading.Thread(target=self._server.serve, daemon=True)
         self._thread.start()
 
@@ -116,7 +152,8 @@ class Server:
 def _guarded(application: WSGIApplication, address: Address) -> WSGIApplication:
     """Return an application that answers only who may ask."""
 
-    def answer(environ: WSGIEnvironment, start: StartResponse) -> Iterable[bytes]:
+    def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
+        start = _adding(begin, HEADERS)
         if not address.token:
             # A page elsewhere must not reach this machine under a name of its own.
             if _loopback(_host(environ)):
@@ -124,7 +161,8 @@ def _guarded(application: WSGIApplication, address: Address) -> WSGIApplication:
             return _refused(start, "this page is for this machine only: ask for localhost")
         given = parse_qs(environ.get("QUERY_STRING", "")).get("token", [""])[0]
         if _same(given, address.token):
-            return application(environ, _remembering(start, given))
+            cookie = f"{COOKIE}={given}; HttpOnly; SameSite=Strict; Path=/"
+            return application(environ, _adding(start, [("Set-Cookie", cookie)]))
         if any(_same(known, address.token) for known in _known(environ)):
             return application(environ, start)
         return _refused(start, "add ?token=... as it was printed where this was started")
@@ -153,11 +191,11 @@ def _same(given: str, token: str) -> bool:
     return bool(given) and hmac.compare_digest(given.encode(), token.encode())
 
 
-def _remembering(start: StartResponse, token: str) -> Any:
-    cookie = f"{COOKIE}={token}; HttpOnly; SameSite=Strict; Path=/"
+def _adding(start: StartResponse, more: list[tuple[str, str]]) -> Any:
+    """Return a beginning of an answer with more headers."""
 
     def begin(status: str, headers: list[tuple[str, str]], *rest: Any) -> Callable[[bytes], object]:
-        return start(status, [*headers, ("Set-Cookie", cookie)], *rest)
+        return start(status, [*headers, *more], *rest)
 
     return begin
 

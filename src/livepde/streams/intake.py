@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-from livepde.errors import DataError
+from livepde.errors import DataError, SampleError
 from livepde.streams.table import Clock, Column, channel_value, row_time
 
 __all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark"]
@@ -220,6 +220,8 @@ class Intake:
     def _placed(self, t: float, row: Mapping[str, Any], token: Any, found: Outcome) -> bool:
         """Return whether a row became part of a sample."""
         values = self._values(row, found)
+        if not (values or found.remarks):
+            found.remark("malformed", "", "no value of any channel")
         moment = self._moment(t)
         if moment is None:
             text = f"t = {t:g} is not later than the last sample at {self._last:g}"
@@ -258,6 +260,9 @@ class Intake:
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
             return None
+        if self.origin is not None and dates != (self.origin != 0.0):
+            was, is_now = ("number", "date") if dates else ("date", "number")
+            raise SampleError(f"the time is a {is_now}; it was a {was} before")
         if self.origin is None:
             self.origin = _microseconds(t / self.clock.second) if dates else 0.0
         return t - self.origin * self.clock.second if dates else t

@@ -17,7 +17,7 @@ from livepde.streams.sources import BATCH, Row
 
 __all__ = ["OpcuaSource"]
 
-PATIENCE = 10.0  # seconds for the first values' subscription, and for each answer
+PATIENCE = 5.0  # seconds for each answer
 LOOK = 1.0  # seconds between two looks at whether the server is there
 LONGEST_WAIT = 30.0  # seconds between two attempts to reach it again
 HELD = 65535  # rows that wait to be taken; newer ones are dropped then
@@ -62,7 +62,6 @@ class OpcuaSource:
         url: str,
         columns: Mapping[str, str],
         time: str,
-        *,
         interval: float = 1.0,
         username: str | None = None,
         password: str | None = None,
@@ -71,6 +70,8 @@ class OpcuaSource:
             import asyncua  # noqa: F401
         except ImportError:
             raise DataError("OPC UA needs asyncua: pip install 'livepde[opcua]'.") from None
+        if "@" in url:
+            raise DataError("OPC UA: a url with a password is written down: use username instead.")
         if not interval > 0.0:
             raise DataError(f"OPC UA: interval must be a time > 0; got {interval}.")
         self.dropped = 0
@@ -81,6 +82,7 @@ class OpcuaSource:
         self._user = (username, password)
         self._rows: queue.Queue[Row] = queue.Queue(HELD)
         self._seen: dict[str, datetime | None] = {}
+        self._wait = LOOK
         self._loop = asyncio.new_event_loop()
         self._stop = asyncio.Event()
         self._started: Future[None] = Future()
@@ -90,7 +92,7 @@ class OpcuaSource:
             self._started.result(3 * PATIENCE)
         except (DataError, OutOfTime) as error:
             self.close()
-            raise DataError(f"OPC UA: {url}: {error or 'it does not answer'}.") from error
+            raise DataError(f"OPC UA: {url}: {str(error) or 'it does not answer'}.") from error
 
     # --- the thread of the connection ------------------------------------------------------------
 
@@ -100,25 +102,24 @@ class OpcuaSource:
 
     async def _stay(self) -> None:
         """Listen, and come back when the server does."""
-        from asyncua import ua
+        from asyncua.ua.uaerrors import UaError
 
-        wait = LOOK
         while not self._stop.is_set():
             try:
                 await self._listen()
                 return
-            except (DataError, ua.UaError, OSError, ValueError, asyncio.TimeoutError) as error:
+            except (DataError, UaError, OSError, ValueError) as error:
                 reason = str(error) or type(error).__name__
             if not self._started.done():
                 self._started.set_exception(DataError(reason))
                 return
             log.warning("the server at %s is lost: %s", self._url, reason)
-            if await self._stopped(wait):
+            if await self._stopped(self._wait):
                 return
-            wait = min(2.0 * wait, LONGEST_WAIT)
+            self._wait = min(2.0 * self._wait, LONGEST_WAIT)
 
     async def _listen(self) -> None:
-        from asyncua import Client
+        from asyncua.client.client import Client
 
         client = Client(self._url, timeout=PATIENCE)
         username, password = self._user
@@ -130,7 +131,7 @@ class OpcuaSource:
             nodes = {name: client.get_node(name) for name in self._columns}
             changes.columns = {nodes[name].nodeid: self._columns[name] for name in nodes}
             period = 1000.0 * self._interval
-            subscription = await client.create_subscription(period, changes)
+            subscription: Any = await client.create_subscription(period, changes)
             answers = await subscription.subscribe_data_change(
                 list(nodes.values()), queuesize=QUEUED, sampling_interval=period
             )
@@ -141,6 +142,7 @@ class OpcuaSource:
                 log.info("the server at %s is back", self._url)
             else:
                 self._started.set_result(None)
+            self._wait = LOOK
             while not await self._stopped(LOOK):
                 await client.check_connection()
                 if changes.ended:
@@ -150,7 +152,7 @@ class OpcuaSource:
         """Wait, and return whether to stop."""
         try:
             await asyncio.wait_for(self._stop.wait(), wait)
-        except asyncio.TimeoutError:
+        except TimeoutError:
             return False
         return True
 

@@ -81,6 +81,14 @@ def json_row(text: str | bytes, token: Any = None) -> Row:
     return Row(found, token)
 
 
+def _line(file: io.BufferedReader) -> bytes:
+    """Return the next line; of one that is too long no more than tells so."""
+    line = piece = file.readline(LONGEST + 1)
+    while len(piece) > LONGEST and not piece.endswith(b"\n"):
+        piece = file.readline(LONGEST + 1)
+    return line if piece is line else line + piece[-1:]
+
+
 class Follow:
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
@@ -209,7 +217,7 @@ class Follow:
         self._file.seek(self._offset)
         while len(rows) < BATCH:
             start = self._offset
-            line = self._file.readline()
+            line = _line(self._file)
             if not line or (self.follow and not line.endswith(b"\n")):
                 break
             self._offset = self._file.tell()
@@ -224,6 +232,8 @@ class Follow:
             return None
         if self._json:
             return json_row(line, token)
+        if len(line) > LONGEST:
+            return Row({}, token, f"longer than {LONGEST} characters")
         try:
             cells = self._cells(line)
         except (UnicodeDecodeError, csv.Error) as error:
@@ -246,15 +256,21 @@ class Lines:
     """JSON lines from standard input, or whatever gives lines; read in a thread of its own."""
 
     def __init__(self, lines: Iterable[str]) -> None:
-        self._queue: queue.Queue[str | None] = queue.Queue(BATCH)
+        self._queue: queue.Queue[str | bytes | None] = queue.Queue(BATCH)
         self._ended = False
         threading.Thread(target=self._pump, args=(lines,), daemon=True).start()
 
     def _pump(self, lines: Iterable[str]) -> None:
-        for line in lines:
-            if line.strip():
-                self._queue.put(line)
-        self._queue.put(None)
+        stream: Any = getattr(lines, "buffer", lines)  # bytes: what is no text is a broken row
+        try:
+            pieces = stream
+            if hasattr(stream, "readline"):  # an endless line comes in pieces, refused one by one
+                pieces = iter(lambda: stream.readline(LONGEST + 1) or None, None)
+            for line in pieces:
+                if line.strip():
+                    self._queue.put(line)
+        finally:
+            self._queue.put(None)
 
     @property
     def done(self) -> bool:

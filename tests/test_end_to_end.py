@@ -1,0 +1,75 @@
+"""From a broker to a browser: real soil temperatures, replayed through all of it."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_dashboard import chromium, count, text, wait
+from test_mqtt import MOSQUITTO, server  # noqa: F401 (a fixture)
+from test_service import start, stopped, until
+
+from livepde import cases, runs
+from livepde.runs import drive
+
+CASE = Path(__file__).parents[1] / "cases" / "soil_uniform.toml"
+SAMPLES = 240  # ten days
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+def publish(port: int, rows: list[dict[str, object]]) -> None:
+    from paho.mqtt.client import Client
+    from paho.mqtt.enums import CallbackAPIVersion
+
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.connect("127.0.0.1", port)
+    client.loop_start()
+    for row in rows:
+        client.publish("soil/rows", json.dumps(row), qos=1).wait_for_publish(30)
+    client.disconnect()
+    client.loop_stop()
+
+
+@pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
+def test_soil_from_a_broker_to_a_browser(tmp_path, monkeypatch, data_dir, server):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    file = data_dir / "soil_temperature" / "soil_2025_mar_jun.csv"
+    table = pd.read_csv(file, dtype=str, keep_default_na=False)
+    begin = int(np.flatnonzero(table["DATETIME_END"] >= "2025-04-01")[0])
+    rows = table.iloc[begin : begin + SAMPLES].to_dict("records")
+    text_of = CASE.read_text()
+    own = f'mqtt = {{ port = {server.port}, rows = ["soil/rows"] }}'
+    Path("soil.toml").write_text(re.sub(r"file = .*", own, text_of, count=1))
+    port = free_port()
+    process = start("soil.toml", "--out", "run", "--watch", str(port))
+    until(lambda: Path("run/run.json").exists(), process)
+    with chromium() as page:
+        publish(server.port, rows[: SAMPLES // 2])
+        until(lambda: "Open" in process.stderr.readline(), process)
+        page.get(f"http://127.0.0.1:{port}/")
+        wait(page, lambda page: count(page) == SAMPLES // 2)
+        assert text(page, "#title") == "Soil, April 2025: uniform diffusivity"
+        before = text(page, "#cards")
+        publish(server.port, rows[SAMPLES // 2 :])
+        wait(page, lambda page: count(page) == SAMPLES)
+        after = text(page, "#cards")
+        assert "alpha" in after
+        assert after != before
+    stopped(process)
+
+    pd.DataFrame(rows).to_csv("april.csv", index=False)
+    prepared = cases.load(CASE).prepare("april.csv")
+    expected = drive(prepared.identifier, prepared.stream).result.to_xarray()
+    found = runs.open("run").dataset
+    assert np.array_equal(found["alpha"], expected["alpha"])
+    assert np.array_equal(found["innovation"], expected["innovation"], equal_nan=True)

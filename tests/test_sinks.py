@@ -1,0 +1,124 @@
+"""Where estimates and logs go, and what happens when they cannot."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_live import live, rows
+
+from livepde.runs.logs import configure
+from livepde.runs.sinks import JsonLinesSink
+from livepde.streams.sources import Rows
+
+
+@pytest.fixture
+def logs():
+    """Leave logging as it was."""
+    root = logging.getLogger()
+    before, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = before
+    root.setLevel(level)
+    for name in ("livepde", "asyncua"):
+        logging.getLogger(name).setLevel(logging.NOTSET)
+
+
+def test_each_estimate_is_a_line(tmp_path):
+    stream = io.StringIO()
+    run = live(tmp_path, Rows(rows(4)), sinks=[JsonLinesSink(stream)])
+    run.run()
+    lines = [json.loads(line) for line in stream.getvalue().splitlines()]
+    assert [line["t"] for line in lines] == [record.t for record in run.journal]
+    last = run.result.last
+    value, std = last.parameters["k"]
+    assert lines[-1]["unknowns"] == {"k": {"value": value, "std": std}}
+    assert lines[-1]["innovation"] == last.innovation.tolist()
+    assert lines[-1]["status"] == "ok"
+    run.journal.close()
+
+
+def test_what_is_no_number_is_null(tmp_path):
+    stream = io.StringIO()
+    row = {**next(iter(rows(1))), "b": None}
+    run = live(tmp_path, Rows([row]), sinks=[JsonLinesSink(stream)])
+    run.run()
+    assert json.loads(stream.getvalue())["innovation"][1] is None
+    run.journal.close()
+
+
+CHILD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_live import live, rows
+from livepde.runs.sinks import JsonLinesSink
+from livepde.streams.sources import Rows
+run = live(Path(sys.argv[1]), Rows(rows(30)), sinks=[JsonLinesSink(sys.stdout)])
+run.run()
+events = [(event.kind, event.message) for event in run.journal.events]
+print(len(run.journal), events, file=sys.stderr)
+run.journal.close()
+"""
+
+
+def child(folder: Path, output) -> str:
+    command = [sys.executable, "-c", CHILD, str(folder), str(Path(__file__).parent)]
+    ended = subprocess.run(
+        command, stdout=output, stderr=subprocess.PIPE, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    return ended.stderr
+
+
+def test_a_closed_pipe_ends_the_sink_and_not_the_run(tmp_path):
+    reading, writing = os.pipe()
+    os.close(reading)
+    told = child(tmp_path, writing)
+    os.close(writing)
+    assert told.count("JsonLinesSink is given up") == 2  # the event, and the log
+    assert "30 [('sink', " in told
+    assert "Exception ignored" not in told
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_ends_the_sink_and_not_the_run(tmp_path):
+    with Path("/dev/full").open("w") as full:
+        told = child(tmp_path, full)
+    assert "No space left on device" in told
+    assert "30 [('sink', " in told
+
+
+def test_a_log_in_json_has_the_fields_of_an_event(tmp_path, capsys, logs):
+    configure("json")
+    late = {"t": 0.0, "a": 0.0, "b": 0.0, "left": 0.0}
+    run = live(tmp_path, Rows([*rows(3), late]))
+    run.run()
+    run.journal.close()
+    logging.getLogger("livepde.mqtt").warning("lost")
+    logging.getLogger("another").info("not said")
+    *events, lost = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert {(event["kind"], event["channel"]) for event in events} == {
+        ("late", "a"),
+        ("late", "b"),
+        ("late", "left"),
+    }
+    assert events[0]["level"] == "WARNING"
+    assert all(isinstance(event["t"], float) for event in events)
+    assert lost["logger"] == "livepde.mqtt"
+    assert lost["message"] == "lost"
+    assert lost["time"].endswith("Z")
+
+
+def test_a_log_as_text(capsys, logs):
+    configure("text", logging.WARNING)
+    logging.getLogger("livepde.run").warning("nothing from the source")
+    logging.getLogger("livepde.run").info("not said")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("WARNING nothing from the source")
