@@ -432,18 +432,24 @@ def test_a_report_says_what_there_is_to_say(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
-    [(0.05, "Nothing speaks against the estimates"), (0.5, "A number is not as it was expected")],
+    ("value", "doubts", "said"),
+    [
+        (0.05, [], "Nothing speaks against the estimates"),
+        (0.05, ["The model does not explain the data."], "The model does not explain the data"),
+        (0.5, [], "Expected error <= 0.1, but it is 0.5"),
+    ],
 )
-def test_a_report_says_first_whether_anything_is_wrong(tmp_path, value, said):
+def test_a_report_says_first_whether_anything_is_wrong(tmp_path, monkeypatch, value, doubts, said):
+    monkeypatch.setattr(runs, "doubts", lambda data: doubts)
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
     data = drive(identifier(), samples()).result.to_xarray()
     checks = [Check("error", value, 0.1, "<=")]
-    writer.finish(status="finished", dataset=data, checks=checks)
+    writer.finish(status="finished", dataset=data, checks=checks, notes=["a note"])
     write_report(runs.open(tmp_path / "run"), tmp_path / "run.html")
     page = Page(tmp_path / "run.html")
-    assert said in page.text
+    assert page.text.index(said) < page.text.index("a note") < page.text.index("Estimates")
     assert ("FAILED" in page.text) == (value > 0.1)
+    assert ("Nothing speaks against" in page.text) == (value <= 0.1 and not doubts)
 
 
 def test_a_report_fetches_nothing(tmp_path):
@@ -516,12 +522,12 @@ def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
     run = made(tmp_path / "run", kind, origin=ORIGIN)
     write_report(run, tmp_path / "run.html")
     browser.get((tmp_path / "run.html").as_uri())
-    places = browser.find_elements(By.CSS_SELECTOR, "[data-figure]")
-    assert len(places) >= 5
-    for place in places:
-        WebDriverWait(browser, 60).until(
-            lambda _, p=place: p.find_elements(By.CLASS_NAME, "main-svg")
-        )
+    count = (tmp_path / "run.html").read_text(encoding="utf-8").count("<div data-figure=")
+    assert count >= 5
+    drawn = "[data-figure]:has(.main-svg)"
+    WebDriverWait(browser, 60).until(
+        lambda _: len(browser.find_elements(By.CSS_SELECTOR, drawn)) == count
+    )
     buttons = browser.find_elements(By.CLASS_NAME, "modebar-btn")
     titles = {button.get_attribute("data-title") for button in buttons}
     assert not [title for title in titles if re.search("share|cloud|edit", title, re.IGNORECASE)]

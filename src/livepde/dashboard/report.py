@@ -18,7 +18,7 @@ from livepde.runs.journal import Event
 
 __all__ = ["page_of", "write_report"]
 
-TEMPLATE = "report.html"
+TEMPLATE, STYLE = "report.html", "assets/page.css"
 MOST_EVENTS = 500
 
 
@@ -61,8 +61,9 @@ def page_of(run: Run) -> str:
     axis, drawn = when_axis(data), panels(data)
     events, counts = _journal(run)
     case = run.path / CASE
+    here = Path(__file__).parent
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
+        loader=FileSystemLoader(here),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -73,8 +74,7 @@ def page_of(run: Run) -> str:
         equation=str(data.attrs.get("equation", "")),
         samples=data.sizes["time"],
         span=[axis.text(float(data["time"][k])) for k in (0, -1)],
-        notes=runs.doubts(data) if run.status == "running" else run.notes,
-        fine=all(check.ok for check in run.checks),
+        verdict=_verdict(run),
         tables=[_shown(table) for table in runs.tables(data)],
         checks=[_checked(check) for check in run.checks],
         sections={
@@ -91,9 +91,24 @@ def page_of(run: Run) -> str:
         drawings={panel.name: json.loads(panel.figure.to_json()) for panel in drawn},
         config=CONFIG,
         written=_written(run),
+        style=(here / STYLE).read_text(encoding="utf-8"),
         plotly=get_plotlyjs(),
         nonce=secrets.token_urlsafe(16),
     )
+
+
+def _verdict(run: Run) -> list[tuple[str, str]]:
+    """Return sentences with how grave they are, the gravest first."""
+    doubts = runs.doubts(run.dataset)
+    found = [
+        ("bad", f"Expected {name} {bound}, but it is {value}.")
+        for name, value, bound, result in map(_checked, run.checks)
+        if result != "ok"
+    ]
+    found += [("warn", doubt) for doubt in doubts]
+    if not found:
+        found.append(("good", "Nothing speaks against the estimates."))
+    return found + [("info", note) for note in run.notes if note not in doubts]
 
 
 def _shown(table: Table) -> Table:
