@@ -21,7 +21,18 @@ from livepde.cases.template import write_template
 from livepde.errors import LivepdeError
 from livepde.runs import Check, Outcome, Table
 
-COMMANDS = ("demo", "reproduce", "init", "equations", "check", "run", "report", "bench")
+COMMANDS = (
+    "demo",
+    "reproduce",
+    "init",
+    "equations",
+    "check",
+    "run",
+    "report",
+    "watch",
+    "export",
+    "bench",
+)
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ import tomllib
 import urllib.error
 import urllib.request
 import zipfile
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +138,33 @@ def test_a_run_of_somebody_else_runs_nothing(hostile):
     assert trace.exists()  # who allows it gets it
 
 
+def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
+    mine = tmp_path / "mine.txt"
+    mine.write_text("mine")
+    (hostile / "report.md").unlink()
+    (hostile / "report.md").symlink_to(mine)
+    assert call("report", str(hostile)) == (
+        2,
+        f"{hostile / 'report.md'} is a link: what is written to it would land elsewhere.",
+    )
+    assert mine.read_text() == "mine"
+
+
+def test_a_damaged_dataset_is_one_sentence(hostile):
+    path = hostile / "estimates.nc"
+    whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    for _ in range(200):
+        content = bytearray(whole)
+        for place in rng.integers(0, 3000, 2):
+            content[place] = rng.integers(0, 256)
+        path.write_bytes(content[: len(content) - int(rng.integers(0, 2)) * 1000])
+        try:
+            _ = runs.open(hostile).dataset
+        except lp.RunError:
+            refused += 1
+    assert refused > 100
+
+
 def test_a_case_cannot_allow_its_own_code(hostile):
     path = hostile / "case.toml"
     path.write_text("allow_code = true\n" + path.read_text())
@@ -176,15 +202,17 @@ def test_long_lines_are_refused_and_the_next_one_is_read(tmp_path):
     good = '{"t": 1, "a": 2}\n'
     path = tmp_path / "data.jsonl"
     path.write_text(long + good)
-    with closing(Follow(path)) as source:
-        first, second = source.poll(0.0)
+    source = Follow(path)
+    first, second = source.poll(0.0)
+    source.close()
     assert "longer than" in first.broken
     assert len(first.values) == 0
     assert second.values == {"t": 1, "a": 2}
     table = tmp_path / "data.csv"
     table.write_text("t,a\n" + "1," * LONGEST + "\n3,4\n")
-    with closing(Follow(table)) as source:
-        first, second = source.poll(0.0)
+    source = Follow(table)
+    first, second = source.poll(0.0)
+    source.close()
     assert "longer than" in first.broken
     assert second.values == {"t": "3", "a": "4"}
     piped = Lines(io.TextIOWrapper(io.BytesIO((long + good).encode() + b"\xff\xfe\n" + b"5\n")))

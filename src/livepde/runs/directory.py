@@ -48,6 +48,7 @@ RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
 JOURNAL = "journal.sqlite"
 LONGEST = 10_000_000  # bytes of a record
+WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
 
 
 def free_path(wanted: Path) -> Path:
@@ -248,7 +249,7 @@ class Run:
             raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.")
         try:
             return xr.load_dataset(path, engine="scipy")
-        except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+        except (OSError, ValueError, TypeError, LookupError, MemoryError) as error:
             raise RunError(f"{path} is damaged: {error}.") from error
 
     def case_file(self) -> Path:
@@ -303,9 +304,12 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     Raises
     ------
     RunError
-        There is no run, or its record is damaged.
+        There is no run, its record is damaged, or its report is a link to another file.
     """
     folder = Path(path)
+    for page in folder.glob("*"):
+        if page.suffix in WRITTEN_LATER and page.is_symlink():
+            raise RunError(f"{page} is a link: what is written to it would land elsewhere.")
     try:
         with (folder / RECORD).open("rb") as file:
             text = file.read(LONGEST + 1)

@@ -478,6 +478,7 @@ class Live:
     def health(self) -> dict[str, Any]:
         """What a watchdog should know: ok, unless the source is silent or steps fail."""
         last = self.result.last
+        counts = self._counts.copy()  # who asks does so from another thread
         failed = last is not None and not last.status.ok
         return {
             "ok": not (self.silent or failed),
@@ -487,7 +488,7 @@ class Live:
             "silent": self.silent,
             "status": "" if last is None else last.status.code,
             "seconds": self._seconds,
-            "counts": [[*key, number] for key, number in sorted(self._counts.items())],
+            "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
 
     def _take(self, ready: Ready) -> None:
