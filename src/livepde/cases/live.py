@@ -177,6 +177,9 @@ class Wiring:
             table = read_data(case.frame, case.columns, case.clock, named)
             self._origin = table.origin
             return Samples(table, after=last)
+        if spec.every > 1:
+            text = f"got {spec.every}; beside a process all rows are taken: leave it out."
+            raise case.frame.error("data.every", text)
         origin = None if journal is None else _seconds(journal.layout.attrs.get("origin"))
         self._intake = Intake(
             case.columns,

@@ -135,9 +135,13 @@ def _observers(
         sinks.append(metrics)
     if how.page is not None:
         # A process of its own: drawing must not delay steps.
-        command = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", how.page]
+        watch = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", how.page]
         secret = {"LIVEPDE_TOKEN": how.token} if how.token else {}
-        page = subprocess.Popen(command, stdout=sys.stderr, env={**os.environ, **secret})
-        stack.callback(page.wait)
-        stack.callback(page.terminate)
+        page = subprocess.Popen(
+            [*watch, "--attached"],
+            stdin=subprocess.PIPE,
+            stdout=sys.stderr,
+            env={**os.environ, **secret},
+        )
+        stack.callback(page.communicate)  # closes its standard input, and waits
     return sinks

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
-from typing import Annotated
+from threading import Thread
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
 from livepde.cli.printing import terminal
+
+if TYPE_CHECKING:
+    from livepde.runs.web import Server
 
 __all__ = ["watch"]
 
@@ -34,6 +39,9 @@ def watch(
             show_default=False,
         ),
     ] = "",
+    attached: Annotated[
+        bool, typer.Option("--attached", help="End with standard input.", hidden=True)
+    ] = False,
 ) -> None:
     """Show a run in a browser, while it goes on and afterwards; Ctrl-C ends it.
 
@@ -44,8 +52,15 @@ def watch(
     from livepde.runs.web import Address
 
     server = serve(folder, Address.read(address, PORT, token))
+    if attached:  # to a run that may be killed without a word
+        Thread(target=_end_with_input, args=(server,), daemon=True).start()
     terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)", soft_wrap=True)
     try:
         server.wait()
     except KeyboardInterrupt:
         server.close()
+
+
+def _end_with_input(server: Server) -> None:
+    sys.stdin.read()
+    server.close()
