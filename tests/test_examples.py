@@ -39,6 +39,7 @@ def test_every_example_is_tested():
         "own_law",
         "nonlinear_sensor",
         "smoothing_sensor",
+        "beside",
     }
 
 
@@ -54,6 +55,7 @@ def test_experiments_find_what_they_import(path, monkeypatch):
         ("ten_lines", {"k": 0.8, "s": 1.5}),
         ("own_pde", {"k": 21.0, "eps": 0.8}),
         ("nonlinear_sensor", {"k": 0.8, "s": 1.5}),
+        ("beside", {"alpha": 9.7e-5}),
     ],
 )
 def test_examples_find_their_truth(name, truth):
@@ -121,7 +123,9 @@ def test_the_case_of_a_new_pde_runs_as_the_page_shows_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if page.name != "conditions.md"], ids=lambda page: page.name
+    "page",
+    [page for page in PAGES if page.name not in ("conditions.md", "formats.md")],
+    ids=lambda page: page.name,
 )
 def test_blocks_of_the_pages_run(page):
     """The blocks of a page share one namespace, as a reader types them one after the other.
@@ -131,6 +135,19 @@ def test_blocks_of_the_pages_run(page):
     namespace = {}
     for block in BLOCK.findall(page.read_text()):
         exec(compile(block, str(page), "exec"), namespace)
+
+
+def test_the_block_of_the_formats_reads_an_export(tmp_path, monkeypatch, data_dir):
+    monkeypatch.chdir(tmp_path)
+    for command in (
+        ["run", str(ROOT / "cases" / "soil_uniform.toml"), "--out", "run"],
+        ["export", "run", "soil.nc"],
+    ):
+        assert CliRunner().invoke(app, command).exit_code == 0
+    (block,) = BLOCK.findall((ROOT / "docs" / "formats.md").read_text())
+    namespace = {}
+    exec(compile(block, "formats.md", "exec"), namespace)
+    assert namespace["data"]["alpha"].sel(time="2025-04-15").sizes["time"] == 24
 
 
 def test_every_page_of_an_equation_is_in_the_navigation():
