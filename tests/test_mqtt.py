@@ -86,10 +86,10 @@ def listen(source, count: int) -> list:
     return found
 
 
-def subscribed(source: MqttSource) -> threading.Event:
-    """Return what is set when the broker answers the next subscription of a source."""
-    answered = threading.Event()
-    source._client.on_subscribe = lambda *_: answered.set()
+def subscribed(source: MqttSource) -> queue.Queue[int]:
+    """Return where the numbers of subscriptions appear that the broker has answered."""
+    answered: queue.Queue[int] = queue.Queue()
+    source._client.on_subscribe = lambda client, _, number, *__: answered.put(number)
     return answered
 
 
@@ -97,8 +97,9 @@ def acknowledge(source: MqttSource, found: list) -> None:
     """Acknowledge rows, and wait until the broker knows."""
     source.acknowledge([row.token for row in found])
     answered = subscribed(source)  # it answers in order
-    source._client.subscribe("nothing")
-    assert answered.wait(30)
+    _, number = source._client.subscribe("nothing")
+    while answered.get(timeout=30) != number:
+        pass
 
 
 def polled(source) -> None:
@@ -297,7 +298,7 @@ def test_an_acknowledgement_is_never_that_of_another_message(server):
     (server.folder / "mosquitto.db").unlink()  # the broker forgets sessions and counts anew
     answered = subscribed(heard)
     server.start()
-    assert answered.wait(30)
+    answered.get(timeout=30)
     publish(server, [{"t": 2}, {"t": 3}])
     new = listen(heard, 2)
     assert [row.token.number for row in new] == [row.token.number for row in old]
