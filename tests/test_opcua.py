@@ -147,6 +147,17 @@ def test_a_server_that_was_away_is_heard_again(server, caplog):
     assert not heard._thread.is_alive()
 
 
+def test_a_connection_that_breaks_down_ends_the_run(server):
+    heard = source(server)
+    listen(heard, lambda row: "left" in row.values)
+    heard._loop.call_soon_threadsafe(heard._stop.set)  # as if its thread had failed
+    heard._thread.join(30)
+    while not heard._rows.empty():
+        heard.poll(0.0)
+    with pytest.raises(lp.DataError, match="has broken down"):
+        heard.poll(0.0)
+
+
 def test_a_run_takes_them(server, tmp_path):
     heard = source(server)
     listen(heard, lambda row: "left" in row.values)
@@ -173,6 +184,8 @@ def test_what_cannot_be_reached_is_one_sentence(server):
     with pytest.raises(lp.DataError, match="BadUserAccessDenied") as refused:
         source(server, username="operator", password="wrong")
     assert "wrong" not in str(refused.value)
+    with pytest.raises(lp.DataError, match="use username instead"):
+        OpcuaSource("opc.tcp://me:secret@localhost:4840", COLUMNS, "t")
     with pytest.raises(lp.DataError, match="interval must be"):
         OpcuaSource(server.url, COLUMNS, "t", interval=0.0)
     server.stop()

@@ -285,6 +285,10 @@ class MqttSource(_Peer):
             topic = str(message.topic)
         except UnicodeDecodeError:
             topic = ""
+        columns = self._columns(topic)
+        if not columns:  # the session still has it from a case that was another
+            client.ack(message.mid, message.qos)
+            return
         with self._lock:
             self._came = time.monotonic()
             delivery = None
@@ -299,7 +303,8 @@ class MqttSource(_Peer):
             elif self._rows.qsize() >= self._broker.ahead:
                 self.dropped += 1
                 return
-            self._rows.put(self._row(topic, payload, delivery, message.dup or message.retain))
+            old = message.dup or message.retain
+            self._rows.put(self._row(columns[0], payload, delivery, old))
 
     def _renew(self, known: _Delivery) -> None:
         """Take note that a message has come again of which the row is under way or safe."""
@@ -315,8 +320,7 @@ class MqttSource(_Peer):
             if self._deliveries.get(oldest.number) is oldest:
                 del self._deliveries[oldest.number]
 
-    def _row(self, topic: str, payload: bytes, token: Any, old: bool) -> Row:
-        column = self._column(topic)
+    def _row(self, column: str | None, payload: bytes, token: Any, old: bool) -> Row:
         if column is None:
             return json_row(payload, token)
         if len(payload) > LONGEST:
@@ -331,11 +335,11 @@ class MqttSource(_Peer):
         moment = values.get(self._time, datetime.now(UTC).isoformat())
         return Row({self._time: moment, column: values.get("value")}, token)
 
-    def _column(self, topic: str) -> str | None:
+    def _columns(self, topic: str) -> list[str | None]:
+        """Return the column of a topic that is listened to, nothing for others."""
         from paho.mqtt.client import topic_matches_sub
 
-        found = (c for t, c in self._topics.items() if topic_matches_sub(t, topic))
-        return next(found, None)
+        return [column for sub, column in self._topics.items() if topic_matches_sub(sub, topic)]
 
     @property
     def done(self) -> bool:

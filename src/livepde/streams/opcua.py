@@ -179,7 +179,13 @@ class OpcuaSource:
         return False
 
     def poll(self, wait: float) -> Sequence[Row]:
-        """Return the changes that have come."""
+        """Return the changes that have come.
+
+        Raises
+        ------
+        DataError
+            The connection has broken down in a way that was not foreseen.
+        """
         rows: list[Row] = []
         while len(rows) < BATCH:
             try:
@@ -187,6 +193,8 @@ class OpcuaSource:
             except queue.Empty:
                 break
             rows.append(row)
+        if not rows and not self._thread.is_alive():
+            raise DataError(f"OPC UA: {self._url}: the connection has broken down, see the log.")
         return rows
 
     def position(self, waiting: Iterable[Any]) -> str:
