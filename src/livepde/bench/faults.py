@@ -690,7 +690,7 @@ class _Audited(Gathered):
 
     def _outcome(self, row: SourceRow) -> RowOutcome:
         found = super()._outcome(row)
-        self.reasons[row.token[0]] = {remark.kind for remark in found.remarks}
+        self.reasons[row.token[1]] = {remark.kind for remark in found.remarks}
         return found
 
 
