@@ -53,7 +53,7 @@ KILLS, SAMPLES, MALFORMED = 200, 2000, 100_000
 PATIENCE = 120.0  # seconds after which a run that does not go on is given up
 STRIDE = 0.25  # seconds after a sign of life within which a kill falls
 LONG_ONES = 0.02  # share of the lines of 2 MB that are written
-LEAD = (50, 400)  # rows that are there before they are asked for
+LEAD = (20, 400)  # rows that are there before they are asked for
 SILENCE = 1.0  # seconds after which a source is said to be silent
 BROKER = "/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin:/opt/homebrew/sbin"
 
@@ -499,10 +499,9 @@ def _killed(
         here.mkdir()
         plant = plants(here, rows, plan.seed + damage.runs)
         with _running(here, plant.source) as run:
-            some = len(rows) - 1  # the last life of a run has something to do
-            while run.look() < some and fallen.total() < plan.kills:
+            while run.look() < len(rows) - LEAD[0] and fallen.total() < plan.kills:
                 moment = str(rng.choice([*MOMENTS], p=[*MOMENTS.values()]))
-                if _kill(run, plant, some, moment, start, rng):
+                if _kill(run, plant, len(rows) - 1, moment, start, rng):
                     fallen[moment] += 1
                     next(bar, None)
             plant.supply(len(rows))
@@ -691,7 +690,7 @@ class _Audited(Gathered):
 
     def _outcome(self, row: SourceRow) -> RowOutcome:
         found = super()._outcome(row)
-        self.reasons[row.token[0]] = {remark.kind for remark in found.remarks}
+        self.reasons[row.token[1]] = {remark.kind for remark in found.remarks}
         return found
 
 

@@ -143,7 +143,7 @@ def peers(
 @bench.command()
 def faults(
     kills: Annotated[int, typer.Option(min=1, help="Kills, with a file and with a broker.")] = 200,
-    samples: Annotated[int, typer.Option(min=10, help="Samples of a run that is killed.")] = 2000,
+    samples: Annotated[int, typer.Option(min=50, help="Samples of a run that is killed.")] = 2000,
     malformed: Annotated[int, typer.Option(min=1, help="Broken rows and messages.")] = 100_000,
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[

@@ -1,0 +1,158 @@
+"""The benchmarks of runs for months, in small: they measure what they say, and can fail."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import call
+
+import livepde as lp
+from livepde import cases
+from livepde.bench import faults, soak
+from livepde.bench.journal import journal
+from livepde.records import Record
+
+MQTT = pytest.mark.skipif(
+    shutil.which("mosquitto", path=f"/usr/bin:{faults.BROKER}") is None,
+    reason="needs the broker mosquitto",
+)
+
+
+def failed(outcome) -> list[str]:
+    return [check.name for check in outcome.checks if not check.ok]
+
+
+@pytest.mark.parametrize("part", ["file", pytest.param("mqtt", marks=MQTT)])
+def test_runs_are_killed_and_lose_nothing(part):
+    pytest.importorskip("paho.mqtt")
+    outcome = faults.faults(kills=2, samples=100, only=[part], seed=2)
+    assert not failed(outcome)
+    (table,) = outcome.tables
+    assert table.rows[0][0] >= 1
+    assert sum(table.rows[0][1:5]) == 2
+
+
+@MQTT
+def test_sources_go_away_and_come_back():
+    pytest.importorskip("paho.mqtt")
+    assert not failed(faults.faults(samples=90, only=["restart"]))
+
+
+@MQTT
+def test_broken_messages_reach_the_real_command():
+    pytest.importorskip("paho.mqtt")
+    assert not failed(faults.faults(samples=60, malformed=1000, only=["messages"]))
+
+
+def test_broken_rows_have_a_reason_and_right_ones_arrive():
+    outcome = faults.faults(samples=100, malformed=1200, only=["malformed"])
+    assert not failed(outcome)
+    sent = sum(row[2] for table in outcome.tables for row in table.rows if row[0] == "sent")
+    assert sent >= 1200
+
+
+@pytest.mark.parametrize("kind", [*(faults.JSON | faults.BYTES)])
+def test_every_kind_of_broken_line_is_no_right_one(kind):
+    row = faults._rows(1)[0]
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        line = (faults.JSON | faults.BYTES)[kind](row, faults._json_line, rng)
+        assert isinstance(line, bytes)
+        assert line != faults._json_line(row)
+
+
+def record(t: float, value: float = 1.0) -> Record:
+    nothing = np.zeros(0)
+    return Record(t, np.array([value]), nothing, nothing, 0, 1, {})
+
+
+def found(*records: Record, state: bytes = b"x") -> faults._Found:
+    return faults._Found(records, len(records), state, Counter(), Counter())
+
+
+@pytest.mark.parametrize(
+    ("other", "lost", "doubled", "different"),
+    [
+        (found(record(0.0), record(1.0)), 0, 0, 0),
+        (found(record(0.0)), 2, 0, 0),  # neither accepted nor estimated
+        (found(record(0.0), record(1.0), record(1.0)), 0, 2, 0),
+        (found(record(0.0), record(1.0, np.nextafter(1.0, 2.0))), 0, 0, 1),
+        (found(record(0.0), record(1.0), state=b"y"), 0, 0, 1),
+    ],
+)
+def test_damage_is_seen(other, lost, doubled, different):
+    damage = faults._Damage()
+    damage.compare(other, found(record(0.0), record(1.0)))
+    assert (damage.lost, damage.doubled, damage.different) == (lost, doubled, different)
+    assert all(check.ok for check in damage.checks("x")) == (lost + doubled + different == 0)
+
+
+def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
+    (tmp_path / "case.toml").write_text(faults.CASE.format(source="", silence=1))
+    monkeypatch.setattr(faults, "JSON", {"right": lambda row, write, rng: write(dict(row))})
+    monkeypatch.setattr(faults, "BYTES", {})
+    case, rows = cases.load(tmp_path / "case.toml"), faults._rows(20)
+    fed = faults._fed(case, rows, tmp_path / "rows.jsonl", 20, np.random.default_rng(0))
+    assert fed.reasons == {"late": 20}
+    monkeypatch.setattr(
+        faults, "JSON", {"new": lambda row, write, rng: write({**row, "time": "2027-01-01"})}
+    )
+    fed = faults._fed(case, rows, tmp_path / "rows.jsonl", 2, np.random.default_rng(0))
+    assert fed.reasons["leap"] == 2
+
+
+def test_soak_in_small(monkeypatch):
+    monkeypatch.setattr(soak, "WARM", 500)
+    monkeypatch.setattr(soak, "BLOCK", 100)
+    outcome = soak.soak(2000)
+    checks = {check.name.split(":")[0]: check for check in outcome.checks}
+    assert checks["memory"].ok
+    assert checks["steps that failed"].ok
+    assert checks["estimates that a reader does not find"].ok
+    assert checks["relative error of k at the end"].ok
+    with pytest.raises(lp.RunError, match="at least 1000"):
+        soak.soak(100)
+
+
+def test_soak_sees_what_grows():
+    steps = range(soak.WARM, 3 * soak.WARM, soak.BLOCK)
+    meter = soak.Meter(None)
+    flat = soak.Reading(0, 1e-3, 1e8, 2e8, 5e6, 4e6)
+    meter.readings = [replace(flat, steps=k) for k in steps]
+    assert not failed(soak._outcome(meter, 30_000, 0, 0.0))
+    meter.readings = [
+        soak.Reading(k, 1e-3 * k / soak.WARM, 1e8 + 1e3 * k, 2e8, 100.0 * k, 1e4 * k) for k in steps
+    ]
+    meter.failed = 1
+    assert len(failed(soak._outcome(meter, 30_000, 1, 0.1))) == 7
+
+
+def test_the_journal_has_a_price(monkeypatch, tmp_path, data_dir):
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+    monkeypatch.setattr("livepde.bench.journal.REPETITIONS", 1)
+    times, ratios = journal(Path(__file__).parents[1] / "cases").tables
+    assert [row[0] for row in times.rows] == ["step", "journal"]
+    assert all(0.0 < cell < 1e3 for row in times.rows for cell in row[1:])
+    assert ratios.rows[0][1] > 0.0
+    (tmp_path / "other.toml").touch()
+    with pytest.raises(lp.ConfigurationError, match="soil_uniform"):
+        journal(tmp_path)
+
+
+def test_the_commands_print_json(monkeypatch):
+    monkeypatch.setattr(
+        "livepde.bench.faults.PARTS", {"file": lambda plan: faults.Outcome(notes=[str(plan.kills)])}
+    )
+    code, out = call("bench", "faults", "--kills", "7", "--only", "file", "--json")
+    assert code == 0
+    assert json.loads(out)["command"].endswith(
+        "--kills 7 --samples 2000 --malformed 100000 --seed 0 --only file"
+    )
+    with pytest.raises(lp.ConfigurationError, match="there is no part 'nothing'"):
+        call("bench", "faults", "--only", "nothing")
