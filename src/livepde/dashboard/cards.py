@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
@@ -27,6 +28,7 @@ __all__ = ["cards", "chip", "facts", "pretty", "summary", "tables", "verdict"]
 
 Level = Literal["good", "info", "warn", "bad"]
 
+MOST_SAID = 6  # sentences of the verdict that are seen at once
 MOST_CARDS = 12
 MOST_ROWS = 100  # of a table
 LONG = 12  # rows from which a table is closed at first
@@ -134,8 +136,12 @@ def verdict(seen: Seen) -> list[Any]:
     grave = data is not None and unexplained(data)
     for k, sentence in enumerate(seen.doubts):
         found.append(("bad" if grave and k == 0 else "warn", sentence))
-    if refused := sum(seen.counts.values()):
-        found.append(("info", f"{refused} rows or values were not used: see Events."))
+    if seen.counts:
+        reasons: Counter[str] = Counter()
+        for (kind, _), number in seen.counts.items():
+            reasons[kind] += number
+        said = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
+        found.append(("info", f"Rows or values that were not used: {said}. See Events."))
     if data is not None and not any(level in ("bad", "warn") for level, _ in found):
         text = "Nothing looks wrong: steps converge, and nothing speaks against the estimates."
         found.insert(0, ("good", text))
@@ -143,7 +149,11 @@ def verdict(seen: Seen) -> list[Any]:
         text = f"Looked at is one in {seen.gap} samples of this long run; counts are of those."
         found.append(("info", text))
     found += [("info", note) for note in seen.notes]
-    return [html.Li([_sign(level), html.Span(text)], className=level) for level, text in found]
+    lines = [html.Li([_sign(level), html.Span(text)], className=level) for level, text in found]
+    if len(lines) <= MOST_SAID + 1:
+        return lines
+    rest = [html.Summary(f"and {len(lines) - MOST_SAID} more"), html.Ul(lines[MOST_SAID:])]
+    return [*lines[:MOST_SAID], html.Li(html.Details(rest))]
 
 
 def _sign(level: Level) -> Any:
@@ -203,7 +213,7 @@ def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
     state = "moves" if moves and known.verdict == "partly" else known.verdict
     level, text = VERDICTS[state]
     if state in ("partly", "pinned"):
-        text += f", {100 * left:.2g} % open"
+        text += f", {100 * left:.2g}\N{NO-BREAK SPACE}% open"
     return html.P([_sign(level), text], className="known")
 
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,7 +80,7 @@ class Panel:
     figure: go.Figure
 
 
-def panels(data: xr.Dataset, at: float | None = None) -> list[Panel]:
+def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[Panel]:
     """Return all there is to draw of a run.
 
     Parameters
@@ -88,10 +89,12 @@ def panels(data: xr.Dataset, at: float | None = None) -> list[Panel]:
         A run's dataset; empty ones give no panel.
     at
         Time to look back to; default the newest.
+    cut
+        Where solids are cut, as share of their size along each axis.
     """
     if not data.sizes.get("time"):
         return []
-    found = [*_unknown_panels(data, at), *_field_panels(data, at)]
+    found = [*_unknown_panels(data, at), *_field_panels(data, at, cut)]
     for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
         if variable in data and data.sizes.get(dimension):
             found.append(_residual_panel(data, variable, dimension, at))
@@ -395,24 +398,25 @@ def _mark_failures(figure: go.Figure, data: xr.Dataset, axis: TimeAxis) -> None:
 # --- fields ---------------------------------------------------------------------------------------
 
 
-def _field_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
+def _field_panels(data: xr.Dataset, at: float | None, cut: float) -> list[Panel]:
     unknown, state = (str(data.attrs.get(key, "")).split() for key in ("fields", "state"))
     found: list[Panel] = []
     if not data.sizes.get("snapshot"):
         return found
     k = at_time(data, "snapshot", at)
     when = when_axis(data).text(float(data["snapshot"].values[k]))
-    draw, hint = _drawn(data)
+    draw, hint = _drawn(data, cut)
     for name in [*unknown, *state]:
         if name not in data:
             continue
         title = f"{'Unknown field' if name in unknown else 'State'} {name}"
         deviates = f"{name}_std" in data and bool(data[f"{name}_std"].values[k].any())
         about = f"Estimate at {when}.{hint}"
-        if draw is field_profile and deviates:
+        profile = draw is field_profile
+        if profile and deviates:
             about += " Band: holds the true one with 95 % probability."
         found.append(Panel(f"field:{name}", "estimates", title, about, draw(data, name, at)))
-        if draw is not field_profile and deviates and name in unknown:
+        if not profile and deviates and name in unknown:
             about = f"Standard deviation at {when}: small where the data have told.{hint}"
             spread = draw(data, f"{name}_std", at)
             title = f"How sure: {name}"
@@ -420,10 +424,11 @@ def _field_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
     return found
 
 
-def _drawn(data: xr.Dataset) -> tuple[Callable[..., go.Figure], str]:
+def _drawn(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], str]:
     """Return what draws a field, and how to read it."""
     if "z" in data.coords:
-        return field_solid, " Surface and three cuts through the middle: drag to turn."
+        hint = f" Surface, seen through, and three cuts at {cut:.0%} of its size: drag to turn."
+        return partial(field_solid, cut=cut), hint
     if "y" in data.coords:
         return field_map, " Shown is where the mesh is fine: double-click for all." * _zoomed(data)
     return field_profile, " Grey: at the start."
@@ -494,11 +499,13 @@ def _fine(lines: Array) -> list[float] | None:
     return [low, high] if np.ptp(lines) > OUT * (high - low) else None
 
 
-def field_solid(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
-    """Draw a field in a solid: its surface, seen through, and three cuts through the middle."""
+def field_solid(
+    data: xr.Dataset, name: str, at: float | None = None, cut: float = 0.5
+) -> go.Figure:
+    """Draw a field in a solid: its surface, seen through, and cuts across x, y and z."""
     values = data[name].values[at_time(data, "snapshot", at)]
     figure = _empty(height=440)
-    parts = [(cuts.boundary(data), 0.15), *((cut, 1.0) for cut in cuts.slices(data))]
+    parts = [(cuts.boundary(data), 0.15), *((found, 1.0) for found in cuts.slices(data, cut))]
     low, high = float(values.min()), float(values.max())
     for k, (surface, opacity) in enumerate(parts):
         x, y, z = surface.points.T
@@ -526,7 +533,10 @@ def field_solid(data: xr.Dataset, name: str, at: float | None = None) -> go.Figu
         f"{axis}axis": {"title": {"text": _text(f"{axis} {unit}")}, "gridcolor": GRID}
         for axis in "xyz"
     }
-    figure.update_layout(hovermode="closest", scene={**axes, "aspectmode": "data"})
+    camera = {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.1}}
+    figure.update_layout(
+        hovermode="closest", scene={**axes, "aspectmode": "data", "camera": camera}
+    )
     return figure
 
 

@@ -96,6 +96,22 @@ def _skeleton() -> Any:
                     ),
                     html.Output(id="shown"),
                     html.Button("Newest", id="newest", n_clicks=0),
+                    html.Div(
+                        [
+                            html.Label("Cuts", htmlFor="cut"),
+                            dcc.Slider(
+                                id="cut",
+                                min=0.05,
+                                max=0.95,
+                                step=0.05,
+                                value=0.5,
+                                marks=None,
+                                allow_direct_input=False,
+                            ),
+                        ],
+                        id="cutbar",
+                        hidden=True,
+                    ),
                 ],
                 id="timebar",
             ),
@@ -188,26 +204,30 @@ def _connect(app: dash.Dash, view: View) -> None:
     @app.callback(
         *(Output(f"panels-{key}", "children") for key in SECTIONS),
         *(Output(f"section-{key}", "hidden") for key in SECTIONS),
+        Output("cutbar", "hidden"),
         Output({"panel": ALL}, "figure"),
         Output({"about": ALL}, "children"),
         Input("at", "data"),
+        Input("cut", "value"),
         State({"panel": ALL}, "id"),
         prevent_initial_call=True,
     )
-    def draw(at: float | None, there: list[dict[str, str]]) -> tuple[Any, ...]:
+    def draw(at: float | None, cut: float, there: list[dict[str, str]]) -> tuple[Any, ...]:
         data = view.look().dataset
-        drawn = {} if data is None else {panel.name: panel for panel in panels(data, at)}
+        shown = [] if data is None else panels(data, at, cut)
         names = [item["panel"] for item in there]
-        if names == [*drawn]:
-            kept = (no_update,) * (2 * len(SECTIONS))
-            return (*kept, [p.figure for p in drawn.values()], [p.about for p in drawn.values()])
-        found = [[p for p in drawn.values() if p.section == key] for key in SECTIONS]
-        still = [no_update] * len(names)
+        if names == [panel.name for panel in shown]:
+            same = (no_update,) * (2 * len(SECTIONS) + 1)
+            return (*same, [panel.figure for panel in shown], [panel.about for panel in shown])
+        parts = [[panel for panel in shown if panel.section == key] for key in SECTIONS]
+        flat = data is None or "z" not in data.coords
+        later = [no_update] * len(names)  # they come with their frames
         return (
-            *([_framed(p) for p in part] for part in found),
-            *(not p for p in found),
-            still,
-            still,
+            *([_framed(panel) for panel in part] for part in parts),
+            *(not part for part in parts),
+            flat,
+            later,
+            later,
         )
 
 

@@ -191,8 +191,8 @@ class View:
         live = journal.is_file()
         written = _written(journal) if live else 0.0
         status = self._status(run, journal if live else None, written)
-        mark = (written, status, str(run.record), self._number, self._seen.reading)
-        if mark == self._mark:
+        mark = (written, status, str(run.record))
+        if mark == self._mark and not self._seen.reading:
             return self._seen
         seen = replace(
             self._seen,
@@ -210,7 +210,7 @@ class View:
             found = run.notes if found else []
         notes = [note for note in run.notes if note not in found] if ended else []
         seen = replace(seen, doubts=found, notes=notes, checks=run.checks if ended else [])
-        self._mark = (written, status, str(run.record), self._number, seen.reading)
+        self._mark = mark
         return seen
 
     def _load(self, seen: Seen, run: runs.Run) -> Seen:

@@ -1,0 +1,563 @@
+"""The live page: figures of datasets, the view of a run, and the page in a real browser."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+import xarray as xr
+from skfem import MeshHex, MeshTri
+from typer.testing import CliRunner
+
+import livepde as lp
+from livepde import cli, runs
+from livepde.dashboard import cards, cuts, figures, serve
+from livepde.dashboard import view as views
+from livepde.dashboard.view import Spread, View
+from livepde.models import heat
+from livepde.result import layout_of
+from livepde.runs import JOURNAL, Journal, RunWriter, drive, journal_of
+from livepde.runs.journal import Event
+from livepde.runs.web import Address
+
+HOSTILE = "<script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
+PATIENCE = 90.0  # seconds until a browser must have shown something
+
+
+def sided(mesh):
+    return mesh.with_boundaries({"left": lambda p: np.isclose(p[0], 0.0)})
+
+
+MESHES = {
+    "line": lambda: lp.interval(0.0, 1.0, 10),
+    "triangle": lambda: sided(MeshTri().refined(2)),
+    "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 3)),
+    "tetra": lambda: lp.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (3, 2, 2)),
+    "hexahedron": lambda: sided(MeshHex().refined(1)),
+}
+
+
+def identifier(kind: str = "line", *, field: bool = False, law=None) -> lp.Identifier:
+    mesh = MESHES[kind]()
+    alpha = lp.Scalar(0.1, 0.05, unit="m^2/s", transform="log")
+    if field:
+        alpha = lp.Field(mesh, lp.linear(mesh), prior=0.1, unit="m^2/s")
+    spot = [(x, *[0.4] * (mesh.dim() - 1)) if mesh.dim() > 1 else x for x in (0.6, 0.3)]
+    return lp.Identifier(
+        heat(mesh, alpha, {"left": lp.Channel("T0")}, loss=lp.Scalar(0.2, 0.1, unit="1/s")),
+        lp.Points({"a": spot[0]}, noise=0.1, unit="degC"),
+        law or lp.SensitivityLaw(),
+        withheld=lp.Points({"b": spot[1]}),
+    )
+
+
+def samples(count: int, pause: float = 0.0):
+    for k in range(count):
+        time.sleep(pause)
+        warm = 20.0 + np.sin(0.1 * k)
+        values = {"T0": warm, "ambient": 0.0, "a": 0.3 * warm, "b": 0.5 * warm}
+        yield lp.Sample(0.2 * k, values)
+
+
+def begun(folder: Path, who: lp.Identifier, title: str = "A rod", **attrs) -> Journal:
+    """Make a run directory, and return the journal to fill."""
+    RunWriter.create(folder, version="1", command=["livepde"], title=title)
+    layout = layout_of(who.model, who.observed, who.withheld)
+    return Journal.create(folder / JOURNAL, who.channels, replace(layout, attrs=attrs))
+
+
+def slow_run(folder: Path) -> None:
+    """Run until somebody ends it, ten samples a second; what the child of a test does."""
+    who = identifier()
+    with begun(folder, who, origin="2025-04-01 00:00:00") as journal:
+        drive(who, samples(100_000, 0.1), journal=journal, fields_every=2)
+
+
+def dataset(kind: str = "line", count: int = 6, **options):
+    who = identifier(kind, **options)
+    kept = journal_of(who)
+    return drive(who, samples(count), journal=kept, fields_every=2).result.to_xarray()
+
+
+# --- figures -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("field", [False, True])
+def test_every_kind_of_run_has_its_panels(kind, field):
+    data = dataset(kind, field=field)
+    found = {panel.name: panel for panel in figures.panels(data)}
+    assert {"field:u", "innovation", "withheld_error", "told", "unknown:loss"} <= {*found}
+    assert ("field:alpha" in found) is field
+    assert ("correlation" in found) is not field
+    for panel in found.values():
+        assert panel.section in figures.SECTIONS
+        assert panel.title
+        assert panel.about
+        json.loads(panel.figure.to_json())
+    drawn = {"line": "scatter", "triangle": "heatmap", "quad": "heatmap"}.get(kind, "mesh3d")
+    assert {trace.type for trace in found["field:u"].figure.data} == {drawn}
+
+
+def test_a_run_of_one_sample_and_one_without_covariance():
+    assert len(figures.panels(dataset(count=1))) > 3
+    law = lp.GradientLaw(gain=1e-3, damping=lp.ResidualDamping(c1=1.0))
+    plain = dataset(law=law)
+    assert not {"told", "correlation"} & {panel.name for panel in figures.panels(plain)}
+    assert "no covariance" in str(cards.cards(plain, None))
+
+
+def test_looking_back_shows_the_fields_of_then():
+    data = dataset(count=9)
+
+    def profile(at):
+        (estimate,) = (
+            trace for trace in figures.field_profile(data, "u", at).data if trace.name == "estimate"
+        )
+        return estimate.y
+
+    times = data["snapshot"].values
+    assert len(times) == 5
+    assert np.array_equal(profile(None), data["u"].values[-1])
+    assert np.array_equal(profile(times[2] + 1e-9), data["u"].values[2])
+    assert np.array_equal(profile(-1.0), data["u"].values[0])
+
+
+def test_unknowns_are_drawn_with_their_intervals():
+    data = dataset(count=9)
+    figure = figures.unknowns(data, ["loss"])
+    (line,) = (trace for trace in figure.data if trace.name == "loss")
+    band = [trace.y for trace in figure.data if trace.legendgroup == "loss" and trace is not line]
+    assert np.array_equal(line.y, data["loss"])
+    half = 1.959964 * data["loss_std"].values
+    assert np.allclose(band, [data["loss"].values - half, data["loss"].values + half])
+
+
+def test_dates_where_the_run_has_an_origin():
+    data = dataset()
+    assert figures.when_axis(data).text(0.6) == "0.6 s"
+    data.attrs["origin"] = "2025-04-01 00:00:00"
+    assert figures.when_axis(data).text(3600.0) == "2025-04-01 01:00:00"
+    data["time"] = data["time"] * 1e300
+    assert not figures.when_axis(data).dates
+
+
+def test_long_series_are_thinned_but_failures_stay():
+    data = dataset(count=4)
+    long = data.isel(time=np.zeros(20_000, dtype=int), snapshot=[0])
+    long["status"].values[777] = 1
+    (line,) = (t for t in figures.unknowns(long, ["loss"]).data if t.name == "loss")
+    assert len(line.y) <= figures.MOST_POINTS + 1
+    assert "failed step" in {trace.name for trace in figures.unknowns(long, ["loss"]).data}
+
+
+def test_names_from_files_are_text_in_figures():
+    data = dataset().rename({"loss": HOSTILE, "loss_std": f"{HOSTILE}_std"})
+    data["sensor"] = [HOSTILE]
+    drawn = [
+        figures.residuals(data, "innovation", "sensor"),
+        figures.unknowns(data, [HOSTILE, HOSTILE]),
+    ]
+    for figure in drawn:
+        names = [trace.name for trace in figure.data if "document" in (trace.name or "")]
+        assert names
+        assert all("<script" not in name for name in names)
+
+
+# --- cuts ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["triangle", "quad"])
+def test_a_map_is_exact_for_what_is_linear(kind):
+    data = dataset(kind, count=1)
+    found = cuts.plane_map(data)
+    values = found.of(2.0 * data["x"].values - 3.0 * data["y"].values)
+    assert found.inside.all()
+    assert np.allclose(values, 2.0 * found.x - 3.0 * found.y[:, None])
+
+
+def test_a_hole_stays_open():
+    mesh = MeshTri.init_tensor(np.linspace(0, 3, 4), np.linspace(0, 3, 4))
+    middle = mesh.p[:, mesh.t].mean(axis=1)
+    outside = ~((abs(middle[0] - 1.5) < 0.5) & (abs(middle[1] - 1.5) < 0.5))
+    data = xr.Dataset(
+        {"triangle": (("cell", "corner"), mesh.t.T[outside])},
+        {axis: ("vertex", mesh.p[k]) for k, axis in enumerate("xy")},
+    )
+    found = cuts.plane_map(data)
+    x, y = np.meshgrid(found.x, found.y)
+    hole = (abs(x - 1.5) < 0.4) & (abs(y - 1.5) < 0.4)
+    values = found.of(np.ones(mesh.nvertices))
+    assert np.isnan(values[hole]).all()
+    assert np.isfinite(values[(x < 0.9) | (y > 2.1)]).all()
+
+
+@pytest.mark.parametrize("kind", ["tetra", "hexahedron"])
+@pytest.mark.parametrize("share", [0.5, 0.37])
+def test_cuts_of_a_cube_are_whole_and_exact(kind, share):
+    data = dataset(kind, count=1)
+
+    def linear(x, y, z):
+        return 2.0 * x - 3.0 * y + 0.5 * z
+
+    def area(surface):
+        a, b, c = (surface.points[surface.triangles[:, k]] for k in range(3))
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
+
+    values = linear(*(data[axis].values for axis in "xyz"))
+    parts = cuts.slices(data, share)
+    assert [area(part) for part in parts] == pytest.approx([1.0, 1.0, 1.0])
+    assert area(cuts.boundary(data)) == pytest.approx(6.0)
+    for axis, part in enumerate(parts):
+        assert np.allclose(part.points[:, axis], share)
+        assert np.allclose(part.of(values), linear(*part.points.T))
+
+
+# --- view ----------------------------------------------------------------------------------------
+
+
+def test_what_is_kept_is_spread_evenly():
+    spread = Spread(50)
+    for number in range(1, 100_001):
+        spread.add(number, -number)
+        spread.add(number, number)  # the newest again
+    numbers = [number for number, _ in spread]
+    assert 20 <= len(numbers) <= 50
+    assert (numbers[0], numbers[-1]) == (1, 100_000)
+    gaps = np.diff(numbers)[:-1]
+    assert gaps.min() == gaps.max() == spread.gap
+    assert all(number == item for number, item in spread)
+
+
+def test_a_view_follows_a_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(views, "OFTEN", 0.0)
+    who = identifier()
+    journal = begun(tmp_path, who)
+    view = View(tmp_path)
+    assert view.look().status == "waiting"
+    stream = samples(30)
+    first = [next(stream) for _ in range(10)]
+    drive(who, first, journal=journal, fields_every=3)
+    seen = view.look()
+    assert (seen.status, seen.samples) == ("running", 10)
+    assert view.look() is seen  # nothing new
+    assert float(seen.dataset["snapshot"][-1]) == first[-1].t  # kept after the estimate
+    drive(who, stream, journal=journal, fields_every=3)
+    journal.note(Event(5.8, "silent", "", "nothing from the source for 9 s"))
+    journal.count("malformed", "", 3)
+    journal.commit()
+    seen = view.look()
+    assert (seen.status, seen.samples) == ("silent", 30)
+    assert np.array_equal(seen.dataset["loss"], journal.dataset()["loss"])
+    said = str(cards.verdict(seen))
+    assert "The source is silent: nothing from the source for 9 s." in said
+    assert "Rows or values that were not used: 3 malformed." in said
+    journal.close()
+    monkeypatch.setattr(views, "QUIET", 0.0)
+    assert view.look().status == "stopped"
+
+
+def test_a_long_run_is_read_bit_by_bit_and_thinned(tmp_path, monkeypatch):
+    monkeypatch.setattr(views, "OFTEN", 0.0)
+    monkeypatch.setattr(views, "AT_ONCE", 100)
+    monkeypatch.setattr(views, "ROWS", 50)
+    monkeypatch.setattr(views, "FIELDS", 10)
+    who = identifier()
+    with begun(tmp_path, who) as journal:
+        drive(who, samples(450), journal=journal, fields_every=2)
+        view, looks = View(tmp_path), 1
+        while (seen := view.look()).reading and looks < 20:
+            looks += 1
+        assert looks == 5
+        whole = journal.dataset()
+    assert seen.samples == 450
+    assert seen.dataset.sizes["time"] <= 60
+    assert 4 <= seen.dataset.sizes["snapshot"] <= 10
+    for end in (0, -1):
+        assert float(seen.dataset["time"][end]) == float(whole["time"][end])
+        assert np.array_equal(seen.dataset["u"][end], whole["u"][end])
+
+
+def test_a_finished_run_without_a_journal(tmp_path):
+    writer = RunWriter.create(tmp_path, version="1", command=["livepde"], title="A rod")
+    check = runs.Check("rmse", 0.5, 0.1, "<=")
+    notes = ["The case says so."]
+    writer.finish(status="finished", dataset=dataset(), checks=[check], notes=notes)
+    seen = View(tmp_path).look()
+    assert (seen.status, seen.samples) == ("finished", 6)
+    said = str(cards.verdict(seen))
+    assert "Expected rmse <= 0.1, but it is 0.5." in said
+    assert "The case says so." in said
+
+
+def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(views, "OFTEN", 0.0)
+    with begun(tmp_path, identifier()):
+        pass
+    view = View(tmp_path)
+    (tmp_path / JOURNAL).write_bytes(b"nothing of use" * 100)
+    for _ in range(3):
+        seen = view.look()
+    assert seen.status == "unreadable"
+    assert "The run cannot be read: " in str(cards.verdict(seen))
+
+
+# --- serving -------------------------------------------------------------------------------------
+
+
+def test_watch_needs_a_run(tmp_path):
+    result = CliRunner().invoke(cli.app, ["watch", str(tmp_path / "none")])
+    assert isinstance(result.exception, lp.RunError)
+    assert "holds no run" in str(result.exception)
+
+
+def test_watch_says_where_and_ends_with_ctrl_c(tmp_path):
+    begun(tmp_path, identifier()).close()
+    command = [sys.executable, "-m", "livepde", "watch", str(tmp_path), "--address", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+        try:
+            url = child.stdout.readline().split()[1]
+            with urllib.request.urlopen(url, timeout=30) as answer:
+                assert "A rod" in answer.read().decode()
+                assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+            child.send_signal(signal.SIGINT)
+            assert child.wait(60) == 0
+        finally:
+            child.kill()
+
+
+# --- in a browser --------------------------------------------------------------------------------
+
+
+@contextmanager
+def served(folder: Path, **options):
+    server = serve(folder, Address(**options))
+    try:
+        yield server.url
+    finally:
+        server.close()
+
+
+@contextmanager
+def chromium(width: int = 1280):
+    """Start a browser, and see at the end that it had nothing to complain of and asked only us."""
+    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if browser is None or driver is None:
+        pytest.skip("no Chromium: apt-get install chromium chromium-driver")
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    options = webdriver.ChromeOptions()
+    options.binary_location = browser
+    for argument in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        f"--window-size={width},1400",
+    ):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    page = webdriver.Chrome(options=options, service=Service(driver))
+    try:
+        yield page
+        assert [line for line in page.get_log("browser") if line["level"] == "SEVERE"] == []
+        here = urlsplit(page.current_url).netloc
+        assert {urlsplit(url).netloc for url in requested(page)} <= {here, ""}
+    finally:
+        page.quit()
+
+
+def requested(page) -> list[str]:
+    """Return the addresses that a page has asked for."""
+    messages = [json.loads(line["message"])["message"] for line in page.get_log("performance")]
+    urls = [
+        message["params"]["request"]["url"]
+        for message in messages
+        if message["method"] == "Network.requestWillBeSent"
+    ]
+    assert urls
+    return [url for url in urls if urlsplit(url).scheme in ("http", "https", "ws", "wss")]
+
+
+def wait(page, condition):
+    """Return what a condition on the page gives, as soon as it is true."""
+    from selenium.common.exceptions import StaleElementReferenceException as Stale
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    return WebDriverWait(page, PATIENCE, 0.2, ignored_exceptions=[Stale]).until(condition)
+
+
+def text(page, selector: str) -> str:
+    return page.execute_script(
+        "return [...document.querySelectorAll(arguments[0])].map(e => e.innerText).join('\\n')",
+        selector,
+    )
+
+
+def profile(page, name: str) -> list[float] | None:
+    """Return the estimate in the figure of a field."""
+    return page.execute_script(
+        """
+        const panel = [...document.querySelectorAll('figure.panel')]
+            .find(p => p.querySelector('h3').innerText === arguments[0]);
+        const plot = panel && panel.querySelector('.js-plotly-plot');
+        const trace = plot && plot.data && plot.data.find(t => t.name === 'estimate');
+        return trace ? [...plot.calcdata[plot.data.indexOf(trace)].map(p => p.y)] : null;
+        """,
+        name,
+    )
+
+
+def colours(page, selector: str, visibility: str = "visible") -> int:
+    """Return how many colours an element is shown in, with or without what WebGL has drawn."""
+    from PIL import Image
+
+    element = page.find_element("css selector", selector)
+    page.execute_script(
+        "arguments[0].scrollIntoView();"
+        "arguments[0].querySelector('.gl-container').style.visibility = arguments[1]",
+        element,
+        visibility,
+    )
+    with Image.open(BytesIO(element.screenshot_as_png)) as picture:
+        return len(picture.convert("RGB").getcolors(2**24))
+
+
+def count(page) -> int:
+    words = text(page, "#facts").split()
+    return int(words[0]) if words else 0
+
+
+CHILD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from test_dashboard import slow_run
+slow_run(Path(sys.argv[1]))
+"""
+
+
+def test_the_page_follows_a_run_and_looks_back(tmp_path):
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    folder = tmp_path / "run"
+    command = [sys.executable, "-c", CHILD, str(folder), str(Path(__file__).parent)]
+    child = subprocess.Popen(command)
+    try:
+        deadline = time.monotonic() + PATIENCE
+        while not (folder / JOURNAL).exists():
+            assert child.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        with served(folder) as url, chromium() as page:
+            page.get(url)
+            wait(page, lambda p: "95 % sure" in text(p, ".card"))
+            assert text(page, "h1") == "A rod"
+            assert "running" in text(page, "#chip")
+            assert "Estimates alpha, loss from 1 sensor; 1 more is withheld" in text(page, "main")
+            assert "m²/s" in text(page, ".card")
+
+            seen, drawn = count(page), wait(page, lambda p: profile(p, "State u"))
+            wait(page, lambda p: count(p) > seen + 5)  # it goes on
+            wait(page, lambda p: profile(p, "State u") != drawn)
+
+            thumb = page.find_element(By.CSS_SELECTOR, "#slider [role=slider]")
+            newest = profile(page, "State u")
+            thumb.send_keys(Keys.HOME)
+            wait(page, lambda p: text(p, "#shown") == "looking back: 2025-04-01 00:00:00")
+            past = wait(page, lambda p: (y := profile(p, "State u")) != newest and y)
+            card = text(page, ".card")
+            seen = count(page)
+            wait(page, lambda p: count(p) > seen + 5)  # the run goes on, the page stays there
+            assert "looking back" in text(page, "#shown")
+            assert profile(page, "State u") == past
+            assert text(page, ".card") == card
+
+            page.find_element(By.ID, "newest").click()
+            wait(page, lambda p: text(p, "#shown").startswith("newest"))
+            wait(page, lambda p: profile(p, "State u") not in (past, None))
+
+            child.send_signal(signal.SIGKILL)
+            wait(page, lambda p: "stopped without an end" in text(p, "#chip"))
+            assert "--resume" in text(page, "#verdict")
+    finally:
+        child.kill()
+        child.wait()
+
+
+def test_text_from_files_is_shown_as_text(tmp_path):
+    who = identifier()
+    with begun(tmp_path, who, title=HOSTILE) as journal:
+        journal.layout = replace(journal.layout, sensors=[HOSTILE])
+        drive(who, samples(5), journal=journal)
+        journal.note(Event(0.5, "refused", HOSTILE, HOSTILE))
+        journal.count(HOSTILE, HOSTILE)
+    rewrite_layout(tmp_path / JOURNAL, sensors=[HOSTILE])
+    with served(tmp_path) as url, chromium(390) as page:
+        page.get(url)
+        wait(page, lambda p: "95 % sure" in text(p, ".card"))
+        wait(page, lambda p: HOSTILE in text(p, "#tables-events td"))
+        assert text(page, "h1") == HOSTILE
+        wait(page, lambda p: HOSTILE in text(p, "#tables-sensors td"))
+        assert page.title == f"{HOSTILE} – livepde"
+        wide = page.execute_script("return document.documentElement.scrollWidth")
+        assert wide <= page.execute_script("return window.innerWidth")  # fits a phone
+
+
+def rewrite_layout(path: Path, **changes) -> None:
+    """Change the layout of a journal as somebody might who means harm."""
+    import sqlite3
+
+    with sqlite3.connect(path) as db:
+        (content,) = db.execute("SELECT value FROM meta WHERE key = 'layout'").fetchone()
+        layout = {**json.loads(content), **changes}
+        db.execute("UPDATE meta SET value = ? WHERE key = 'layout'", (json.dumps(layout),))
+    db.close()
+
+
+def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
+    who = identifier("tetra", field=True)
+    with begun(tmp_path, who) as journal:
+        drive(who, samples(4), journal=journal)
+    with served(tmp_path, token="secret") as url, chromium() as page:
+        from selenium.webdriver.common.keys import Keys
+
+        address = url.partition("?")[0]
+        for path in ("", "_dash-layout", "assets/page.css"):
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(address + path, timeout=30)
+        page.get(url)
+        panel = "figure.panel canvas"
+        wait(page, lambda p: len(p.find_elements("css selector", panel)) >= 3)
+        assert "field, mean" in text(page, ".card")
+        drawn = ".panel:nth-child(2) .js-plotly-plot"
+        wait(page, lambda p: colours(p, drawn) > colours(p, drawn, "hidden") + 500)
+        assert "three cuts at 50%" in text(page, ".panel figcaption")
+        page.find_element("css selector", "#cut [role=slider]").send_keys(Keys.ARROW_LEFT)
+        wait(page, lambda p: "three cuts at 45%" in text(p, ".panel figcaption"))
+
+
+def test_every_visitor_has_a_page_that_needs_nothing_from_elsewhere(tmp_path):
+    """What the page names in its text, beside what it has asked for above."""
+    begun(tmp_path, identifier()).close()
+    with served(tmp_path) as url, urllib.request.urlopen(url, timeout=30) as answer:
+        shown = answer.read().decode()
+    assert "https://" not in shown
+    assert os.fspath(tmp_path) not in shown
