@@ -50,6 +50,7 @@ from livepde.streams.sources import Source
 __all__ = ["PARTS", "faults"]
 
 KILLS, SAMPLES, MALFORMED = 200, 2000, 100_000
+ALPHA = 2e-5  # m^2/s, of the rod
 PATIENCE = 120.0  # seconds after which a run that does not go on is given up
 STRIDE = 0.25  # seconds after a sign of life within which a kill falls
 LONG_ONES = 0.02  # share of the lines of 2 MB that are written
@@ -77,7 +78,7 @@ silence = "{silence} s"
 leap = "1 d"
 
 [unknowns.alpha]
-prior = "2e-5 m^2/s"
+prior = "3e-5 m^2/s"
 std = "1e-5 m^2/s"
 bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
 
@@ -92,6 +93,7 @@ right = "20 degC"
 [law]
 kind = "sensitivity"
 noise = "0.2 K"
+replay = true
 
 [output]
 fields_every = 20
@@ -144,12 +146,15 @@ class _Plan:
 def _rows(count: int) -> list[dict[str, Any]]:
     """Return rows of a rod whose end is warmed and cooled, with noise."""
     rng, start = np.random.default_rng(0), datetime(2026, 1, 1)
+    x, rate = np.array([0.0, 0.3, 0.6]), 0.04  # places, and the phase that passes in a minute
+    decay = x / math.sqrt(2.0 * ALPHA / (rate / 60.0))  # of a wave that goes into the rod
     found = []
     for k in range(count):
-        left = 20.0 + 10.0 * math.sin(0.02 * k) ** 2
-        a, b = 20.0 + np.array([0.4, 0.1]) * (left - 20.0) + 0.2 * rng.standard_normal(2)
-        moment = str(start + timedelta(minutes=k))
-        found.append({"time": moment, "left": left, "T_3": float(a), "T_6": float(b)})
+        wave = np.exp(-decay) * np.cos(rate * k - decay)
+        T = 20.0 + 5.0 * (1.0 - x - wave) + [0.0, *0.2 * rng.standard_normal(2)]
+        names = ("left", "T_3", "T_6")
+        values = dict(zip(names, T.tolist(), strict=True))
+        found.append({"time": str(start + timedelta(minutes=k)), **values})
     return found
 
 
