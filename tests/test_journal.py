@@ -20,6 +20,7 @@ from test_live import CLOCK, COLUMNS, identifier, journal, live, rows, same, wri
 import livepde as lp
 from livepde import checkpoint
 from livepde.records import Record
+from livepde.runs import RunWriter
 from livepde.runs.journal import KEPT_EVENTS, Event, Journal
 from livepde.runs.live import CHECKPOINT, Live, Retention, Samples
 from livepde.streams.intake import Intake
@@ -684,3 +685,46 @@ def test_right_lines_arrive_between_any_others(tmp_path):
     run.run()
     assert len(run.journal) == 40
     run.journal.close()
+
+
+# --- the folder around it ------------------------------------------------------------------------
+
+
+def test_a_folder_whose_making_was_ended_is_made_again(tmp_path):
+    def create():
+        return RunWriter.create(
+            tmp_path / "run", version="1", command=["x"], title="A run", case="abc = 1\n"
+        )
+
+    folder = tmp_path / "run"
+    for text in ("", "abc", "abc = 1\n"):
+        folder.mkdir()
+        (folder / "case.toml").write_text(text)
+        (folder / "run.json.partial").write_text("{")
+        create()
+        assert (folder / "case.toml").read_text() == "abc = 1\n"
+        with pytest.raises(lp.RunError, match="already holds a run"):
+            create()
+        shutil.rmtree(folder)
+    for name, text in (("case.toml", "other"), ("mine.txt", "")):
+        folder.mkdir()
+        (folder / name).write_text(text)
+        with pytest.raises(lp.RunError, match="is not empty"):
+            create()
+        shutil.rmtree(folder)
+
+
+def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path):
+    options = {"version": "1", "case": "a = 1\n"}
+    path = tmp_path / "run"
+    RunWriter.create(path, command=["x"], title="A run", **options)
+    (path / "run.json.partial").mkdir()
+    with pytest.raises(lp.RunError, match="cannot be written: Is a directory; make room"):
+        RunWriter.reopen(path, command=["x"], settings=(), **options)
+
+
+def test_an_error_has_an_exit_code(tmp_path):
+    command = [sys.executable, "-m", "livepde", "report", str(tmp_path)]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert found.returncode == 2
+    assert found.stderr.startswith("Error: ")

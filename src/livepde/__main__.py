@@ -1,5 +1,7 @@
 """Run the command line as `python -m livepde`."""
 
+import sys
+
 from livepde.cli import main
 
-main()
+sys.exit(main())

@@ -187,10 +187,10 @@ def _refuse(
 
 def _writer(loaded: Case, folder: Path, settings: Sequence[str], resume: bool) -> RunWriter:
     """Return the writer of the run directory, new or to go on with."""
-    from livepde.runs import RunWriter
+    from livepde.runs import RECORD, RunWriter
 
     command = ["livepde", *sys.argv[1:]]
-    if resume and folder.exists() and any(folder.iterdir()):
+    if resume and (folder / RECORD).exists():
         return RunWriter.reopen(
             folder, version=__version__, command=command, case=loaded.text, settings=settings
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livepde.runs.directory import JOURNAL, Run, RunWriter, free_path, refuse_taken
+from livepde.runs.directory import JOURNAL, RECORD, Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
 from livepde.runs.doubts import doubts, unexplained
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
@@ -12,6 +12,7 @@ from livepde.runs.summary import Jump, arrivals, checks_of, jumps, measures, tab
 
 __all__ = [
     "JOURNAL",
+    "RECORD",
     "Check",
     "Driven",
     "Journal",

@@ -46,7 +46,7 @@ __all__ = [
 FORMAT = 1
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
-JOURNAL = "journal.sqlite"
+JOURNAL, PARTIAL = "journal.sqlite", "run.json.partial"
 LONGEST = 10_000_000  # bytes of a record
 WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
 
@@ -69,6 +69,14 @@ def refuse_taken(path: Path) -> None:
     if any(path.iterdir()):
         what = "already holds a run" if (path / RECORD).exists() else "is not empty"
         raise RunError(f"{path} {what}: choose another folder, nothing was written.")
+
+
+def _only_begun(path: Path, case: str) -> bool:
+    """Return whether a kill or a full disk has ended the making of this very folder."""
+    names = {item.name for item in path.iterdir()} if path.is_dir() else set()
+    if CASE not in names or names - {CASE, PARTIAL}:
+        return False
+    return case.encode().startswith((path / CASE).read_bytes())
 
 
 class RunWriter:
@@ -109,7 +117,8 @@ class RunWriter:
             The directory exists and is not empty, or cannot be made.
         """
         try:
-            refuse_taken(path)
+            if not _only_begun(path, case or ""):
+                refuse_taken(path)
             path.mkdir(parents=True, exist_ok=True)
             record = {
                 "format": FORMAT,
@@ -199,10 +208,16 @@ class RunWriter:
 
     def _save_record(self) -> None:
         target = self.path / RECORD
-        partial = target.with_name(RECORD + ".partial")
+        partial = target.with_name(PARTIAL)
         text = json.dumps(plain(self.record), indent=2, ensure_ascii=False)
-        partial.write_text(text + "\n", encoding="utf-8")
-        partial.replace(target)
+        try:
+            partial.write_text(text + "\n", encoding="utf-8")
+            partial.replace(target)
+        except OSError as error:
+            raise RunError(
+                f"{self.path} cannot be written: {error.strerror or error}; make room or mend the "
+                "folder."
+            ) from error
 
 
 class Run:
