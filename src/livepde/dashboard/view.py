@@ -174,7 +174,9 @@ class View:
         problem = f"The run cannot be read: {said}"
         self._mark = None
         version = self._seen.version + (self._seen.problem != problem)
-        return replace(self._seen, version=version, status="unreadable", problem=problem)
+        return replace(
+            self._seen, version=version, status="unreadable", problem=problem, reading=False
+        )
 
     def _begin(self, run: runs.Run) -> None:
         self._started = run.record.get("started")
