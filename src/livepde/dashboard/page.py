@@ -114,6 +114,8 @@ def _skeleton() -> Any:
                     ),
                 ],
                 id="timebar",
+                role="group",
+                **_aria(label="Look back: arrow keys move, End follows the newest"),
             ),
             *sections,
             html.Footer(f"livepde {__version__}"),

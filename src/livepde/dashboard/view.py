@@ -174,7 +174,9 @@ class View:
         problem = f"The run cannot be read: {said}"
         self._mark = None
         version = self._seen.version + (self._seen.problem != problem)
-        return replace(self._seen, version=version, status="unreadable", problem=problem)
+        return replace(
+            self._seen, version=version, status="unreadable", problem=problem, reading=False
+        )
 
     def _begin(self, run: runs.Run) -> None:
         self._started = run.record.get("started")
@@ -223,7 +225,7 @@ class View:
         with Journal.open(path) as journal:
             # The last one again: its fields may have been kept after it.
             new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]
-            layout, count = journal.layout, len(journal)
+            layout, count = journal.layout, journal.estimated
             events, counts = journal.events, journal.counts
         for number, record in new:
             self._add(number, record)
