@@ -122,12 +122,13 @@ def test_soak_in_small(monkeypatch):
 
 def test_soak_sees_what_grows():
     steps = range(soak.WARM, 3 * soak.WARM, soak.BLOCK)
-    meter = soak.Meter(None)
-    flat = soak.Reading(0, 1e-3, 1e8, 2e8, 5e6, 4e6)
+    meter = soak.Meter(None, lambda: 1e-3)
+    flat = soak.Reading(0, 1e-3, 1e-3, 1e8, 2e8, 5e6, 4e6)
     meter.readings = [replace(flat, steps=k) for k in steps]
     assert not failed(soak._outcome(meter, 30_000, 0, 0.0))
     meter.readings = [
-        soak.Reading(k, 1e-3 * k / soak.WARM, 1e8 + 1e3 * k, 2e8, 100.0 * k, 1e4 * k) for k in steps
+        soak.Reading(k, 1e-3 * k / soak.WARM, 1e-3, 1e8 + 1e3 * k, 2e8, 100.0 * k, 1e4 * k)
+        for k in steps
     ]
     meter.failed = 1
     assert len(failed(soak._outcome(meter, 30_000, 1, 0.1))) == 7
