@@ -7,12 +7,11 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from livepde.cases import load
-from livepde.cases.live import Wiring
+from livepde.cases import Wiring, load
 from livepde.cases.template import write_template
 from livepde.result import Estimate
-from livepde.runs.live import Sink
-from livepde.streams.sources import Rows
+from livepde.runs import Sink
+from livepde.streams import Rows
 
 
 def measured(path: Path) -> Iterator[dict[str, str]]:

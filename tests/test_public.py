@@ -30,7 +30,7 @@ def test_the_reference_holds_what_is_exported():
     for name in livepde.__all__:
         owner = getattr(getattr(livepde, name), "__module__", "livepde")
         assert owner.startswith("livepde") != (name in helpers), name
-    for package in ("", ".models", ".diagnostics", ".runs", ".streams"):
+    for package in ("", ".models", ".diagnostics", ".cases", ".runs", ".streams", ".streams.mqtt"):
         assert f"::: livepde{package}\n" in reference
         module = importlib.import_module(f"livepde{package}")
         for name in module.__all__:
@@ -42,7 +42,8 @@ def test_the_reference_holds_what_is_exported():
 def test_import_is_light():
     code = (
         "import sys, livepde; heavy = {'matplotlib', 'mpi4py', 'pint', 'pydantic', 'typer', "
-        "'flask', 'fastapi'} & set(sys.modules); print(sorted(heavy))"
+        "'flask', 'dash', 'plotly', 'cheroot', 'prometheus_client', 'paho', 'asyncua', 'meshio', 'zarr', "
+        "'h5py'} & set(sys.modules); print(sorted(heavy))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

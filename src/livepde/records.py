@@ -121,11 +121,6 @@ class Layout:
         """Return the layout as JSON can hold it."""
         return asdict(self)
 
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Layout:
-        """Return the layout that `to_dict` gave."""
-        return cls(**content)
-
     def dataset(self, records: Sequence[Record]) -> xr.Dataset:
         """Return records as a dataset; see `Result.to_xarray`."""
         kept = [(row.t, row.snapshot) for row in records if row.snapshot is not None]

@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 from livepde.cases.case import Case, Prepared, load
+from livepde.cases.live import Wiring
 
-__all__ = ["Case", "Prepared", "load"]
+__all__ = ["Case", "Prepared", "Wiring", "load"]

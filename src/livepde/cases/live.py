@@ -16,13 +16,12 @@ from livepde.cases.sources import Data, limits_of, policy_of, publishers_of, sou
 from livepde.errors import DataError
 from livepde.identifier import Sample
 from livepde.runs.journal import Journal
-from livepde.runs.live import Feed, Gathered, Live, Paced, Samples, Sink
+from livepde.runs.live import LOOK, Feed, Gathered, Live, Paced, Samples, Sink
 from livepde.streams.intake import Intake, Ready
 
 __all__ = ["Wiring"]
 
 LOG = logging.getLogger("livepde.run")
-LOOK = 0.5  # seconds between two looks at whether to stop
 
 
 class Wiring:

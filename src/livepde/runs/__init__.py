@@ -7,19 +7,24 @@ from livepde.runs.directory import open_run as open
 from livepde.runs.doubts import doubts, unexplained
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
+from livepde.runs.live import Backlog, Live, Retention, Sink
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.runs.summary import Jump, arrivals, checks_of, jumps, measures, tables
 
 __all__ = [
     "JOURNAL",
     "RECORD",
+    "Backlog",
     "Check",
     "Driven",
     "Journal",
     "Jump",
+    "Live",
     "Outcome",
+    "Retention",
     "Run",
     "RunWriter",
+    "Sink",
     "Table",
     "arrivals",
     "checks_of",

@@ -9,6 +9,7 @@ from livepde.streams.smoothing import (
     Smoother,
     WindowAverage,
 )
+from livepde.streams.sources import Follow, Lines, Row, Rows, Source
 from livepde.streams.table import (
     Clock,
     Column,
@@ -25,12 +26,17 @@ __all__ = [
     "Clock",
     "Column",
     "Exponential",
+    "Follow",
     "JsonLines",
+    "Lines",
     "LocalPolynomial",
     "Noise",
     "RelativeNoise",
+    "Row",
+    "Rows",
     "Smoothed",
     "Smoother",
+    "Source",
     "Table",
     "Twin",
     "WindowAverage",
