@@ -222,6 +222,22 @@ def test_estimates_as_lines_of_json(here):
     assert found[-1]["unknowns"]["alpha"]["value"] == float(runs.open("run").dataset["alpha"][-1])
 
 
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--speed", "2"), "--speed belongs to a run beside a process"),
+        (("--realtime", "--speed", "0"), "a speed > 0; got 0"),
+        (("--realtime", "--speed", "nan"), "a speed > 0; got nan"),
+        (("--realtime", "--speed", "2", "--data", "-"), "replays a finished file"),
+    ],
+)
+def test_a_speed_of_nothing_is_refused(here, arguments, told):
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(4))))
+    with pytest.raises(lp.ConfigurationError, match=told):
+        call("run", case('file = "rows.csv"'), "--out", "run", *arguments)
+    assert not Path("run").exists()
+
+
 def test_a_finished_file_is_replayed_at_its_pace():
     now, slept = [100.0], []
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from livepde.cases.case import Case, Prepared
 from livepde.cases.data import read_data
 from livepde.cases.sources import Data, limits_of, policy_of, publishers_of, source_of
-from livepde.errors import DataError
+from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
 from livepde.runs.journal import Journal
 from livepde.runs.live import LOOK, Feed, Gathered, Live, Paced, Samples, Sink
@@ -55,6 +55,8 @@ class Wiring:
     ------
     CaseError, DataError
         No source, one that cannot be reached, a policy that makes no sense.
+    ConfigurationError
+        A pace that is not positive.
     RunError
         The journal cannot be gone on with.
     """
@@ -62,6 +64,8 @@ class Wiring:
     def __init__(
         self, case: Case, data: Data = None, *, path: Path | None = None, pace: float = math.inf
     ) -> None:
+        if not pace > 0.0:
+            raise ConfigurationError(f"a replay needs a speed > 0; got {pace}.")
         self.case = case
         self.prepared: Prepared | None = None
         # Before anything is connected: a case that is wrong says so at once.

@@ -79,13 +79,13 @@ def run(
         ),
     ] = False,
     speed: Annotated[
-        float,
+        float | None,
         typer.Option(
             help="With --realtime: how many times faster than it happened a file is replayed; inf "
-            "for as fast as it goes.",
-            min=0.0,
+            "for as fast as it goes. Default: 1.",
+            show_default=False,
         ),
-    ] = 1.0,
+    ] = None,
     listen: Annotated[
         str | None,
         typer.Option(
@@ -134,16 +134,26 @@ def run(
 
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
+    goes_on = source is sys.stdin or (loaded.live and data is None)
     live = realtime or (loaded.live and data is None)
-    only = {"--listen": listen, "--watch": watch, "--estimates": estimates}
+    only = {
+        "--speed": speed is not None,
+        "--listen": listen,
+        "--watch": watch,
+        "--estimates": estimates,
+    }
     _refuse(out, resume, live, only, as_json)
+    if goes_on and speed is not None:
+        raise ConfigurationError(
+            "--speed replays a finished file: a source that goes on has its own."
+        )
     folder = out or free_path(Path("runs") / loaded.name)
     write = partial(_writer, loaded, folder, settings or (), resume)
     with ExitStack() as stack:
         if live:
             configure(log.value)
-            goes_on = source is sys.stdin or (loaded.live and data is None)
-            pace = math.inf if goes_on else speed
+            own = math.inf if goes_on else 1.0
+            pace = own if speed is None else speed
             how = Beside(source, pace, listen, watch, token, estimates)
             writer, taken = beside(loaded, how, folder, write, stack)
         else:
