@@ -265,7 +265,7 @@ def test_a_view_follows_a_run(tmp_path, monkeypatch):
     assert np.array_equal(seen.dataset["loss"], journal.dataset()["loss"])
     said = str(cards.verdict(seen))
     assert "The source is silent: nothing from the source for 9 s." in said
-    assert "Rows or values that were not used: 3 malformed." in said
+    assert "Irregular rows or values: 3 malformed." in said
     journal.close()
     monkeypatch.setattr(views, "QUIET", 0.0)
     assert view.look().status == "stopped"

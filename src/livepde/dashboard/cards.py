@@ -141,7 +141,7 @@ def verdict(seen: Seen) -> list[Any]:
         for (kind, _), number in seen.counts.items():
             reasons[kind] += number
         said = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
-        found.append(("info", f"Rows or values that were not used: {said}. See Events."))
+        found.append(("info", f"Irregular rows or values: {said}. See Events."))
     if data is not None and not any(level in ("bad", "warn") for level, _ in found):
         text = "Nothing looks wrong: steps converge, and nothing speaks against the estimates."
         found.insert(0, ("good", text))
@@ -264,7 +264,7 @@ def tables(seen: Seen) -> dict[str, list[Any]]:
         found["events"].append(_table("Events, the newest first", EVENTS, rows))
     if seen.counts:
         counts = [(kind, channel or "–", n) for (kind, channel), n in seen.counts.items()]
-        about = "Rows and values that were not used"
+        about = "Irregular rows and values"
         found["events"].append(_table(about, ("reason", "channel", "number"), counts))
     if seen.checks:
         checks = [
@@ -274,7 +274,7 @@ def tables(seen: Seen) -> dict[str, list[Any]]:
         columns = ("", "number", "value", "expected")
         found["events"].append(_table("What was expected of this run", columns, checks))
     if not found["events"]:
-        found["events"].append(html.P("Nothing has happened, and every row was used."))
+        found["events"].append(html.P("Nothing has happened, and no row was irregular."))
     return found
 
 

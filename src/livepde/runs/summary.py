@@ -325,4 +325,4 @@ def arrivals(journal: Journal) -> list[Table]:
     rows = [(kind, channel or "(row)", n) for (kind, channel), n in journal.counts.items()]
     if not rows:
         return []
-    return [Table("Irregular rows", ("what", "channel", "number"), rows)]
+    return [Table("Irregular rows and values", ("what", "channel", "number"), rows)]
