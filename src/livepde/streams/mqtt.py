@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from livepde.errors import DataError
 from livepde.result import Estimate
-from livepde.streams.sources import BATCH, LONGEST, Row, json_row
+from livepde.streams.sources import LONGEST, Row, drained, json_row
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -355,13 +355,7 @@ class MqttSource(_Peer):
             Another client has taken the session; or nothing can come any more, because as many
             messages as the broker sends ahead wait for later ones.
         """
-        rows: list[Row] = []
-        while len(rows) < BATCH:
-            try:
-                row = self._rows.get_nowait() if rows or not wait else self._rows.get(timeout=wait)
-            except queue.Empty:
-                break
-            rows.append(row)
+        rows = drained(self._rows, wait)
         if wait and not rows:
             self._check()
         return rows

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from livepde.errors import DataError
-from livepde.streams.sources import BATCH, Row
+from livepde.streams.sources import Row, drained
 
 __all__ = ["OpcuaSource"]
 
@@ -186,13 +186,7 @@ class OpcuaSource:
         DataError
             The connection has broken down in a way that was not foreseen.
         """
-        rows: list[Row] = []
-        while len(rows) < BATCH:
-            try:
-                row = self._rows.get_nowait() if rows or not wait else self._rows.get(timeout=wait)
-            except queue.Empty:
-                break
-            rows.append(row)
+        rows = drained(self._rows, wait)
         if not rows and not self._thread.is_alive():
             raise DataError(f"OPC UA: {self._url}: the connection has broken down, see the log.")
         return rows

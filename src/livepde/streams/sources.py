@@ -13,11 +13,13 @@ import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
 
-__all__ = ["Follow", "Lines", "Row", "Rows", "Source", "json_row"]
+__all__ = ["Follow", "Lines", "Row", "Rows", "Source", "drained", "json_row"]
+
+T = TypeVar("T")
 
 LONGEST = 1_000_000  # characters of a line or message; longer ones are refused unread
 BATCH = 100  # rows that a poll brings at most
@@ -79,6 +81,17 @@ def json_row(text: str | bytes, token: Any = None) -> Row:
     if not isinstance(found, dict):
         return Row({}, token, "not an object, column -> value")
     return Row(found, token)
+
+
+def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
+    """Return what waits in a queue, at most a batch, or after `wait` seconds nothing."""
+    found: list[T] = []
+    while len(found) < BATCH:
+        try:
+            found.append(waiting.get(timeout=wait) if not found and wait else waiting.get_nowait())
+        except queue.Empty:
+            break
+    return found
 
 
 def _line(file: io.BufferedReader) -> bytes:
@@ -279,17 +292,11 @@ class Lines:
 
     def poll(self, wait: float) -> Sequence[Row]:
         """Return the lines that have come."""
-        rows: list[Row] = []
-        while len(rows) < BATCH and not self._ended:
-            try:
-                line = self._queue.get(timeout=wait) if not rows else self._queue.get_nowait()
-            except queue.Empty:
-                break
-            if line is None:
-                self._ended = True
-            else:
-                rows.append(json_row(line))
-        return rows
+        if self._ended:
+            return []
+        lines = drained(self._queue, wait)
+        self._ended = None in lines
+        return [json_row(line) for line in lines if line is not None]
 
     def position(self, waiting: Iterable[Any]) -> str:
         """Nothing can be asked for again."""
