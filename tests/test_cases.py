@@ -523,7 +523,13 @@ def test_lines_instead_of_a_file(rod):
         cases.load(rod()).prepare(iter(()))
     path = rod().with_name("lines.jsonl")
     path.write_text("\n".join(lines))
-    assert len(list(cases.load(rod()).prepare(str(path)).stream)) == 5
+    with pytest.raises(lp.DataError, match="there is no column 'T_10'"):
+        cases.load(rod()).prepare(str(path))
+    lines[2] = lines[2].replace("}", ', "T_10": 20, "T_20": 20, "T_30": null}')
+    path.write_text("\n".join(lines))
+    samples = list(cases.load(rod()).prepare(str(path)).stream)
+    assert len(samples) == 5
+    assert [sample.z["T_10"] for sample in samples if np.isfinite(sample.z["T_10"])] == [20.0]
 
 
 def test_borehole_needs_its_options_and_input(tmp_path):

@@ -284,9 +284,11 @@ def test_a_bad_line_ends_a_run_that_is_kept(rod, here):
 
 def test_json_lines_file_can_be_checked(rod, here):
     (here / "data.jsonl").write_text(lines(30))
-    code, output = call("check", rod, "--data", "data.jsonl")
-    assert code == 0
-    assert "30 samples can tell" in output
+    for arguments in (("--data", "data.jsonl"), ("--set", f"data.file={here}/data.jsonl")):
+        code, output = call("check", rod, *arguments, "--advise")
+        assert code == 0
+        assert "30 samples can tell" in output
+        assert "One more sensor helps most at" in output
 
 
 def test_ctrl_c_keeps_what_there_is(rod, here):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -135,6 +136,16 @@ def test_json_lines_with_dates_and_bounds(tmp_path):
     assert str(stream.origin) == "2025-04-02 00:00:00"
     with pytest.raises(DataError, match="cannot be read"):
         read_json_lines(tmp_path / "none.jsonl", COLUMNS, clock)
+    for line, told in (
+        ("[" * 100_000, "line 7: is not JSON"),
+        (f'{{"t": {"9" * 5000}}}', "line 7: is not JSON"),
+        ('{"a": 1}', "line 7: there is no column 't'"),
+        ('{"t": "2025-04-06", "a": "warm"}', "line 7, 'a': got 'warm'"),
+        ('{"t": "2025-04-03"}', "line 7: the time is not later"),
+    ):
+        path.write_text("\n".join([*rows, "", line]))
+        with pytest.raises(DataError, match=re.escape(told)):
+            read_json_lines(path, COLUMNS, Clock("t"))
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from livepde.cases.schema import CaseSpec
 from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
+from livepde.streams.table import JSON_LINES
 
 __all__ = ["assimilation_start", "clock_of", "data_file", "read_data", "reader_of"]
 
@@ -64,7 +65,7 @@ def read_data(
     if source is None and frame.reader is not None:
         return _from_reader(frame, frame.reader, columns, clock)
     path = Path(source) if source is not None else data_file(frame)
-    if path.suffix in (".jsonl", ".ndjson"):
+    if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
     if path.suffix == ".parquet":
         from livepde.streams.parquet import read_parquet

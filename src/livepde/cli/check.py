@@ -36,7 +36,9 @@ def check(
     case: CaseArgument,
     data: Annotated[
         str | None,
-        typer.Option(help="Other data than the case names (.csv, .jsonl).", show_default=False),
+        typer.Option(
+            help="Other data than the case names (.csv, .jsonl, .parquet).", show_default=False
+        ),
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
@@ -58,8 +60,7 @@ def check(
         return
     prepared = loaded.prepare(data)
     samples: Samples = prepared.stream  # type: ignore[assignment]
-    if data is None or not data.endswith((".jsonl", ".ndjson")):
-        _show_data(console, loaded, prepared, samples)
+    _show_data(console, loaded, prepared, samples)
     failed = _show_checks(console, prepared)
     notes = [*loaded.notes, *_show_preview(console, prepared)]
     if advise:

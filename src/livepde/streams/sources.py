@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
+from livepde.streams.table import JSON_LINES
 
 __all__ = ["Follow", "Lines", "Row", "Rows", "Source", "drained", "json_row"]
 
@@ -133,7 +134,7 @@ class Follow:
         self.path = Path(path)
         self.follow = follow
         self._separator = separator
-        self._json = self.path.suffix in (".jsonl", ".ndjson")
+        self._json = self.path.suffix in JSON_LINES
         self._resumed = tuple(map(int, position.split())) if position else None
         self._file: io.BufferedReader | None = None
         self._number = 0  # of the file: 1 for the first, 2 for that which replaced it

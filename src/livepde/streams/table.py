@@ -1,4 +1,4 @@
-"""Samples from a CSV file, and from JSON lines as they come."""
+"""Samples from files of CSV and JSON lines, and from JSON lines as they come."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from livepde.identifier import Sample
 from livepde.linalg import Array
 
 __all__ = [
+    "JSON_LINES",
     "Clock",
     "Column",
     "JsonLines",
@@ -31,6 +32,7 @@ __all__ = [
     "tabulated",
 ]
 
+JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "#n/a"})
 Instant: TypeAlias = float | str | date | datetime
 
@@ -214,6 +216,49 @@ def read_csv(
         return f"{path}, row {rows[k]}, column '{clock.name}'"
 
     return _table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
+
+
+def read_json_lines(
+    path: str | Path,
+    columns: Mapping[str, Column],
+    clock: Clock,
+    *,
+    every: int = 1,
+    missing: Iterable[float] = (),
+) -> Table:
+    """Read channels from a file of JSON lines, one object with column -> value for each moment.
+
+    Parameters
+    ----------
+    columns, clock, every, missing
+        As for `read_csv`; a column that a line has not is missing there.
+
+    Raises
+    ------
+    DataError
+        No such file; no such column in any line; a line that is no object or has no time; no
+        number in a channel; times that do not increase. The message names file and line.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").split("\n")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read: {error}.") from error
+    places = [f"{path}, line {k}" for k, line in enumerate(lines, start=1) if line.strip()]
+    texts = [line for line in lines if line.strip()]
+    rows = [_object(text, place) for text, place in zip(texts, places, strict=True)]
+    if not rows:
+        raise SampleError(f"{path}: holds no samples.")
+    for row, place in zip(rows, places, strict=True):
+        check_columns(place, [clock.name], list(row))
+    needed = [name for column in columns.values() for name in column.names]
+    check_columns(str(path), needed, [*dict.fromkeys(name for row in rows for name in row)])
+    times, dates = _times([row[clock.name] for row in rows], clock, lambda k: f"{places[k]},")
+
+    def numbers(name: str, use: Any) -> Array:
+        return np.array([_number(rows[k].get(name), f"{places[k]}, '{name}'") for k in use])
+
+    where = (str(path), places.__getitem__)
+    return _table(times, dates, numbers, columns, clock, every, missing, where)
 
 
 def tabulated(
@@ -435,22 +480,12 @@ def _check_widths(path: Path, width: int, separator: str) -> None:
                 )
 
 
-def read_json_lines(
-    path: str | Path, columns: Mapping[str, Column], clock: Clock, **options: Any
-) -> JsonLines:
-    """Return the samples of a file of JSON lines; see `JsonLines`."""
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read: {error}.") from error
-    return JsonLines(lines, columns, clock, where=str(path), **options)
-
-
 def _object(line: str, where: str) -> dict[str, Any]:
     try:
         row = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise SampleError(f"{where}: is not JSON ({error.msg}).") from None
+    except (ValueError, RecursionError) as error:
+        reason = getattr(error, "msg", type(error).__name__)
+        raise SampleError(f"{where}: is not JSON ({reason}).") from None
     if not isinstance(row, dict):
         raise SampleError(f"{where}: got {row!r}; expected an object, column -> value.")
     return row
