@@ -21,7 +21,7 @@ import livepde as lp
 from livepde import checkpoint
 from livepde.records import Record
 from livepde.runs import RunWriter
-from livepde.runs.journal import KEPT_EVENTS, Event, Journal
+from livepde.runs.journal import KEPT_EVENTS, Event, Journal, in_use, log_of, written
 from livepde.runs.live import CHECKPOINT, Live, Retention, Samples
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Rows, json_row
@@ -198,7 +198,7 @@ def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
         run.journal.checkpoint(run.identifier.dump())
     run.journal.close()
     with Journal.open(tmp_path / NAME) as kept:
-        assert kept.accepted == len(kept) + 1 or kept.accepted >= len(kept)
+        assert kept.accepted - len(kept) in (0, 1)  # the last one may lack its estimate
         assert kept.estimated == len(kept)
 
 
@@ -311,6 +311,19 @@ def test_a_journal_appears_whole_or_not_at_all(tmp_path):
     Journal.open(path, write=True).close()  # the lock is free
 
 
+def test_whether_a_journal_is_written_and_when(tmp_path):
+    path = tmp_path / NAME
+    assert written(path) == 0.0
+    run = started(tmp_path, 5)
+    run.run()
+    assert in_use(path)
+    assert written(path) >= log_of(path).stat().st_mtime > 0.0
+    run.journal.close()
+    assert not log_of(path).exists()
+    assert written(path) == path.stat().st_mtime
+    assert not in_use(path)
+
+
 def test_two_writers(tmp_path):
     first = journal(tmp_path / NAME)
     with pytest.raises(lp.RunError, match="written by another process"):
@@ -351,6 +364,12 @@ def test_a_file_that_was_cut_off(tmp_path, keep):
     refused(path)
 
 
+@pytest.fixture(scope="module")
+def twelve(tmp_path_factory) -> bytes:
+    """The journal of twelve samples."""
+    return finished(tmp_path_factory.mktemp("twelve"), 12).read_bytes()
+
+
 @settings(
     max_examples=60,
     deadline=None,
@@ -358,11 +377,11 @@ def test_a_file_that_was_cut_off(tmp_path, keep):
     derandomize=True,
 )
 @given(seed=st.integers(0, 2**32), share=st.sampled_from([1e-5, 1e-4, 1e-3, 1e-2, 0.3]))
-def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, seed, share):
+def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, twelve, seed, share):
     folder = tmp_path_factory.mktemp("bytes")
-    path = finished(folder, 12)
+    path = folder / NAME
     rng = np.random.default_rng(seed)
-    data = np.frombuffer(path.read_bytes(), dtype=np.uint8).copy()
+    data = np.frombuffer(twelve, dtype=np.uint8).copy()
     where = rng.integers(0, len(data), max(int(share * len(data)), 1))
     data[where] = rng.integers(0, 256, len(where))
     path.write_bytes(data.tobytes())

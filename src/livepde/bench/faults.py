@@ -41,6 +41,7 @@ from livepde.identifier import Sample
 from livepde.progress import watched
 from livepde.records import Record
 from livepde.runs import JOURNAL, Check, Journal, Outcome, Table
+from livepde.runs.journal import log_of
 from livepde.runs.live import Gathered, Live
 from livepde.streams.intake import Intake, Ready
 from livepde.streams.intake import Outcome as RowOutcome
@@ -306,7 +307,7 @@ class _Run:
     @property
     def log_size(self) -> int:
         """Bytes of the journal's write-ahead log."""
-        log = self.out / f"{JOURNAL}-wal"
+        log = log_of(self.out / JOURNAL)
         return log.stat().st_size if log.exists() else 0
 
     @property

@@ -26,6 +26,7 @@ from livepde.observation import Points
 from livepde.progress import watched
 from livepde.result import Estimate
 from livepde.runs import Check, Journal, Outcome, Table, journal_of
+from livepde.runs.journal import log_of
 from livepde.runs.live import Live, Retention, Samples
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
@@ -88,7 +89,7 @@ class Meter:
         for number, _ in self.reader.after(self._read):
             self._read = number
         file = self.reader.path
-        sizes = [_size(path) for path in (file, file.with_name(file.name + "-wal"))]
+        sizes = [_size(path) for path in (file, log_of(file))]
         self.readings.append(Reading(self._steps, seconds, self.fresh(), *_memory(), *sizes))
         self._since = process_time()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,14 +12,13 @@ from typing import Generic, TypeVar
 
 import numpy as np
 import xarray as xr
-from filelock import FileLock, Timeout
 
 from livepde import runs
 from livepde.errors import RunError
 from livepde.records import Layout, Record
 from livepde.runs import Check, Journal
 from livepde.runs.directory import JOURNAL
-from livepde.runs.journal import Event
+from livepde.runs.journal import Event, in_use, written
 
 __all__ = ["Seen", "Spread", "View"]
 
@@ -191,9 +189,9 @@ class View:
             self._begin(run)
         journal = self.path / JOURNAL
         live = journal.is_file()
-        written = _written(journal) if live else 0.0
-        status = self._status(run, journal if live else None, written)
-        mark = (written, status, str(run.record))
+        latest = written(journal) if live else 0.0
+        status = self._status(run, journal if live else None, latest)
+        mark = (latest, status, str(run.record))
         if mark == self._mark and not self._seen.reading:
             return self._seen
         seen = replace(
@@ -201,7 +199,7 @@ class View:
             version=self._seen.version + 1,
             title=run.title,
             status=status,
-            written=written,
+            written=latest,
             ended=str(run.record.get("ended", "")) if run.status != "running" else "",
             problem="",
         )
@@ -264,28 +262,11 @@ class View:
             return None
         return layout.dataset([kept[number] for number in sorted(kept)])
 
-    def _status(self, run: runs.Run, journal: Path | None, written: float) -> str:
+    def _status(self, run: runs.Run, journal: Path | None, latest: float) -> str:
         if run.status != "running":
             return run.status
         if journal is None:
             return "waiting"
-        if time.time() - written > QUIET and not _in_use(journal):
+        if time.time() - latest > QUIET and not in_use(journal):
             return "stopped"
         return "running"
-
-
-def _written(journal: Path) -> float:
-    """Return when a journal was written last."""
-    files = [journal, journal.with_name(journal.name + "-wal")]
-    return max(os.stat(file).st_mtime for file in files if file.exists())
-
-
-def _in_use(journal: Path) -> bool:
-    """Return whether a process holds a journal to write it."""
-    lock = FileLock(journal.with_name(journal.name + ".lock"))
-    try:
-        lock.acquire(timeout=0)
-    except (Timeout, OSError):
-        return True
-    lock.release()
-    return False

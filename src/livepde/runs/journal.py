@@ -34,7 +34,7 @@ from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, Snapshot
 
-__all__ = ["Event", "Journal", "Taken"]
+__all__ = ["Event", "Journal", "Taken", "in_use", "log_of", "written"]
 
 FORMAT = 1
 MEMORY = Path(":memory:")
@@ -101,9 +101,9 @@ class Event:
 
 
 class Journal:
-    """The journal of one run.
+    """The journal of one run; `create` makes a new one, `open` takes one that is there.
 
-    Parameters
+    Attributes
     ----------
     path
         The SQLite file.
@@ -520,7 +520,7 @@ def _reader(path: Path) -> sqlite3.Connection:
     try:
         connection.execute("SELECT 1 FROM sqlite_schema").close()
     except sqlite3.OperationalError:
-        log = path.with_name(path.name + "-wal")
+        log = log_of(path)
         if log.exists() and log.stat().st_size:
             raise
         # A folder in which nothing can be made, and nobody writes.
@@ -536,8 +536,37 @@ def _connect(path: Path, options: str) -> sqlite3.Connection:
     return connection
 
 
+def log_of(path: Path) -> Path:
+    """Return the write-ahead log beside a journal; it need not be there."""
+    return path.with_name(path.name + "-wal")
+
+
+def written(path: Path) -> float:
+    """Return when a journal was written last, in seconds since 1970; 0 if there is none."""
+    times = [0.0]
+    for file in (path, log_of(path)):
+        with suppress(OSError):  # the log goes away with its writer
+            times.append(file.stat().st_mtime)
+    return max(times)
+
+
+def in_use(path: Path) -> bool:
+    """Return whether a process holds a journal to write it."""
+    lock = _lock_of(path)
+    try:
+        lock.acquire(timeout=0)
+    except (Timeout, OSError):
+        return True
+    lock.release()
+    return False
+
+
+def _lock_of(path: Path) -> FileLock:
+    return FileLock(path.with_name(path.name + ".lock"))
+
+
 def _locked(path: Path) -> FileLock:
-    lock = FileLock(path.with_name(path.name + ".lock"))
+    lock = _lock_of(path)
     try:
         lock.acquire(timeout=0)
     except Timeout:
