@@ -41,13 +41,13 @@ def test_runs_are_killed_and_lose_nothing(part):
 @MQTT
 def test_sources_go_away_and_come_back():
     pytest.importorskip("paho.mqtt")
-    assert not failed(faults.faults(samples=90, only=["restart"]))
+    assert not failed(faults.faults(samples=100, only=["restart"]))
 
 
 @MQTT
 def test_broken_messages_reach_the_real_command():
     pytest.importorskip("paho.mqtt")
-    assert not failed(faults.faults(samples=60, malformed=1000, only=["messages"]))
+    assert not failed(faults.faults(samples=100, malformed=1000, only=["messages"]))
 
 
 def test_broken_rows_have_a_reason_and_right_ones_arrive():

@@ -325,7 +325,15 @@ def test_watch_needs_a_run(tmp_path):
     assert "holds no run" in str(result.exception)
 
 
-def test_watch_says_where_and_ends_with_ctrl_c(tmp_path):
+@pytest.fixture
+def ctrl_c():
+    """Let children hear Ctrl-C, also where tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_watch_says_where_and_ends_with_ctrl_c(tmp_path, ctrl_c):
     begun(tmp_path, identifier()).close()
     command = [sys.executable, "-m", "livepde", "watch", str(tmp_path), "--address", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:

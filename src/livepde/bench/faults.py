@@ -26,6 +26,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol, TypeAlias
@@ -451,17 +452,20 @@ def _running(folder: Path, source: str) -> Iterator[_Run]:
         run.close()
 
 
-def _undisturbed(folder: Path, rows: Sequence[Row]) -> tuple[_Found, float]:
+@cache
+def _undisturbed(count: int) -> tuple[_Found, float]:
     """Return what a run finds that nobody disturbs, and the seconds until its first sample."""
-    plant = _File(folder, rows, 0)
-    plant.supply(len(rows))
-    with _running(folder, plant.source) as run:
-        begun = time.monotonic()
-        run.start()
-        _wait(lambda: run.alive() and run.look() > 0, "a run did not begin")
-        start = time.monotonic() - begun
-        run.end(len(rows))
-    return _Found.of(folder / "run"), start
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        plant = _File(folder, _rows(count), 0)
+        plant.supply(count)
+        with _running(folder, plant.source) as run:
+            begun = time.monotonic()
+            run.start()
+            _wait(lambda: run.alive() and run.look() > 0, "a run did not begin")
+            start = time.monotonic() - begun
+            run.end(count)
+        return _Found.of(folder / "run"), start
 
 
 # --- kills ---------------------------------------------------------------------------------------
@@ -494,9 +498,7 @@ def _killed(
     plan: _Plan, folder: Path, name: str, plants: Callable[[Path, Sequence[Row], int], _Plant]
 ) -> Outcome:
     rows, rng = _rows(plan.samples), np.random.default_rng(plan.seed)
-    calm = folder / "calm"
-    calm.mkdir()
-    expected, start = _undisturbed(calm, rows)
+    expected, start = _undisturbed(plan.samples)
     damage, fallen = _Damage(), Counter[str]()
     bar = plan.watched(plan.kills, f"kills, {name}")
     next(bar, None)
@@ -565,10 +567,10 @@ def _outages(plan: _Plan) -> Outcome:
     third, rest = len(rows) // 3, 2 * len(rows) // 3
     damage, restarts = _Damage(), 2
     with TemporaryDirectory() as name, ExitStack() as stack:
-        folders = {key: Path(name) / key for key in ("broker", "calm", "mqtt", "file")}
+        folders = {key: Path(name) / key for key in ("broker", "mqtt", "file")}
         for folder in folders.values():
             folder.mkdir()
-        expected, _ = _undisturbed(folders["calm"], rows)
+        expected, _ = _undisturbed(len(rows))
         broker = Mosquitto(folders["broker"])
         stack.callback(broker.stop)
         topic = _Topic(broker, rows, "rod")
@@ -646,10 +648,10 @@ def _messages(plan: _Plan) -> Outcome:
     rows, count = _rows(min(plan.samples, 600)), max(plan.malformed // 20, 1)
     damage = _Damage()
     with TemporaryDirectory() as name, ExitStack() as stack:
-        folders = {key: Path(name) / key for key in ("broker", "calm", "mqtt")}
+        folders = {key: Path(name) / key for key in ("broker", "mqtt")}
         for folder in folders.values():
             folder.mkdir()
-        expected, _ = _undisturbed(folders["calm"], rows)
+        expected, _ = _undisturbed(len(rows))
         broker = Mosquitto(folders["broker"])
         stack.callback(broker.stop)
         topic = _Topic(broker, rows, "rod")
