@@ -137,6 +137,8 @@ def run(
     live = realtime or (loaded.live and data is None)
     only = {"--listen": listen, "--watch": watch, "--estimates": estimates}
     _refuse(out, resume, live, only, as_json)
+    if speed == 0.0:
+        raise ConfigurationError("--speed 0 would never take the next sample: give a speed > 0.")
     folder = out or free_path(Path("runs") / loaded.name)
     write = partial(_writer, loaded, folder, settings or (), resume)
     with ExitStack() as stack:
