@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -333,6 +334,19 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     )
     assert call("run", rod, "--out", "begun", "--resume")[0] == 0  # there is none: it begins
     xr.testing.assert_identical(runs.open("begun").dataset, whole)
+
+
+def test_a_full_disk_is_one_sentence_where_a_run_goes_on_or_is_shown(rod, here, monkeypatch):
+    assert call("run", rod, "--out", "full")[0] == 0
+
+    def full(*arguments, **options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full)
+        assert "No space left" in bad("run", rod, "--out", "full", "--resume")
+        assert "No space left" in bad("report", "full")
+    assert call("run", rod, "--out", "full", "--resume")[0] == 0
 
 
 def test_no_figures_without_matplotlib(rod, here, monkeypatch):

@@ -235,6 +235,10 @@ def test_runs_that_cannot_be_opened(tmp_path, driven):
     (tmp_path / "estimates.nc").write_text("not netCDF")
     with pytest.raises(lp.RunError, match="is damaged"):
         _ = run.dataset
+    for checks in ([{"name": "k"}], {"name": "k"}, 5):
+        (tmp_path / "run.json").write_text(json.dumps({"format": 1, "checks": checks}))
+        with pytest.raises(lp.RunError, match=r"run\.json is damaged"):
+            _ = runs.open(tmp_path).checks
 
 
 def test_figures_are_drawn(tmp_path, driven):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -342,3 +344,60 @@ def test_a_password_comes_from_the_environment(here, monkeypatch):
     text = case('mqtt = { rows = ["a"], username = "me", password_env = "ROD_PASSWORD" }')
     monkeypatch.delenv("ROD_PASSWORD", raising=False)
     assert "the environment variable ROD_PASSWORD is not set" in bad("run", text)
+
+
+def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
+    wrong = [{"when": k, "left": 20.0, "T_3": 20.0, "T_6": 20.0} for k in range(3)]
+    loaded = cases.load(case(intake='silence = "1 ms"'))
+    with (
+        caplog.at_level("WARNING"),
+        Wiring(loaded, Rows(wrong)) as wiring,
+        pytest.raises(lp.DataError, match=r"no sample came \(malformed: .*'time'"),
+    ):
+        wiring.live()
+    assert [one.message.split(":")[0] for one in caplog.records] == ["malformed"]
+
+    good = [row(k) for k in range(3)]
+    with Wiring(loaded, Rows([*wrong, *good])) as wiring:
+        live = wiring.live()
+        live.run()
+        assert live.journal.counts == {("malformed", ""): 3}
+        assert len(live.result) == 3
+
+    class Nothing(Rows):
+        stopping = threading.Event()
+        polls = 0
+
+        def poll(self, wait):
+            self.polls += 1
+            time.sleep(0.01)
+            if self.polls == 3:
+                self.stopping.set()
+            return []
+
+    caplog.clear()
+    with Wiring(loaded, Nothing([])) as wiring:
+        assert wiring.live(stopping=Nothing.stopping) is None
+        assert wiring.silent
+    assert "nothing from the source" in caplog.text
+
+
+def test_a_run_without_a_sample_has_failed_and_can_begin_again(here):
+    Path("rows.csv").write_text(HEADER)
+    arguments = ["run", case('file = "rows.csv"'), "--realtime", "--speed", "inf"]
+    assert "no sample came" in bad(*arguments, "--out", "live")
+    assert runs.open("live").status == "failed"
+    assert "status is 'failed'. case.toml: no sample came" in bad("report", "live")
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(5))))
+    assert call(*arguments, "--out", "live", "--resume")[0] == 0
+    assert runs.open("live").status == "finished"
+
+
+def test_a_port_that_is_taken_or_no_speed_leaves_nothing_behind(here):
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(5))))
+    arguments = ["run", case('file = "rows.csv"'), "--realtime", "--out", "live"]
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert "choose another port" in bad(*arguments, "--listen", port)
+    assert "speed > 0" in bad(*arguments, "--speed", "0")
+    assert not Path("live").exists()

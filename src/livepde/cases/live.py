@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
+import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -17,7 +18,7 @@ from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
 from livepde.runs.journal import Journal
 from livepde.runs.live import LOOK, Feed, Gathered, Live, Paced, Samples, Sink
-from livepde.streams.intake import Intake, Ready
+from livepde.streams.intake import Intake, Ready, Remark, gather
 
 __all__ = ["Wiring"]
 
@@ -50,6 +51,8 @@ class Wiring:
     ----------
     prepared
         The case as its first sample found it; None before that.
+    silent
+        Nothing has come for too long while the first sample was waited for.
 
     Raises
     ------
@@ -68,6 +71,7 @@ class Wiring:
             raise ConfigurationError(f"a replay needs a speed > 0; got {pace}.")
         self.case = case
         self.prepared: Prepared | None = None
+        self.silent = False
         # Before anything is connected: a case that is wrong says so at once.
         self._policy, self._limits = policy_of(case.frame), limits_of(case.frame)
         self._path = path
@@ -119,11 +123,12 @@ class Wiring:
         for sink in sinks:
             self._stack.callback(sink.close)
         waiting: Sequence[Ready] = ()
+        irregular: dict[tuple[str, str], Remark] = {}
         if self._journal is not None and self._journal.first is not None:
             first = self._journal.first
             self.prepared = self.case.begin(Sample(first.t, first.values), self._start)
         else:
-            found = self._begun(stopping or threading.Event())
+            found = self._begun(stopping or threading.Event(), irregular)
             if found is None:
                 return None
             self.prepared, waiting = found
@@ -140,6 +145,7 @@ class Wiring:
             retention=retention,
             silence=silence,
             begun=waiting,
+            irregular=irregular.values(),
         )
         again = live.resume()
         if len(live.result):
@@ -151,25 +157,44 @@ class Wiring:
         """The date of t = 0, if times are dates; known after the first row."""
         return self._origin if self._intake is None else self._intake.start
 
-    def _begun(self, stopping: threading.Event) -> tuple[Prepared, Sequence[Ready]] | None:
-        """Return the case as its first sample finds it, and the samples that wait."""
+    def _begun(
+        self, stopping: threading.Event, irregular: dict[tuple[str, str], Remark]
+    ) -> tuple[Prepared, Sequence[Ready]] | None:
+        """Return the case as its first sample finds it, and the samples that wait.
+
+        What was irregular meanwhile is added to what is given.
+        """
         LOG.info("waits for the first sample")
-        why, told = DataError(f"{self.case.frame.path}: no sample came."), ""
+        why = told = "no sample came"
+        heard, silence = time.monotonic(), self._limits[-1]
         while not (stopping.is_set() or self._feed.done):
             found = list(self._feed.poll(LOOK))
+            if self._feed.heard():
+                heard, self.silent = time.monotonic(), False
+            elif not self.silent and time.monotonic() - heard > silence:
+                self.silent = True
+                LOG.warning("silent: nothing from the source for %.0f s", silence)
+            remarks = self._feed.remarks()
+            new = [one for one in remarks if (one.kind, one.channel) not in irregular]
+            for remark in remarks:
+                gather(irregular, remark)
             while found:
                 values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
                 try:
                     return self.case.begin(Sample(found[0].t, values), self._start), found
                 except DataError as error:
-                    why = error
-                if str(why) != told:
-                    told = str(why)
+                    why = str(error).removesuffix(".")
+                if why != told:
+                    told = why
                     LOG.warning("cannot begin yet: %s", why)
                 self._feed.acknowledge(found.pop(0))
+            for remark in new:
+                LOG.warning("%s: %s", remark.kind, remark.message)
         if stopping.is_set():
             return None
-        raise why
+        first = next(iter(irregular.values()), None)
+        wrong = f" ({first.kind}: {first.message})" if first is not None else ""
+        raise DataError(f"{self.case.frame.path}: {why}{wrong}.")
 
     def _fed(self, data: Data) -> Feed:
         case, journal, spec = self.case, self._journal, self.case.frame.spec.data

@@ -15,8 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from livepde.errors import DataError
+
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
+    from livepde.cases.live import Wiring
     from livepde.result import Estimate
     from livepde.runs import Driven, RunWriter
     from livepde.runs.live import Live, Sink
@@ -75,10 +78,17 @@ def beside(
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
 
     wiring = stack.enter_context(Wiring(case, how.data, path=folder / JOURNAL, pace=how.speed))
-    writer, health, stopping = write(), _Health(), threading.Event()
-    sinks = _observers(case, how, folder, stack, health)
+    health, stopping = _Health(wiring), threading.Event()
+    sinks = _observers(case, how, stack, health)
+    writer = write()
+    if how.page is not None:
+        _show(how.page, how.token, folder, stack)
     with stopped_by_signals(stopping, lambda: True):
-        live = wiring.live(sinks, stopping)
+        try:
+            live = wiring.live(sinks, stopping)
+        except DataError as error:
+            writer.finish(status="failed", notes=[str(error)])
+            raise
     if live is None or wiring.prepared is None:
         return writer, None
     health.live = live
@@ -88,11 +98,14 @@ def beside(
 class _Health:
     """What /health says, also before there is a run."""
 
-    live: Live | None = None
+    def __init__(self, wiring: Wiring) -> None:
+        self.live: Live | None = None
+        self._wiring = wiring
 
     def __call__(self) -> Mapping[str, Any]:
         if self.live is None:
-            return {"ok": True, "samples": 0, "status": "waits for the first sample"}
+            silent, status = self._wiring.silent, "waits for the first sample"
+            return {"ok": not silent, "samples": 0, "silent": silent, "status": status}
         return self.live.health
 
 
@@ -116,7 +129,7 @@ class _Heartbeat:
 
 
 def _observers(
-    case: Case, how: Beside, folder: Path, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
+    case: Case, how: Beside, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
 ) -> list[Sink]:
     """Start what looks at the run, and return the sinks that it needs."""
     sinks: list[Sink] = [_Heartbeat()]
@@ -133,15 +146,17 @@ def _observers(
         stack.callback(monitor.close)
         LOG.info("health and metrics at %s", monitor.shown)
         sinks.append(metrics)
-    if how.page is not None:
-        # A process of its own: drawing must not delay steps.
-        watch = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", how.page]
-        secret = {"LIVEPDE_TOKEN": how.token} if how.token else {}
-        page = subprocess.Popen(
-            [*watch, "--attached"],
-            stdin=subprocess.PIPE,
-            stdout=sys.stderr,
-            env={**os.environ, **secret},
-        )
-        stack.callback(page.communicate)  # closes its standard input, and waits
     return sinks
+
+
+def _show(page: str, token: str, folder: Path, stack: ExitStack) -> None:
+    """Serve the page from a process of its own: drawing must not delay steps."""
+    watch = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", page]
+    secret = {"LIVEPDE_TOKEN": token} if token else {}
+    process = subprocess.Popen(
+        [*watch, "--attached"],
+        stdin=subprocess.PIPE,
+        stdout=sys.stderr,
+        env={**os.environ, **secret},
+    )
+    stack.callback(process.communicate)  # closes its standard input, and waits

@@ -51,6 +51,7 @@ def report(
     Theory:   livepde report runs/mycase --theory
     """
     from livepde import runs
+    from livepde.errors import RunError
 
     if theory:
         _report_theory(runs.open(folder), data, as_json, allow_code)
@@ -61,14 +62,16 @@ def report(
     shown = opened.summary()
     checks = opened.checks
     console = terminal(err=as_json)
-    drawn = []
-    if can_draw(console):
-        for name, draw in figures_of(opened.dataset, opened.title).items():
-            draw().savefig(folder / f"{name}.png", dpi=120)
-            drawn.append(f"{name}.png")
     notes = opened.notes
-    text = markdown(opened.title, shown, checks, notes, drawn)
-    (folder / "report.md").write_text(text, encoding="utf-8")
+    figures = figures_of(opened.dataset, opened.title) if can_draw(console) else {}
+    drawn = [f"{name}.png" for name in figures]
+    try:
+        for name, draw in figures.items():
+            draw().savefig(folder / f"{name}.png", dpi=120)
+        text = markdown(opened.title, shown, checks, notes, drawn)
+        (folder / "report.md").write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"{folder} cannot be written: {error.strerror or error}.") from error
     if as_json:
         print_json(
             shown, checks, notes, run=str(folder), status=opened.status, dataset=opened.dataset

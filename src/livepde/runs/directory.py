@@ -246,10 +246,13 @@ class Run:
     def checks(self) -> list[Check]:
         """Checks as they were when the run ended."""
         found = []
-        for item in self.record.get("checks", []):
-            value = math.nan if item["value"] is None else float(item["value"])
-            bound = tuple(item["bound"]) if isinstance(item["bound"], list) else item["bound"]
-            found.append(Check(item["name"], value, bound, item["sense"]))
+        try:
+            for item in self.record.get("checks", []):
+                value = math.nan if item["value"] is None else float(item["value"])
+                bound = tuple(item["bound"]) if isinstance(item["bound"], list) else item["bound"]
+                found.append(Check(item["name"], value, bound, item["sense"]))
+        except (LookupError, TypeError, ValueError):
+            raise RunError(f"{self.path / RECORD} is damaged: its checks are none.") from None
         return found
 
     @cached_property
@@ -261,7 +264,8 @@ class Run:
             with Journal.open(journal) as kept:
                 return kept.dataset()
         if not path.is_file():
-            raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.")
+            told = "".join(f" {note}" for note in self.notes)
+            raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.{told}")
         try:
             return xr.load_dataset(path, engine="scipy")
         except (OSError, ValueError, TypeError, LookupError, MemoryError) as error:

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from livepde.errors import DataError, LivepdeError
 from livepde.identifier import Identifier, Sample
 from livepde.result import Estimate, Result
 from livepde.runs.journal import Event, Journal, Taken
-from livepde.streams.intake import Intake, Outcome, Ready, Remark
+from livepde.streams.intake import Intake, Outcome, Ready, Remark, gather
 from livepde.streams.sources import Row, Source
 
 __all__ = ["Backlog", "Feed", "Gathered", "Live", "Paced", "Retention", "Samples", "Sink"]
@@ -96,11 +96,7 @@ class Gathered:
 
     def _used(self, outcome: Outcome) -> list[Ready]:
         for remark in outcome.remarks:
-            key = remark.kind, remark.channel
-            same = self._remarks.get(key)
-            if same is not None:
-                remark = replace(same, number=same.number + remark.number)
-            self._remarks[key] = remark
+            gather(self._remarks, remark)
         self.source.acknowledge(outcome.spent)
         return outcome.ready
 
@@ -347,8 +343,8 @@ class Live:
     strict
         A sample that the identifier cannot use ends the run with its `DataError`; otherwise it is
         an event.
-    begun
-        Samples that the feed has brought already.
+    begun, irregular
+        Samples that the feed has brought already, and what was worth counting until then.
     clock
         Seconds that pass.
     """
@@ -366,6 +362,7 @@ class Live:
         silence: float = math.inf,
         strict: bool = False,
         begun: Iterable[Ready] = (),
+        irregular: Iterable[Remark] = (),
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
@@ -388,6 +385,7 @@ class Live:
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
+        self._count(irregular)
 
     def resume(self) -> int:
         """Take again what the journal holds after its last checkpoint; return how many samples."""
@@ -456,7 +454,7 @@ class Live:
             for ready in relieved:
                 self.feed.acknowledge(ready)
 
-    def _count(self, remarks: Sequence[Remark]) -> None:
+    def _count(self, remarks: Iterable[Remark]) -> None:
         """Count remarks; the first of each kind and channel is an event, with its words."""
         for remark in remarks:
             self._counts[remark.kind, remark.channel] += remark.number

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
 
 from livepde.errors import DataError, SampleError
 from livepde.streams.table import Clock, Column, channel_value, row_time
 
-__all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark"]
+__all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark", "gather"]
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,13 @@ class Remark:
     channel: str
     message: str
     number: int = 1
+
+
+def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
+    """Add a remark to those of its kind and channel: the first one's words, and their number."""
+    key = remark.kind, remark.channel
+    same = found.get(key)
+    found[key] = remark if same is None else replace(same, number=same.number + remark.number)
 
 
 @dataclass(frozen=True)
