@@ -559,7 +559,7 @@ def _released(path: Path, lock: FileLock | None) -> Iterator[None]:
             lock.release()
         if isinstance(error, sqlite3.Error | UnicodeDecodeError):
             raise RunError(_told(path, error)) from error
-        if isinstance(error, OSError) and not isinstance(error, RunError):
+        if not isinstance(error, RunError):
             raise RunError(f"{path} cannot be written: {error.strerror or error}.") from error
         raise
 
