@@ -747,3 +747,12 @@ def test_an_error_has_an_exit_code(tmp_path):
     found = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert found.returncode == 2
     assert found.stderr.startswith("Error: ")
+
+
+def test_an_error_while_a_journal_is_opened_is_told_once(tmp_path, monkeypatch):
+    def full(path):
+        raise lp.RunError("the disk is full; make room.")
+
+    monkeypatch.setattr("livepde.runs.journal._writer", full)
+    with pytest.raises(lp.RunError, match=r"^the disk is full; make room\.$"):
+        journal(tmp_path / NAME)
