@@ -12,6 +12,8 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,7 @@ from livepde.runs.journal import Event, Journal
 from livepde.runs.live import Backlog, Gathered, Live, Samples
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
+from livepde.stepping import Advance, ImplicitEuler
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Follow, Rows, json_row
 from livepde.streams.table import Clock, Column
@@ -288,6 +291,64 @@ def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
 @pytest.mark.parametrize("text", ["", "{", "[1]", "nan", "1" * 2_000_000, "[" * 100_000])
 def test_lines_that_are_no_rows(text):
     assert json_row(text).broken
+
+
+def test_a_clock_that_is_wrong_for_long_does_not_hold_a_run_up(tmp_path):
+    mixed = list(rows(20))
+    wrong = {"a": 0.7, "b": 0.4, "left": 1.0}
+    mixed[8:8] = [{"t": 1e12, **wrong}]
+    run = live(tmp_path, Rows(mixed))
+    run.identifier.problem = replace(run.identifier.problem, control=Advance(ImplicitEuler(), 0.1))
+    run.run()
+    assert [event.kind for event in run.journal.events] == ["refused"]
+    assert "more than 1000000 substeps" in run.journal.events[0].message
+    assert len(run.journal) == 20
+
+
+def test_what_is_irregular_is_counted_once_whenever_it_is_killed(tmp_path):
+    write(tmp_path, 30)
+    path = tmp_path / "data.csv"
+    lines = path.read_text().splitlines()
+    for k in (25, 12, 5):
+        lines[k:k] = ["broken", lines[k - 2]]
+    path.write_text("\n".join([*lines, "broken", "broken"]) + "\n")
+    whole = live(tmp_path)
+    whole.run()
+    expected = whole.journal.counts
+    whole.journal.close()
+    assert expected == {("malformed", ""): 5, **{("late", name): 3 for name in COLUMNS}}
+    (tmp_path / "journal.sqlite").unlink()
+    stops = iter([3, 1, 7, 1, 1, 9, 4, 30, 30])
+    for stop in stops:
+        run = live(tmp_path, sinks=[Stop(stop)])
+        with suppress(Killed):
+            run.resume()
+            run._run()
+        run.journal._db.rollback()  # what is not committed is lost
+        run.journal.close()
+        OPENED.pop().close()
+    with Journal.open(tmp_path / "journal.sqlite") as kept:
+        assert kept.counts == expected
+        assert len(kept) == 30
+
+
+class Killed(Exception):
+    pass
+
+
+class Stop:
+    """A sink that ends a run as a kill would, at its n-th estimate."""
+
+    def __init__(self, n: int) -> None:
+        self.left = n
+
+    def put(self, estimate) -> None:
+        self.left -= 1
+        if self.left == 0:
+            raise Killed
+
+    def close(self) -> None:
+        pass
 
 
 def followed(source: Follow) -> list[float]:

@@ -319,7 +319,6 @@ def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
         ('follow = true\nmqtt = { rows = ["a"] }', "", "", "follow belongs to a file"),
         ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are two sources"),
         ('file = "rows.csv"\nfollow = true\nevery = 2', "", "", "every belongs to data that are"),
-        ('file = "rows.csv"\nevery = 2', "", "", "data.every: got 2; beside a process"),
         ('file = "rows.csv"', 'wait = "-1 s"', "", "wait must be a time >= 0"),
         ('file = "rows.csv"', 'wait = "1 m"', "", "intake.wait: 'm' cannot be converted to 's'"),
         ('file = "rows.csv"', "queue = 0", "", "queue"),

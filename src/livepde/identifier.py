@@ -30,6 +30,7 @@ from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
 __all__ = ["Identifier", "Sample"]
 
 FORMAT = 1  # of the checkpoint
+MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
 @dataclass(frozen=True)
@@ -193,6 +194,12 @@ class Identifier:
         measured, withheld, named = self._parse(z, inputs or {})
         values, held = self._filled(named)
         first = self._samples == 0
+        if t - self._t > MOST_SUBSTEPS * self.problem.control.dt_max:
+            raise SampleError(
+                f"the sample at t = {t:g} is more than {MOST_SUBSTEPS} substeps of dt_max = "
+                f"{self.problem.control.dt_max:g} after t = {self._t:g}: check its time, or take a "
+                "longer dt_max."
+            )
         if t < self._t or (t == self._t and not first):
             raise TimeOrderError(
                 f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}: "

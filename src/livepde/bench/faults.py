@@ -696,8 +696,8 @@ class _Audited(Gathered):
         super().__init__(source, intake)
         self.reasons: dict[int, set[str]] = {}
 
-    def _outcome(self, row: SourceRow) -> RowOutcome:
-        found = super()._outcome(row)
+    def _outcome(self, row: SourceRow, token: Any) -> RowOutcome:
+        found = super()._outcome(row, token)
         self.reasons[row.token[1]] = {remark.kind for remark in found.remarks}
         return found
 

@@ -204,9 +204,8 @@ class Case:
 
     @property
     def name(self) -> str:
-        """A name for its runs: that of the file, of its folder if the file is just 'case.toml'."""
-        path = self.frame.path.absolute()
-        return path.stem if path.stem != "case" else path.parent.name or "case"
+        """A name for its runs."""
+        return self.frame.name
 
     @property
     def title(self) -> str:

@@ -37,6 +37,12 @@ class Frame:
     equation: Equation
     reader: Callable[..., Any] | None = None
 
+    @property
+    def name(self) -> str:
+        """A name for what comes of the case: that of the file, of its folder if that is 'case'."""
+        path = self.path.absolute()
+        return path.stem if path.stem != "case" else path.parent.name or "case"
+
     def error(self, key: str, text: str) -> CaseError:
         """Return an error that names file and key."""
         return CaseError(f"{self.path}: {key}: {text}")

@@ -174,7 +174,7 @@ class Wiring:
             elif not self.silent and time.monotonic() - heard > silence:
                 self.silent = True
                 LOG.warning("silent: nothing from the source for %.0f s", silence)
-            remarks = self._feed.remarks()
+            remarks = self._feed.remarks(found)
             new = [one for one in remarks if (one.kind, one.channel) not in irregular]
             for remark in remarks:
                 gather(irregular, remark)
@@ -201,20 +201,22 @@ class Wiring:
         last = -math.inf if journal is None else journal.last
         named = data if isinstance(data, str) else None
         file = spec.file or "" if data is None else named or ""
-        if file.endswith(".parquet") or (data is None and case.frame.reader is not None):
+        reader = data is None and case.frame.reader is not None
+        if spec.every > 1 and not (file or reader):
+            text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
+            raise case.frame.error("data.every", text)
+        if reader or file.endswith(".parquet") or spec.every > 1:
             table = read_data(case.frame, case.columns, case.clock, named)
             self._origin = table.origin
             return Samples(table, after=last)
-        if spec.every > 1:
-            text = f"got {spec.every}; beside a process all rows are taken: leave it out."
-            raise case.frame.error("data.every", text)
-        origin = None if journal is None else _seconds(journal.layout.attrs.get("origin"))
+        begun = None if journal is None else journal.layout.attrs.get("origin")
         self._intake = Intake(
             case.columns,
             case.clock,
             self._policy,
             missing=spec.missing,
-            origin=origin,
+            origin=None if journal is None else _seconds(begun),
+            dates=None if journal is None else begun is not None,
             last=last,
         )
         position = "" if journal is None else journal.position

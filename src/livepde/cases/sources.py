@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Data", "limits_of", "policy_of", "publishers_of", "source_of", "source_text"]
 
+LEAP = "30 d"  # a process that was away for longer needs a second row that says so
+
 Data: TypeAlias = str | Iterable[str] | Source | None  # a file, lines of JSON, or the case's own
 
 
@@ -78,7 +80,7 @@ def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
     return Broker(
         host=spec.host,
         port=spec.port,
-        client_id=spec.client_id or f"livepde-{frame.path.stem}",
+        client_id=spec.client_id or f"livepde-{frame.name}",
         username=spec.username,
         password=_password(frame, spec.password_env, key),
         tls=spec.tls,
@@ -123,7 +125,7 @@ def policy_of(frame: Frame) -> Policy:
         if channel.wait is not None:
             wait = duration(channel.wait, f"channels.{name}.wait")
         habits[name] = Habit(wait, channel.repeated)
-    leap = math.inf
+    leap = frame.convert(LEAP, unit, "intake.leap") if unit else math.inf
     if spec.leap is not None:
         leap = frame.positive(spec.leap, unit, "intake.leap")
     return Policy(

@@ -82,6 +82,7 @@ def beside(
     sinks = _observers(case, how, stack, health)
     writer = write()
     if how.page is not None:
+        Address.read(how.page, 0, how.token)  # a sentence before anything is begun
         _show(how.page, how.token, folder, stack)
     with stopped_by_signals(stopping, lambda: True):
         try:
@@ -132,6 +133,8 @@ def _observers(
     case: Case, how: Beside, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
 ) -> list[Sink]:
     """Start what looks at the run, and return the sinks that it needs."""
+    from livepde.runs.web import Address
+
     sinks: list[Sink] = [_Heartbeat()]
     if how.estimates:
         from livepde.runs.sinks import JsonLinesSink
@@ -139,7 +142,6 @@ def _observers(
         sinks.append(JsonLinesSink(sys.stdout))
     if how.listen is not None:
         from livepde.runs.monitor import Metrics, Monitor
-        from livepde.runs.web import Address
 
         metrics = Metrics(case.sensors)
         monitor = Monitor(Address.read(how.listen, METRICS_PORT, how.token), health, metrics)

@@ -59,7 +59,7 @@ def report(
     from livepde.runs.directory import markdown
 
     opened = runs.open(folder)
-    shown = opened.summary()
+    shown = [*opened.summary(), *opened.arrivals()]
     checks = opened.checks
     console = terminal(err=as_json)
     notes = opened.notes

@@ -30,7 +30,7 @@ from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, FigureFactory, Table
-from livepde.runs.summary import tables
+from livepde.runs.summary import arrivals, tables
 
 __all__ = [
     "Run",
@@ -161,6 +161,12 @@ class RunWriter:
             raise RunError(
                 f"{path} was run with another case or other settings: resume it with those, or "
                 "choose another folder."
+            )
+        named = _data_of(command)
+        if named != run.data_file:
+            raise RunError(
+                f"{path} was run with {_said(run.data_file)}, not with {_said(named)}: resume it "
+                "so, or choose another folder."
             )
         resumed = [*run.record.get("resumed", []), {"at": _now(), "livepde": version}]
         record = run.record | {"status": "running", "resumed": resumed}
@@ -304,13 +310,14 @@ class Run:
     @property
     def data_file(self) -> str | None:
         """What --data named when the run was made; None: the case's own, or standard input."""
-        command = [str(word) for word in self.record.get("command", [])]
-        for k, word in enumerate(command):
-            if word.startswith("--data="):
-                return word.removeprefix("--data=")
-            if word == "--data" and k + 1 < len(command) and command[k + 1] != "-":
-                return command[k + 1]
-        return None
+        return _data_of(self.record.get("command", []))
+
+    def arrivals(self) -> list[Table]:
+        """Return the table of rows that were irregular, if any; of a run with a journal."""
+        if not (self.path / JOURNAL).is_file():
+            return []
+        with Journal.open(self.path / JOURNAL) as kept:
+            return arrivals(kept)
 
     def summary(self) -> list[Table]:
         """Return its tables: estimates ± deviation, errors of each channel."""
@@ -424,3 +431,18 @@ def _without_token(command: Sequence[str]) -> list[str]:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _data_of(command: Sequence[Any]) -> str | None:
+    """Return the file that --data names in a command; None for standard input, too."""
+    words = [str(word) for word in command]
+    for k, word in enumerate(words):
+        if word.startswith("--data="):
+            return word.removeprefix("--data=")
+        if word == "--data" and k + 1 < len(words) and words[k + 1] != "-":
+            return words[k + 1]
+    return None
+
+
+def _said(data: str | None) -> str:
+    return f"--data {data}" if data else "the data of its case"

@@ -287,8 +287,17 @@ class Journal:
         )
         self._write(self._db.commit)
 
-    def commit(self) -> None:
-        """Show readers what was written since the last sample was accepted."""
+    def commit(self, position: str | None = None) -> None:
+        """Show readers what was written since the last sample was accepted.
+
+        Parameters
+        ----------
+        position
+            Where the source stands now, if it has brought anything but samples since then.
+        """
+        if position is not None:
+            stands = json.dumps([self.accepted, position])
+            self._execute("INSERT OR REPLACE INTO meta VALUES ('position', ?)", stands)
         self._write(self._db.commit)
 
     def note(self, event: Event) -> None:
@@ -348,9 +357,12 @@ class Journal:
 
     @property
     def position(self) -> str:
-        """Where the source stood after the last accepted sample."""
-        rows = self._read("SELECT position FROM samples ORDER BY id DESC LIMIT 1")
-        return str(rows[0][0]) if rows else ""
+        """Where the source stood after the last accepted sample, or what came after it."""
+        rows = self._read("SELECT id, position FROM samples ORDER BY id DESC LIMIT 1")
+        last, position = rows[0] if rows else (0, "")
+        with _sound(self.path):
+            after, later = json.loads(self._meta().get("position", '[-1, ""]'))
+            return str(later if after == last else position)
 
     def rewind(self) -> bytes | None:
         """Return the last checkpoint, None if there is none.

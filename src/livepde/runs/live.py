@@ -43,14 +43,21 @@ class Feed(Protocol):
     def heard(self) -> bool:
         """Return whether anything has come since this was asked last, be it of no use."""
 
-    def remarks(self) -> Sequence[Remark]:
-        """Return what has been worth counting since this was asked last."""
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
+        """Return what has been worth counting since this was asked last.
+
+        Only of what would not be read again from `position(waiting)`: so nothing is counted twice
+        after a crash.
+        """
 
     def position(self, waiting: Sequence[Ready]) -> str:
         """Return from where to go on if these samples are still to be taken."""
 
     def acknowledge(self, ready: Ready) -> None:
         """Hear that a sample has been taken for good, or never will be."""
+
+    def withdraw(self, last: float) -> None:
+        """Hear that nothing could be made of the last sample; `last`: time of the one before."""
 
     def close(self) -> None:
         """Let go of what it holds."""
@@ -69,7 +76,8 @@ class Gathered:
         self.source = source
         self.intake = intake
         self._heard = False
-        self._remarks: dict[tuple[str, str], Remark] = {}
+        self._remarks: list[Remark] = []
+        self._rows = 0  # a token is the number of the row, and what the source gave with it
         self._flushed = False
 
     @property
@@ -83,46 +91,67 @@ class Gathered:
         self._heard |= bool(rows)
         found: list[Ready] = []
         for row in rows:
-            found += self._used(self._outcome(row))
+            self._rows += 1
+            found += self._used(self._outcome(row, (self._rows, row.token)))
         if self.source.done and not self._flushed:
             self._flushed = True
             found += self._used(self.intake.flush())
         return found
 
-    def _outcome(self, row: Row) -> Outcome:
+    def _outcome(self, row: Row, token: Any) -> Outcome:
         if row.broken:
-            return Outcome(remarks=[Remark("malformed", "", row.broken)], spent=[row.token])
-        return self.intake.take(row.values, row.token)
+            return Outcome(remarks=[Remark("malformed", "", row.broken, row=token)], spent=[token])
+        return self.intake.take(row.values, token)
 
     def _used(self, outcome: Outcome) -> list[Ready]:
-        for remark in outcome.remarks:
-            gather(self._remarks, remark)
-        self.source.acknowledge(outcome.spent)
+        self._remarks += outcome.remarks
+        self.source.acknowledge(_given(outcome.spent))
         return outcome.ready
+
+    def _waiting(self, waiting: Sequence[Ready]) -> list[Any]:
+        """Return the tokens of all rows that are still to be taken."""
+        return [*(token for ready in waiting for token in ready.tokens), *self.intake.waiting]
 
     def heard(self) -> bool:
         """Return whether a row has come since this was asked last."""
         heard, self._heard = self._heard, False
         return heard
 
-    def remarks(self) -> Sequence[Remark]:
-        """Return what was refused, missing or out of order."""
-        found = list(self._remarks.values())
-        self._remarks.clear()
-        return found
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
+        """Return what was refused, missing or out of order, each kind and channel once."""
+        if not self._remarks:
+            return ()
+        first = min((number for number, _ in self._waiting(waiting)), default=math.inf)
+        found: dict[tuple[str, str], Remark] = {}
+        later: list[Remark] = []
+        for remark in self._remarks:
+            if remark.row[0] < first:
+                gather(found, remark)
+            else:
+                later.append(remark)
+        self._remarks = later
+        return list(found.values())
 
     def position(self, waiting: Sequence[Ready]) -> str:
         """Return where the source stands if these samples are still to be taken."""
-        tokens = [token for ready in waiting for token in ready.tokens]
-        return self.source.position([*tokens, *self.intake.waiting])
+        return self.source.position(_given(self._waiting(waiting)))
 
     def acknowledge(self, ready: Ready) -> None:
         """Tell the source."""
-        self.source.acknowledge(ready.tokens)
+        self.source.acknowledge(_given(ready.tokens))
+
+    def withdraw(self, last: float) -> None:
+        """Tell the intake."""
+        self.intake.withdraw(last)
 
     def close(self) -> None:
         """Close the source."""
         self.source.close()
+
+
+def _given(tokens: Iterable[Any]) -> list[Any]:
+    """Return what the source gave, without the numbers of rows."""
+    return [token for _, token in tokens]
 
 
 class Samples:
@@ -169,7 +198,7 @@ class Samples:
         """Samples that are there are never silent."""
         return True
 
-    def remarks(self) -> Sequence[Remark]:
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
         """Nothing is refused: what is wrong raises."""
         return ()
 
@@ -179,6 +208,9 @@ class Samples:
 
     def acknowledge(self, ready: Ready) -> None:
         """Nobody waits to hear it."""
+
+    def withdraw(self, last: float) -> None:
+        """The next one is later anyway."""
 
     def close(self) -> None:
         """Nothing is held."""
@@ -238,9 +270,9 @@ class Paced:
         """A replay is heard as long as it holds samples."""
         return self.feed.heard() or bool(self._held)
 
-    def remarks(self) -> Sequence[Remark]:
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
         """Return what was worth counting."""
-        return self.feed.remarks()
+        return self.feed.remarks([*waiting, *self._held])
 
     def position(self, waiting: Sequence[Ready]) -> str:
         """Return from where to go on if these samples, and those held, are still to be taken."""
@@ -249,6 +281,10 @@ class Paced:
     def acknowledge(self, ready: Ready) -> None:
         """Tell the feed."""
         self.feed.acknowledge(ready)
+
+    def withdraw(self, last: float) -> None:
+        """Tell the feed."""
+        self.feed.withdraw(last)
 
     def close(self) -> None:
         """Close the feed."""
@@ -380,7 +416,7 @@ class Live:
         self._heard = clock()
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
-        self._remarked: set[tuple[str, str]] = set()
+        self._remarked = set(self._counts)
         self._steps = 0
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
@@ -434,16 +470,22 @@ class Live:
     def _run(self) -> None:
         while not self.stopping.is_set():
             if not self._waiting:
-                self.journal.commit()  # who reads the journal sees all before it is waited for more
+                self._settle()  # who reads the journal sees all before it is waited for more
             if self.backlog.has_room(self._waiting):
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
                 self._watch(self.feed.heard())
-                self._count(self.feed.remarks())
             self._relieve()
             if self._waiting:
                 self._take(self._waiting.popleft())
             elif self.feed.done:
                 break
+        self._settle()
+
+    def _settle(self) -> None:
+        """Keep what was irregular, and where the source stands, for good."""
+        remarks = self.feed.remarks(self._waiting)
+        self._count(remarks)
+        self.journal.commit(self.feed.position(self._waiting) if remarks else None)
 
     def _relieve(self) -> None:
         relieved = self.backlog.relieved(self._waiting)
@@ -491,6 +533,7 @@ class Live:
 
     def _take(self, ready: Ready) -> None:
         position = self.feed.position(self._waiting)
+        self._count(self.feed.remarks(self._waiting))
         taken = self.journal.accept(ready.t, ready.values, position)
         self.feed.acknowledge(ready)
         self._step(taken)
@@ -503,6 +546,7 @@ class Live:
             if not self.strict:
                 self._tell("refused", str(error))
             self.journal.withdraw()
+            self.feed.withdraw(self.journal.last)
             if self.strict:
                 raise
         finally:

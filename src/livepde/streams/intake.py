@@ -98,12 +98,15 @@ class Remark:
         In words; of several the first's.
     number
         How often.
+    row
+        Token of the row that it is about, the last one of a sample.
     """
 
     kind: str
     channel: str
     message: str
     number: int = 1
+    row: Any = None
 
 
 def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
@@ -138,9 +141,12 @@ class Outcome:
     remarks: list[Remark] = field(default_factory=list)
     spent: list[Any] = field(default_factory=list)
 
-    def remark(self, kind: str, channel: str, message: str) -> None:
-        """Add a remark."""
-        self.remarks.append(Remark(kind, channel, message))
+    row: Any = None
+
+    def remark(self, kind: str, channel: str, message: str, row: Any = None) -> None:
+        """Add a remark, about the row that was taken or another one."""
+        about = self.row if row is None else row
+        self.remarks.append(Remark(kind, channel, message, row=about))
 
 
 @dataclass
@@ -164,6 +170,8 @@ class Intake:
         Numbers that mean a missing value.
     origin
         Seconds since 1970 of t = 0 where times are dates; default the first row's.
+    dates
+        Whether times are dates; default as in the first row.
     last
         Time of the last sample that was taken before, to go on after it.
     """
@@ -176,6 +184,7 @@ class Intake:
         *,
         missing: Iterable[float] = (),
         origin: float | None = None,
+        dates: bool | None = None,
         last: float = -math.inf,
     ) -> None:
         self.columns = dict(columns)
@@ -183,6 +192,7 @@ class Intake:
         self.policy = policy or Policy()
         self.missing = frozenset(float(number) for number in missing)
         self.origin = origin
+        self._dates = dates
         self._last = last
         self._newest = last
         self._doubted = math.inf
@@ -191,7 +201,7 @@ class Intake:
     @property
     def start(self) -> datetime | None:
         """The date of t = 0, if times are dates."""
-        if not self.origin:
+        if self.origin is None or not self._dates:
             return None
         return datetime.fromtimestamp(self.origin, UTC).replace(tzinfo=None)
 
@@ -202,7 +212,7 @@ class Intake:
 
     def take(self, row: Mapping[str, Any], token: Any = None) -> Outcome:
         """Take a row; return what becomes of it and of those before it."""
-        found = Outcome()
+        found = Outcome(row=token)
         try:
             t = self._time(row)
         except DataError as error:
@@ -219,6 +229,17 @@ class Intake:
         found.spent.append(token)
         self._release(found)
         return found
+
+    def withdraw(self, last: float) -> None:
+        """Hear that nothing could be made of the sample that was released last.
+
+        Parameters
+        ----------
+        last
+            Time of the last one before: what is later may still come.
+        """
+        self._last = self._newest = last
+        self._open = {t: sample for t, sample in self._open.items() if t > last}
 
     def flush(self) -> Outcome:
         """Release all samples that are still open: nothing more will come."""
@@ -270,9 +291,10 @@ class Intake:
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
             return None
-        if self.origin is not None and dates != (self.origin != 0.0):
+        if self._dates not in (None, dates):
             was, is_now = ("number", "date") if dates else ("date", "number")
             raise SampleError(f"the time is a {is_now}; it was a {was} before")
+        self._dates = dates
         if self.origin is None:
             self.origin = _microseconds(t / self.clock.second) if dates else 0.0
         return t - self.origin * self.clock.second if dates else t
@@ -315,10 +337,10 @@ class Intake:
             self._last = t
             lacking = [c for c in self.columns if math.isnan(sample.values.get(c, math.nan))]
             for channel in lacking:
-                found.remark("missing", channel, f"no value for t = {t:g}")
+                found.remark("missing", channel, f"no value for t = {t:g}", sample.tokens[-1])
             needed = [channel for channel in lacking if self.columns[channel].needed]
             if needed:
-                found.remark("skipped", needed[0], f"t = {t:g} is left out")
+                found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
                 found.spent += sample.tokens
             else:
                 found.ready.append(Ready(t, sample.values, tuple(sample.tokens)))
