@@ -82,7 +82,6 @@ def beside(
     sinks = _observers(case, how, stack, health)
     writer = write()
     if how.page is not None:
-        Address.read(how.page, 0, how.token)  # a sentence before anything is begun
         _show(how.page, how.token, folder, stack)
     with stopped_by_signals(stopping, lambda: True):
         try:
@@ -135,6 +134,8 @@ def _observers(
     """Start what looks at the run, and return the sinks that it needs."""
     from livepde.runs.web import Address
 
+    if how.page is not None:
+        Address.read(how.page, 0, how.token)  # what is no address is said before all else
     sinks: list[Sink] = [_Heartbeat()]
     if how.estimates:
         from livepde.runs.sinks import JsonLinesSink
