@@ -28,7 +28,7 @@ demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) 
 	@$(BIN)/livepde demo
 
 test: $(READY)  ## Run all tests and doctests, with coverage
-	@$(BIN)/pytest --cov
+	@$(BIN)/pytest --cov --numprocesses auto --maxprocesses 8 --dist loadfile
 
 check: $(READY)  ## Check style, format, types and import layers
 	@$(BIN)/ruff check --quiet
