@@ -21,8 +21,9 @@ import livepde as lp
 from livepde import checkpoint
 from livepde.records import Record
 from livepde.runs import RunWriter
+from livepde.runs.feeds import Samples
 from livepde.runs.journal import KEPT_EVENTS, Event, Journal, in_use, log_of, written
-from livepde.runs.live import CHECKPOINT, Live, Retention, Samples
+from livepde.runs.live import CHECKPOINT, Live, Retention
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Rows, json_row
 

@@ -22,8 +22,9 @@ import xarray as xr
 
 import livepde as lp
 from livepde.result import layout_of
+from livepde.runs.feeds import Gathered, Samples
 from livepde.runs.journal import Event, Journal
-from livepde.runs.live import Backlog, Gathered, Live, Samples
+from livepde.runs.live import Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 from livepde.stepping import Advance, ImplicitEuler

@@ -19,7 +19,7 @@ import pytest
 from test_live import COLUMNS, live, rows
 
 import livepde as lp
-from livepde.runs.live import Gathered
+from livepde.runs.feeds import Gathered
 from livepde.streams.intake import Intake, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
 from livepde.streams.sources import Rows

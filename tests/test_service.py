@@ -22,7 +22,7 @@ import livepde as lp
 from livepde import cases, runs
 from livepde.cases.live import Wiring
 from livepde.runs import JOURNAL, Journal
-from livepde.runs.live import Paced, Samples
+from livepde.runs.feeds import Paced, Samples
 from livepde.streams.sources import Rows
 
 CASE = """

@@ -42,8 +42,9 @@ from livepde.identifier import Sample
 from livepde.progress import watched
 from livepde.records import Record
 from livepde.runs import JOURNAL, Check, Journal, Outcome, Table
+from livepde.runs.feeds import Gathered
 from livepde.runs.journal import log_of
-from livepde.runs.live import Gathered, Live
+from livepde.runs.live import Live
 from livepde.streams.intake import Intake, Ready
 from livepde.streams.intake import Outcome as RowOutcome
 from livepde.streams.sources import Row as SourceRow

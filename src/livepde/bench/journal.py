@@ -18,7 +18,8 @@ from livepde.bench.cases import find_cases
 from livepde.cases import load
 from livepde.errors import ConfigurationError
 from livepde.runs import Check, Outcome, Table
-from livepde.runs.live import Live, Samples
+from livepde.runs.feeds import Samples
+from livepde.runs.live import Live
 
 __all__ = ["journal"]
 

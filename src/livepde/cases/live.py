@@ -16,8 +16,9 @@ from livepde.cases.data import read_data
 from livepde.cases.sources import Data, limits_of, policy_of, publishers_of, source_of
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
+from livepde.runs.feeds import Feed, Gathered, Paced, Samples
 from livepde.runs.journal import Journal
-from livepde.runs.live import LOOK, Feed, Gathered, Live, Paced, Samples, Sink
+from livepde.runs.live import LOOK, Live, Sink
 from livepde.streams.intake import Intake, Ready, Remark, gather
 
 __all__ = ["Wiring"]

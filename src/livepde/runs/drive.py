@@ -13,8 +13,9 @@ from types import FrameType
 from livepde.errors import DataError
 from livepde.identifier import Identifier, Sample
 from livepde.result import Result, layout_of
+from livepde.runs.feeds import Samples
 from livepde.runs.journal import Journal
-from livepde.runs.live import Live, Samples
+from livepde.runs.live import Live
 
 __all__ = ["Driven", "conduct", "drive", "journal_of", "stopped_by_signals"]
 

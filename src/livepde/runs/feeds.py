@@ -1,0 +1,278 @@
+"""How samples come to a run: put in order, or as they are, or at the pace of their times."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from livepde.identifier import Sample
+from livepde.streams.intake import Intake, Outcome, Ready, Remark, gather
+from livepde.streams.sources import Row, Source
+
+__all__ = ["Feed", "Gathered", "Paced", "Samples"]
+
+
+class Feed(Protocol):
+    """Brings samples in time order, complete and checked."""
+
+    @property
+    def done(self) -> bool:
+        """True if nothing more will come."""
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the samples that are there, or after at most `wait` seconds none."""
+
+    def heard(self) -> bool:
+        """Return whether anything has come since this was asked last, be it of no use."""
+
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
+        """Return what has been worth counting since this was asked last.
+
+        Only of what would not be read again from `position(waiting)`: so nothing is counted twice
+        after a crash.
+        """
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """Return from where to go on if these samples are still to be taken."""
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Hear that a sample has been taken for good, or never will be."""
+
+    def withdraw(self, last: float) -> None:
+        """Hear that nothing could be made of the last sample; `last`: time of the one before."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+class Gathered:
+    """Samples from the rows of a source, as an `Intake` puts them in order.
+
+    Parameters
+    ----------
+    source, intake
+        Where rows come from, and how they become samples.
+    """
+
+    def __init__(self, source: Source, intake: Intake) -> None:
+        self.source = source
+        self.intake = intake
+        self._heard = False
+        self._remarks: list[Remark] = []
+        self._rows = 0  # a token is the number of the row, and what the source gave with it
+        self._flushed = False
+
+    @property
+    def done(self) -> bool:
+        """True when the source has ended and all its samples are out."""
+        return self._flushed
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the samples that are ready."""
+        rows = self.source.poll(wait)
+        self._heard |= bool(rows)
+        found: list[Ready] = []
+        for row in rows:
+            self._rows += 1
+            found += self._used(self._outcome(row, (self._rows, row.token)))
+        if self.source.done and not self._flushed:
+            self._flushed = True
+            found += self._used(self.intake.flush())
+        return found
+
+    def _outcome(self, row: Row, token: Any) -> Outcome:
+        if row.broken:
+            return Outcome(remarks=[Remark("malformed", "", row.broken, row=token)], spent=[token])
+        return self.intake.take(row.values, token)
+
+    def _used(self, outcome: Outcome) -> list[Ready]:
+        self._remarks += outcome.remarks
+        self.source.acknowledge(_given(outcome.spent))
+        return outcome.ready
+
+    def _waiting(self, waiting: Sequence[Ready]) -> list[Any]:
+        """Return the tokens of all rows that are still to be taken."""
+        return [*(token for ready in waiting for token in ready.tokens), *self.intake.waiting]
+
+    def heard(self) -> bool:
+        """Return whether a row has come since this was asked last."""
+        heard, self._heard = self._heard, False
+        return heard
+
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
+        """Return what was refused, missing or out of order, each kind and channel once."""
+        if not self._remarks:
+            return ()
+        first = min((number for number, _ in self._waiting(waiting)), default=math.inf)
+        found: dict[tuple[str, str], Remark] = {}
+        later: list[Remark] = []
+        for remark in self._remarks:
+            if remark.row[0] < first:
+                gather(found, remark)
+            else:
+                later.append(remark)
+        self._remarks = later
+        return list(found.values())
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """Return where the source stands if these samples are still to be taken."""
+        return self.source.position(_given(self._waiting(waiting)))
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Tell the source."""
+        self.source.acknowledge(_given(ready.tokens))
+
+    def withdraw(self, last: float) -> None:
+        """Tell the intake."""
+        self.intake.withdraw(last)
+
+    def close(self) -> None:
+        """Close the source."""
+        self.source.close()
+
+
+def _given(tokens: Iterable[Any]) -> list[Any]:
+    """Return what the source gave, without the numbers of rows."""
+    return [token for _, token in tokens]
+
+
+class Samples:
+    """Samples that are in order already: a table, or any iterable that raises `DataError`.
+
+    Parameters
+    ----------
+    samples
+        The samples.
+    names
+        Sensors whose values an array z holds.
+    after
+        Time of the last one that was taken before; those up to it are passed over.
+    """
+
+    def __init__(
+        self, samples: Iterable[Sample], names: Sequence[str] = (), after: float = -np.inf
+    ) -> None:
+        self._samples = iter(samples)
+        self._names = names
+        self._after = after
+        self._done = False
+
+    @property
+    def done(self) -> bool:
+        """True when there are no more."""
+        return self._done
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the next sample."""
+        for sample in self._samples:
+            if sample.t > self._after:
+                return [Ready(sample.t, self._values(sample), ())]
+        self._done = True
+        return []
+
+    def _values(self, sample: Sample) -> dict[str, float]:
+        values = sample.z
+        if not isinstance(values, Mapping):
+            values = dict(zip(self._names, np.atleast_1d(values).tolist(), strict=True))
+        return {**values, **(sample.inputs or {})}
+
+    def heard(self) -> bool:
+        """Samples that are there are never silent."""
+        return True
+
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
+        """Nothing is refused: what is wrong raises."""
+        return ()
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """The time of the last sample is enough to go on."""
+        return ""
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Nobody waits to hear it."""
+
+    def withdraw(self, last: float) -> None:
+        """The next one is later anyway."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class Paced:
+    """Samples of the past, replayed at the pace of their times.
+
+    Parameters
+    ----------
+    feed
+        Where they come from.
+    pace
+        Model time that passes in one second.
+    clock, sleep
+        Seconds that pass, and how to let them pass.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        pace: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.feed = feed
+        self.pace = pace
+        self._clock = clock
+        self._sleep = sleep
+        self._held: deque[Ready] = deque()
+        self._begun: tuple[float, float] | None = None
+
+    @property
+    def done(self) -> bool:
+        """True when the last sample is out."""
+        return self.feed.done and not self._held
+
+    def poll(self, wait: float) -> Sequence[Ready]:
+        """Return the samples whose time has come."""
+        if not self._held:
+            self._held.extend(self.feed.poll(wait))
+        if not self._held:
+            return []
+        now, first = self._clock(), self._held[0].t
+        begun = self._begun or (now, first)
+        self._begun = begun
+        due = begun[0] + (first - begun[1]) / self.pace
+        if due > now:
+            self._sleep(min(wait, due - now))
+        passed = begun[1] + (self._clock() - begun[0]) * self.pace
+        found = []
+        while self._held and self._held[0].t <= passed:
+            found.append(self._held.popleft())
+        return found
+
+    def heard(self) -> bool:
+        """A replay is heard as long as it holds samples."""
+        return self.feed.heard() or bool(self._held)
+
+    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
+        """Return what was worth counting."""
+        return self.feed.remarks([*waiting, *self._held])
+
+    def position(self, waiting: Sequence[Ready]) -> str:
+        """Return from where to go on if these samples, and those held, are still to be taken."""
+        return self.feed.position([*waiting, *self._held])
+
+    def acknowledge(self, ready: Ready) -> None:
+        """Tell the feed."""
+        self.feed.acknowledge(ready)
+
+    def withdraw(self, last: float) -> None:
+        """Tell the feed."""
+        self.feed.withdraw(last)
+
+    def close(self) -> None:
+        """Close the feed."""
+        self.feed.close()
