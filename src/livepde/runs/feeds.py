@@ -44,7 +44,7 @@ class Feed(Protocol):
         """Hear that a sample has been taken for good, or never will be."""
 
     def withdraw(self, last: float) -> None:
-        """Hear that nothing could be made of the last sample; `last`: time of the one before."""
+        """Hear that nothing could be made of samples later than this time."""
 
     def close(self) -> None:
         """Let go of what it holds."""
@@ -270,8 +270,8 @@ class Paced:
         self.feed.acknowledge(ready)
 
     def withdraw(self, last: float) -> None:
-        """Tell the feed."""
-        self.feed.withdraw(last)
+        """Tell the feed, unless later samples are held."""
+        self.feed.withdraw(self._held[-1].t if self._held else last)
 
     def close(self) -> None:
         """Close the feed."""

@@ -285,7 +285,8 @@ class Live:
             if not self.strict:
                 self._tell("refused", str(error))
             self.journal.withdraw()
-            self.feed.withdraw(self.journal.last)
+            # Those that wait are later: they are taken, or refused in their turn.
+            self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
             if self.strict:
                 raise
         finally:

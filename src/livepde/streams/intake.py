@@ -135,12 +135,14 @@ class Ready:
 
 @dataclass
 class Outcome:
-    """What has become of a row: samples that are ready, remarks, tokens that are done with."""
+    """What has become of a row: samples that are ready, remarks, tokens that are done with.
+
+    `row` is the token of the row, which remarks are about unless they say so.
+    """
 
     ready: list[Ready] = field(default_factory=list)
     remarks: list[Remark] = field(default_factory=list)
     spent: list[Any] = field(default_factory=list)
-
     row: Any = None
 
     def remark(self, kind: str, channel: str, message: str, row: Any = None) -> None:
@@ -231,15 +233,8 @@ class Intake:
         return found
 
     def withdraw(self, last: float) -> None:
-        """Hear that nothing could be made of the sample that was released last.
-
-        Parameters
-        ----------
-        last
-            Time of the last one before: what is later may still come.
-        """
+        """Hear that nothing could be made of samples later than this: others may still come."""
         self._last = self._newest = last
-        self._open = {t: sample for t, sample in self._open.items() if t > last}
 
     def flush(self) -> Outcome:
         """Release all samples that are still open: nothing more will come."""
