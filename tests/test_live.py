@@ -309,7 +309,7 @@ def test_a_clock_that_is_wrong_for_long_does_not_hold_a_run_up(tmp_path):
 def test_a_refused_sample_does_not_let_known_ones_come_again(tmp_path):
     mixed = list(rows(20))
     mixed[1:1] = [{"t": 0.05, "a": 0.7, "b": 0.4, "left": None}]  # of the moment it is refused
-    mixed[15:15] = mixed[8:12]
+    mixed[10:10] = mixed[3:7]  # the next rows after it has been refused
     run = live(tmp_path, Batch(mixed))
     step = run.identifier.step
 
@@ -327,10 +327,10 @@ def test_a_refused_sample_does_not_let_known_ones_come_again(tmp_path):
 
 
 class Batch(Rows):
-    """Brings many rows at once, as a file does."""
+    """Brings several rows at once, as a file does."""
 
     def poll(self, wait):
-        return [row for _ in range(14) for row in super(Batch, self).poll(wait)]
+        return [row for _ in range(5) for row in super(Batch, self).poll(wait)]
 
 
 def test_what_is_irregular_is_counted_once_whenever_it_is_killed(tmp_path):
