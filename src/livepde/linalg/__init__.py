@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
+from livepde.linalg.blocks import BandedBlocks, BlockFactor
 from livepde.linalg.leading import Leading
 from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
@@ -13,7 +14,9 @@ from livepde.linalg.types import Array, IntArray, Sparse
 __all__ = [
     "Array",
     "Assembler",
+    "BandedBlocks",
     "BandedSolver",
+    "BlockFactor",
     "Factor",
     "IntArray",
     "Leading",
