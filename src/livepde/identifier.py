@@ -333,9 +333,10 @@ class Identifier:
             value = named.get(name, np.nan)
             if np.isnan(value) and name not in self.optional_inputs:
                 if name not in last:
+                    needed = [c for c in self.inputs if c not in self.optional_inputs]
                     raise MissingInputError(
                         f"input '{name}' has no value in the first sample; start the stream where "
-                        f"all of {[c for c in self.inputs if c not in self.optional_inputs]} have one."
+                        f"all of {needed} have one."
                     )
                 value = last[name]
                 held.append(name)

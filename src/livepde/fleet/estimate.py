@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from livepde.fem import FunctionSpace
 from livepde.laws import Belief, Status
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.records import STATUS_CODES, Layout
 from livepde.result import Estimate
 
@@ -62,7 +63,7 @@ class FleetEstimate:
     belief: Callable[[int], Belief]
 
     @property
-    def ok(self) -> Array:
+    def ok(self) -> Mask:
         """Members whose step was taken, shape (members,)."""
         return np.array([status.ok for status in self.statuses])
 
@@ -126,7 +127,7 @@ class FleetResult:
             }
         )
 
-        def table(values: Sequence[Array], *more: int) -> Array:
+        def table(values: Any, *more: int) -> Array:
             shape = (len(rows), len(self.members), *more)
             return np.swapaxes(np.reshape(values, shape), 0, 1)
 

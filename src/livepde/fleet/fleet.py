@@ -25,7 +25,7 @@ from livepde.fleet.separately import Separately
 from livepde.fleet.span import Span
 from livepde.fleet.together import Together
 from livepde.identifier import Identifier
-from livepde.laws import AnyLaw, Belief
+from livepde.laws import AnyLaw, Belief, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
@@ -111,10 +111,10 @@ class Fleet:
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
+        self._engine: Engine = Separately(law, self._work, self.problem)
         self.note = Together.refuses(law, self._work)
-        self._engine: Engine = (
-            Separately(law, self._work, self.problem) if self.note else Together(law, self._work)
-        )
+        if isinstance(law, SensitivityLaw) and not self.note:
+            self._engine = Together(law, self._work)
         count = len(names)
         self._state: Any = None
         self._t = np.full(count, float(t0))
@@ -298,9 +298,7 @@ class Fleet:
             channels = self._one.channels
             for name in z:
                 if name not in channels:
-                    raise SampleError(
-                        f"unknown channel '{name}'; this fleet has {list(channels)}."
-                    )
+                    raise SampleError(f"unknown channel '{name}'; this fleet has {list(channels)}.")
             columns = {name: self._column(name, values) for name, values in z.items()}
             nothing = np.full(len(self), np.nan)
             shape = (len(self), -1)

@@ -32,9 +32,7 @@ class Separately:
         return tuple(self.law.start(self.work, q, u, moment) for q, u, moment in each)
 
     def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
-        return tuple(
-            self.law.begin(self.work, one, span.member(k)) for k, one in enumerate(state)
-        )
+        return tuple(self.law.begin(self.work, one, span.member(k)) for k, one in enumerate(state))
 
     def step(self, state: tuple[Any, ...], span: Span) -> tuple[tuple[Any, ...], FleetReport]:
         taken = [self.law.step(self.work, one, span.member(k)) for k, one in enumerate(state)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.stepping import Interval
 
 __all__ = ["Span"]
@@ -61,21 +61,9 @@ class Span:
         mixed: Array = (1 - s) * self.inputs0 + s * self.inputs1
         return mixed
 
-    def of(self, members: Array) -> Span:
-        """Return the spans of some members."""
-        return Span(
-            self.t0[members],
-            self.t1,
-            self.channels,
-            self.inputs0[members],
-            self.inputs1[members],
-            self.z0[members],
-            self.z1[members],
-        )
-
     @property
-    def together(self) -> Array:
+    def together(self) -> Mask:
         """Members that begin where most do, shape (members,)."""
         times, counts = np.unique(self.t0, return_counts=True)
-        most: Array = self.t0 == times[np.argmax(counts)]
+        most: Mask = self.t0 == times[np.argmax(counts)]
         return most

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from livepde import checkpoint
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 
 __all__ = ["Stack"]
 
@@ -49,11 +49,7 @@ class Stack:
         """Return the values with some leaves exchanged."""
         return Stack(self.template, {**self.leaves, **leaves})
 
-    def of_members(self, members: Array) -> Stack:
-        """Return the values of some members."""
-        return Stack(self.template, {path: leaf[members] for path, leaf in self.leaves.items()})
-
-    def where(self, chosen: Array, other: Stack) -> Stack:
+    def where(self, chosen: Mask, other: Stack) -> Stack:
         """Return these values for the members chosen, those of another stack for the rest."""
         if chosen.all():
             return self

@@ -21,7 +21,7 @@ from livepde.laws.level import LEARN
 from livepde.laws.level import WINDOW as LEVEL_WINDOW
 from livepde.laws.past import Past, Samples
 from livepde.laws.sensitivity import SensitivityState
-from livepde.linalg import Array, BlockFactor
+from livepde.linalg import Array, BlockFactor, Mask
 from livepde.observation import Observed
 from livepde.stepping import Interval, advance
 
@@ -104,7 +104,9 @@ class Pasts:
             new.z[which, 0] = np.nan
         new.rows[due] -= new.between[due]
         new.between[due] = new.rows[due] - 1
-        return replace(new, older=self.newer.where(due, self.older), newer=now.where(due, self.newer))
+        return replace(
+            new, older=self.newer.where(due, self.older), newer=now.where(due, self.newer)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,8 +220,8 @@ class Together:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such members step alone
     def _ordinary(
-        self, state: TogetherState, span: Span, able: Array
-    ) -> tuple[TogetherState, FleetReport, Array]:
+        self, state: TogetherState, span: Span, able: Mask
+    ) -> tuple[TogetherState, FleetReport, Mask]:
         """Return state and report after a sample, and for which members they hold."""
         guards, law = self.law.guards, self.law
         before = state.now
@@ -231,8 +233,7 @@ class Together:
         moved = before.changed({"u": u, "U": U})
         now, refused = self._updated(moved, span.z1, predicted)
         able = able & np.isfinite(u).all(axis=1) & np.isfinite(U).all(axis=(1, 2))
-        able &= np.isfinite(now["da"]).all(axis=1)
-        notes = {}
+        able = able & np.isfinite(now["da"]).all(axis=1)
         if guards is not None:
             able &= ~(np.abs(now["da"]).max(axis=1) > guards.reach)
         now, within = self._recentred(now)
@@ -296,7 +297,8 @@ class Together:
         """Return the filters after the sample, and how many values the gate refused of each."""
         work = self.work
         d = z - predicted
-        used = present = np.isfinite(d)
+        present: Mask = np.asarray(np.isfinite(d))
+        used = present
         noise = np.sqrt(now["level.square"])[:, None] * work.noise
         Y = (self._G @ now["U"]) / noise[:, :, None]
         e = d / (noise * np.sqrt(1.0 + (Y**2).sum(axis=2)))
@@ -308,7 +310,7 @@ class Together:
             used = present & ~(far & (refused <= work.patience))
             leaves["refused"] = refused
             e = np.where(used, e, np.nan)
-        some = present.any(axis=1)
+        some = np.asarray(present.any(axis=1))
         told = _consistency(now)
         for name, value in innovations.added(told, e).items():
             mask = some[:, None] if value.ndim == 2 else some
@@ -318,7 +320,7 @@ class Together:
         d = np.where(used, d / noise, 0.0)
         members, _, r = Y.shape
         unit = np.broadcast_to(np.eye(r), (members, r, r))
-        root = np.linalg.qr(np.concatenate([unit, Y], axis=1), mode="r")
+        root: Array = np.asarray(np.linalg.qr(np.concatenate([unit, Y], axis=1), mode="r"))
         W = _inverse(root)
         half = (W.transpose(0, 2, 1) @ (Y.transpose(0, 2, 1) @ d[:, :, None]))[:, :, 0]
         U, C = now["U"] @ W, now["C"] @ W
@@ -343,11 +345,11 @@ class Together:
             )
         return now.changed(leaves), present.sum(axis=1) - used.sum(axis=1)
 
-    def _recentred(self, now: Stack) -> tuple[Stack, Array]:
+    def _recentred(self, now: Stack) -> tuple[Stack, Mask]:
         """Return the filters with references at the estimates, and which are within the bounds."""
         estimate = now["q"] + now["da"] @ self.work.Phi.T
         lower, upper = self.model.latent.bounds
-        within = ((estimate >= lower) & (estimate <= upper)).all(axis=1)
+        within: Mask = np.asarray(((estimate >= lower) & (estimate <= upper)).all(axis=1))
         u = now["u"] + now["du"]
         zero = {"du": np.zeros_like(now["du"]), "da": np.zeros_like(now["da"])}
         return now.changed({"q": estimate, "u": u, **zero}), within

@@ -9,7 +9,7 @@ from livepde.linalg.leading import Leading
 from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
-from livepde.linalg.types import Array, IntArray, Sparse
+from livepde.linalg.types import Array, IntArray, Mask, Sparse
 
 __all__ = [
     "Array",
@@ -20,6 +20,7 @@ __all__ = [
     "Factor",
     "IntArray",
     "Leading",
+    "Mask",
     "Pattern",
     "PatternOperator",
     "Solver",

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from livepde.linalg.banded import BandedSolver
-from livepde.linalg.types import Array, IntArray
+from livepde.linalg.types import Array, IntArray, Mask
 
 __all__ = ["BandedBlocks", "BlockFactor"]
 
@@ -26,7 +26,7 @@ class BlockFactor:
     solver: BandedSolver
     lu: Array
     pivots: IntArray
-    good: Array
+    good: Mask
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b for each block: shape (columns, blocks, n) as b has.
@@ -35,7 +35,7 @@ class BlockFactor:
         overflows, other blocks may be NaN with it; what is finite is right.
         """
         columns, blocks, n = b.shape
-        good = self.good & np.isfinite(b).all(axis=(0, 2))
+        good: Mask = self.good & np.isfinite(b).all(axis=(0, 2))
         x = np.take(b, self.solver.order, axis=2)
         x[:, ~good] = 0.0
         lower, upper = self.solver.band
@@ -60,7 +60,7 @@ class BandedBlocks:
         """Factorise the matrices `pattern.matrix(data[k])`, data of shape (blocks, nnz)."""
         shape, position = self.solver.storage
         blocks, (n, height) = len(data), shape
-        good = np.isfinite(data).all(axis=1)
+        good: Mask = np.asarray(np.isfinite(data).all(axis=1))
         storage = np.zeros((blocks, n * height))
         storage[:, position] = data
         lower, upper = self.solver.band
