@@ -20,7 +20,12 @@ POSITIVE = {"transform": "log", "bounds": (0.0, np.inf)}
 def rod(**alpha):
     """Two unknowns; inputs in the boundary values and beside an unknown."""
     ends = {"left": lp.Channel("T_0"), "right": 0.0}
-    return heat(line(16), lp.Scalar(0.5, std=0.25, unit="m^2/s", **alpha), ends, loss=lp.Scalar(0.3, std=0.2))
+    return heat(
+        line(16),
+        lp.Scalar(0.5, std=0.25, unit="m^2/s", **alpha),
+        ends,
+        loss=lp.Scalar(0.3, std=0.2),
+    )
 
 
 def sources():
@@ -34,10 +39,14 @@ def sources():
 
 
 def layers():
-    """One unknown for each of two layers, and a heat flux that is an input."""
-    mesh = lp.interval(0.0, 1.0, 16, layers={"top": (0.0, 0.4), "bottom": (0.4, 1.0)})
-    return heat(
-        mesh, lp.Piecewise({"top": 0.5, "bottom": 0.8}, std=0.2), {"left": lp.Channel("T_0")}
+    """One unknown for each of two layers, and a source that is an input."""
+    halves = {"top": lambda x: x[0] < 0.4, "bottom": lambda x: x[0] >= 0.4}
+    return lp.Model(
+        lp.Field(line(16), ElementLineP1(), dirichlet={"left": lp.Channel("T_0")}),
+        {"k": lp.Piecewise(halves, 0.6, 0.2), "c": lp.Scalar(0.0, std=0.1)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - q.c * u * v,
+        f=lambda x, t: 0.1 * x.inputs["sun"] * np.cos(t) * x[0],
+        inputs=["sun"],
     )
 
 
