@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from livepde.fleet.span import Span
 from livepde.fleet.stack import Stack
 from livepde.fleet.stage import AffineStage, Moments
 from livepde.laws import Belief, SensitivityLaw
-from livepde.laws.filter import Filter
+from livepde.laws.filter import Filter, Point
 from livepde.laws.guards import Scale
 from livepde.laws.level import LEARN
 from livepde.laws.level import WINDOW as LEVEL_WINDOW
@@ -151,10 +152,6 @@ class Together:
             return f"{type(law).__name__} steps one at a time"
         if law.replay is not None or law.jumps is not None:
             return "replays and the test for jumps go back, each member to a time of its own"
-        if work.moves:
-            return "unknowns that move add columns to the factor"
-        if work.rank != work.Phi.shape[1]:
-            return "rank is larger than the number of reduced coordinates"
         if work.problem.model.parameter_space.fields:
             return "an unknown is a field"
         observed = work.problem.observed
@@ -169,7 +166,7 @@ class Together:
             self.law.start(self.work, q, u, moment)
             for q, u, moment in zip(q0, u0, moments, strict=True)
         ]
-        now = Stack.of([state.now for state in states])
+        now = Stack.of([self._filled(state.now) for state in states])
         problem = self.work.problem
         sizes = self._length, problem.observed.size, len(problem.channels)
         scales = Stack.of([state.scale for state in states])
@@ -189,11 +186,20 @@ class Together:
         )
 
     def _put(self, state: TogetherState, alone: Mapping[int, SensitivityState]) -> TogetherState:
+        pasts = {
+            k: replace(past, older=self._filled(past.older), newer=self._filled(past.newer))
+            for k, past in ((k, one.past) for k, one in alone.items())
+        }
         return TogetherState(
-            state.now.put({k: one.now for k, one in alone.items()}),
-            state.pasts.put({k: one.past for k, one in alone.items()}),
+            state.now.put({k: self._filled(one.now) for k, one in alone.items()}),
+            state.pasts.put(pasts),
             state.scales.put({k: one.scale for k, one in alone.items()}),
         )
+
+    def _filled(self, point: Point) -> Point:
+        """Return a filter whose factor has all columns it may ever have: more of zeros."""
+        more = ((0, 0), (0, self.work.rank - point.C.shape[1]))
+        return replace(point, U=np.pad(point.U, more), C=np.pad(point.C, more))
 
     def begin(self, state: TogetherState, span: Span) -> TogetherState:
         begun = {}
@@ -226,11 +232,11 @@ class Together:
         guards, law = self.law.guards, self.law
         before = state.now
         t0 = float(span.t0[able][0])
-        u, U, steps = self._advanced(before, replace(span, t0=np.full(len(span), t0)), t0)
+        moved, steps = self._advanced(before, replace(span, t0=np.full(len(span), t0)), t0)
         if np.isfinite(law.memory):
-            U = np.exp(-(span.t1 - t0) / law.memory) * U
+            moved = moved.changed({"U": np.exp(-(span.t1 - t0) / law.memory) * moved["U"]})
+        u, U = moved["u"], moved["U"]
         predicted = u @ self._G.T
-        moved = before.changed({"u": u, "U": U})
         now, refused = self._updated(moved, span.z1, predicted)
         able = able & np.isfinite(u).all(axis=1) & np.isfinite(U).all(axis=(1, 2))
         able = able & np.isfinite(now["da"]).all(axis=1)
@@ -261,26 +267,77 @@ class Together:
         report = FleetReport((OK,) * len(span), predicted, np.full(len(span), steps), notes)
         return TogetherState(now, pasts, scales), report, able
 
-    def _advanced(self, now: Stack, span: Span, t0: float) -> tuple[Array, Array, int]:
-        """Return state and factor at the end of the span, and substeps."""
-        latent = self.model.latent
-        a = now["q"].T
-        q = latent.value(a).T
-        slopes = self._tangent(a, self.work.Phi @ now["C"])
-        factors: dict[float, BlockFactor] = {}
-        channels = len(self.stage.channels)
+    def _advanced(self, now: Stack, span: Span, t0: float) -> tuple[Stack, int]:
+        """Return the filters at the end of the span, and substeps."""
+        none = np.zeros(0)
+        whole, control = Interval(t0, span.t1, {}, {}, none, none), self.work.problem.control
+        # What unknowns gain in one substep is independent of what they gain in the next.
+        count = control.count(whole) if self.work.moves else 1
+        inner = (t0 + k / count * (span.t1 - t0) for k in range(1, count))
+        steps = 0
+        for start, stop in pairwise([t0, *inner, span.t1]):
+            now, taken = self._carried(now, span, Interval(start, stop, {}, {}, none, none))
+            steps += taken
+        return now, steps
+
+    def _carried(self, now: Stack, span: Span, part: Interval) -> tuple[Stack, int]:
+        """Return the filters at the end of a part of the span, and substeps."""
+        end, channels = self._moved(now, part.t1 - part.t0), len(self.stage.channels)
+        at_end = self._directions(end)
+        factors: dict[tuple[float, float], BlockFactor] = {}
 
         def stage(columns: Array, t: float, h: float) -> Array:
-            if h not in factors:
-                factors[h] = self.stage.factor(q, h)
+            (q, slopes), key = at_end, (part.t1, h)
+            if self.work.moves and t != part.t1:
+                q, slopes = self._directions(self._moved(now, t - part.t0))
+                key = (t, h)
+            if key not in factors:
+                factors[key] = self.stage.factor(q, h)
             at = Moments(t, span.at(t)[:, :channels])
-            return self.stage.solve(columns, q, slopes, factors[h], at, h)
+            return self.stage.solve(columns, q, slopes, factors[key], at, h)
 
-        columns = np.concatenate([now["u"][None], now["U"].transpose(2, 0, 1)])
-        none = np.zeros(0)
-        interval = Interval(t0, span.t1, {}, {}, none, none)
-        columns, steps, _ = advance(self.work.problem.control, stage, columns, interval)
-        return columns[0], columns[1:].transpose(1, 2, 0), steps
+        columns = np.concatenate([end["u"][None], end["U"].transpose(2, 0, 1)])
+        columns, steps, _ = advance(self.work.problem.control, stage, columns, part)
+        U, C = columns[1:].transpose(1, 2, 0), end["C"]
+        if C.shape[2] > self.work.rank:
+            U, C = _compressed(U, C, self.work.scale, self.work.rank)
+        return end.changed({"u": columns[0], "U": U, "C": C}), steps
+
+    def _directions(self, now: Stack) -> tuple[Array, Array]:
+        """Return q, (members, m), and how it changes along the columns, (members, m, r)."""
+        a = now["q"].T
+        return self.model.latent.value(a).T, self._tangent(a, self.work.Phi @ now["C"])
+
+    def _moved(self, now: Stack, h: float) -> Stack:
+        """Return filters whose unknowns have moved for a time h, as `Filter.moved` does."""
+        work, C = self.work, now["C"]
+        if not work.moves:
+            return now
+        variance = (C**2).sum(axis=2)
+        shape = variance.shape
+        gained = np.concatenate(
+            [
+                np.broadcast_to(m.gained(h, variance), (shape[0], m.part.stop - m.part.start))
+                for m in work.motions
+            ],
+            axis=1,
+        )
+        grows = np.flatnonzero((gained > 0.0).any(axis=0))
+        new = np.zeros((*shape, len(grows)))
+        new[:, grows, np.arange(len(grows))] = np.sqrt(gained[:, grows])
+        latent, q, U = self.model.latent, now["q"], now["U"]
+        if latent.generator.nnz:
+            units = latent.prior + np.eye(latent.dim)
+            T = np.array([latent.moved(unit, h) - latent.prior for unit in units])
+            q = latent.prior + (q - latent.prior) @ T
+        return now.changed(
+            {
+                "q": q,
+                "U": np.concatenate([U, np.zeros((*U.shape[:2], len(grows)))], axis=2),
+                "C": np.concatenate([work.transition(h) @ C, new], axis=2),
+                "age": now["age"] + h,
+            }
+        )
 
     def _tangent(self, a: Array, directions: Array) -> Array:
         """Return dq/da applied to columns of each member, (members, dim, r): (members, m, r)."""
@@ -426,3 +483,19 @@ def _inverse(root: Array) -> Array:
     inverse = np.full_like(root, np.nan)
     inverse[good] = np.linalg.inv(root[good])
     return inverse
+
+
+def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:
+    """Return the factors with `rank` columns, as `livepde.laws.filter` compresses one."""
+    members, k, _ = C.shape
+    rotation, root = np.linalg.qr(C.transpose(0, 2, 1), mode="complete")
+    rotated = U @ rotation
+    alone = rotated[:, :, k:]
+    weighted = scale[:, None] * alone
+    square = weighted.transpose(0, 2, 1) @ weighted
+    square[~np.isfinite(square).all(axis=(1, 2))] = 0.0  # those step alone
+    _, vectors = np.linalg.eigh(square)
+    kept = alone @ vectors[:, :, ::-1][:, :, : rank - k]
+    small = np.zeros((members, k, rank))
+    small[:, :, :k] = root[:, :k].transpose(0, 2, 1)
+    return np.concatenate([rotated[:, :, :k], kept], axis=2), small
