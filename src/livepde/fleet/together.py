@@ -130,8 +130,8 @@ class TogetherState:
 class Together:
     """Steps members of one affine model with banded matrices by `SensitivityLaw`, as blocks.
 
-    What is out of the ordinary, a member that is late, at a bound, moved far by a sample, or whose
-    step fails, is left to the law itself, member by member: so its rules stand in one place.
+    What is out of the ordinary, a member that is late, moved far by a sample, or whose step fails,
+    is left to the law itself, member by member: so its rules stand in one place.
     """
 
     def __init__(self, law: SensitivityLaw, work: Filter) -> None:
@@ -210,19 +210,12 @@ class Together:
         return self._put(state, begun)
 
     def step(self, state: TogetherState, span: Span) -> tuple[TogetherState, FleetReport]:
-        able = span.together & ~state.now["du"].any(axis=1) & ~state.now["da"].any(axis=1)
-        new, report = state, self._blank(len(span))
-        if able.any():
-            new, report, able = self._ordinary(state, span, able)
+        new, report, able = self._ordinary(state, span, span.together)
         alone, reports = {}, {}
         for k in np.flatnonzero(~able).tolist():
             member = self._member(state, k)
             alone[k], reports[k] = self.law.step(self.work, member, span.member(k))
         return self._put(new, alone), report.with_members(reports)
-
-    def _blank(self, members: int) -> FleetReport:
-        predicted = np.zeros((members, self.work.problem.observed.size))
-        return FleetReport((OK,) * members, predicted, np.zeros(members, dtype=int))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such members step alone
     def _ordinary(
@@ -236,14 +229,13 @@ class Together:
         if np.isfinite(law.memory):
             moved = moved.changed({"U": np.exp(-(span.t1 - t0) / law.memory) * moved["U"]})
         u, U = moved["u"], moved["U"]
-        predicted = u @ self._G.T
+        predicted = (u + moved["du"]) @ self._G.T
         now, refused = self._updated(moved, span.z1, predicted)
         able = able & np.isfinite(u).all(axis=1) & np.isfinite(U).all(axis=(1, 2))
         able = able & np.isfinite(now["da"]).all(axis=1)
         if guards is not None:
-            able &= ~(np.abs(now["da"]).max(axis=1) > guards.reach)
-        now, within = self._recentred(now)
-        able &= within
+            able &= ~(np.abs(now["da"] - before["da"]).max(axis=1) > guards.reach)
+        now = self._recentred(now)
         scales, pasts = state.scales, state.pasts
         if guards is not None:
             d = span.z1 - predicted
@@ -296,17 +288,24 @@ class Together:
             at = Moments(t, span.at(t)[:, :channels])
             return self.stage.solve(columns, q, slopes, factors[key], at, h)
 
-        columns = np.concatenate([end["u"][None], end["U"].transpose(2, 0, 1)])
+        last = [end["du"][None]] if _off_centre(end) else []
+        columns = np.concatenate([end["u"][None], end["U"].transpose(2, 0, 1), *last])
         columns, steps, _ = advance(self.work.problem.control, stage, columns, part)
-        U, C = columns[1:].transpose(1, 2, 0), end["C"]
+        C, du = end["C"], columns[-1] if last else end["du"]
+        U = columns[1 : 1 + C.shape[2]].transpose(1, 2, 0)
         if C.shape[2] > self.work.rank:
             U, C = _compressed(U, C, self.work.scale, self.work.rank)
-        return end.changed({"u": columns[0], "U": U, "C": C}), steps
+        return end.changed({"u": columns[0], "U": U, "C": C, "du": du}), steps
 
     def _directions(self, now: Stack) -> tuple[Array, Array]:
-        """Return q, (members, m), and how it changes along the columns, (members, m, r)."""
-        a = now["q"].T
-        return self.model.latent.value(a).T, self._tangent(a, self.work.Phi @ now["C"])
+        """Return q, (members, m), and how it changes along the columns, (members, m, r).
+
+        The last column is the deviation of the estimate, if there is one.
+        """
+        a, C = now["q"].T, now["C"]
+        if _off_centre(now):
+            C = np.concatenate([C, now["da"][:, :, None]], axis=2)
+        return self.model.latent.value(a).T, self._tangent(a, self.work.Phi @ C)
 
     def _moved(self, now: Stack, h: float) -> Stack:
         """Return filters whose unknowns have moved for a time h, as `Filter.moved` does."""
@@ -333,6 +332,7 @@ class Together:
         return now.changed(
             {
                 "q": q,
+                "da": now["da"] @ work.transition(h).T,
                 "U": np.concatenate([U, np.zeros((*U.shape[:2], len(grows)))], axis=2),
                 "C": np.concatenate([work.transition(h) @ C, new], axis=2),
                 "age": now["age"] + h,
@@ -402,14 +402,27 @@ class Together:
             )
         return now.changed(leaves), present.sum(axis=1) - used.sum(axis=1)
 
-    def _recentred(self, now: Stack) -> tuple[Stack, Mask]:
-        """Return the filters with references at the estimates, and which are within the bounds."""
-        estimate = now["q"] + now["da"] @ self.work.Phi.T
-        lower, upper = self.model.latent.bounds
-        within: Mask = np.asarray(((estimate >= lower) & (estimate <= upper)).all(axis=1))
-        u = now["u"] + now["du"]
-        zero = {"du": np.zeros_like(now["du"]), "da": np.zeros_like(now["da"])}
-        return now.changed({"q": estimate, "u": u, **zero}), within
+    def _recentred(self, now: Stack) -> Stack:
+        """Return the filters with references at the estimates within the bounds.
+
+        What lies beyond stays in da and du, as in `Filter.recentred`.
+        """
+        Phi, q = self.work.Phi, now["q"]
+        estimate = q + now["da"] @ Phi.T
+        within = self.work.bounded(estimate)
+        beyond = (within != estimate).any(axis=1)
+        da, du = np.zeros_like(now["da"]), np.zeros_like(now["du"])
+        if beyond.any():
+            shift = (self.model.Q.gram @ (within[beyond] - q[beyond]).T).T @ Phi
+            left = now["da"][beyond] - shift
+            C = now["C"][beyond]
+            good = np.isfinite(C).all(axis=(1, 2))
+            C[~good] = 0.0  # those step alone
+            weights = np.linalg.pinv(C, rcond=np.finfo(float).eps * max(C.shape[1:]))
+            along = now["U"][beyond] @ (weights @ left[:, :, None])
+            da[beyond], du[beyond] = left, along[:, :, 0]
+            estimate[beyond] = q[beyond] + shift @ Phi.T
+        return now.changed({"q": estimate, "u": now["u"] + now["du"] - du, "du": du, "da": da})
 
     @staticmethod
     def _scaled(scales: Stack, z: Array, d: Array) -> Stack:
@@ -455,6 +468,11 @@ class Together:
             pasts, older=stack("older", pasts.older), newer=stack("newer", pasts.newer), **buffers
         )
         return TogetherState(stack("now", template.now), pasts, stack("scale", template.scales))
+
+
+def _off_centre(now: Stack) -> bool:
+    """Return whether the estimate of any member is not its reference."""
+    return bool(now["da"].any() or now["du"].any())
 
 
 def _consistency(now: Stack) -> dict[str, Array]:
