@@ -11,7 +11,7 @@ import xarray as xr
 
 from livepde.fem import FunctionSpace
 from livepde.laws import Belief, Status
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.records import STATUS_CODES, Layout
 from livepde.result import Estimate
 
@@ -93,6 +93,19 @@ class FleetEstimate:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """What is kept of an estimate: numbers, and no state."""
+
+    t: float
+    parameters: Mapping[str, tuple[Array, Array]]
+    innovation: Array
+    withheld_error: Array
+    status: IntArray
+    steps: Array
+    notes: Mapping[str, Array]
+
+
 class FleetResult:
     """Estimates of a fleet, as they are added: numbers, innovations and statuses of all samples."""
 
@@ -100,14 +113,25 @@ class FleetResult:
         self.members = tuple(members)
         self.layout = layout
         self.last: FleetEstimate | None = None
-        self._rows: list[FleetEstimate] = []
+        self._rows: list[_Row] = []
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def add(self, estimate: FleetEstimate) -> None:
         """Add one estimate."""
-        self._rows.append(estimate)
+        codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
+        self._rows.append(
+            _Row(
+                estimate.t,
+                estimate.parameters,
+                estimate.innovation,
+                estimate.withheld_error,
+                np.array(codes, dtype=np.int32),
+                estimate.steps,
+                estimate.notes,
+            )
+        )
         self.last = estimate
 
     def to_xarray(self) -> xr.Dataset:
@@ -141,12 +165,11 @@ class FleetResult:
         if layout.withheld is not None:
             errors = table([row.withheld_error for row in rows], len(layout.withheld))
             data["withheld_error"] = ((*both, "withheld"), errors, unit)
-        codes = [[STATUS_CODES.index(one.code) for one in row.statuses] for row in rows]
         flags = {
             "flag_values": list(range(len(STATUS_CODES))),
             "flag_meanings": " ".join(STATUS_CODES),
         }
-        data["status"] = (both, table(np.array(codes, dtype=np.int32)), flags)
+        data["status"] = (both, table([row.status for row in rows]), flags)
         steps = table([row.steps for row in rows])
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
         nothing = np.full(len(self.members), np.nan)
