@@ -8,6 +8,7 @@ from problems import laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
+from livepde.bench.fleet import fleet as benchmark
 from livepde.fleet import innovations
 from livepde.laws.consistency import Consistency
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern
@@ -211,8 +212,12 @@ def test_a_member_that_fails_does_not_disturb_the_others():
                 inputs["T_0"][2] = 1e308
             yield t, z, inputs
 
-    for guards in (None, lp.Guards()):
-        fleet, estimate = compare(rod(), lp.SensitivityLaw(guards=guards), stream)
+    for model, guards in (
+        (rod(), None),
+        (rod(), lp.Guards()),
+        (rod(bounds=(0.45, 0.55)), None),
+    ):
+        fleet, estimate = compare(model, lp.SensitivityLaw(guards=guards), stream)
         assert fleet.together
         assert estimate.ok.all()
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], ["a", "b", "c", "d"])
@@ -414,3 +419,12 @@ def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
     for k in (0, 2, 5):
         dense = pattern.matrix(data[k]).toarray()
         np.testing.assert_allclose(x[:, k], np.linalg.solve(dense, right[:, k].T).T, rtol=1e-9)
+
+
+def test_the_benchmark_compares_equal_estimates():
+    outcome = benchmark(members=3)
+    faster, apart = outcome.checks
+    assert apart.ok
+    assert faster.value > 0.0
+    ((_, low, middle, high),) = outcome.tables[0].rows
+    assert low <= middle <= high

@@ -231,8 +231,8 @@ class Together:
         u, U = moved["u"], moved["U"]
         predicted = (u + moved["du"]) @ self._G.T
         now, refused = self._updated(moved, span.z1, predicted)
-        able = able & np.isfinite(u).all(axis=1) & np.isfinite(U).all(axis=(1, 2))
-        able = able & np.isfinite(now["da"]).all(axis=1)
+        able = able & np.isfinite(U).all(axis=(1, 2)) & np.isfinite(now["da"]).all(axis=1)
+        able = able & np.isfinite(u).all(axis=1) & np.isfinite(moved["du"]).all(axis=1)
         if guards is not None:
             able &= ~(np.abs(now["da"] - before["da"]).max(axis=1) > guards.reach)
         now = self._recentred(now)
