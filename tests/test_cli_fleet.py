@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pandas as pd
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 
 from livepde import cli, runs
 from livepde.cases.template import write_template
+from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
 
 TABLE = """name,data,unknowns.alpha.prior,law.noise
@@ -114,3 +116,17 @@ def test_bad_options(here):
         call(*arguments, "--resume")
     with pytest.raises(ConfigurationError, match="--jobs 0"):
         call(*arguments, "--jobs", "0")
+
+
+def test_an_interruption_ends_all(here, monkeypatch):
+    """Members after the one that was interrupted do not begin."""
+    begun = []
+
+    def run(*arguments):
+        begun.append(arguments[-1].name)
+        return module.Ended(begun[-1], "interrupted" if len(begun) == 2 else "finished")
+
+    module = sys.modules["livepde.cli.fleet"]
+    monkeypatch.setattr(module, "_run", run)
+    code, _ = call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
+    assert (code, begun) == (INTERRUPTED, ["plain", "warm"])

@@ -13,7 +13,7 @@ import typer
 from rich.markup import escape
 
 from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case
-from livepde.cli.printing import CHECK_FAILED, print_json, show, terminal
+from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, print_json, show, terminal
 from livepde.cli.run import batch, concluded, writer_of
 from livepde.errors import ConfigurationError, DataError, LivepdeError
 
@@ -135,6 +135,8 @@ def fleet(
         console = terminal()
         show(console, [_table(summary)], [], notes)
         console.print(f"[bold]Run directories: {escape(str(folder))}[/]", soft_wrap=True)
+    if any(item.status == "interrupted" for item in ended):
+        raise typer.Exit(INTERRUPTED)
     if wrong:
         raise typer.Exit(CHECK_FAILED)
 
@@ -170,7 +172,12 @@ def _read(path: Path) -> list[Member]:
 def _each(run: Any, rows: Sequence[Member], jobs: int) -> list[Ended]:
     """Run all members, in so many processes."""
     if jobs == 1:
-        return [run(row) for row in rows]
+        ended: list[Ended] = []
+        for row in rows:
+            ended.append(run(row))
+            if ended[-1].status == "interrupted":  # Ctrl-C ends all
+                break
+        return ended
     try:
         from joblib import Parallel, delayed, parallel_config
     except ImportError as error:
@@ -179,7 +186,7 @@ def _each(run: Any, rows: Sequence[Member], jobs: int) -> list[Ended]:
             "other."
         ) from error
     with parallel_config(backend="loky", inner_max_num_threads=1):
-        ended: list[Ended] = Parallel(n_jobs=jobs)(delayed(run)(row) for row in rows)
+        ended = Parallel(n_jobs=jobs)(delayed(run)(row) for row in rows)
     return ended
 
 
