@@ -29,6 +29,7 @@ COMMANDS = (
     "equations",
     "check",
     "run",
+    "fleet",
     "report",
     "watch",
     "export",

@@ -62,6 +62,7 @@ from livepde.fem import (
     transpose,
     upwind,
 )
+from livepde.fleet import Fleet, FleetEstimate, FleetResult
 from livepde.identifier import Identifier, Sample
 from livepde.laws import (
     AutoLaw,
@@ -133,6 +134,9 @@ __all__ = [
     "DualOperator",
     "Estimate",
     "Field",
+    "Fleet",
+    "FleetEstimate",
+    "FleetResult",
     "Full",
     "Functionals",
     "GradientLaw",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -160,7 +160,7 @@ class Identifier:
         return tuple(dict.fromkeys([*self.problem.channels, *withheld]))
 
     @cached_property
-    def _optional(self) -> frozenset[str]:
+    def optional_inputs(self) -> frozenset[str]:
         """Inputs that may be missing: positions of moving sensors."""
         sensors = [item.observation for item in (self.observed, self.withheld) if item is not None]
         needed = {name for item in sensors for name in set(item.inputs) - item.optional}
@@ -232,21 +232,7 @@ class Identifier:
 
     def _belief(self) -> Belief:
         """Return what the law believes, of the physical parameter."""
-        belief, latent = self.latent_belief(), self.model.latent
-        if latent.plain:
-            return belief
-        q_factor, prior_factor = (
-            None if factor is None else latent.tangent(belief.q, factor)
-            for factor in (belief.q_factor, belief.prior_factor)
-        )
-        rest = None if belief.rest is None else latent.deviation(belief.q, belief.rest)
-        return replace(
-            belief,
-            q=latent.value(belief.q),
-            q_factor=q_factor,
-            prior_factor=prior_factor,
-            rest=rest,
-        )
+        return self.problem.physical(self.latent_belief())
 
     def _estimate(
         self,
@@ -352,11 +338,12 @@ class Identifier:
         values, held, last = {}, [], dict(self._inputs)
         for name in self.inputs:
             value = named.get(name, np.nan)
-            if np.isnan(value) and name not in self._optional:
+            if np.isnan(value) and name not in self.optional_inputs:
                 if name not in last:
+                    needed = [c for c in self.inputs if c not in self.optional_inputs]
                     raise MissingInputError(
                         f"input '{name}' has no value in the first sample; start the stream where "
-                        f"all of {[c for c in self.inputs if c not in self._optional]} have one."
+                        f"all of {needed} have one."
                     )
                 value = last[name]
                 held.append(name)

@@ -45,6 +45,21 @@ def step(as_json: JsonOption = False) -> None:
 
 
 @bench.command()
+def fleet(
+    members: Annotated[int, typer.Option(min=1, help="How many rods.")] = 1000,
+    as_json: JsonOption = False,
+) -> None:
+    """Time a step of a fleet of rods against one of as many separate identifiers.
+
+    Example:  livepde bench fleet --json
+    """
+    from livepde.bench.fleet import fleet as benchmark
+
+    command = ["livepde", "bench", "fleet", "--members", str(members)]
+    report_outcome(benchmark(members), command, as_json)
+
+
+@bench.command()
 def cases(
     only: Annotated[
         list[str] | None, typer.Option(help="Only this case. Repeat it for more.")

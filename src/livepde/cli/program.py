@@ -15,6 +15,7 @@ from livepde.cli.cases import equations, init
 from livepde.cli.check import check
 from livepde.cli.experiments import demo, reproduce
 from livepde.cli.export import export
+from livepde.cli.fleet import fleet
 from livepde.cli.printing import BAD_INPUT, terminal
 from livepde.cli.report import report
 from livepde.cli.run import run
@@ -34,7 +35,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, init, check, run, watch, report, export, equations, reproduce):
+for command in (demo, init, check, run, fleet, watch, report, export, equations, reproduce):
     app.command()(command)
 app.add_typer(bench)
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
     from livepde.runs import Check, Driven, RunWriter, Table
 
-__all__ = ["run"]
+__all__ = ["batch", "concluded", "run", "writer_of"]
 
 
 class LogKind(StrEnum):
@@ -148,7 +148,7 @@ def run(
             "--speed replays a finished file: a source that goes on has its own."
         )
     folder = out or free_path(Path("runs") / loaded.name)
-    write = partial(_writer, loaded, folder, settings or (), resume)
+    write = partial(writer_of, loaded, folder, settings or (), resume, ["livepde", *sys.argv[1:]])
     with ExitStack() as stack:
         if live:
             configure(log.value)
@@ -157,12 +157,12 @@ def run(
             how = Beside(source, pace, listen, watch, token, estimates)
             writer, taken = beside(loaded, how, folder, write, stack)
         else:
-            writer, taken = _batch(loaded, source, folder, write, stack, quiet=as_json)
+            writer, taken = batch(loaded, source, folder, write, stack, quiet=as_json)
         if taken is None:
             writer.finish(status="interrupted", notes=["Ended before the first sample."])
             raise typer.Exit(INTERRUPTED)
         prepared, driven = taken
-        dataset, shown, checks, notes = _concluded(loaded, prepared, driven, writer)
+        dataset, shown, checks, notes = concluded(loaded, prepared, driven, writer)
     if driven.error is not None:
         raise driven.error
     if as_json:
@@ -195,11 +195,12 @@ def _refuse(
         raise ConfigurationError("--json and --estimates both print to standard output: keep one.")
 
 
-def _writer(loaded: Case, folder: Path, settings: Sequence[str], resume: bool) -> RunWriter:
+def writer_of(
+    loaded: Case, folder: Path, settings: Sequence[str], resume: bool, command: Sequence[str]
+) -> RunWriter:
     """Return the writer of the run directory, new or to go on with."""
     from livepde.runs import RECORD, RunWriter
 
-    command = ["livepde", *sys.argv[1:]]
     if resume and (folder / RECORD).exists():
         return RunWriter.reopen(
             folder, version=__version__, command=command, case=loaded.text, settings=settings
@@ -215,7 +216,7 @@ def _writer(loaded: Case, folder: Path, settings: Sequence[str], resume: bool) -
     )
 
 
-def _batch(
+def batch(
     loaded: Case,
     source: str | Iterable[str] | None,
     folder: Path,
@@ -248,7 +249,7 @@ def _batch(
     return writer, (prepared, driven)
 
 
-def _concluded(
+def concluded(
     loaded: Case, prepared: Prepared, driven: Driven, writer: RunWriter
 ) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
     """Write what a run gave; return its dataset, tables, checks and notes."""

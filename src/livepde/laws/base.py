@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
@@ -75,6 +75,24 @@ class Problem:
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         """Return what the sensors are expected to show, for state u and latent parameter q."""
         return self.observed.predict(u, self.model.latent.value(q), moment)
+
+    def physical(self, belief: Belief) -> Belief:
+        """Return a belief of latent coefficients as one of the physical parameter."""
+        latent = self.model.latent
+        if latent.plain:
+            return belief
+        q_factor, prior_factor = (
+            None if factor is None else latent.tangent(belief.q, factor)
+            for factor in (belief.q_factor, belief.prior_factor)
+        )
+        rest = None if belief.rest is None else latent.deviation(belief.q, belief.rest)
+        return replace(
+            belief,
+            q=latent.value(belief.q),
+            q_factor=q_factor,
+            prior_factor=prior_factor,
+            rest=rest,
+        )
 
 
 @dataclass(frozen=True, eq=False)

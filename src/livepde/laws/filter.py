@@ -110,11 +110,11 @@ class Motion:
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
 
     def gained(self, h: float, variance: Array) -> Array:
-        """Return what its coordinates gain in a time h, given their variances."""
+        """Return what its coordinates gain in a time h, given variances of shape (..., k)."""
         growth = self.growth(h)
         if not self.saturates:
             return growth
-        room: Array = np.maximum(1.0 - variance[self.part], 0.0)
+        room: Array = np.maximum(1.0 - variance[..., self.part], 0.0)
         return -np.expm1(-growth) * room  # V' = growth (1 - V)/h, whatever the length of the step
 
     def backward(self, h: float) -> Array:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
+from livepde.linalg.blocks import BandedBlocks, BlockFactor
 from livepde.linalg.leading import Leading
 from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
-from livepde.linalg.types import Array, IntArray, Sparse
+from livepde.linalg.types import Array, IntArray, Mask, Sparse
 
 __all__ = [
     "Array",
     "Assembler",
+    "BandedBlocks",
     "BandedSolver",
+    "BlockFactor",
     "Factor",
     "IntArray",
     "Leading",
+    "Mask",
     "Pattern",
     "PatternOperator",
     "Solver",

@@ -65,7 +65,8 @@ class BandedSolver:
         return max(int(offset.max(initial=0)), 0), max(int(-offset.min(initial=0)), 0)
 
     @cached_property
-    def _storage(self) -> tuple[tuple[int, int], IntArray]:
+    def storage(self) -> tuple[tuple[int, int], IntArray]:
+        """Shape of LAPACK's band storage, and where in it each entry of the pattern stands."""
         lower, upper = self.band
         row, col = self.inverse[self.pattern.rows], self.inverse[self.pattern.indices]
         # LAPACK's storage is column major: the flat position counts down the columns.
@@ -74,7 +75,7 @@ class BandedSolver:
 
     def factorise(self, data: Array) -> BandedFactor:
         """Factorise; raises `LinearAlgebraError` for a singular or non-finite matrix."""
-        shape, position = self._storage
+        shape, position = self.storage
         storage = np.zeros(shape)
         storage.ravel()[position] = data
         lower, upper = self.band

@@ -1,0 +1,99 @@
+"""What steps the members of a fleet, and what it tells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+
+from livepde.fem import Moment
+from livepde.fleet.span import Span
+from livepde.laws import Belief, Report, Status
+from livepde.linalg import Array
+
+__all__ = ["Engine", "FleetReport", "State", "reported"]
+
+State: TypeAlias = Any
+"""What evolves: the arrays or values of an engine."""
+
+OK = Status()
+
+
+@dataclass(frozen=True, eq=False)
+class FleetReport:
+    """What a step tells beside the new state.
+
+    Attributes
+    ----------
+    statuses
+        How it went for each member.
+    predicted
+        What was expected of each sensor, shape (members, sensors).
+    steps
+        Substeps taken, shape (members,).
+    notes
+        Numbers worth keeping, each of shape (members,); NaN for members without.
+    """
+
+    statuses: tuple[Status, ...]
+    predicted: Array
+    steps: Array
+    notes: Mapping[str, Array] = field(default_factory=dict)
+
+    def with_members(self, reports: Mapping[int, Report]) -> FleetReport:
+        """Return the report with those of some members exchanged."""
+        if not reports:
+            return self
+        statuses, predicted, steps = list(self.statuses), self.predicted.copy(), self.steps.copy()
+        notes = {name: values.copy() for name, values in self.notes.items()}
+        for name in dict.fromkeys(name for one in reports.values() for name in one.notes):
+            notes.setdefault(name, np.full(len(statuses), np.nan))
+        for k, one in reports.items():
+            statuses[k], predicted[k], steps[k] = one.status, one.predicted, one.steps
+            for name, values in notes.items():
+                values[k] = one.notes.get(name, np.nan)
+        return FleetReport(tuple(statuses), predicted, steps, notes)
+
+
+def reported(reports: Sequence[Report]) -> FleetReport:
+    """Return the report of members of which each has its own."""
+    members, sensors = len(reports), len(reports[0].predicted)
+    blank = FleetReport((OK,) * members, np.zeros((members, sensors)), np.zeros(members, dtype=int))
+    return blank.with_members(dict(enumerate(reports)))
+
+
+class Engine(Protocol):
+    """Steps all members. A state is a value: what was returned is not changed any more."""
+
+    def start(self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]) -> State:
+        """Return the state at the start, from coefficients of each member."""
+        ...
+
+    def begin(self, state: State, span: Span) -> State:
+        """Return the state after a sample at the initial time."""
+        ...
+
+    def step(self, state: State, span: Span) -> tuple[State, FleetReport]:
+        """Return the state at the end of a span; that of a failed member is the old one."""
+        ...
+
+    def believed(self, state: State, k: int) -> Belief:
+        """Return what the law believes of a member, in latent coefficients."""
+        ...
+
+    def means(self, state: State) -> tuple[Array, Array, Array | None]:
+        """Return physical parameter, state, and the parameter's deviation if the law has one.
+
+        Shapes (members, m), (members, n) and (members, m).
+        """
+        ...
+
+    def leaves(self, state: State) -> dict[str, Any]:
+        """Return the state as plain arrays."""
+        ...
+
+    def restored(self, template: State, leaves: Mapping[str, Array]) -> State:
+        """Return the state that `leaves` gave; raises KeyError or ValueError if it does not fit."""
+        ...

@@ -1,0 +1,180 @@
+"""What is known of all members at one time, and as a table with axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from livepde.fem import FunctionSpace
+from livepde.laws import Belief, Status
+from livepde.linalg import Array, IntArray, Mask
+from livepde.records import STATUS_CODES, Layout
+from livepde.result import Estimate
+
+__all__ = ["FleetEstimate", "FleetResult"]
+
+
+@dataclass(frozen=True, eq=False)
+class FleetEstimate:
+    """What is known of all members at one time.
+
+    Attributes
+    ----------
+    t
+        Time of the sample.
+    members
+        Their names.
+    q, u
+        Coefficients of parameter and state, shapes (members, m) and (members, n).
+    q_std
+        Standard deviations of q, or None if the law has none.
+    innovation, withheld_error
+        As for `Estimate`, shapes (members, sensors) and (members, withheld).
+    statuses
+        How the step went for each member; unless ok, its q and u are those of its last good step.
+    steps
+        Substeps taken, shape (members,).
+    notes
+        Numbers of the law, each of shape (members,); NaN for members without.
+    held
+        Input channels whose last value was held -> which members had none, shape (members,).
+    space
+        The unknowns.
+    belief
+        Number of a member -> what the law believes of it.
+    """
+
+    t: float
+    members: tuple[str, ...]
+    q: Array
+    u: Array
+    q_std: Array | None
+    innovation: Array
+    withheld_error: Array
+    statuses: tuple[Status, ...]
+    steps: Array
+    notes: Mapping[str, Array]
+    held: Mapping[str, Array]
+    space: FunctionSpace
+    belief: Callable[[int], Belief]
+
+    @property
+    def ok(self) -> Mask:
+        """Members whose step was taken, shape (members,)."""
+        return np.array([status.ok for status in self.statuses])
+
+    @property
+    def parameters(self) -> dict[str, tuple[Array, Array]]:
+        """Label of each scalar unknown -> values and standard deviations, (members,) each."""
+        std = self.q_std if self.q_std is not None else np.full_like(self.q, np.nan)
+        return {label: (self.q[:, k], std[:, k]) for label, k in self.space.labels.items()}
+
+    def member(self, name: str | int) -> Estimate:
+        """Return the estimate of one member, by name or number, as `Identifier.step` does."""
+        k = name if isinstance(name, int) else self.members.index(name)
+        notes = {key: float(values[k]) for key, values in self.notes.items()}
+        belief = self.belief(k)
+        return Estimate(
+            t=self.t,
+            q=belief.q,
+            u=belief.u,
+            belief=belief,
+            innovation=self.innovation[k],
+            withheld_error=self.withheld_error[k],
+            status=self.statuses[k],
+            steps=int(self.steps[k]),
+            notes={key: value for key, value in notes.items() if np.isfinite(value)},
+            held=tuple(channel for channel, members in self.held.items() if members[k]),
+            space=self.space,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """What is kept of an estimate: numbers, and no state."""
+
+    t: float
+    parameters: Mapping[str, tuple[Array, Array]]
+    innovation: Array
+    withheld_error: Array
+    status: IntArray
+    steps: Array
+    notes: Mapping[str, Array]
+
+
+class FleetResult:
+    """Estimates of a fleet, as they are added: numbers, innovations and statuses of all samples."""
+
+    def __init__(self, members: Sequence[str], layout: Layout) -> None:
+        self.members = tuple(members)
+        self.layout = layout
+        self.last: FleetEstimate | None = None
+        self._rows: list[_Row] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, estimate: FleetEstimate) -> None:
+        """Add one estimate."""
+        codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
+        self._rows.append(
+            _Row(
+                estimate.t,
+                estimate.parameters,
+                estimate.innovation,
+                estimate.withheld_error,
+                np.array(codes, dtype=np.int32),
+                estimate.steps,
+                estimate.notes,
+            )
+        )
+        self.last = estimate
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return a dataset with dimensions member, time, sensor and withheld.
+
+        Scalar unknowns, with `_std` variables beside them, status, steps and notes are over
+        (`member`, `time`); innovations over (`member`, `time`, `sensor`).
+        """
+        rows, layout, both = self._rows, self.layout, ("member", "time")
+        times = np.array([row.t for row in rows])
+        data = xr.Dataset(
+            coords={
+                "member": list(self.members),
+                "time": ("time", times, {"units": layout.time_unit}),
+                "sensor": list(layout.sensors),
+                "withheld": list(layout.withheld or ()),
+            }
+        )
+
+        def table(values: Any, *more: int) -> Array:
+            shape = (len(rows), len(self.members), *more)
+            return np.swapaxes(np.reshape(values, shape), 0, 1)
+
+        for label in layout.scalars:
+            pairs = [row.parameters[label] for row in rows]
+            for k, name in enumerate((label, f"{label}_std")):
+                data[name] = (both, table([pair[k] for pair in pairs]), dict(layout.numbers[name]))
+        unit = {"units": layout.sensor_unit}
+        innovations = table([row.innovation for row in rows], len(layout.sensors))
+        data["innovation"] = ((*both, "sensor"), innovations, unit)
+        if layout.withheld is not None:
+            errors = table([row.withheld_error for row in rows], len(layout.withheld))
+            data["withheld_error"] = ((*both, "withheld"), errors, unit)
+        flags = {
+            "flag_values": list(range(len(STATUS_CODES))),
+            "flag_meanings": " ".join(STATUS_CODES),
+        }
+        data["status"] = (both, table([row.status for row in rows]), flags)
+        steps = table([row.steps for row in rows])
+        data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
+        nothing = np.full(len(self.members), np.nan)
+        for name in dict.fromkeys(name for row in rows for name in row.notes):
+            key = f"note_{name}" if name in data else name
+            data[key] = (both, table([row.notes.get(name, nothing) for row in rows]))
+        data.attrs["scalars"] = "\n".join(layout.scalars)
+        return data

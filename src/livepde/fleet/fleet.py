@@ -1,0 +1,448 @@
+"""Many identifications of one model, stepped together."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from livepde import checkpoint
+from livepde.errors import (
+    ConfigurationError,
+    MissingInputError,
+    RunError,
+    SampleError,
+    TimeOrderError,
+)
+from livepde.fem import Inputs, Moment
+from livepde.fleet.engine import OK, Engine, FleetReport
+from livepde.fleet.estimate import FleetEstimate, FleetResult
+from livepde.fleet.separately import Separately
+from livepde.fleet.span import Span
+from livepde.fleet.together import Together
+from livepde.identifier import Identifier
+from livepde.laws import AnyLaw, Belief, SensitivityLaw
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observation, Observed
+from livepde.result import layout_of
+from livepde.stepping import Scheme
+
+__all__ = ["Fleet"]
+
+FORMAT = 1  # of the checkpoint
+
+Values = ArrayLike | Mapping[str, ArrayLike]
+
+
+class Fleet:
+    """Identifies many processes of one model, with sensors and sample times in common.
+
+    Members differ in data, inputs, and where they start. The estimates are those of one
+    `Identifier` for each, to rounding. With `SensitivityLaw` for numbers, on a model in one
+    dimension that is linear in state and inputs, all are stepped as blocks; else, and wherever
+    something out of the ordinary happens, one by one: `note` says why.
+
+    Parameters
+    ----------
+    model, observation, law
+        As for `Identifier`.
+    members
+        How many, or their names.
+    q0, u0
+        As for `Identifier`, for all members; or a list with one for each.
+    t0, withheld, scheme, dt_max, assimilate_from
+        As for `Identifier`.
+
+    Raises
+    ------
+    ConfigurationError
+        Parts that do not fit together.
+
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> model = heat(lp.interval(0, 1, 20), lp.Scalar(0.5, 0.2), {"left": 0.0, "right": 0.0})
+    >>> fleet = Fleet(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), members=3, u0=1.0)
+    >>> fleet.step(0.1, [[0.9], [0.8], [float("nan")]]).q.shape
+    (3, 1)
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        observation: Observation,
+        law: AnyLaw,
+        members: int | Sequence[str],
+        *,
+        q0: Any = None,
+        u0: Any = None,
+        t0: float = 0.0,
+        withheld: Observation | None = None,
+        scheme: Scheme | None = None,
+        dt_max: float = np.inf,
+        assimilate_from: float = -np.inf,
+    ) -> None:
+        names = [str(k) for k in range(members)] if isinstance(members, int) else list(members)
+        if not names:
+            raise ConfigurationError("a fleet needs at least one member.")
+        if len(set(names)) < len(names):
+            raise ConfigurationError("the names of the members of a fleet must differ.")
+        self.members = tuple(names)
+        q0s, u0s = self._each("q0", q0), self._each("u0", u0)
+        self._one = Identifier(
+            model,
+            observation,
+            law,
+            q0=q0s[0],
+            u0=u0s[0],
+            t0=t0,
+            withheld=withheld,
+            scheme=scheme,
+            dt_max=dt_max,
+            assimilate_from=assimilate_from,
+        )
+        self.model = model
+        self.law = law
+        self.problem = self._one.problem
+        self._work = law.prepare(self.problem)
+        self._q0 = [model.initial_parameter(q) for q in q0s]
+        self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
+        self._engine: Engine = Separately(law, self._work, self.problem)
+        self.note = Together.refuses(law, self._work)
+        if isinstance(law, SensitivityLaw) and not self.note:
+            self._engine = Together(law, self._work)
+        count = len(names)
+        self._state: Any = None
+        self._t = np.full(count, float(t0))
+        self._z = np.full((count, self.observed.size), np.nan)
+        self._inputs = np.full((count, len(self.inputs)), np.nan)
+        self._samples = 0
+        if not self.inputs:
+            self._begin(self._inputs)
+
+    def _each(self, what: str, value: Any) -> list[Any]:
+        """Return a value for each member: a list has one for each."""
+        if not isinstance(value, list):
+            return [value] * len(self.members)
+        if len(value) != len(self.members):
+            raise ConfigurationError(
+                f"{what}: a list of {len(value)} for {len(self.members)} members; give one for "
+                "each, or one value for all that is no list."
+            )
+        return value
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    @property
+    def observed(self) -> Observed:
+        """What the assimilated sensors see."""
+        return self._one.observed
+
+    @property
+    def withheld(self) -> Observed | None:
+        """Sensors that are only scored."""
+        return self._one.withheld
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Channels that the model and the sensors read."""
+        return self._one.inputs
+
+    @property
+    def together(self) -> bool:
+        """True if members are stepped as blocks."""
+        return not self.note
+
+    @property
+    def t(self) -> Array:
+        """Time of the last accepted sample of each member, shape (members,)."""
+        return self._t.copy()
+
+    def _moments(self, t: Array, inputs: Array) -> list[Moment]:
+        return [
+            Moment(float(at), Inputs(dict(zip(self.inputs, row.tolist(), strict=True))))
+            for at, row in zip(t, inputs, strict=True)
+        ]
+
+    def _begin(self, inputs: Array) -> None:
+        moments, u0 = self._moments(self._t, inputs), self._u0
+        if self.model.form_initial is None:
+            starts = [self.model.impose(u, at) for u, at in zip(u0, moments, strict=True)]
+        else:
+            pairs = zip(self._q0, moments, strict=True)
+            starts = [self.model.initial_state(q, at) for q, at in pairs]
+        self._state = self._engine.start(self._q0, starts, moments)
+        self._inputs = inputs
+
+    def step(
+        self, t: float, z: Values, inputs: Mapping[str, ArrayLike] | None = None
+    ) -> FleetEstimate:
+        """Take one sample of every member and return the estimates at its time.
+
+        A member whose step fails numerically stays as it was, says so in its status, and tries
+        again with the next sample; the others do not notice. Bad input raises and changes nothing.
+
+        Parameters
+        ----------
+        t
+            Time, the same for all.
+        z
+            Measurements, shape (members, sensors), NaN where missing; or channel name -> a number
+            for all members, or one for each.
+        inputs
+            Input channels, each a number for all members, or one for each; NaN holds the last one.
+
+        Raises
+        ------
+        SampleError, TimeOrderError, MissingInputError
+            As `Identifier.step`.
+        """
+        t = float(t)
+        if not np.isfinite(t):
+            raise SampleError(f"time t is {t}; give the time of the sample.")
+        measured, withheld, named = self._parsed(z, inputs or {})
+        last = float(self._t.max())
+        if t < last or (t == last and self._samples):
+            raise TimeOrderError(
+                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
+                "sort the stream, and drop repeated samples."
+            )
+        values, held = self._filled(named)
+        if self._state is None:
+            self._begin(values)
+        used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
+        if t == last:
+            span = Span(self._t, t, self.inputs, values, values, used, used)
+            report = self._expected(span)
+            self._state = self._engine.begin(self._state, span)
+        else:
+            span = Span(self._t, t, self.inputs, self._inputs, values, self._z, used)
+            self._state, report = self._engine.step(self._state, span)
+        self._samples += 1
+        good = np.array([status.ok for status in report.statuses])
+        self._t = np.where(good, t, self._t)
+        self._z = np.where(good[:, None], used, self._z)
+        self._inputs = np.where(good[:, None], values, self._inputs)
+        return self._estimate(span, measured, withheld, report, held)
+
+    def _expected(self, span: Span) -> FleetReport:
+        """Return what the sensors are expected to show at the start."""
+        members = range(len(self))
+        beliefs = [self._believed(self._state, k) for k in members]
+        predicted = [
+            self.observed.predict(belief.u, belief.q, span.end(k))
+            for k, belief in zip(members, beliefs, strict=True)
+        ]
+        return FleetReport((OK,) * len(self), np.array(predicted), np.zeros(len(self), dtype=int))
+
+    def _believed(self, state: Any, k: int) -> Belief:
+        return self.problem.physical(self._engine.believed(state, k))
+
+    def _estimate(
+        self,
+        span: Span,
+        measured: Array,
+        withheld: Array,
+        report: FleetReport,
+        held: dict[str, Array],
+    ) -> FleetEstimate:
+        state = self._state
+        q, u, std = self._engine.means(state)
+        error = withheld
+        if self.withheld is not None:
+            error = withheld - self._shown(self.withheld, u, q, span)
+        return FleetEstimate(
+            t=span.t1,
+            members=self.members,
+            q=q,
+            u=u,
+            q_std=std,
+            innovation=measured - report.predicted,
+            withheld_error=error,
+            statuses=report.statuses,
+            steps=report.steps,
+            notes=report.notes,
+            held=held,
+            space=self.model.parameter_space,
+            belief=lambda k: self._believed(state, k),
+        )
+
+    @staticmethod
+    def _shown(observed: Observed, u: Array, q: Array, span: Span) -> Array:
+        """Return what sensors are expected to show, shape (members, sensors)."""
+        if type(observed) is Observed and observed.linear:
+            shown: Array = (observed.G @ u.T).T
+            return shown
+        rows = [observed.predict(u[k], q[k], span.end(k)) for k in range(len(span))]
+        return np.array(rows)
+
+    def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
+        """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
+        result = FleetResult(self.members, layout_of(self.model, self.observed, self.withheld))
+        for sample in stream:
+            result.add(self.step(*sample))
+        return result
+
+    def _parsed(
+        self, z: Values, inputs: Mapping[str, ArrayLike]
+    ) -> tuple[Array, Array, dict[str, Array]]:
+        """Return assimilated and withheld values and inputs, all checked."""
+        hidden = self.withheld.names if self.withheld else ()
+        named: dict[str, Array] = {}
+        if isinstance(z, Mapping):
+            channels = self._one.channels
+            for name in z:
+                if name not in channels:
+                    raise SampleError(f"unknown channel '{name}'; this fleet has {list(channels)}.")
+            columns = {name: self._column(name, values) for name, values in z.items()}
+            nothing = np.full(len(self), np.nan)
+            shape = (len(self), -1)
+
+            def table(names: Sequence[str]) -> Array:
+                rows = [columns.get(name, nothing) for name in names]
+                return np.array(rows).T.reshape(*shape) if rows else np.zeros((len(self), 0))
+
+            measured, withheld = table(self.observed.names), table(hidden)
+            named = {name: columns[name] for name in self.inputs if name in columns}
+        else:
+            measured = self._measured(z)
+            withheld = np.full((len(self), len(hidden)), np.nan)
+        for name, values in inputs.items():
+            if name not in self.inputs:
+                raise SampleError(
+                    f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
+                )
+            named[name] = self._column(name, values)
+        return measured, withheld, named
+
+    def _measured(self, z: ArrayLike) -> Array:
+        array = _numbers("z", z)
+        expected = (len(self), self.observed.size)
+        if array.shape != expected:
+            raise SampleError(
+                f"z has shape {array.shape}; {expected[0]} members with {expected[1]} sensors each "
+                f"need {expected}, NaN where a sample is missing."
+            )
+        for name, column in zip(self.observed.names, array.T, strict=True):
+            self._refuse_infinite(name, column)
+        return array
+
+    def _column(self, name: str, values: ArrayLike) -> Array:
+        """Return a value of a channel for each member."""
+        array = _numbers(f"channel '{name}'", values)
+        if array.shape not in ((), (len(self),)):
+            raise SampleError(
+                f"channel '{name}' has shape {array.shape}; give one number for all, or "
+                f"{len(self)}, one for each member."
+            )
+        column = np.broadcast_to(array, (len(self),)).copy()
+        self._refuse_infinite(name, column)
+        return column
+
+    def _refuse_infinite(self, name: str, column: Array) -> None:
+        if np.isinf(column).any():
+            member = self.members[int(np.argmax(np.isinf(column)))]
+            raise SampleError(
+                f"channel '{name}' of member '{member}' is infinite; send NaN for a missing sample."
+            )
+
+    def _filled(self, named: Mapping[str, Array]) -> tuple[Array, dict[str, Array]]:
+        """Return all inputs, (members, channels), and which members hold their last value."""
+        values, held = np.full((len(self), len(self.inputs)), np.nan), {}
+        for k, name in enumerate(self.inputs):
+            column = named.get(name, values[:, k])
+            missing = np.isnan(column)
+            if name not in self._one.optional_inputs and missing.any():
+                column = np.where(missing, self._inputs[:, k], column)
+                if np.isnan(column).any():
+                    member = self.members[int(np.argmax(np.isnan(column)))]
+                    raise MissingInputError(
+                        f"input '{name}' of member '{member}' has no value in the first sample; "
+                        "start the stream where every member has one."
+                    )
+                held[name] = missing
+            values[:, k] = column
+        return values, held
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "law": type(self.law).__name__,
+            "n": self.model.X.dim,
+            "m": self.model.Q.dim,
+            "members": list(self.members),
+            "sensors": list(self.observed.names),
+            "channels": list(self.inputs),
+            "together": self.together,
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the state to a file, from which `load` continues with bit-identical numbers."""
+        checkpoint.write(path, self.dump())
+
+    def dump(self) -> bytes:
+        """Return the state as `save` writes it."""
+        header = {**self._fingerprint, "begun": self._state is not None}
+        leaves = {"t": self._t, "z": self._z, "inputs": self._inputs, "samples": self._samples}
+        if self._state is not None:
+            leaves |= {
+                f"state/{path}": leaf for path, leaf in self._engine.leaves(self._state).items()
+            }
+        return checkpoint.packed(header, leaves)
+
+    def load(self, path: str | os.PathLike[str]) -> None:
+        """Continue from a saved state; the fleet must be built as the one that was saved.
+
+        Raises
+        ------
+        RunError
+            The file is damaged, or of another fleet.
+        """
+        self.restore(checkpoint.read(path), str(path))
+
+    def restore(self, content: bytes, where: str = "the checkpoint") -> None:
+        """Continue from what `dump` returned; `where` names it in messages. Raises as `load`."""
+        header, leaves = checkpoint.unpacked(content, where)
+        for key, value in self._fingerprint.items():
+            if header.get(key) != value:
+                raise RunError(
+                    f"{where} was saved with another {key}; build the fleet as it was when it was "
+                    "saved."
+                )
+        state = None
+        try:
+            if header["begun"]:
+                moments = self._moments(self._t, np.zeros_like(self._inputs))
+                template = self._engine.start(self._q0, self._u0, moments)
+                inner = {
+                    path.removeprefix("state/"): leaf
+                    for path, leaf in leaves.items()
+                    if path.startswith("state/")
+                }
+                state = self._engine.restored(template, inner)
+            parts = leaves["t"], leaves["z"], leaves["inputs"], int(leaves["samples"])
+        except (KeyError, ValueError) as error:
+            raise RunError(
+                f"{where} does not fit this fleet ({error}): build it with the law's options as "
+                "they were when it was saved."
+            ) from error
+        self._t, self._z, self._inputs, self._samples = parts
+        self._state = state
+        if state is None and not self.inputs:
+            self._begin(self._inputs)
+
+
+def _numbers(what: str, values: ArrayLike) -> Array:
+    """Return an array of floats of its own."""
+    try:
+        if np.asarray(values).dtype.kind in "USb":
+            raise TypeError
+        return np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise SampleError(f"{what} holds something that is not a number.") from None

@@ -1,0 +1,430 @@
+"""A fleet: the numbers of separate identifiers, whatever happens to some of its members."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from problems import laplace, line, truth
+from skfem import ElementLineP1, ElementLineP2
+
+import livepde as lp
+from livepde.bench.fleet import fleet as benchmark
+from livepde.fleet import innovations
+from livepde.laws.consistency import Consistency
+from livepde.linalg import BandedBlocks, BandedSolver, Pattern
+from livepde.models import heat
+
+SENSORS = lp.Points({"T_1": 0.3, "T_2": 0.5, "T_3": 0.8}, noise=0.02)
+POSITIVE = {"transform": "log", "bounds": (0.0, np.inf)}
+
+
+def rod(**alpha):
+    """Two unknowns; inputs in the boundary values and beside an unknown."""
+    ends = {"left": lp.Channel("T_0"), "right": 0.0}
+    return heat(
+        line(16),
+        lp.Scalar(0.5, std=0.25, unit="m^2/s", **alpha),
+        ends,
+        loss=lp.Scalar(0.3, std=0.2),
+    )
+
+
+def sources():
+    """Sources that depend on time, without inputs; elements of second order."""
+    return lp.Model(
+        lp.Field(line(12), ElementLineP2(), dirichlet={"boundary": 0.0}),
+        {"a": lp.Scalar(0.5, std=2.0), "b": lp.Scalar(-1.0, std=0.5)},
+        A=lambda q, u, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
+        B=laplace,
+    )
+
+
+def layers():
+    """One unknown for each of two layers, and a source that is an input."""
+    halves = {"top": lambda x: x[0] < 0.4, "bottom": lambda x: x[0] >= 0.4}
+    return lp.Model(
+        lp.Field(line(16), ElementLineP1(), dirichlet={"left": lp.Channel("T_0")}),
+        {"k": lp.Piecewise(halves, 0.6, 0.2), "c": lp.Scalar(0.0, std=0.1)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - q.c * u * v,
+        f=lambda x, t: 0.1 * x.inputs["sun"] * np.cos(t) * x[0],
+        inputs=["sun"],
+    )
+
+
+def walks():
+    """An unknown that walks, one that reverts, one with harmonics, and one that stays."""
+    evolutions = {
+        "a": lp.RandomWalk(0.1),
+        "b": lp.MeanReverting(2.0),
+        "c": lp.Periodic(3.0),
+        "d": None,
+    }
+    unknowns = {
+        name: lp.Scalar(0.5, std=0.2, **({"evolution": kind} if kind else {}))
+        for name, kind in evolutions.items()
+    }
+    return lp.Model(
+        lp.Field(line(16), ElementLineP1(), dirichlet={"left": lp.Channel("T_0"), "right": 0.0}),
+        unknowns,
+        A=[
+            lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.b * u * v,
+            lambda q, u, v, x: -q.c * x[0] * v - q.d * np.sin(x.t) * v,
+        ],
+    )
+
+
+MODELS = {
+    "walks": walks,
+    "rod": rod,
+    "logarithm": lambda: rod(**POSITIVE),
+    "sources": sources,
+    "layers": layers,
+}
+LAWS = {
+    "drift": lp.SensitivityLaw(drift=0.1),
+    "rank": lp.SensitivityLaw(rank=8),
+    "plain": lp.SensitivityLaw(),
+    "gate, noise": lp.SensitivityLaw(gate=3.0, noise="auto"),
+    "no guards, memory": lp.SensitivityLaw(guards=None, memory=2.0),
+}
+
+
+def samples(fleet, steps=25, seed=0):
+    """Return what members with values near the prior show, with gaps and a few outliers."""
+    rng = np.random.default_rng(seed)
+    members, model = len(fleet), fleet.model
+    times = [0.1 * k for k in range(steps + 1)]
+    size = rng.uniform(0.7, 1.3, members)
+    shown = []
+    for k in range(members):
+
+        def inputs(t, k=k):
+            return dict.fromkeys(fleet.inputs, size[k] * np.sin(2.0 * t))
+
+        q = model.latent.prior + 0.3 * model.latent.deviations * rng.standard_normal(model.Q.dim)
+        states = truth(model, q, 0.0, times, inputs=inputs)
+        shown.append([fleet.observed.G @ u for u in states])
+    z = np.array(shown)
+    z += 0.02 * rng.standard_normal(z.shape)
+    z[rng.random(z.shape) < 0.1] = np.nan
+    z[rng.random(z.shape) < 0.01] += 0.3
+    z[1, 5] = np.nan
+    found = []
+    for k, t in enumerate(times[1:], 1):
+        given = {name: size * np.sin(2.0 * t) for name in fleet.inputs}
+        if given and k > 3:
+            given["T_0"] = np.where(rng.random(members) < 0.1, np.nan, given["T_0"])
+        found.append((t, z[:, k], given))
+    return found
+
+
+def assert_equal(estimate, others, tolerance=1e-8):
+    """Every number of the estimate is that of separate identifiers."""
+    for k, other in enumerate(others):
+        one = estimate.member(k)
+        pairs = [(estimate.q[k], other.q), (one.q, other.q), (one.u, other.u)]
+        pairs += [(estimate.u[k], other.u), (estimate.innovation[k], other.innovation)]
+        if other.q_std is not None:
+            pairs += [(estimate.q_std[k], other.q_std), (one.u_std, other.u_std)]
+        for mine, separate in pairs:
+            np.testing.assert_allclose(mine, separate, rtol=tolerance, atol=tolerance)
+        assert one.status.code == other.status.code
+        assert (one.steps, one.held) == (other.steps, other.held)
+        assert one.notes == pytest.approx(dict(other.notes), rel=1e-6, abs=1e-8)
+
+
+def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
+    """Step a fleet and separate identifiers by the same samples."""
+    fleet = lp.Fleet(model, sensors, law, members, **options)
+
+    def each(name, k):
+        value = options.get(name)
+        return value[k] if isinstance(value, list) else value
+
+    separate = [
+        lp.Identifier(model, sensors, law, **{**options, "q0": each("q0", k), "u0": each("u0", k)})
+        for k in range(members)
+    ]
+    for t, z, inputs in stream(fleet):
+        estimate = fleet.step(t, z, inputs)
+        others = [
+            one.step(t, z[k], {name: values[k] for name, values in inputs.items()})
+            for k, one in enumerate(separate)
+        ]
+        assert_equal(estimate, others)
+    return fleet, estimate
+
+
+@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS.keys())
+@pytest.mark.parametrize("build", MODELS.values(), ids=MODELS.keys())
+def test_equals_separate_identifiers(build, law):
+    fleet, _ = compare(build(), law)
+    assert fleet.together, fleet.note
+
+
+@pytest.mark.parametrize("build", MODELS.values(), ids=MODELS.keys())
+def test_equals_separate_identifiers_with_another_scheme_and_substeps(build):
+    fleet, estimate = compare(build(), LAWS["plain"], scheme=lp.Alexander2(), dt_max=0.04)
+    assert fleet.together
+    assert estimate.steps.tolist() == [3, 3, 3, 3]
+
+
+def test_members_start_where_they_are_told_to():
+    starts = [{"alpha": 0.3 + 0.1 * k, "loss": 0.2} for k in range(4)]
+    states = [0.0, 0.2, lambda x: x[0], 1.0]
+    _, estimate = compare(rod(), LAWS["plain"], q0=starts, u0=states, assimilate_from=0.75)
+    assert len(np.unique(estimate.q[:, 0])) == 4
+
+
+def test_an_unknown_initial_state_learns_from_a_first_sample():
+    model = lp.Model(
+        lp.Field(line(16), ElementLineP1(), dirichlet={"right": 0.0}),
+        {"a": lp.Scalar(0.5, std=0.2), "u0": lp.Scalar(0.0, std=1.0)},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+        initial=lambda q, v, x: q.u0 * v,
+    )
+
+    def stream(fleet):
+        z = np.array([[0.9, 0.8, 0.7], [0.3, 0.35, np.nan], [np.nan] * 3, [0.1, 0.1, 0.1]])
+        return [(0.1 * k, z * np.exp(-0.3 * k), {}) for k in range(8)]
+
+    fleet, estimate = compare(model, LAWS["plain"], stream)
+    assert fleet.together
+    assert np.ptp(estimate.q[:, 1]) > 0.5
+
+
+def test_a_bound_is_kept_and_left_again():
+    model = rod(bounds=(0.45, 0.55))
+    fleet, estimate = compare(model, LAWS["plain"], members=6)
+    assert fleet.together
+    alpha, _ = estimate.parameters["alpha"]
+    assert np.isin(alpha, (0.45, 0.55)).any()
+    assert ((alpha >= 0.45) & (alpha <= 0.55)).all()
+
+
+def test_a_member_that_fails_does_not_disturb_the_others():
+    """Its input overflows for some samples: it stays as it was, and later goes on."""
+
+    def stream(fleet):
+        for k, (t, z, inputs) in enumerate(samples(fleet)):
+            if k in (8, 9, 14):
+                inputs = {**inputs, "T_0": inputs["T_0"].copy()}
+                inputs["T_0"][2] = 1e308
+            yield t, z, inputs
+
+    for model, guards in (
+        (rod(), None),
+        (rod(), lp.Guards()),
+        (rod(bounds=(0.45, 0.55)), None),
+    ):
+        fleet, estimate = compare(model, lp.SensitivityLaw(guards=guards), stream)
+        assert fleet.together
+        assert estimate.ok.all()
+    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], ["a", "b", "c", "d"])
+    estimates = [fleet.step(*sample) for sample in stream(fleet)]
+    assert estimates[8].ok.tolist() == [True, True, False, True]
+    assert estimates[8].member("c").status.code == "not_finite"
+    assert estimates[8].steps[2] == 0
+
+
+@pytest.mark.parametrize(
+    ("law", "why"),
+    [
+        (lp.SensitivityLaw(replay=lp.Replay(first=5)), "replays"),
+        (lp.SensitivityLaw(jumps=lp.Jumps(settle=5)), "jump"),
+        (lp.AutoLaw(), "AutoLaw"),
+    ],
+)
+def test_other_laws_step_one_by_one_and_say_so(law, why):
+    fleet, _ = compare(rod(), law)
+    assert not fleet.together
+    assert why in fleet.note
+
+
+def nonlinear():
+    return lp.Model(
+        lp.Field(line(16), ElementLineP1(), dirichlet={"left": lp.Channel("T_0"), "right": 0.0}),
+        {"a": lp.Scalar(0.5, std=0.2)},
+        A=lambda q, u, v, x: q.a * (1 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
+def curved_in_inputs():
+    return lp.Model(
+        lp.Field(line(16), ElementLineP1(), dirichlet={"boundary": 0.0}),
+        {"a": lp.Scalar(0.5, std=0.2)},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+        f=lambda x, t: x.inputs["T_0"] ** 2,
+        inputs=["T_0"],
+    )
+
+
+def moving_matrix():
+    return lp.Model(
+        lp.Field(line(16), ElementLineP1(), dirichlet={"boundary": 0.0}),
+        {"a": lp.Scalar(0.5, std=0.2)},
+        A=lambda q, u, v, x: (1.0 + x.inputs["T_0"]) * q.a * lp.dot(lp.grad(u), lp.grad(v)),
+        f=1.0,
+        inputs=["T_0"],
+    )
+
+
+@pytest.mark.parametrize(
+    ("build", "why"),
+    [
+        (nonlinear, "affine in its state"),
+        (curved_in_inputs, "affine in its input"),
+        (moving_matrix, "depend on time or inputs"),
+    ],
+)
+def test_other_models_step_one_by_one_and_say_so(build, why):
+    fleet, _ = compare(build(), LAWS["plain"])
+    assert why in fleet.note
+
+
+def test_sensors_that_see_an_unknown_step_one_by_one():
+    model = rod().with_unknowns({"offset": lp.Scalar(0.0, std=0.1)})
+    sensors = lp.Points(
+        {"T_1": 0.3, "T_2": 0.5, "T_3": 0.8},
+        noise=0.02,
+        direct={"T_1": lambda q, x: q.offset},
+    )
+    fleet, _ = compare(model, LAWS["plain"], sensors=sensors)
+    assert "sensors" in fleet.note
+
+
+@pytest.mark.parametrize("law", [LAWS["plain"], lp.SensitivityLaw(replay=lp.Replay(first=5))])
+def test_goes_on_from_a_checkpoint_with_the_same_numbers(law, tmp_path):
+    model = rod()
+    fleet, other = (lp.Fleet(model, SENSORS, law, ["a", "b"]) for _ in range(2))
+    stream = samples(fleet, steps=90)
+    for sample in stream[:40]:
+        fleet.step(*sample)
+    fleet.save(tmp_path / "fleet.npz")
+    other.load(tmp_path / "fleet.npz")
+    for sample in stream[40:]:
+        mine, restored = fleet.step(*sample), other.step(*sample)
+        np.testing.assert_array_equal(mine.q, restored.q)
+        np.testing.assert_array_equal(mine.u, restored.u)
+    assert fleet.dump() == other.dump()
+    strange = lp.Fleet(model, SENSORS, law, ["a", "c"])
+    with pytest.raises(lp.RunError, match="another members"):
+        strange.load(tmp_path / "fleet.npz")
+
+
+def test_a_fleet_that_has_not_begun_is_saved_too():
+    fleet, other = (lp.Fleet(rod(), SENSORS, LAWS["plain"], 2) for _ in range(2))
+    other.restore(fleet.dump())
+    (sample, *_) = samples(fleet)
+    np.testing.assert_array_equal(fleet.step(*sample).q, other.step(*sample).q)
+
+
+def test_channels_by_name_and_withheld_sensors():
+    model, hidden = rod(), lp.Points({"T_4": 0.6})
+    fleet = lp.Fleet(model, SENSORS, LAWS["plain"], 2, withheld=hidden)
+    one = lp.Identifier(model, SENSORS, LAWS["plain"], withheld=hidden)
+    row = {"T_1": 0.2, "T_2": 0.1, "T_4": 0.05, "T_0": 0.3, "ambient": 0.0}
+    estimate = fleet.step(0.1, {**row, "T_1": [0.9, 0.2]})
+    other = one.step(0.1, row)
+    np.testing.assert_allclose(estimate.withheld_error[1], other.withheld_error, rtol=1e-9)
+    np.testing.assert_allclose(estimate.innovation[1], other.innovation, rtol=1e-9)
+    assert estimate.innovation[0, 0] == pytest.approx(estimate.innovation[1, 0] + 0.7)
+
+
+def test_a_run_becomes_a_dataset_with_a_dimension_of_members():
+    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], ["north", "south"])
+    result = fleet.run(samples(fleet, steps=6))
+    data = result.to_xarray()
+    assert dict(data.sizes) == {"member": 2, "time": 6, "sensor": 3, "withheld": 0}
+    assert data["alpha"].dims == ("member", "time")
+    assert data["innovation"].dims == ("member", "time", "sensor")
+    last = data.sel(member="south").isel(time=-1)
+    value, std = result.last.parameters["alpha"]
+    assert (float(last["alpha"]), float(last["alpha_std"])) == (value[1], std[1])
+    assert data["alpha"].attrs["units"] == "m^2/s"
+    assert (data["status"] == 0).all()
+
+
+def fleet_of_two():
+    return lp.Fleet(rod(), SENSORS, LAWS["plain"], ["north", "south"])
+
+
+INPUTS = {"T_0": 0.1, "ambient": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("sample", "error", "match"),
+    [
+        ((0.1, np.zeros((3, 3)), INPUTS), lp.SampleError, r"z has shape \(3, 3\)"),
+        ((0.1, [["a", 1, 2]] * 2, INPUTS), lp.SampleError, "not a number"),
+        ((0.1, [[0, 1, np.inf]] * 2, INPUTS), lp.SampleError, "'T_3' of member 'north'"),
+        ((np.nan, np.zeros((2, 3)), INPUTS), lp.SampleError, "time t is nan"),
+        ((0.1, {"T_9": 1.0}, INPUTS), lp.SampleError, "unknown channel 'T_9'"),
+        ((0.1, {"T_1": [1.0] * 3}, INPUTS), lp.SampleError, r"channel 'T_1' has shape \(3,\)"),
+        ((0.1, np.zeros((2, 3)), {"T_9": 1.0}), lp.SampleError, "unknown input 'T_9'"),
+        ((-0.1, np.zeros((2, 3)), INPUTS), lp.TimeOrderError, "not later"),
+        (
+            (0.1, np.zeros((2, 3)), {"T_0": [0.1, np.nan], "ambient": 0.0}),
+            lp.MissingInputError,
+            "'T_0' of member 'south'",
+        ),
+    ],
+)
+def test_bad_samples_change_nothing(sample, error, match):
+    fleet = fleet_of_two()
+    with pytest.raises(error, match=match):
+        fleet.step(*sample)
+    fleet.step(0.1, np.zeros((2, 3)), INPUTS)
+    assert fleet.t.tolist() == [0.1, 0.1]
+    with pytest.raises(lp.TimeOrderError, match="not later"):
+        fleet.step(0.1, np.zeros((2, 3)), INPUTS)
+
+
+def test_bad_members():
+    with pytest.raises(lp.ConfigurationError, match="at least one"):
+        lp.Fleet(rod(), SENSORS, LAWS["plain"], 0)
+    with pytest.raises(lp.ConfigurationError, match="must differ"):
+        lp.Fleet(rod(), SENSORS, LAWS["plain"], ["a", "a"])
+    with pytest.raises(lp.ConfigurationError, match="a list of 3 for 2 members"):
+        lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, u0=[0.0, 0.0, 0.0])
+
+
+def test_statistics_of_innovations_are_those_of_each_member():
+    rng = np.random.default_rng(0)
+    each = [Consistency.start(3) for _ in range(4)]
+    fields = list(vars(each[0]))
+    stacked = {name: np.stack([getattr(one, name) for one in each]) for name in fields}
+    for k in range(40):
+        e = (1.0 + np.arange(4))[:, None] * (rng.standard_normal((4, 3)) + np.sin(0.1 * k))
+        e[rng.random(e.shape) < 0.2] = np.nan
+        each = [one.add(row) for one, row in zip(each, e, strict=True)]
+        stacked = innovations.added(stacked, e)
+        for name in ("ratio", "correlation", "inflation"):
+            mine = getattr(innovations, name)(stacked)
+            np.testing.assert_allclose(mine, [getattr(one, name) for one in each], rtol=1e-12)
+
+
+def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
+    rng = np.random.default_rng(0)
+    n, blocks = 9, 6
+    near = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 2
+    pattern = Pattern.from_entries(*np.nonzero(near), (n, n))
+    data = rng.standard_normal((blocks, pattern.nnz))
+    data[1] = 0.0
+    data[3, 0] = np.nan
+    right = rng.standard_normal((3, blocks, n))
+    right[0, 4, 2] = np.inf
+    x = BandedBlocks(BandedSolver(pattern)).factorise(data).solve(right)
+    assert np.isnan(x[:, [1, 3, 4]]).all()
+    for k in (0, 2, 5):
+        dense = pattern.matrix(data[k]).toarray()
+        np.testing.assert_allclose(x[:, k], np.linalg.solve(dense, right[:, k].T).T, rtol=1e-9)
+
+
+def test_the_benchmark_compares_equal_estimates():
+    outcome = benchmark(members=3)
+    faster, apart = outcome.checks
+    assert apart.ok
+    assert faster.value > 0.0
+    ((_, low, middle, high),) = outcome.tables[0].rows
+    assert low <= middle <= high
