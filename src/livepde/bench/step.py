@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from time import process_time
 from typing import Any
 
@@ -63,12 +62,15 @@ class Problem:
     steps: int
     pairs: int
 
+    def u0(self, x: Any) -> Any:
+        """Return the exact state at the start."""
+        return self.u_true(x, 0.0)
+
     def forward(self, q: Any) -> Iterator[tuple[float, Array]]:
         """Simulate with a known parameter: the initial state, and after each step."""
         known = self.model.initial_parameter(q)
         times = (0.6 * np.arange(self.steps + 2)).tolist()
-        u0 = partial(self.u_true, t=0.0)
-        return simulate(self.model, known, u0, times, Advance(ImplicitEuler()))
+        return simulate(self.model, known, self.u0, times, Advance(ImplicitEuler()))
 
 
 def problem(size: int) -> Problem:
@@ -76,7 +78,7 @@ def problem(size: int) -> Problem:
     steps, pairs = (99, 15) if size <= 100 else (20, 9) if size <= LONGEST_ROD else (6, 5)
     if size <= LONGEST_ROD:
         model, omega = seed.build(nodes=size)
-        points = Points(np.linspace(0.1, 0.9, SENSORS))
+        points = Points(np.linspace(0.1, 0.9, SENSORS).tolist())
         return Problem(model, omega, points, seed.q_true, seed.u_true, steps, pairs)
     cells = round(np.sqrt(size)) - 1
     mesh = rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
@@ -90,7 +92,7 @@ def problem(size: int) -> Problem:
     )
     omega = Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87))
     side = np.linspace(0.1, 0.9, round(np.sqrt(SENSORS)))
-    points = Points(np.array([(x, y) for x in side for y in side]))
+    points = Points([(x, y) for x in side for y in side])
     return Problem(model, omega, points, _q_true, _u_true, steps, pairs)
 
 
@@ -121,9 +123,9 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
         given = problem(size)
         laws: list[tuple[str, AnyLaw, Observation, float]] = []
         for gain, c1 in GAINS:
-            law = GradientLaw(gain, ResidualDamping(c1))
+            learning = GradientLaw(gain, ResidualDamping(c1))
             bound = SMALL if size < LONGEST_ROD else LARGE
-            laws.append((f"gradient, gain {gain:g}, c1 {c1:g}", law, given.omega, bound))
+            laws.append((f"gradient, gain {gain:g}, c1 {c1:g}", learning, given.omega, bound))
         for count in modes:
             if count <= given.model.Q.free.sum():
                 name = f"sensitivity, modes {count}"
@@ -149,10 +151,9 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
 def _ratios(given: Problem, sensors: Observation, law: AnyLaw) -> list[float]:
     G = sensors.matrix(given.model.state_space)
     samples = [(t, G @ u) for t, u in given.forward(given.q_true)]
-    u0 = partial(given.u_true, t=0.0)
 
     def steps() -> float:
-        identifier = Identifier(given.model, sensors, law, q0=0.0, u0=u0)
+        identifier = Identifier(given.model, sensors, law, q0=0.0, u0=given.u0)
         identifier.step(*samples[1])  # builds what is built once
 
         def run() -> None:

@@ -14,7 +14,7 @@ from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array, Assembler, Factor, Leading, Pattern, Solver, analyse
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import Newton
+from livepde.stepping import Newton, relative
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
@@ -205,6 +205,10 @@ class CoupledStage:
             return None
         return _Bilinear(self, vq, vu, qu)
 
+    def missed(self, start: Array, y: Array) -> float:
+        """Return how far a start was from the solution y, relative to the norms of u and q."""
+        return relative(y - start, y, self.blocks, self.floors)
+
     def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
         """Return the norms of r that a damping rule may use; r lies in the range of R."""
 
@@ -229,6 +233,7 @@ class CoupledStage:
         u_alpha: Array,
         start: Array,
         metric: Metric | None = None,
+        near: bool = False,
     ) -> Array:
         """Return y = (u, q) of one stage; raises `StepFailed`.
 
@@ -242,6 +247,8 @@ class CoupledStage:
             Where the iteration starts, shape (n + m,); it does not change the result.
         metric
             In the place of G_Q/gain (with gain = inf) and of the damping rule.
+        near
+            The start is thought to be good: Newton may begin.
         """
         start[: self.n] = self.model.impose(start[: self.n], moment)
         if self._bilinear is not None:
@@ -249,7 +256,9 @@ class CoupledStage:
         else:
             equation = _Equation(self, c, h, moment, u_alpha)
         equation.metric = metric
-        return self.newton.solve(equation, start, self.blocks, floors=self.floors, lagged=True)
+        return self.newton.solve(
+            equation, start, self.blocks, floors=self.floors, lagged=True, near=near
+        )
 
 
 class _Equation:

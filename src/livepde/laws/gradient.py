@@ -30,12 +30,14 @@ class GradientState:
     """Estimates u^ and q^, shapes (n,) and (m,), and how fast they moved.
 
     `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,): where the next
-    iteration starts. `excitation` is what `Rest` goes by.
+    iteration starts. `missed` is how far such a start was from the last solution, relative.
+    `excitation` is what `Rest` goes by.
     """
 
     u: Array
     q: Array
     rate: Array
+    missed: float
     excitation: Excitation
 
 
@@ -196,8 +198,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         excitation = Excitation.none()
         if work.learning is not None:
             balance = Balance.none(work.problem.observed.size, len(u0))
-            return LearningState(u0, q0, rate, excitation, work.learning.init(q0), balance)
-        return GradientState(u0, q0, rate, excitation)
+            return LearningState(u0, q0, rate, np.inf, excitation, work.learning.init(q0), balance)
+        return GradientState(u0, q0, rate, np.inf, excitation)
 
     def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
         form = work.problem.model.form_initial
@@ -249,8 +251,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
             spread = learning.spread(state.learned, seen, length) * (HOLD if waits else 1.0)
             metric = learning.metric(state.learned, spread, state.q, length)
 
+        missed = state.missed
+
         def stage(c: Array, t: float, h: float) -> Array:
-            nonlocal found
+            nonlocal found, missed
             found = reconstruct(t)
             # The observed part moves with the data, the rest as in the step before.
             start = c + h * state.rate
@@ -260,7 +264,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 start[: model.X.dim] += (
                     coupled.split.inverse @ interval.change(t - h, t)[interval.present]
                 )
-            return coupled.solve(c, h, interval.at(t), found.u, start, metric)
+            near = missed <= coupled.newton.basin
+            y = coupled.solve(c, h, interval.at(t), found.u, start, metric, near)
+            missed = coupled.missed(start, y)
+            return y
 
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stage, y, interval)
@@ -290,7 +297,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         if rest is not None and work.probes is not None:
             excitation = rest.add(excitation, work.probes(u - r, q, interval.end))
         if learning is None or not isinstance(state, LearningState):
-            after = GradientState(u, q, rate, excitation)
+            after = GradientState(u, q, rate, missed, excitation)
             return after, Report(Status(), predicted, steps, notes)
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
@@ -300,7 +307,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             same = np.array_equal(np.isnan(interval.z0), np.isnan(interval.z1))
             learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
-        after = LearningState(u, q, rate, excitation, learned, balance or state.balance)
+        after = LearningState(u, q, rate, missed, excitation, learned, balance or state.balance)
         return after, Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:

@@ -11,11 +11,13 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["Newton", "StepFailed"]
+__all__ = ["Newton", "StepFailed", "relative"]
 
 
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
+
+SLOWEST = 0.1  # rate at which a kept factor of a stage with sweeps is expected to go on
 
 STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
 
@@ -78,6 +80,7 @@ class Newton:
         *,
         floors: tuple[float, ...] = (),
         lagged: bool = False,
+        near: bool = False,
     ) -> Array:
         """Return the solution, starting from y.
 
@@ -90,6 +93,9 @@ class Newton:
             errors has no relative accuracy.
         lagged
             Begin with lagged sweeps.
+        near
+            The start is thought to be so good that Newton may begin; if its first update says
+            otherwise, sweeps begin after all.
 
         Raises
         ------
@@ -99,8 +105,8 @@ class Newton:
         factor: Factor | None = None
         begin = start = y
         floors = floors or (0.0,) * len(blocks)
-        last, basin, sweeps = np.inf, self.basin, lagged
-        first, stalled = np.inf, 0
+        last, basin, sweeps = np.inf, self.basin, lagged and not near
+        limit, stalled = self.basin if near else np.inf, 0
         for _ in range(self.iterations):
             residual = equation.residual(y)
             try:
@@ -109,22 +115,25 @@ class Newton:
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
-            size = _relative(update, new, blocks, floors)
+            size = relative(update, new, blocks, floors)
             if not math.isfinite(size):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
             ratio = size / last
             if ratio >= 0.5 and size <= ROUNDING:
                 return new  # updates that no longer shrink down there are rounding errors
-            if lagged and not sweeps and size >= first:
+            if lagged and not sweeps and size >= limit:
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
-                y, factor, sweeps, last, basin = begin, None, True, np.inf, 0.3 * basin
-                first, stalled = np.inf, 0
+                basin = basin if near else 0.3 * basin
+                y, factor, sweeps, near, last = begin, None, True, False, np.inf
+                limit, stalled = np.inf, 0
                 continue
-            if not sweeps and math.isinf(first):
-                first = size
+            if not sweeps and math.isinf(last):
+                limit = size
             y = new
-            # The error left behind is about ratio/(1 - ratio) times the update.
-            left = size * ratio / (1.0 - ratio) if 0.0 < ratio < 1.0 else np.inf
+            # The error left behind is about ratio/(1 - ratio) times the update; what converges
+            # slowly may only show later.
+            rate = max(ratio, SLOWEST) if lagged else ratio
+            left = size * rate / (1.0 - rate) if 0.0 < ratio < 1.0 else np.inf
             if size == 0.0 or left <= self.tolerance:
                 return y
             last = size
@@ -142,7 +151,7 @@ class Newton:
         )
 
 
-def _relative(
+def relative(
     update: Array, y: Array, blocks: tuple[slice, ...], floors: tuple[float, ...]
 ) -> float:
     """Return the largest update of a block relative to the block, in Euclidean norms."""
