@@ -50,6 +50,8 @@ class Problem:
         What the sensitivity law observes.
     q_true, u_true
         The exact parameter, and the exact state at (x, t).
+    width
+        Time step, a binary number: the differences of all times are exactly this.
     steps, pairs
         Steps that are timed at once, and how often they are.
     """
@@ -59,6 +61,7 @@ class Problem:
     points: Points
     q_true: Callable[[Any], Any]
     u_true: Callable[[Any, float], Any]
+    width: float
     steps: int
     pairs: int
 
@@ -69,17 +72,17 @@ class Problem:
     def forward(self, q: Any) -> Iterator[tuple[float, Array]]:
         """Simulate with a known parameter: the initial state, and after each step."""
         known = self.model.initial_parameter(q)
-        times = (0.6 * np.arange(self.steps + 2)).tolist()
+        times = (self.width * np.arange(self.steps + 2)).tolist()
         return simulate(self.model, known, self.u0, times, Advance(ImplicitEuler()))
 
 
 def problem(size: int) -> Problem:
     """Return the paper's example with so many nodes, or the same on a square if there are many."""
-    steps, pairs = (99, 15) if size <= 100 else (20, 9) if size <= LONGEST_ROD else (6, 5)
+    steps, pairs = (99, 15) if size <= 100 else (20, 9) if size <= LONGEST_ROD else (10, 3)
     if size <= LONGEST_ROD:
         model, omega = seed.build(nodes=size)
         points = Points(np.linspace(0.1, 0.9, SENSORS).tolist())
-        return Problem(model, omega, points, seed.q_true, seed.u_true, steps, pairs)
+        return Problem(model, omega, points, seed.q_true, seed.u_true, 0.625, steps, pairs)
     cells = round(np.sqrt(size)) - 1
     mesh = rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
     zero = {"boundary": 0.0}
@@ -93,7 +96,7 @@ def problem(size: int) -> Problem:
     omega = Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87))
     side = np.linspace(0.1, 0.9, round(np.sqrt(SENSORS)))
     points = Points([(x, y) for x in side for y in side])
-    return Problem(model, omega, points, _q_true, _u_true, steps, pairs)
+    return Problem(model, omega, points, _q_true, _u_true, 0.0625, steps, pairs)
 
 
 def _q_true(x: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
-from livepde.laws.coupled import PULL, CoupledStage, Gains
+from livepde.laws.coupled import PULL, CoupledStage, Gains, Warm
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
 from livepde.laws.rest import Excitation, Probes, Rest
@@ -30,14 +30,16 @@ class GradientState:
     """Estimates u^ and q^, shapes (n,) and (m,), and how fast they moved.
 
     `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,): where the next
-    iteration starts. `missed` is how far such a start was from the last solution, relative.
-    `excitation` is what `Rest` goes by.
+    iteration starts; `warm` is what it starts with, and `present`, shape (sensors,), and `resting`
+    tell with which stage that was made. `excitation` is what `Rest` goes by.
     """
 
     u: Array
     q: Array
     rate: Array
-    missed: float
+    warm: Warm
+    present: Array
+    resting: bool
     excitation: Excitation
 
 
@@ -194,12 +196,12 @@ class GradientLaw(Law[GradientWork, GradientState]):
         return GradientWork(problem, gains, self.newton, learning, smooths(problem.observed))
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
-        rate = np.zeros(len(u0) + len(q0))
-        excitation = Excitation.none()
+        rate, present = np.zeros(len(u0) + len(q0)), np.zeros(work.problem.observed.size, bool)
+        fresh = (u0, q0, rate, Warm.none(), present, False, Excitation.none())
         if work.learning is not None:
             balance = Balance.none(work.problem.observed.size, len(u0))
-            return LearningState(u0, q0, rate, np.inf, excitation, work.learning.init(q0), balance)
-        return GradientState(u0, q0, rate, np.inf, excitation)
+            return LearningState(*fresh, work.learning.init(q0), balance)
+        return GradientState(*fresh)
 
     def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
         form = work.problem.model.form_initial
@@ -251,10 +253,11 @@ class GradientLaw(Law[GradientWork, GradientState]):
             spread = learning.spread(state.learned, seen, length) * (HOLD if waits else 1.0)
             metric = learning.metric(state.learned, spread, state.q, length)
 
-        missed = state.missed
+        same = resting == state.resting and np.array_equal(interval.present, state.present)
+        warm = state.warm if same else Warm.none()
 
         def stage(c: Array, t: float, h: float) -> Array:
-            nonlocal found, missed
+            nonlocal found, warm
             found = reconstruct(t)
             # The observed part moves with the data, the rest as in the step before.
             start = c + h * state.rate
@@ -264,9 +267,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 start[: model.X.dim] += (
                     coupled.split.inverse @ interval.change(t - h, t)[interval.present]
                 )
-            near = missed <= coupled.newton.basin
-            y = coupled.solve(c, h, interval.at(t), found.u, start, metric, near)
-            missed = coupled.missed(start, y)
+            y, warm = coupled.solve(c, h, interval.at(t), found.u, start, metric, warm)
             return y
 
         y = np.concatenate([state.u, state.q])
@@ -296,8 +297,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         predicted = work.problem.predict(u, q, interval.end)
         if rest is not None and work.probes is not None:
             excitation = rest.add(excitation, work.probes(u - r, q, interval.end))
+        moved = (u, q, rate, warm, interval.present, resting, excitation)
         if learning is None or not isinstance(state, LearningState):
-            after = GradientState(u, q, rate, missed, excitation)
+            after = GradientState(*moved)
             return after, Report(Status(), predicted, steps, notes)
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
@@ -307,7 +309,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             same = np.array_equal(np.isnan(interval.z0), np.isnan(interval.z1))
             learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
-        after = LearningState(u, q, rate, missed, excitation, learned, balance or state.balance)
+        after = LearningState(*moved, learned, balance or state.balance)
         return after, Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:

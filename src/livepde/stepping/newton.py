@@ -81,6 +81,7 @@ class Newton:
         floors: tuple[float, ...] = (),
         lagged: bool = False,
         near: bool = False,
+        kept: Factor | None = None,
     ) -> Array:
         """Return the solution, starting from y.
 
@@ -96,13 +97,16 @@ class Newton:
         near
             The start is thought to be so good that Newton may begin; if its first update says
             otherwise, sweeps begin after all.
+        kept
+            With `near`: the factor of a Jacobian not far away, with which Newton may begin. It is
+            replaced as one of this stage would be.
 
         Raises
         ------
         StepFailed
             "not_converged", "not_finite" or "singular".
         """
-        factor: Factor | None = None
+        factor = kept if near else None
         begin = start = y
         floors = floors or (0.0,) * len(blocks)
         last, basin, sweeps = np.inf, self.basin, lagged and not near
