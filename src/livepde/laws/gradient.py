@@ -37,6 +37,7 @@ class GradientState:
     u: Array
     q: Array
     rate: Array
+    u_alpha: Array
     warm: Warm
     present: Array
     resting: bool
@@ -197,7 +198,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         rate, present = np.zeros(len(u0) + len(q0)), np.zeros(work.problem.observed.size, bool)
-        fresh = (u0, q0, rate, Warm.none(), present, False, Excitation.none())
+        fresh = (u0, q0, rate, np.zeros(len(u0)), Warm.none(), present, False, Excitation.none())
         if work.learning is not None:
             balance = Balance.none(work.problem.observed.size, len(u0))
             return LearningState(*fresh, work.learning.init(q0), balance)
@@ -253,13 +254,13 @@ class GradientLaw(Law[GradientWork, GradientState]):
             spread = learning.spread(state.learned, seen, length) * (HOLD if waits else 1.0)
             metric = learning.metric(state.learned, spread, state.q, length)
 
-        same = resting == state.resting and np.array_equal(interval.present, state.present)
-        warm = state.warm if same else Warm.none()
+        known = resting == state.resting and np.array_equal(interval.present, state.present)
+        warm = state.warm if known else Warm.none()
 
         def stage(c: Array, t: float, h: float) -> Array:
             nonlocal found, warm
             found = reconstruct(t)
-            # The observed part moves with the data, the rest as in the step before.
+            # u_alpha moves with the data, the rest as in the step before.
             start = c + h * state.rate
             if regularises or alpha > 0.0:
                 start[: model.X.dim] += found.u - reconstruct(t - h).u
@@ -284,7 +285,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         u, q = end[: model.X.dim], end[model.X.dim :].clip(lower, upper)
         observed_u = coupled.split.R @ u
         rate = end - y
-        rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
+        shift = found.u - state.u_alpha if known else observed_u - coupled.split.R @ state.u
+        rate[: model.X.dim] -= shift
         rate /= length
         r = observed_u - found.u
         notes = {"residual": model.X.norm(r)}
@@ -297,7 +299,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         predicted = work.problem.predict(u, q, interval.end)
         if rest is not None and work.probes is not None:
             excitation = rest.add(excitation, work.probes(u - r, q, interval.end))
-        moved = (u, q, rate, warm, interval.present, resting, excitation)
+        moved = (u, q, rate, found.u, warm, interval.present, resting, excitation)
         if learning is None or not isinstance(state, LearningState):
             after = GradientState(*moved)
             return after, Report(Status(), predicted, steps, notes)
