@@ -192,7 +192,7 @@ def test_stage_solves_its_equations():
         c = 0.3 * rng.standard_normal(n + model.Q.dim)
         c[:n] *= model.X.free
         u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
-        y = stage.solve(c, h, moment, u_alpha, c.copy())
+        y, _ = stage.solve(c, h, moment, u_alpha, c.copy())
         u, q = y[:n], y[n:]
         r, w = split.R @ u - u_alpha, u_alpha + split.P @ u
         Mr = split.R.T @ M_op @ r

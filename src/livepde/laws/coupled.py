@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -266,6 +266,7 @@ class CoupledStage:
         u_alpha: Array,
         start: Array,
         metric: Metric | None = None,
+        near: Array | None = None,
         warm: Warm | None = None,
     ) -> tuple[Array, Warm]:
         """Return y = (u, q) of one stage, and what it leaves to the next; raises `StepFailed`.
@@ -280,27 +281,31 @@ class CoupledStage:
             Where the iteration starts, shape (n + m,); it does not change the result.
         metric
             In the place of G_Q/gain (with gain = inf) and of the damping rule.
+        near
+            A start that follows the steps before more closely, shape (n + m,). If it was good at
+            the stage before, Newton begins there without sweeps.
         warm
-            What the stage before has left: if its start was good, Newton begins without sweeps,
-            with the factor that was kept.
+            What the stage before has left: how good `near` was, and the factor that was kept.
         """
         warm = warm or Warm.none()
-        start[: self.n] = self.model.impose(start[: self.n], moment)
+        near = start if near is None else near
+        for y in (start, near):
+            y[: self.n] = self.model.impose(y[: self.n], moment)
         equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
-        near = warm.missed <= self.newton.basin
+        good = warm.missed <= self.newton.basin
         y = self.newton.solve(
             equation,
             start,
             self.blocks,
             floors=self.floors,
             lagged=True,
-            near=near,
-            kept=self._factor(warm, moment) if near and warm.h == h else None,
+            near=near if good else None,
+            kept=self._factor(warm, moment) if good and warm.h == h else None,
         )
-        missed = relative(y - start, y, self.blocks, self.floors)
+        missed = relative(y - near, y, self.blocks, self.floors)
         if not (self.keeps and equation.made):
-            return y, replace(warm, missed=missed)
+            return y, Warm(missed, warm.y, warm.u_alpha, warm.h)
         self._kept = equation.made
         return y, Warm(missed, equation.made[0], u_alpha, h)
 

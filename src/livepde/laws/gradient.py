@@ -29,15 +29,17 @@ HOLD = 1e12  # times heavier is a prior that keeps q where it is
 class GradientState:
     """Estimates u^ and q^, shapes (n,) and (m,), and how fast they moved.
 
-    `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,): where the next
-    iteration starts; `warm` is what it starts with, and `present`, shape (sensors,), and `resting`
-    tell with which stage that was made. `excitation` is what `Rest` goes by.
+    `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,), `r` the last residual
+    and `r_rate` its change: where the next iteration starts. `warm` is what it starts with, and
+    `present`, shape (sensors,), and `resting` tell with which stage that was made. `excitation` is
+    what `Rest` goes by.
     """
 
     u: Array
     q: Array
     rate: Array
-    u_alpha: Array
+    r: Array
+    r_rate: Array
     warm: Warm
     present: Array
     resting: bool
@@ -197,8 +199,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         return GradientWork(problem, gains, self.newton, learning, smooths(problem.observed))
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
-        rate, present = np.zeros(len(u0) + len(q0)), np.zeros(work.problem.observed.size, bool)
-        fresh = (u0, q0, rate, np.zeros(len(u0)), Warm.none(), present, False, Excitation.none())
+        rate, zero = np.zeros(len(u0) + len(q0)), np.zeros(len(u0))
+        present = np.zeros(work.problem.observed.size, dtype=bool)
+        fresh = (u0, q0, rate, zero, zero, Warm.none(), present, False, Excitation.none())
         if work.learning is not None:
             balance = Balance.none(work.problem.observed.size, len(u0))
             return LearningState(*fresh, work.learning.init(q0), balance)
@@ -260,7 +263,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         def stage(c: Array, t: float, h: float) -> Array:
             nonlocal found, warm
             found = reconstruct(t)
-            # u_alpha moves with the data, the rest as in the step before.
+            # The observed part moves with the data, the rest as in the step before.
             start = c + h * state.rate
             if regularises or alpha > 0.0:
                 start[: model.X.dim] += found.u - reconstruct(t - h).u
@@ -268,7 +271,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 start[: model.X.dim] += (
                     coupled.split.inverse @ interval.change(t - h, t)[interval.present]
                 )
-            y, warm = coupled.solve(c, h, interval.at(t), found.u, start, metric, warm)
+            near = start.copy()
+            near[: model.X.dim] += h * state.r_rate
+            y, warm = coupled.solve(c, h, interval.at(t), found.u, start, metric, near, warm)
             return y
 
         y = np.concatenate([state.u, state.q])
@@ -285,10 +290,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
         u, q = end[: model.X.dim], end[model.X.dim :].clip(lower, upper)
         observed_u = coupled.split.R @ u
         rate = end - y
-        shift = found.u - state.u_alpha if known else observed_u - coupled.split.R @ state.u
-        rate[: model.X.dim] -= shift
+        rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
         rate /= length
         r = observed_u - found.u
+        r_rate = (r - state.r) / length if known else zero
         notes = {"residual": model.X.norm(r)}
         if resting:
             notes |= {"at_rest": 1.0}
@@ -299,7 +304,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         predicted = work.problem.predict(u, q, interval.end)
         if rest is not None and work.probes is not None:
             excitation = rest.add(excitation, work.probes(u - r, q, interval.end))
-        moved = (u, q, rate, found.u, warm, interval.present, resting, excitation)
+        moved = (u, q, rate, r, r_rate, warm, interval.present, resting, excitation)
         if learning is None or not isinstance(state, LearningState):
             after = GradientState(*moved)
             return after, Report(Status(), predicted, steps, notes)

@@ -80,7 +80,7 @@ class Newton:
         *,
         floors: tuple[float, ...] = (),
         lagged: bool = False,
-        near: bool = False,
+        near: Array | None = None,
         kept: Factor | None = None,
     ) -> Array:
         """Return the solution, starting from y.
@@ -95,8 +95,9 @@ class Newton:
         lagged
             Begin with lagged sweeps.
         near
-            The start is thought to be so good that Newton may begin; if its first update says
-            otherwise, sweeps begin after all.
+            A start that is thought to be so good that Newton may begin there. Where its first
+            update is large, or its own factor does not serve to the end, sweeps begin from y after
+            all: where solutions meet, they and not Newton choose.
         kept
             With `near`: the factor of a Jacobian not far away, with which Newton may begin. It is
             replaced as one of this stage would be.
@@ -106,11 +107,12 @@ class Newton:
         StepFailed
             "not_converged", "not_finite" or "singular".
         """
-        factor = kept if near else None
+        factor = kept
         begin = start = y
+        y = start if near is None else near
         floors = floors or (0.0,) * len(blocks)
-        last, basin, sweeps = np.inf, self.basin, lagged and not near
-        limit, stalled = self.basin if near else np.inf, 0
+        last, basin, sweeps = np.inf, self.basin, lagged and near is None
+        limit, stalled = np.inf if near is None else self.basin, 0
         for _ in range(self.iterations):
             residual = equation.residual(y)
             try:
@@ -125,20 +127,26 @@ class Newton:
             ratio = size / last
             if ratio >= 0.5 and size <= ROUNDING:
                 return new  # updates that no longer shrink down there are rounding errors
-            if lagged and not sweeps and size >= limit:
+            # The error left behind is about rate/(1 - rate) times the update; what converges slowly
+            # may only show later.
+            rate = max(ratio, SLOWEST) if lagged else ratio
+            left = size * rate / (1.0 - rate) if 0.0 < ratio < 1.0 else np.inf
+            done = size == 0.0 or left <= self.tolerance
+            slow = ratio > self.refresh and not done
+            if (
+                lagged
+                and not sweeps
+                and (size >= limit or (slow and near is not None and kept is None))
+            ):
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
-                basin = basin if near else 0.3 * basin
-                y, factor, sweeps, near, last = begin, None, True, False, np.inf
+                basin = 0.3 * basin if near is None else basin
+                y, factor, sweeps, near, last = begin, None, True, None, np.inf
                 limit, stalled = np.inf, 0
                 continue
             if not sweeps and math.isinf(last):
                 limit = size
             y = new
-            # The error left behind is about ratio/(1 - ratio) times the update; what converges
-            # slowly may only show later.
-            rate = max(ratio, SLOWEST) if lagged else ratio
-            left = size * rate / (1.0 - rate) if 0.0 < ratio < 1.0 else np.inf
-            if size == 0.0 or left <= self.tolerance:
+            if done:
                 return y
             last = size
             stalled = stalled + 1 if sweeps and size > 0.9 else 0
@@ -147,8 +155,8 @@ class Newton:
             if sweeps and (size <= basin or stalled == STALLED):
                 # Newton's first update may be larger: sweeps creep, Newton goes all the way.
                 begin, factor, sweeps, last = y, None, False, np.inf
-            elif sweeps or ratio > self.refresh:
-                factor = None
+            elif sweeps or slow:
+                factor = kept = None
         raise StepFailed(
             "not_converged",
             f"{self.iterations} iterations left a relative update of {size:.1e}",
