@@ -29,6 +29,8 @@ RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as thi
 
 PULL = 10.0  # theta h where the law tunes itself: r forgets within a step
 
+NOTHING = (np.zeros(0), np.zeros(0), 0.0)  # kept
+
 __all__ = ["PULL", "CoupledStage", "Gains", "Metric", "Warm"]
 
 
@@ -107,7 +109,7 @@ class Warm:
     @classmethod
     def none(cls) -> Warm:
         """Return the value before any stage."""
-        return cls(np.inf, np.zeros(0), np.zeros(0), 0.0)
+        return cls(np.inf, *NOTHING)
 
 
 class CoupledStage:
@@ -304,7 +306,9 @@ class CoupledStage:
             kept=self._factor(warm, moment) if good and warm.h == h else None,
         )
         missed = relative(y - near, y, self.blocks, self.floors)
-        if not (self.keeps and equation.made):
+        if not self.keeps or (equation.made is None and equation.count > self.patience):
+            return y, Warm(missed, *NOTHING)
+        if equation.made is None:
             return y, Warm(missed, warm.y, warm.u_alpha, warm.h)
         self._kept = equation.made
         return y, Warm(missed, equation.made[0], u_alpha, h)
@@ -316,8 +320,13 @@ class CoupledStage:
 
     @cached_property
     def keeps(self) -> bool:
-        """True if a factor is kept from stage to stage: one of a band costs less than it saves."""
-        return self._bilinear is not None and not isinstance(self.solver, BandedSolver)
+        """True if a factor is kept from stage to stage."""
+        return self._bilinear is not None
+
+    @cached_property
+    def patience(self) -> int:
+        """Updates of a stage by a kept factor, beyond which the next one makes its own."""
+        return 3 if isinstance(self.solver, BandedSolver) else 12
 
     def _factor(self, warm: Warm, moment: Moment) -> Factor:
         """Return the factor that a stage has left, made again if this is not its stage."""
@@ -345,12 +354,14 @@ class _Equation:
         self.u_alpha = u_alpha
         self.source = stage.model.F(moment)
         self.metric: Metric | None = None
+        self.count = 0  # residuals
         self.made: tuple[Array, Factor] | None = None  # Newton's last factor, and where
 
     def residual(self, y: Array) -> Array:
         """Return the residual at y = (u, q)."""
         stage, model, n, g = self.stage, self.stage.model, self.stage.n, self.stage.gains
         u, q = y[:n], y[n:]
+        self.count += 1
         self.r = r = stage.split.R @ u - self.u_alpha
         self.w = w = u if g.at_estimate else u - r  # u_alpha + P u, since P = I - R
         self.Mr, self.mass_r = stage.RM @ r, stage.RT @ (model.mass @ r)
@@ -508,6 +519,7 @@ class _BilinearEquation(_Equation):
 
     def residual(self, y: Array) -> Array:
         n, size = self.stage.n, len(y)
+        self.count += 1
         stack = self.linear @ y - self.known
         self.r = r = stack[size : size + n]
         self.Mr, self.mass_r = stack[size + n : size + 2 * n], stack[size + 2 * n :]
