@@ -155,8 +155,10 @@ class Newton:
             if sweeps and (size <= basin or stalled == STALLED):
                 # Newton's first update may be larger: sweeps creep, Newton goes all the way.
                 begin, factor, sweeps, last = y, None, False, np.inf
+            elif kept is not None and slow:
+                factor, kept, last = None, None, np.inf  # a factor of its own begins anew
             elif sweeps or slow:
-                factor = kept = None
+                factor = None
         raise StepFailed(
             "not_converged",
             f"{self.iterations} iterations left a relative update of {size:.1e}",
