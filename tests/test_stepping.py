@@ -240,7 +240,7 @@ class Slope:
 
 
 class Cubic:
-    """x^3 = x for x = y - 5: sweeps go to 1 from x > 0, Newton anywhere; says what it factorised."""
+    """x^3 = x for x = y - 5: sweeps go to 1 from x > 0, Newton anywhere."""
 
     def __init__(self):
         self.sweeps = []
