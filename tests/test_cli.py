@@ -410,7 +410,7 @@ def fake(monkeypatch):
     def install(value: float) -> Fake:
         one = Fake(value)
         monkeypatch.setattr(reproduce, "EXPERIMENTS", {"seed": one})
-        monkeypatch.setattr(step, "step", lambda: outcome(value))
+        monkeypatch.setattr(step, "step", lambda sizes, modes: outcome(value))
         return one
 
     return install

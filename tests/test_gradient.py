@@ -192,7 +192,7 @@ def test_stage_solves_its_equations():
         c = 0.3 * rng.standard_normal(n + model.Q.dim)
         c[:n] *= model.X.free
         u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
-        y = stage.solve(c, h, moment, u_alpha, c.copy())
+        y, _ = stage.solve(c, h, moment, u_alpha, c.copy())
         u, q = y[:n], y[n:]
         r, w = split.R @ u - u_alpha, u_alpha + split.P @ u
         Mr = split.R.T @ M_op @ r
@@ -422,7 +422,7 @@ def test_forward_stage_agrees_with_the_coupled_stage_without_data():
     rng = np.random.default_rng(1)
     c = rng.standard_normal(model.X.dim + model.Q.dim)
     c[: model.X.dim] *= model.X.free
-    y = stage.solve(c, 0.1, Moment(0.1), np.zeros(model.X.dim), c.copy())
+    y, _ = stage.solve(c, 0.1, Moment(0.1), np.zeros(model.X.dim), c.copy())
     u = ForwardStage(model).solve(c[: model.X.dim], c[model.X.dim :], 0.1, Moment(0.1))
     np.testing.assert_allclose(y[: model.X.dim], u, atol=1e-9)
     np.testing.assert_allclose(y[model.X.dim :], c[model.X.dim :], atol=1e-9)

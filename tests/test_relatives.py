@@ -95,7 +95,7 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     c = 0.3 * rng.standard_normal(n + model.Q.dim)
     c[:n] *= model.X.free
     u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
-    y = stage.solve(c, h, lp.Moment(0.2), u_alpha, np.zeros_like(c))
+    y, _ = stage.solve(c, h, lp.Moment(0.2), u_alpha, np.zeros_like(c))
     u, q = y[:n], y[n:]
     r, A = split.R @ u - u_alpha, model.A(u)
     state = model.mass @ (u - c[:n]) / h + model.B(u) + A.matrix @ q

@@ -229,6 +229,58 @@ def test_newton_keeps_its_factor_while_it_is_good():
     assert equation.factors == 1
 
 
+class Slope:
+    """The factor of a single number."""
+
+    def __init__(self, slope):
+        self.slope = slope
+
+    def solve(self, b):
+        return b / self.slope
+
+
+class Cubic:
+    """x^3 = x for x = y - 5: sweeps go to 1 from x > 0, Newton anywhere."""
+
+    def __init__(self):
+        self.sweeps = []
+
+    def residual(self, y):
+        x = y - 5.0
+        return x**3 - x
+
+    def factor(self, y, sweep):
+        self.sweeps.append(sweep)
+        return Slope(2.0 if sweep else 3.0 * (y[0] - 5.0) ** 2 - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("near", "kept", "made"),
+    [
+        (6.01, None, [False]),  # a good start: one factor, and no sweep
+        (6.01, Slope(2.0), []),  # none at all
+        (6.01, Slope(5.0), [False]),  # a kept one that is not good enough is replaced
+    ],
+)
+def test_newton_begins_where_the_start_is_good(near, kept, made):
+    equation = Cubic()
+    start = np.array([5.6])
+    y = lp.Newton().solve(equation, start, lagged=True, near=np.array([near]), kept=kept)
+    np.testing.assert_allclose(y, 6.0, rtol=1e-7)
+    assert equation.sweeps == made
+
+
+@pytest.mark.parametrize("near", [5.5, 5.55])
+def test_sweeps_choose_where_newton_goes_far(near):
+    """From there Newton goes to 4, or far below."""
+    equation, swept = Cubic(), Cubic()
+    start = np.array([5.6])
+    y = lp.Newton().solve(equation, start, lagged=True, near=np.array([near]))
+    assert equation.sweeps[:2] == [False, True]
+    assert np.array_equal(y, lp.Newton().solve(swept, start, lagged=True))
+    assert equation.sweeps[1:] == swept.sweeps
+
+
 @pytest.mark.parametrize(
     ("equation", "start", "newton", "code"),
     [

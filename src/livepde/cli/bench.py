@@ -34,14 +34,30 @@ bench = typer.Typer(
 
 
 @bench.command()
-def step(as_json: JsonOption = False) -> None:
+def step(
+    size: Annotated[
+        list[int] | None,
+        typer.Option(min=5, help="Number of nodes, default 31, 1000 and 10000. Repeat for more."),
+    ] = None,
+    modes: Annotated[
+        list[int] | None,
+        typer.Option(
+            min=1, help="Unknowns of the sensitivity law, default 1, 10 and 50. Repeat for more."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
     """Time a step of each law against one forward step of the same model.
 
-    Example:  livepde bench step --json
+    Example:  livepde bench step --size 1000 --json
     """
+    from livepde.bench.step import MODES, SIZES
     from livepde.bench.step import step as benchmark
 
-    report_outcome(benchmark(), ["livepde", "bench", "step"], as_json)
+    command = ["livepde", "bench", "step"]
+    command += [word for nodes in size or () for word in ("--size", str(nodes))]
+    command += [word for count in modes or () for word in ("--modes", str(count))]
+    report_outcome(benchmark(size or SIZES, modes or MODES), command, as_json)
 
 
 @bench.command()

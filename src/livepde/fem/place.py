@@ -16,7 +16,10 @@ class Inputs(Mapping[str, float]):
     """Values of the input channels at one moment; a missing name is one clear sentence."""
 
     def __init__(self, values: Mapping[str, float]) -> None:
-        self._values = MappingProxyType(dict(values))
+        if isinstance(values, Inputs):  # they never change
+            self._values: Mapping[str, float] = values._values
+        else:
+            self._values = MappingProxyType(dict(values))
 
     def __getitem__(self, name: str) -> float:
         try:

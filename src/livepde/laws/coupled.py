@@ -11,16 +11,27 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.damping import Damping, Residual
-from livepde.linalg import Array, Assembler, Factor, Leading, Pattern, Solver, analyse
+from livepde.linalg import (
+    Array,
+    Assembler,
+    BandedSolver,
+    Factor,
+    Leading,
+    Pattern,
+    Solver,
+    analyse,
+)
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import Newton
+from livepde.stepping import Newton, relative
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
 PULL = 10.0  # theta h where the law tunes itself: r forgets within a step
 
-__all__ = ["PULL", "CoupledStage", "Gains", "Metric"]
+NOTHING = (np.zeros(0), np.zeros(0), 0.0)  # kept
+
+__all__ = ["PULL", "CoupledStage", "Gains", "Metric", "Warm"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +85,33 @@ class Metric:
     shift: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Warm:
+    """What a stage leaves to the next one: how good its start was, and where its factor was made.
+
+    The factor itself is made again from this where it is gone, after a restart say: the numbers
+    that follow are the same.
+
+    Attributes
+    ----------
+    missed
+        How far the start was from the solution, relative to the norms of u and q.
+    y, u_alpha, h
+        Point, data and step of the last Jacobian of Newton that was factorised, shapes (n + m,) and
+        (n,); empty if none is kept.
+    """
+
+    missed: float
+    y: Array
+    u_alpha: Array
+    h: float
+
+    @classmethod
+    def none(cls) -> Warm:
+        """Return the value before any stage."""
+        return cls(np.inf, *NOTHING)
+
+
 class CoupledStage:
     """One implicit Euler stage of (est_exact_q), (est_exact_u), or (noisy_q), (noisy_u), coupled.
 
@@ -112,6 +150,7 @@ class CoupledStage:
         self.W = sp.csr_array(sp.eye_array(self.n)) if gains.at_estimate else split.P
         self.free_q = model.Q.free
         self._constant: tuple[float, Array] | None = None
+        self._kept: tuple[Array, Factor] | None = None
         # G_Q, or where that is dense a sparse matrix of which it is the Schur complement: then
         # the Jacobian has auxiliary unknowns behind q.
         self.gram = model.Q.augmented
@@ -229,8 +268,10 @@ class CoupledStage:
         u_alpha: Array,
         start: Array,
         metric: Metric | None = None,
-    ) -> Array:
-        """Return y = (u, q) of one stage; raises `StepFailed`.
+        near: Array | None = None,
+        warm: Warm | None = None,
+    ) -> tuple[Array, Warm]:
+        """Return y = (u, q) of one stage, and what it leaves to the next; raises `StepFailed`.
 
         Parameters
         ----------
@@ -242,14 +283,58 @@ class CoupledStage:
             Where the iteration starts, shape (n + m,); it does not change the result.
         metric
             In the place of G_Q/gain (with gain = inf) and of the damping rule.
+        near
+            A start that follows the steps before more closely, shape (n + m,). If it was good at
+            the stage before, Newton begins there without sweeps.
+        warm
+            What the stage before has left: how good `near` was, and the factor that was kept.
         """
-        start[: self.n] = self.model.impose(start[: self.n], moment)
-        if self._bilinear is not None:
-            equation: _Equation = _BilinearEquation(self._bilinear, self, c, h, moment, u_alpha)
-        else:
-            equation = _Equation(self, c, h, moment, u_alpha)
+        warm = warm or Warm.none()
+        near = start if near is None else near
+        for y in (start, near):
+            y[: self.n] = self.model.impose(y[: self.n], moment)
+        equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
-        return self.newton.solve(equation, start, self.blocks, floors=self.floors, lagged=True)
+        good = warm.missed <= self.newton.basin
+        y = self.newton.solve(
+            equation,
+            start,
+            self.blocks,
+            floors=self.floors,
+            lagged=True,
+            near=near if good else None,
+            kept=self._factor(warm, moment) if good and warm.h == h else None,
+        )
+        missed = relative(y - near, y, self.blocks, self.floors)
+        if not self.keeps or (equation.made is None and equation.count > self.patience):
+            return y, Warm(missed, *NOTHING)
+        if equation.made is None:
+            return y, Warm(missed, warm.y, warm.u_alpha, warm.h)
+        self._kept = equation.made
+        return y, Warm(missed, equation.made[0], u_alpha, h)
+
+    def _equation(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> _Equation:
+        if self._bilinear is not None:
+            return _BilinearEquation(self._bilinear, self, c, h, moment, u_alpha)
+        return _Equation(self, c, h, moment, u_alpha)
+
+    @cached_property
+    def keeps(self) -> bool:
+        """True if a factor is kept from stage to stage."""
+        return self._bilinear is not None
+
+    @cached_property
+    def patience(self) -> int:
+        """Updates of a stage by a kept factor, beyond which the next one makes its own."""
+        return 3 if isinstance(self.solver, BandedSolver) else 12
+
+    def _factor(self, warm: Warm, moment: Moment) -> Factor:
+        """Return the factor that a stage has left, made again if this is not its stage."""
+        if self._kept is None or self._kept[0] is not warm.y:
+            equation = self._equation(np.zeros_like(warm.y), warm.h, moment, warm.u_alpha)
+            equation.residual(warm.y)
+            self._kept = (warm.y, equation.factor(warm.y, False))
+        return self._kept[1]
 
 
 class _Equation:
@@ -269,11 +354,14 @@ class _Equation:
         self.u_alpha = u_alpha
         self.source = stage.model.F(moment)
         self.metric: Metric | None = None
+        self.count = 0  # residuals
+        self.made: tuple[Array, Factor] | None = None  # Newton's last factor, and where
 
     def residual(self, y: Array) -> Array:
         """Return the residual at y = (u, q)."""
         stage, model, n, g = self.stage, self.stage.model, self.stage.n, self.stage.gains
         u, q = y[:n], y[n:]
+        self.count += 1
         self.r = r = stage.split.R @ u - self.u_alpha
         self.w = w = u if g.at_estimate else u - r  # u_alpha + P u, since P = I - R
         self.Mr, self.mass_r = stage.RM @ r, stage.RT @ (model.mass @ r)
@@ -345,11 +433,12 @@ class _Equation:
         if sweep or metric is not None:
             return factor
         row = stage.slope(self.norms, self.Mr, self.mass_r)
-        if not row.any():
-            return factor
-        column = np.zeros_like(y)
-        column[: stage.n] = self.Mr
-        return _Bordered(factor, factor.solve(column), row)
+        if row.any():
+            column = np.zeros_like(y)
+            column[: stage.n] = self.Mr
+            factor = _Bordered(factor, factor.solve(column), row)
+        self.made = (y, factor)
+        return factor
 
 
 class _Bilinear:
@@ -430,6 +519,7 @@ class _BilinearEquation(_Equation):
 
     def residual(self, y: Array) -> Array:
         n, size = self.stage.n, len(y)
+        self.count += 1
         stack = self.linear @ y - self.known
         self.r = r = stack[size : size + n]
         self.Mr, self.mass_r = stack[size + n : size + 2 * n], stack[size + 2 * n :]

@@ -10,7 +10,7 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report, Status
-from livepde.laws.coupled import PULL, CoupledStage, Gains
+from livepde.laws.coupled import PULL, CoupledStage, Gains, Warm
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
 from livepde.laws.rest import Excitation, Probes, Rest
@@ -29,13 +29,20 @@ HOLD = 1e12  # times heavier is a prior that keeps q where it is
 class GradientState:
     """Estimates u^ and q^, shapes (n,) and (m,), and how fast they moved.
 
-    `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,): where the next
-    iteration starts. `excitation` is what `Rest` goes by.
+    `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,), `r` the last residual
+    and `r_rate` its change: where the next iteration starts. `warm` is what it starts with, and
+    `present`, shape (sensors,), and `resting` tell with which stage that was made. `excitation` is
+    what `Rest` goes by.
     """
 
     u: Array
     q: Array
     rate: Array
+    r: Array
+    r_rate: Array
+    warm: Warm
+    present: Array
+    resting: bool
     excitation: Excitation
 
 
@@ -192,12 +199,13 @@ class GradientLaw(Law[GradientWork, GradientState]):
         return GradientWork(problem, gains, self.newton, learning, smooths(problem.observed))
 
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
-        rate = np.zeros(len(u0) + len(q0))
-        excitation = Excitation.none()
+        rate, zero = np.zeros(len(u0) + len(q0)), np.zeros(len(u0))
+        present = np.zeros(work.problem.observed.size, dtype=bool)
+        fresh = (u0, q0, rate, zero, zero, Warm.none(), present, False, Excitation.none())
         if work.learning is not None:
             balance = Balance.none(work.problem.observed.size, len(u0))
-            return LearningState(u0, q0, rate, excitation, work.learning.init(q0), balance)
-        return GradientState(u0, q0, rate, excitation)
+            return LearningState(*fresh, work.learning.init(q0), balance)
+        return GradientState(*fresh)
 
     def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
         form = work.problem.model.form_initial
@@ -249,8 +257,11 @@ class GradientLaw(Law[GradientWork, GradientState]):
             spread = learning.spread(state.learned, seen, length) * (HOLD if waits else 1.0)
             metric = learning.metric(state.learned, spread, state.q, length)
 
+        known = resting == state.resting and np.array_equal(interval.present, state.present)
+        warm = state.warm if known else Warm.none()
+
         def stage(c: Array, t: float, h: float) -> Array:
-            nonlocal found
+            nonlocal found, warm
             found = reconstruct(t)
             # The observed part moves with the data, the rest as in the step before.
             start = c + h * state.rate
@@ -260,7 +271,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 start[: model.X.dim] += (
                     coupled.split.inverse @ interval.change(t - h, t)[interval.present]
                 )
-            return coupled.solve(c, h, interval.at(t), found.u, start, metric)
+            near = start.copy()
+            near[: model.X.dim] += h * state.r_rate
+            y, warm = coupled.solve(c, h, interval.at(t), found.u, start, metric, near, warm)
+            return y
 
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stage, y, interval)
@@ -279,6 +293,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
         rate /= length
         r = observed_u - found.u
+        r_rate = (r - state.r) / length if known else zero
         notes = {"residual": model.X.norm(r)}
         if resting:
             notes |= {"at_rest": 1.0}
@@ -289,8 +304,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         predicted = work.problem.predict(u, q, interval.end)
         if rest is not None and work.probes is not None:
             excitation = rest.add(excitation, work.probes(u - r, q, interval.end))
+        moved = (u, q, rate, r, r_rate, warm, interval.present, resting, excitation)
         if learning is None or not isinstance(state, LearningState):
-            after = GradientState(u, q, rate, excitation)
+            after = GradientState(*moved)
             return after, Report(Status(), predicted, steps, notes)
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
@@ -300,7 +316,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             same = np.array_equal(np.isnan(interval.z0), np.isnan(interval.z1))
             learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
-        after = LearningState(u, q, rate, excitation, learned, balance or state.balance)
+        after = LearningState(*moved, learned, balance or state.balance)
         return after, Report(Status(), predicted, steps, notes)
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:

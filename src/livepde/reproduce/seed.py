@@ -49,9 +49,9 @@ def f(x: Any, t: float) -> Any:
     return (D * np.pi**2 - 1 / (1 + t) + q_true(x)) * u_true(x, t)
 
 
-def build(std: float = 1.0) -> tuple[Model, Subdomain]:
+def build(std: float = 1.0, nodes: int = N) -> tuple[Model, Subdomain]:
     """Return the paper's model, with a prior deviation of q, and observation."""
-    mesh = interval(0, 1, N - 1)
+    mesh = interval(0, 1, nodes - 1)
     element = hermite(mesh)
     zero = {"boundary": 0.0}
     model = Model(

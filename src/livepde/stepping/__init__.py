@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.newton import Newton, StepFailed
+from livepde.stepping.newton import Newton, StepFailed, relative
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.state import ForwardStage, simulate
 
@@ -18,5 +18,6 @@ __all__ = [
     "Stage",
     "StepFailed",
     "advance",
+    "relative",
     "simulate",
 ]

@@ -11,11 +11,13 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["Newton", "StepFailed"]
+__all__ = ["Newton", "StepFailed", "relative"]
 
 
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
+
+SLOWEST = 0.1  # rate at which a kept factor of a stage with sweeps is expected to go on
 
 STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
 
@@ -78,6 +80,8 @@ class Newton:
         *,
         floors: tuple[float, ...] = (),
         lagged: bool = False,
+        near: Array | None = None,
+        kept: Factor | None = None,
     ) -> Array:
         """Return the solution, starting from y.
 
@@ -90,17 +94,25 @@ class Newton:
             errors has no relative accuracy.
         lagged
             Begin with lagged sweeps.
+        near
+            A start that is thought to be so good that Newton may begin there. Where its first
+            update is large, or its own factor does not serve to the end, sweeps begin from y after
+            all: where solutions meet, they and not Newton choose.
+        kept
+            With `near`: the factor of a Jacobian not far away, with which Newton may begin. It is
+            replaced as one of this stage would be.
 
         Raises
         ------
         StepFailed
             "not_converged", "not_finite" or "singular".
         """
-        factor: Factor | None = None
+        factor = kept
         begin = start = y
+        y = start if near is None else near
         floors = floors or (0.0,) * len(blocks)
-        last, basin, sweeps = np.inf, self.basin, lagged
-        first, stalled = np.inf, 0
+        last, basin, sweeps = np.inf, self.basin, lagged and near is None
+        limit, stalled = np.inf if near is None else self.basin, 0
         for _ in range(self.iterations):
             residual = equation.residual(y)
             try:
@@ -109,23 +121,32 @@ class Newton:
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
-            size = _relative(update, new, blocks, floors)
+            size = relative(update, new, blocks, floors)
             if not math.isfinite(size):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
             ratio = size / last
             if ratio >= 0.5 and size <= ROUNDING:
                 return new  # updates that no longer shrink down there are rounding errors
-            if lagged and not sweeps and size >= first:
+            # The error left behind is about rate/(1 - rate) times the update; what converges slowly
+            # may only show later.
+            rate = max(ratio, SLOWEST) if lagged else ratio
+            left = size * rate / (1.0 - rate) if 0.0 < ratio < 1.0 else np.inf
+            done = size == 0.0 or left <= self.tolerance
+            slow = ratio > self.refresh and not done
+            if (
+                lagged
+                and not sweeps
+                and (size >= limit or (slow and near is not None and kept is None))
+            ):
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
-                y, factor, sweeps, last, basin = begin, None, True, np.inf, 0.3 * basin
-                first, stalled = np.inf, 0
+                basin = 0.3 * basin if near is None else basin
+                y, factor, sweeps, near, last = begin, None, True, None, np.inf
+                limit, stalled = np.inf, 0
                 continue
-            if not sweeps and math.isinf(first):
-                first = size
+            if not sweeps and math.isinf(last):
+                limit = size
             y = new
-            # The error left behind is about ratio/(1 - ratio) times the update.
-            left = size * ratio / (1.0 - ratio) if 0.0 < ratio < 1.0 else np.inf
-            if size == 0.0 or left <= self.tolerance:
+            if done:
                 return y
             last = size
             stalled = stalled + 1 if sweeps and size > 0.9 else 0
@@ -134,7 +155,9 @@ class Newton:
             if sweeps and (size <= basin or stalled == STALLED):
                 # Newton's first update may be larger: sweeps creep, Newton goes all the way.
                 begin, factor, sweeps, last = y, None, False, np.inf
-            elif sweeps or ratio > self.refresh:
+            elif kept is not None and slow:
+                factor, kept, last = None, None, np.inf  # a factor of its own begins anew
+            elif sweeps or slow:
                 factor = None
         raise StepFailed(
             "not_converged",
@@ -142,7 +165,7 @@ class Newton:
         )
 
 
-def _relative(
+def relative(
     update: Array, y: Array, blocks: tuple[slice, ...], floors: tuple[float, ...]
 ) -> float:
     """Return the largest update of a block relative to the block, in Euclidean norms."""
