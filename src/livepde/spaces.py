@@ -97,8 +97,9 @@ class HilbertSpace:
             f"The Gram matrix of {self.name} is singular: its inner product does not see every "
             "element. Add a zero-order term (inner='H1' has one) or fix boundary values."
         )
+        solver = analyse(pattern, symmetric=True)
         try:
-            factor = analyse(pattern, symmetric=True).factorise(_data(self.tangent_gram, pattern))
+            factor = solver.factorise(_data(self.tangent_gram, pattern))
         except LinearAlgebraError as error:
             raise SpaceError(singular) from error
         # Two steps of inverse iteration find a nearly zero eigenvalue that no pivot shows; on the
@@ -107,13 +108,16 @@ class HilbertSpace:
         if not scale.all():
             raise SpaceError(singular)
         x = np.random.default_rng(0).standard_normal(self.dim)
-        for _ in range(2):
-            x = scale * factor.solve(scale * x / np.linalg.norm(x))
+        try:
+            for _ in range(2):
+                x = scale * factor.solve(scale * x / np.linalg.norm(x))
+        except LinearAlgebraError as error:
+            raise SpaceError(f"The Gram matrix of {self.name}: {error}") from error
         unit = sp.diags_array(1.0 / scale)
         largest = abs(unit @ self.tangent_gram @ unit).sum(axis=1).max()
         if not np.isfinite(x).all() or np.linalg.norm(x) * largest > LARGEST_CONDITION:
             raise SpaceError(singular)
-        if not positive_definite(self.tangent_gram):
+        if not (solver.definite or positive_definite(self.tangent_gram)):
             raise SpaceError(
                 f"The Gram matrix of {self.name} is not positive definite: check the sign of the "
                 "terms of its inner product."

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
+from livepde.linalg.choice import Choice, analyse, choose
+from livepde.linalg.cholmod import CholmodSolver
+from livepde.linalg.kept import KeptSolver
+from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
+from livepde.linalg.multigrid import MultigridSolver
+from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
@@ -14,29 +20,23 @@ __all__ = [
     "Array",
     "Assembler",
     "BandedSolver",
+    "Choice",
+    "CholmodSolver",
     "Factor",
     "IntArray",
+    "KeptSolver",
     "Leading",
+    "MultigridSolver",
+    "PardisoSolver",
     "Pattern",
     "PatternOperator",
     "Solver",
     "Sparse",
     "SuperLUSolver",
     "analyse",
+    "choose",
+    "conjugate_gradients",
+    "gmres",
     "positive_definite",
     "sandwich",
 ]
-
-WIDEST_BAND = 48
-
-
-def analyse(pattern: Pattern, *, symmetric: bool = False) -> Solver:
-    """Choose the engine for a pattern: the only place where this is decided.
-
-    Banded LU up to `WIDEST_BAND` diagonals on each side (every 1D problem), SuperLU beyond it.
-    `symmetric` promises that every matrix to come is symmetric positive definite.
-    """
-    banded = BandedSolver(pattern)
-    if max(banded.band) <= WIDEST_BAND:
-        return banded
-    return SuperLUSolver(pattern, symmetric)
