@@ -11,7 +11,8 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.damping import Damping, Residual
-from livepde.linalg import Array, Assembler, Factor, Leading, Pattern, Solver, analyse
+from livepde.laws.schur import LARGE, Blocks, BlockSolver
+from livepde.linalg import Array, Assembler, BandedSolver, Factor, Leading, Pattern, Solver, analyse
 from livepde.model import Model
 from livepde.observation import Split
 from livepde.stepping import Newton
@@ -155,6 +156,17 @@ class CoupledStage:
     def solver(self) -> Solver:
         """The engine of the coupled matrix."""
         return self._assembled[0]
+
+    @cached_property
+    def by_blocks(self) -> BlockSolver | None:
+        """What solves a large system by blocks; None: the coupled matrix is factorised."""
+        if self.size < LARGE or isinstance(self.solver, BandedSolver):
+            return None
+        free = sp.diags_array(self.model.X.free)
+        mass = sp.csr_array(free @ self.model.mass @ free)
+        moves = self.auxiliary or self.model.latent.generator.nnz or not self.linear
+        symmetric = ((self.W @ free).count_nonzero() == 0, not moves)
+        return BlockSolver(self.solver.pattern, self.n, self.split.R, mass, symmetric)
 
     @property
     def maps(self) -> dict[str, sp.csr_array]:
@@ -339,7 +351,10 @@ class _Equation:
         if metric is not None:
             data += stage.maps["G"] @ ((metric.spread / PULL) * stage.gram_data)
             data += stage.maps["J"] @ (metric.data / PULL)
-        factor: Factor = stage.solver.factorise(data)
+        large = stage.by_blocks
+        factor: Factor = (
+            large.factorise(data, self.h, self.theta) if large else stage.solver.factorise(data)
+        )
         if stage.auxiliary:
             factor = Leading(factor, stage.size, stage.size + stage.auxiliary)
         if sweep or metric is not None:
@@ -347,6 +362,8 @@ class _Equation:
         row = stage.slope(self.norms, self.Mr, self.mass_r)
         if not row.any():
             return factor
+        if isinstance(factor, Blocks):
+            return factor.bordered(self.Mr, row)
         column = np.zeros_like(y)
         column[: stage.n] = self.Mr
         return _Bordered(factor, factor.solve(column), row)

@@ -9,7 +9,7 @@ from livepde.linalg.cholmod import CholmodSolver
 from livepde.linalg.kept import KeptSolver
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
-from livepde.linalg.multigrid import MultigridSolver
+from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
 from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
@@ -34,6 +34,7 @@ __all__ = [
     "Sparse",
     "SuperLUSolver",
     "analyse",
+    "approximate_inverse",
     "choose",
     "conjugate_gradients",
     "gmres",

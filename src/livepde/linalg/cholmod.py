@@ -43,7 +43,8 @@ class CholmodSolver:
     def _order(self) -> Any:
         from sksparse.cholmod import analyze
 
-        return analyze(self._matrix(np.ones(self.pattern.nnz)))
+        # The other mode makes L D L^T, of indefinite matrices, too.
+        return analyze(self._matrix(np.ones(self.pattern.nnz)), mode="supernodal")
 
     def _matrix(self, data: Array) -> sp.csc_matrix:
         # A symmetric matrix is its transpose; scikit-sparse knows no sparse arrays.

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.linalg.krylov import conjugate_gradients, gmres
+from livepde.linalg.multigrid import approximate_inverse
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.types import Array
@@ -114,15 +115,15 @@ class _Preconditioned:
     def solve(self, b: Array) -> Array:
         """Return x with K x = b to the tolerance."""
         start = perf_counter()
-        apply = self.matrix.__matmul__
+        apply, precondition = self.matrix.__matmul__, approximate_inverse(self.factor)
         if self.symmetric:
             x, iterations = conjugate_gradients(
-                apply, self.factor.solve, b, TOLERANCE, ITERATIONS, REMEDY
+                apply, precondition, b, TOLERANCE, ITERATIONS, REMEDY
             )
         else:
             columns = b.reshape(len(b), -1).T
             found = [
-                gmres(apply, self.factor.solve, column, TOLERANCE, ITERATIONS, REMEDY)
+                gmres(apply, precondition, column, TOLERANCE, ITERATIONS, REMEDY)
                 for column in columns
             ]
             x = np.stack([column for column, _ in found], axis=1).reshape(b.shape)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator
-from scipy.sparse.linalg import gmres as scipy_gmres
 
 from livepde.errors import LinearAlgebraError
 from livepde.linalg.types import Array
@@ -84,29 +82,62 @@ def _ratio(a: Array, b: Array) -> Array:
 def gmres(
     apply: Map, precondition: Map, b: Array, tolerance: float, limit: int, remedy: str
 ) -> tuple[Array, int]:
-    """Solve with any regular matrix, preconditioned from the left; as `conjugate_gradients`.
+    """Solve with any regular matrix, preconditioned from the left.
 
-    `tolerance` bounds the preconditioned residual, which is about the error, relative to the
-    preconditioned right-hand side. b has shape (n,).
+    Unlike SciPy's it applies the preconditioner once for b and once in each iteration.
+
+    Parameters
+    ----------
+    apply, precondition
+        Products with the matrix and with the approximate inverse.
+    b
+        Shape (n,).
+    tolerance
+        Bound on the preconditioned residual, about the error, relative to that of x = 0.
+    limit
+        At most this many iterations; all directions are kept.
+    remedy
+        What to do if they do not suffice.
+
+    Returns
+    -------
+    x
+        The solution.
+    iterations
+        How many it took.
+
+    Raises
+    ------
+    LinearAlgebraError
+        A value is not finite, or `limit` was reached.
     """
-    right = precondition(b)
-    if not np.isfinite(right).all():
-        raise LinearAlgebraError("The preconditioned right-hand side is not finite.")
-    shape = (len(b), len(b))
-    operator = LinearOperator(shape, matvec=lambda x: precondition(apply(x)), dtype=float)
-    seen: list[float] = []
-    x, failed = scipy_gmres(
-        operator,
-        right,
-        rtol=tolerance,
-        restart=limit,
-        maxiter=1,
-        callback=seen.append,
-        callback_type="pr_norm",
+    first = precondition(b)
+    size = float(np.linalg.norm(first))
+    if size == 0.0:
+        return first, 0
+    basis = [first / size]
+    H = np.zeros((limit + 1, limit))
+    unit = np.zeros(limit + 1)
+    unit[0] = 1.0
+    left = 1.0
+    for k in range(limit):
+        new = precondition(apply(basis[k]))
+        for j, vector in enumerate(basis):
+            H[j, k] = new @ vector
+            new -= H[j, k] * vector
+        H[k + 1, k] = np.linalg.norm(new)
+        if not np.isfinite(H[: k + 2, k]).all():
+            raise LinearAlgebraError(f"An iteration of GMRES is not finite: {remedy}")
+        part = H[: k + 2, : k + 1]
+        weights = np.linalg.lstsq(part, unit[: k + 2], rcond=None)[0]
+        left = float(np.linalg.norm(unit[: k + 2] - part @ weights))
+        if left <= tolerance:
+            x = sum(size * w * vector for w, vector in zip(weights, basis, strict=True))
+            return np.asarray(x), k + 1
+        if H[k + 1, k] == 0.0:
+            break
+        basis.append(new / H[k + 1, k])
+    raise LinearAlgebraError(
+        f"{limit} iterations of GMRES left a residual of {left:.1e}, with {tolerance:.0e} asked "
+        f"for: {remedy}"
     )
-    if failed:
-        raise LinearAlgebraError(
-            f"{limit} iterations of GMRES left a residual of {seen[-1]:.1e}, with "
-            f"{tolerance:.0e} asked for: {remedy}"
-        )
-    return x, len(seen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +12,10 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.linalg.krylov import conjugate_gradients
 from livepde.linalg.pattern import Pattern
+from livepde.linalg.protocol import Factor
 from livepde.linalg.types import Array
 
-__all__ = ["MultigridSolver"]
+__all__ = ["MultigridSolver", "approximate_inverse"]
 
 TOLERANCE = 1e-10  # residual relative to the right-hand side
 ITERATIONS = 200
@@ -66,3 +68,8 @@ class MultigridSolver:
             )
         levels = ruge_stuben_solver(sp.csr_matrix(matrix, copy=True))
         return MultigridFactor(matrix, levels.aspreconditioner(cycle="V").matvec)
+
+
+def approximate_inverse(factor: Factor) -> Callable[[Array], Array]:
+    """Return what a factor offers a Krylov method: one V-cycle instead of an iteration within."""
+    return factor.precondition if isinstance(factor, MultigridFactor) else factor.solve
