@@ -259,6 +259,9 @@ def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
         chosen = choose(pattern, symmetric=symmetric)
         assert chosen.solver.name.startswith(name)
         assert str(band) in chosen.reason
+        rough = choose(pattern, symmetric=symmetric, approximate=True).solver
+        expects_cycle = symmetric and "pyamg" in modules and band > 150
+        assert isinstance(rough, MultigridSolver) == (expects_cycle or name == "multigrid")
 
 
 @pytest.mark.skipif(find_spec("pyamg") is None, reason="pyamg not installed")

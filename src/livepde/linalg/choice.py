@@ -44,15 +44,22 @@ class Choice:
     reason: str
 
 
-def analyse(pattern: Pattern, *, symmetric: bool = False) -> Solver:
+def analyse(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Solver:
     """Return the engine for a pattern, as `choose` does."""
-    return choose(pattern, symmetric=symmetric).solver
+    return choose(pattern, symmetric=symmetric, approximate=approximate).solver
 
 
-def choose(pattern: Pattern, *, symmetric: bool = False) -> Choice:
+def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Choice:
     """Choose the engine for a pattern, by its band and by what is installed.
 
-    `symmetric` promises that every matrix to come is symmetric positive definite.
+    Parameters
+    ----------
+    pattern
+        Of the matrices to come.
+    symmetric
+        Each will be symmetric positive definite.
+    approximate
+        Its `approximate_inverse` is all that is needed: multigrid serves from a band of 150 on.
     """
     banded = BandedSolver(pattern)
     band = max(banded.band)
@@ -62,8 +69,9 @@ def choose(pattern: Pattern, *, symmetric: bool = False) -> Choice:
     superlu = SuperLUSolver(pattern, symmetric)
     if band <= SMALL:
         return Choice(superlu, f"{wide}, at most {SMALL}")
-    if symmetric and band > WIDEST_FACTOR and _installed("pyamg"):
-        return Choice(MultigridSolver(pattern), f"{wide}, more than {WIDEST_FACTOR}")
+    most = SMALL if approximate else WIDEST_FACTOR
+    if symmetric and band > most and _installed("pyamg"):
+        return Choice(MultigridSolver(pattern), f"{wide}, more than {most}")
     if symmetric and _installed("sksparse"):
         return Choice(CholmodSolver(pattern), f"{wide}; scikit-sparse is installed")
     if _installed("pypardiso"):
