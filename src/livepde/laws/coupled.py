@@ -164,8 +164,9 @@ class CoupledStage:
             return None
         free = sp.diags_array(self.model.X.free)
         mass = sp.csr_array(free @ self.model.mass @ free)
-        moves = self.auxiliary or self.model.latent.generator.nnz or not self.linear
-        symmetric = ((self.W @ free).count_nonzero() == 0, not moves)
+        constant = (self.W @ free).count_nonzero() == 0  # S is M/h + theta R^T M_op R
+        plain = not self.auxiliary and not self.model.latent.generator.nnz and self.linear
+        symmetric = (constant and _is_symmetric(mass) and _is_symmetric(self.RMR), plain)
         return BlockSolver(self.solver.pattern, self.n, self.split.R, mass, symmetric)
 
     @property
@@ -495,3 +496,7 @@ def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
     coo = sp.coo_array(matrix)
     data: Array = (pattern or Pattern.of(matrix)).gather(coo.row, coo.col) @ coo.data
     return data
+
+
+def _is_symmetric(matrix: sp.csr_array) -> bool:
+    return bool(abs(matrix - matrix.T).max() <= 1e-12 * abs(matrix).max())

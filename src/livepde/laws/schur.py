@@ -13,9 +13,8 @@ and [[S, 0], [-A^T R - ..., C]] is the preconditioner: a solve with a factor of 
 of C. D^{-1} is the better in the place of S^{-1} the smoother what it is applied to and the shorter
 h; the larger the gain, the more this counts.
 
-The factors are kept while that pays. Iterations beyond those that they needed when they were new
-cost time; when it adds up to the time of the factorisation, both are made again. That changes how
-many iterations it takes, not to which tolerance.
+The factors are kept while that pays (`livepde.linalg.Costs`). That changes how many iterations it
+takes, not to which tolerance.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import (
     Array,
+    Costs,
     Factor,
     IntArray,
     Pattern,
@@ -43,7 +43,7 @@ __all__ = ["LARGE", "BlockSolver", "Blocks"]
 
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-2  # of u and of q, relative to their first approximation: Newton goes on from there
-ITERATIONS = 150
+ITERATIONS = 60  # each keeps a vector; with factors that need more, new ones are cheaper
 REMEDY = "take a smaller gain or a smaller time step."
 
 
@@ -67,6 +67,12 @@ class BlockSolver:
     ----------
     iterations
         Of each solve with the factors at hand.
+    costs
+        Of these factors.
+    tolerance
+        To which systems are solved.
+    cycles
+        C is not factorised where a cycle of multigrid is cheaper; false after one was not enough.
     """
 
     def __init__(
@@ -86,7 +92,9 @@ class BlockSolver:
         self.lumped = np.where(lumped > 0.0, lumped, 1.0)  # fixed coefficients have no mass
         self.iterations: list[int] = []
         self._factors: tuple[Factor, Factor] | None = None
-        self._seconds, self._extra = 0.0, 0.0
+        self.costs = Costs(0.0, ITERATIONS)
+        self.tolerance = TOLERANCE
+        self.cycles = True
         self._schur: Solver | None = None
 
     @cached_property
@@ -128,26 +136,41 @@ class BlockSolver:
 
     def factors(self, data: Array, rate: Array, renew: bool) -> tuple[Factor, Factor]:
         """Return the factors of S and C: the kept ones, or new ones where they are due."""
-        if self._factors is None or renew or self._extra > self._seconds:
+        if self._factors is None or renew or self.costs.due:
             start = perf_counter()
             S = self._state.factorise(data[self._blocks["uu"][0]])
             A = sp.csr_array(self.R.T @ self.block(data, "uq"))
             D = sp.diags_array(1.0 / (self.lumped * rate))
             C = sp.csr_array(self.block(data, "qq") + A.T @ D @ A)
             C.sort_indices()
-            pattern, schur = Pattern.of(C), self._schur
-            if schur is None or not _same(schur.pattern, pattern):  # sums drop zeros
-                self._schur = schur = analyse(
-                    pattern, symmetric=self.symmetric[1], approximate=True
-                )
-            self._factors = S, schur.factorise(C.data)
-            self._seconds, self._extra, self.iterations = perf_counter() - start, 0.0, []
+            self._factors = S, self._engine(Pattern.of(C)).factorise(C.data)
+            self.costs, self.iterations = Costs(perf_counter() - start, ITERATIONS), []
         return self._factors
 
+    def _engine(self, pattern: Pattern) -> Solver:
+        """Return the engine of C; its pattern may change, since sums drop what is zero."""
+        last = self._schur
+        if last is None or not (
+            np.array_equal(last.pattern.indptr, pattern.indptr)
+            and np.array_equal(last.pattern.indices, pattern.indices)
+        ):
+            last = analyse(pattern, symmetric=self.symmetric[1], approximate=self.cycles)
+        self._schur = last
+        return last
+
+    @property
+    def engines(self) -> tuple[str, str]:
+        """Names of the engines of S and C; the latter is known once it was needed."""
+        return self._state.name, "" if self._schur is None else self._schur.name
+
+    def without_cycles(self) -> None:
+        """Factorise C from now on."""
+        self.cycles, self._schur = False, None
+
     def account(self, iterations: int, seconds: float) -> None:
-        """Add up what a solve took beyond one with new factors."""
+        """Take note of a solve."""
         self.iterations.append(iterations)
-        self._extra += seconds * (1.0 - min(self.iterations) / max(iterations, 1))
+        self.costs.add(iterations, seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +202,14 @@ class Blocks:
         try:
             return self._solve(b, renew=False)
         except LinearAlgebraError:
+            pass
+        try:
             return self._solve(b, renew=True)
+        except LinearAlgebraError:
+            if not self.solver.cycles:
+                raise
+        self.solver.without_cycles()
+        return self._solve(b, renew=True)
 
     def _solve(self, b: Array, renew: bool) -> Array:
         solver, n = self.solver, self.solver.n
@@ -202,10 +232,6 @@ class Blocks:
             return z
 
         start = perf_counter()
-        x, iterations = gmres(self._apply, scaled, b, TOLERANCE, ITERATIONS, REMEDY)
+        x, iterations = gmres(self._apply, scaled, b, solver.tolerance, ITERATIONS, REMEDY)
         solver.account(iterations, perf_counter() - start)
         return x
-
-
-def _same(a: Pattern, b: Pattern) -> bool:
-    return np.array_equal(a.indptr, b.indptr) and np.array_equal(a.indices, b.indices)

@@ -6,7 +6,7 @@ from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
 from livepde.linalg.choice import Choice, analyse, choose
 from livepde.linalg.cholmod import CholmodSolver
-from livepde.linalg.kept import KeptSolver
+from livepde.linalg.kept import Costs, KeptSolver
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
 from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
@@ -22,6 +22,7 @@ __all__ = [
     "BandedSolver",
     "Choice",
     "CholmodSolver",
+    "Costs",
     "Factor",
     "IntArray",
     "KeptSolver",

@@ -1,4 +1,4 @@
-"""A factor that outlives its matrix: preconditioner of a Krylov method for the next ones."""
+"""Factors that outlive their matrix: preconditioners of a Krylov method for the next ones."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
-import scipy.sparse as sp
 
+from livepde.errors import LinearAlgebraError
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.multigrid import approximate_inverse
 from livepde.linalg.pattern import Pattern
@@ -23,45 +23,51 @@ REMEDY = "the matrix has moved too far from the one that was factorised; take a 
 
 @dataclass
 class Costs:
-    """What the last factor and the solves with it have cost: the rule of when to factorise again.
+    """The rule of when a kept factor is made again.
+
+    Iterations beyond those with a new factor take time. Once it adds up to that of the
+    factorisation, a new one is due: all in all that costs at most twice as much as if one had known
+    what would come.
 
     Attributes
     ----------
     factor
-        Seconds of the last factorisation.
-    iteration
-        Seconds of an iteration: a solve with the factor, and a product.
+        Measured seconds of the factorisation.
+    least
+        Fewest iterations of a solve so far; at first, what it takes with a new factor, or more.
     extra
-        Iterations that a solve took beyond the first.
-    solves
-        Solves with the last matrix.
+        Seconds of what iterations there were beyond `least`.
+
+    >>> costs = Costs(factor=1.0, least=1)
+    >>> for _ in range(3):
+    ...     costs.add(iterations=5, seconds=0.5)
+    >>> round(costs.extra, 3), costs.due
+    (1.2, True)
     """
 
-    factor: float = 0.0
-    iteration: float = 0.0
-    extra: int = 0
-    solves: int = 0
+    factor: float
+    least: int
+    extra: float = 0.0
 
     @property
     def due(self) -> bool:
-        """True if a matrix's solves with the old factor cost more than a new factor.
+        """True if keeping the factor has cost more than a new one."""
+        return self.extra > self.factor
 
-        >>> Costs(factor=1.0, iteration=0.05, extra=4, solves=2).due
-        False
-        >>> Costs(factor=1.0, iteration=0.05, extra=4, solves=10).due
-        True
-        """
-        return self.solves * self.extra * self.iteration > self.factor
+    def add(self, iterations: int, seconds: float) -> None:
+        """Account for a solve."""
+        if iterations:
+            self.least = min(self.least, iterations)
+            self.extra += seconds * (1.0 - self.least / iterations)
 
 
 class KeptSolver:
-    """An engine that keeps a factor while that is cheaper than a new one.
+    """An engine that keeps a factor while that is cheaper than a new one (`Costs`).
 
-    `factorise` returns at once while iterations with the old factor cost less than the measured
-    factorisation: conjugate gradients for symmetric positive definite matrices, otherwise GMRES,
-    to a tolerance of 1e-10. With a factor 10 to 50 % off that takes 4 or 5 iterations. What is
-    solved with a matrix before it is due to be factorised depends on measured times: results
-    agree to the tolerance, not to the last digit.
+    Other matrices than the one factorised are solved by iterations that the factor preconditions:
+    conjugate gradients if they are symmetric positive definite, otherwise GMRES, to a tolerance of
+    1e-10. When the matrix has moved by 10 to 50 % that takes 4 or 5. How often it is factorised
+    goes by measured times: results are the same to the tolerance, not to the last digit.
 
     Parameters
     ----------
@@ -74,8 +80,8 @@ class KeptSolver:
     def __init__(self, inner: Solver, *, symmetric: bool = False) -> None:
         self.inner = inner
         self.symmetric = symmetric
-        self.costs = Costs()
-        self._factor: Factor | None = None
+        self.costs = Costs(0.0, 1)
+        self._kept: tuple[Array, Factor] | None = None
 
     @property
     def name(self) -> str:
@@ -95,41 +101,55 @@ class KeptSolver:
 
     def factorise(self, data: Array) -> Factor:
         """Return what solves with this matrix; raises as the inner engine does."""
-        if self._factor is None or self.costs.due or not np.isfinite(data).all():
-            start = perf_counter()
-            self._factor = self.inner.factorise(data)
-            self.costs = Costs(perf_counter() - start)
-            return self._factor
-        self.costs.solves = 0
-        matrix = self.pattern.matrix(data)
-        return _Preconditioned(matrix, self._factor, self.costs, self.symmetric)
+        if self._kept is None or self.costs.due or not np.isfinite(data).all():
+            self._renew(data)
+        return _KeptFactor(self, data)
 
-
-@dataclass(frozen=True, eq=False)
-class _Preconditioned:
-    matrix: sp.csr_array
-    factor: Factor
-    costs: Costs
-    symmetric: bool
-
-    def solve(self, b: Array) -> Array:
-        """Return x with K x = b to the tolerance."""
+    def _renew(self, data: Array) -> Factor:
         start = perf_counter()
-        apply, precondition = self.matrix.__matmul__, approximate_inverse(self.factor)
+        factor = self.inner.factorise(data)
+        self._kept, self.costs = (data, factor), Costs(perf_counter() - start, 1)
+        return factor
+
+    def solve(self, data: Array, b: Array) -> Array:
+        """Return x with `pattern.matrix(data)` x = b, by the factor at hand or by a new one."""
+        if self._kept is None:
+            return self._renew(data).solve(b)
+        known, factor = self._kept
+        if known is data:
+            return factor.solve(b)
+        if not self.costs.due:
+            try:
+                return self._iterated(data, factor, b)
+            except LinearAlgebraError:  # too far from the matrix that was factorised
+                pass
+        return self._renew(data).solve(b)
+
+    def _iterated(self, data: Array, factor: Factor, b: Array) -> Array:
+        start = perf_counter()
+        apply, precondition = self.pattern.matrix(data).__matmul__, approximate_inverse(factor)
         if self.symmetric:
             x, iterations = conjugate_gradients(
                 apply, precondition, b, TOLERANCE, ITERATIONS, REMEDY
             )
         else:
-            columns = b.reshape(len(b), -1).T
             found = [
                 gmres(apply, precondition, column, TOLERANCE, ITERATIONS, REMEDY)
-                for column in columns
+                for column in b.reshape(len(b), -1).T
             ]
             x = np.stack([column for column, _ in found], axis=1).reshape(b.shape)
-            iterations = max((count for _, count in found), default=0)
-        costs = self.costs
-        costs.solves += 1
-        costs.extra = max(iterations - 1, 0)
-        costs.iteration = (perf_counter() - start) / max(iterations, 1)
+            iterations = max(count for _, count in found)
+        self.costs.add(iterations, perf_counter() - start)
         return x
+
+
+@dataclass(frozen=True, eq=False)
+class _KeptFactor:
+    """A matrix of a `KeptSolver`."""
+
+    solver: KeptSolver
+    data: Array
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b."""
+        return self.solver.solve(self.data, b)
