@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -13,9 +15,18 @@ from livepde.errors import LinearAlgebraError
 from livepde.linalg import (
     Assembler,
     BandedSolver,
+    CholmodSolver,
+    KeptSolver,
+    MultigridSolver,
+    PardisoSolver,
     Pattern,
     SuperLUSolver,
     analyse,
+    choice,
+    choose,
+    conjugate_gradients,
+    gmres,
+    kept,
     positive_definite,
     sandwich,
 )
@@ -96,42 +107,138 @@ def regular(n, rng, spd=False):
     return sp.csr_array(matrix + sp.diags_array(np.full(n, 4.0)))
 
 
-def engines(pattern):
-    return {
-        "banded": BandedSolver(pattern),
-        "general": SuperLUSolver(pattern),
-        "symmetric": SuperLUSolver(pattern, symmetric=True),
-    }
+def installed(*modules):
+    """Skip a parameter visibly where a module is missing."""
+    missing = [module for module in modules if find_spec(module) is None]
+    return pytest.mark.skipif(bool(missing), reason=f"{missing} not installed")
 
 
-@pytest.mark.parametrize("engine", ["banded", "general", "symmetric"])
+BUILD = {
+    "banded": BandedSolver,
+    "general": SuperLUSolver,
+    "symmetric": lambda pattern: SuperLUSolver(pattern, symmetric=True),
+    "cholmod": CholmodSolver,
+    "pardiso": PardisoSolver,
+    "pardiso symmetric": lambda pattern: PardisoSolver(pattern, symmetric=True),
+    "multigrid": MultigridSolver,
+}
+OPTIONAL = {"cholmod": "sksparse", "multigrid": "pyamg"} | dict.fromkeys(
+    ("pardiso", "pardiso symmetric"), "pypardiso"
+)
+ENGINES = [
+    pytest.param(name, marks=installed(OPTIONAL[name]) if name in OPTIONAL else ())
+    for name in BUILD
+]
+DEFINITE = ("symmetric", "cholmod", "pardiso symmetric", "multigrid")
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("seed", range(3))
 def test_engines_agree_with_dense_algebra(engine, seed):
     rng = np.random.default_rng(seed)
-    matrix = regular(25, rng, spd=engine == "symmetric")
+    matrix = regular(25, rng, spd=engine in DEFINITE)
     pattern = Pattern.of(matrix)
-    solver = engines(pattern)[engine]
+    solver = BUILD[engine](pattern)
     assert solver.pattern is pattern
     assert solver.name
-    factor = solver.factorise(pattern.gather(*matrix.tocoo().coords) @ matrix.tocoo().data)
+    data = pattern.gather(*matrix.tocoo().coords) @ matrix.tocoo().data
+    factor = solver.factorise(data)
+    other = solver.factorise(2.0 * data)  # leaves the first as it is
     for shape in ((25,), (25, 1), (25, 4)):
         b = rng.standard_normal(shape)
         kept = b.copy()
-        np.testing.assert_allclose(matrix @ factor.solve(b), b, atol=1e-12)
+        np.testing.assert_allclose(matrix @ factor.solve(b), b, atol=1e-9)
+        np.testing.assert_allclose(2.0 * (matrix @ other.solve(b)), b, atol=1e-9)
         np.testing.assert_array_equal(b, kept)  # right-hand sides are not written over
 
 
-@pytest.mark.parametrize("engine", ["banded", "general", "symmetric"])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_engines_refuse_singular_and_infinite_matrices(engine):
     pattern = Pattern.of(sp.diags_array([np.ones(4), np.ones(5), np.ones(4)], offsets=[-1, 0, 1]))
-    solver = engines(pattern)[engine]
-    with pytest.raises(LinearAlgebraError, match="singular"):
-        solver.factorise(np.zeros(pattern.nnz))
+    solver = BUILD[engine](pattern)
+    if engine != "pardiso":  # exchanges a pivot of zero for a tiny one, and goes on
+        with pytest.raises(LinearAlgebraError, match="singular"):
+            solver.factorise(np.zeros(pattern.nnz))
     for bad in (np.nan, np.inf):
         data = pattern.matrix(np.ones(pattern.nnz)).data.copy()
         data[4] = bad
         with pytest.raises(LinearAlgebraError, match="finite"):
             solver.factorise(data)
+
+
+@pytest.mark.parametrize("engine", [e for e in ENGINES if e.values[0] in DEFINITE[1:]])
+def test_engines_that_prove_it_refuse_an_indefinite_matrix(engine):
+    matrix = sp.diags_array([np.ones(19), np.full(20, 1.5), np.ones(19)], offsets=[-1, 0, 1])
+    matrix = sp.csr_array(matrix)  # its smallest eigenvalue is about -1/2
+    solver = BUILD[engine](Pattern.of(matrix))
+    assert solver.definite
+    with pytest.raises(LinearAlgebraError, match="definite"):
+        solver.factorise(matrix.data).solve(np.random.default_rng(0).standard_normal(20))
+
+
+def grid(n, reaction=0.0):
+    """Five-point Laplacian of n by n nodes, with a reaction coefficient."""
+    line = sp.diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    one = sp.eye_array(n)
+    matrix = sp.kron(line, one) + sp.kron(one, line) + (1e-3 + reaction) * sp.eye_array(n * n)
+    return sp.csr_array(matrix)
+
+
+def test_conjugate_gradients_solve_every_column_to_the_tolerance():
+    A, rng = grid(12), np.random.default_rng(0)
+    b = rng.standard_normal((144, 3)) * [1.0, 1e6, 0.0]
+    x, iterations = conjugate_gradients(A.__matmul__, np.copy, b, 1e-9, 200, "")
+    left = np.linalg.norm(A @ x - b, axis=0)
+    assert np.all(left <= 2e-9 * np.linalg.norm(b, axis=0))
+    assert iterations > 10
+    assert conjugate_gradients(A.__matmul__, np.copy, 0 * b, 1e-9, 200, "")[1] == 0
+
+
+def test_gmres_solves_an_unsymmetric_system():
+    rng = np.random.default_rng(1)
+    A = regular(60, rng)
+    b = rng.standard_normal(60)
+    x, iterations = gmres(A.__matmul__, lambda r: r / 4.0, b, 1e-10, 60, "")
+    assert np.linalg.norm(A @ x - b) <= 1e-9 * np.linalg.norm(b)
+    assert 1 < iterations < 60
+    assert gmres(A.__matmul__, np.copy, 0 * b, 1e-10, 60, "")[1] == 0
+
+
+@pytest.mark.parametrize("method", [conjugate_gradients, gmres])
+def test_krylov_methods_say_what_to_do_if_they_do_not_converge(method):
+    A = grid(30)
+    b = np.random.default_rng(0).standard_normal(900)
+    with pytest.raises(LinearAlgebraError, match=r"3 iterations.*take a smaller step"):
+        method(A.__matmul__, np.copy, b, 1e-10, 3, "take a smaller step")
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_a_kept_factor_serves_matrices_that_have_moved(symmetric, monkeypatch):
+    A, B = grid(20, reaction=1.0), grid(20, reaction=1.3)
+    b = np.random.default_rng(0).standard_normal((400, 2))
+    solver = KeptSolver(SuperLUSolver(Pattern.of(A), symmetric), symmetric=symmetric)
+    first = solver.factorise(A.data)
+    np.testing.assert_allclose(A @ first.solve(b), b, atol=1e-12)
+    made = []
+    renew = KeptSolver._renew
+    monkeypatch.setattr(
+        KeptSolver, "_renew", lambda self, data: [made.append(data), renew(self, data)][1]
+    )
+    solver.costs.factor = np.inf  # a new factor never pays
+    moved = solver.factorise(B.data)
+    for _ in range(3):
+        np.testing.assert_allclose(B @ moved.solve(b), b, atol=1e-8)
+        np.testing.assert_allclose(A @ first.solve(b), b, atol=1e-12)
+    assert not made
+    assert solver.costs.extra > 0.0
+    solver.costs.factor = 0.0  # it has paid long since
+    np.testing.assert_allclose(B @ moved.solve(b), b, atol=1e-12)
+    assert [data is B.data for data in made] == [True]
+    assert solver.costs.extra == 0.0
+    solver.costs.factor = np.inf
+    monkeypatch.setattr(kept, "ITERATIONS", 1)  # not enough: a new factor after all
+    np.testing.assert_allclose(A @ first.solve(b), b, atol=1e-12)
+    assert len(made) == 2
 
 
 def test_engine_is_chosen_by_the_band():
@@ -142,6 +249,45 @@ def test_engine_is_chosen_by_the_band():
     assert isinstance(analyse(wide), SuperLUSolver)
     assert "symmetric" in analyse(wide, symmetric=True).name
     assert "symmetric" not in analyse(wide).name
+
+
+@pytest.mark.parametrize(
+    ("modules", "symmetric", "expected"),
+    [
+        ("", True, ["SuperLU", "SuperLU", "SuperLU"]),
+        ("", False, ["SuperLU", "SuperLU", "SuperLU"]),
+        ("pyamg", True, ["SuperLU", "SuperLU", "multigrid"]),
+        ("pyamg", False, ["SuperLU", "SuperLU", "SuperLU"]),
+        ("pyamg pypardiso", True, ["SuperLU", "Pardiso", "Pardiso"]),
+        ("pyamg pypardiso", False, ["SuperLU", "Pardiso", "Pardiso"]),
+        ("pyamg pypardiso sksparse", True, ["SuperLU", "CHOLMOD", "CHOLMOD"]),
+    ],
+)
+def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
+    modules, symmetric, expected, monkeypatch
+):
+    monkeypatch.setattr(choice, "_installed", lambda module: module in modules.split())
+    for band, name in zip((100, 400, 600), expected, strict=True):
+        diagonals = [np.ones(3000 - k) for k in (0, band, band)]
+        pattern = Pattern.of(sp.diags_array(diagonals, offsets=[0, band, -band]))
+        # Reverse Cuthill and McKee would find the chains: the rule is about the band it leaves.
+        monkeypatch.setattr(BandedSolver, "band", (band, band))
+        chosen = choose(pattern, symmetric=symmetric)
+        assert chosen.solver.name.startswith(name)
+        assert str(band) in chosen.reason
+        rough = choose(pattern, symmetric=symmetric, approximate=True).solver
+        expects_cycle = symmetric and "pyamg" in modules and band > 150
+        assert isinstance(rough, MultigridSolver) == (expects_cycle or name == "multigrid")
+
+
+@pytest.mark.skipif(find_spec("pyamg") is None, reason="pyamg not installed")
+def test_multigrid_iterations_do_not_grow_with_the_mesh():
+    for n in (20, 60):
+        A = grid(n)
+        factor = MultigridSolver(Pattern.of(A)).factorise(A.data)
+        b = np.random.default_rng(0).standard_normal(n * n)
+        _, iterations = conjugate_gradients(A.__matmul__, factor.precondition, b, 1e-8, 50, "")
+        assert iterations <= 12
 
 
 def test_banded_engine_finds_a_narrow_order():

@@ -9,7 +9,9 @@ from problems import CASES, excited, excited_q, excited_u, line, product, reacti
 from skfem import ElementLineHermite, ElementLineP1, ElementQuadBFS, ElementTriP1, MeshTri
 
 import livepde as lp
+from livepde import spaces
 from livepde.fem.sobolev import _balakrishnan
+from livepde.linalg import Leading
 from livepde.spaces import LARGEST_EXPLICIT, BorderedSpace
 from livepde.streams import Twin
 
@@ -54,6 +56,28 @@ def test_spaces_pass_their_check(name, s):
         model = CASES[name].model(inner=lp.Sobolev(s, LENGTH), q_dirichlet=zero)
         lp.check_space(model.Q).raise_if_failed()
         np.testing.assert_array_equal(model.Q.riesz(np.ones(model.Q.dim))[model.Q.fixed], 0.0)
+
+
+@pytest.mark.parametrize("zero", [{}, {"boundary": 0.0}])
+def test_riesz_map_of_a_large_space_of_second_order_is_two_solves(zero, monkeypatch):
+    Q = CASES["triangles P1"].model(inner=lp.Sobolev(2.0, LENGTH), q_dirichlet=zero).Q
+    functional = np.random.default_rng(0).standard_normal((Q.dim, 3))
+    expected = Q.riesz(functional)
+    monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1)
+    large = BorderedSpace(Q.border, Q.dim, Q.name, Q.fixed)
+    assert isinstance(Q.factor, Leading)
+    assert not isinstance(large.factor, Leading)
+    found = large.riesz(functional)
+    np.testing.assert_allclose(found, expected, atol=1e-10 * abs(expected).max())
+    free = functional * Q.free[:, None]
+    np.testing.assert_allclose(Q.free[:, None] * large.dual(found), free, atol=1e-8)
+
+
+@pytest.mark.parametrize("s", [1.5, 2.5, 3.0])
+def test_other_large_spaces_keep_their_border(s, monkeypatch):
+    Q = CASES["triangles P1"].model(inner=lp.Sobolev(s, LENGTH)).Q
+    monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1)
+    assert isinstance(BorderedSpace(Q.border, Q.dim).factor, Leading)
 
 
 def test_names_of_orders():

@@ -26,7 +26,8 @@ __all__ = ["BorderedSpace", "HilbertSpace", "product"]
 LARGEST_CONDITION = 1e14
 LARGEST_EXPLICIT = 2000  # coefficients up to which a bordered Gram matrix is written out
 SOLVED = 1000  # coefficients whose prior variance is computed; that of others lies in between
-BLOCK = 250  # right-hand sides solved at once
+BLOCK = 250  # right-hand sides solved at once,
+ENTRIES = 25_000_000  # and at most so many numbers of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +98,9 @@ class HilbertSpace:
             f"The Gram matrix of {self.name} is singular: its inner product does not see every "
             "element. Add a zero-order term (inner='H1' has one) or fix boundary values."
         )
+        solver = analyse(pattern, symmetric=True)
         try:
-            factor = analyse(pattern, symmetric=True).factorise(_data(self.tangent_gram, pattern))
+            factor = solver.factorise(_data(self.tangent_gram, pattern))
         except LinearAlgebraError as error:
             raise SpaceError(singular) from error
         # Two steps of inverse iteration find a nearly zero eigenvalue that no pivot shows; on the
@@ -107,13 +109,16 @@ class HilbertSpace:
         if not scale.all():
             raise SpaceError(singular)
         x = np.random.default_rng(0).standard_normal(self.dim)
-        for _ in range(2):
-            x = scale * factor.solve(scale * x / np.linalg.norm(x))
+        try:
+            for _ in range(2):
+                x = scale * factor.solve(scale * x / np.linalg.norm(x))
+        except LinearAlgebraError as error:
+            raise SpaceError(f"The Gram matrix of {self.name}: {error}") from error
         unit = sp.diags_array(1.0 / scale)
         largest = abs(unit @ self.tangent_gram @ unit).sum(axis=1).max()
         if not np.isfinite(x).all() or np.linalg.norm(x) * largest > LARGEST_CONDITION:
             raise SpaceError(singular)
-        if not positive_definite(self.tangent_gram):
+        if not (solver.definite or positive_definite(self.tangent_gram)):
             raise SpaceError(
                 f"The Gram matrix of {self.name} is not positive definite: check the sign of the "
                 "terms of its inner product."
@@ -158,8 +163,9 @@ class HilbertSpace:
         """
         variance, free = np.zeros(self.dim), np.flatnonzero(self.free)
         solved = free[np.unique(np.linspace(0, len(free) - 1, SOLVED).astype(int))]
-        for start in range(0, len(solved), BLOCK):
-            at = solved[start : start + BLOCK]
+        block = max(1, min(BLOCK, ENTRIES // self.dim))
+        for start in range(0, len(solved), block):
+            at = solved[start : start + block]
             unit = np.zeros((self.dim, len(at)))
             unit[at, np.arange(len(at))] = 1.0
             variance[at] = self.factor.solve(unit)[at, np.arange(len(at))]
@@ -285,22 +291,41 @@ class BorderedSpace(HilbertSpace):
 
     @cached_property
     def _inner_factor(self) -> tuple[sp.csr_array, sp.csr_array, Factor]:
-        n = self.dim
-        E, F, H = self.border[:n, :n], self.border[:n, n:], sp.csr_array(self.border[n:, n:])
-        return sp.csr_array(E), sp.csr_array(F), self._factorised(H)
+        E, F, H = self._parts
+        return E, F, self._factorised(H)
+
+    @property
+    def _parts(self) -> tuple[sp.csr_array, sp.csr_array, sp.csr_array]:
+        """E, F and H."""
+        n, K = self.dim, self.border
+        return sp.csr_array(K[:n, :n]), sp.csr_array(K[:n, n:]), sp.csr_array(K[n:, n:])
 
     @cached_property
     def factor(self) -> Factor:
         """Factorised G on the free coefficients, by that of K."""
+        if (root := self._root()) is not None:
+            return root
         free = sp.diags_array(np.concatenate([self.free, np.ones(self.border.shape[0] - self.dim)]))
         fixed = sp.diags_array(1.0 - free.diagonal())
         factor = self._factorised(sp.csr_array(free @ self.border @ free + fixed))
         return Leading(factor, self.dim, self.border.shape[0])
 
-    def _factorised(self, matrix: sp.csr_array) -> Factor:
+    def _root(self) -> _Root | None:
+        """Return G^{-1} by solves with F if G = -F H^{-1} F with a symmetric F, as of H^2.
+
+        For large spaces: F has an engine that K, which is indefinite, has not.
+        """
+        n, (E, F, H) = self.dim, self._parts
+        if n <= LARGEST_EXPLICIT or E.count_nonzero() or F.shape != (n, n):
+            return None
+        if abs(F - F.T).max() > 1e-10 * abs(F).max():
+            return None
+        return _Root(self._factorised(F, symmetric=True), H)
+
+    def _factorised(self, matrix: sp.csr_array, symmetric: bool = False) -> Factor:
         pattern = Pattern.of(matrix)
         try:
-            return analyse(pattern).factorise(_data(matrix, pattern))
+            return analyse(pattern, symmetric=symmetric).factorise(_data(matrix, pattern))
         except LinearAlgebraError as error:
             raise SpaceError(f"The Gram matrix of {self.name} is singular.") from error
 
@@ -330,6 +355,18 @@ class BorderedSpace(HilbertSpace):
             return self.dual(full)[free]
 
         return LinearOperator((len(free), len(free)), matvec=apply, dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class _Root:
+    """The inverse of -F H^{-1} F, from the factor of F."""
+
+    F: Factor
+    H: sp.csr_array
+
+    def solve(self, b: Array) -> Array:
+        """Return the Riesz representative of b, which is zero at fixed coefficients."""
+        return -self.F.solve(self.H @ self.F.solve(b))
 
 
 def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> HilbertSpace:

@@ -76,6 +76,26 @@ def fleet(
 
 
 @bench.command()
+def scale(
+    size: Annotated[
+        list[int] | None,
+        typer.Option(min=4, help="Number of nodes, default 2500 and 10000. Repeat for more."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Count the iterations of the coupled step of large problems, at several gains.
+
+    Example:  livepde bench scale --size 100000
+    """
+    from livepde.bench.scale import SIZES
+    from livepde.bench.scale import scale as benchmark
+
+    command = ["livepde", "bench", "scale"]
+    command += [word for nodes in size or () for word in ("--size", str(nodes))]
+    report_outcome(benchmark(size or SIZES), command, as_json)
+
+
+@bench.command()
 def cases(
     only: Annotated[
         list[str] | None, typer.Option(help="Only this case. Repeat it for more.")

@@ -150,13 +150,13 @@ def _show_wiring(console: Console, case: Case) -> None:
 def _show_model(console: Console, case: Case) -> None:
     model = case.model
     console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.frame.equation.formula)}")
-    from livepde.linalg import analyse
+    from livepde.linalg import choose
 
-    engine = type(analyse(model.form_M.pattern("v", "u"))).__name__.removesuffix("Solver")
+    engine = choose(model.form_M.pattern("v", "u"))
     console.print(
         f"State: {model.X.dim} coefficients; parameter: {model.Q.dim}; "
         f"law: {type(case.law).__name__}; scheme: {type(case.scheme).__name__}; "
-        f"engine: {engine}."
+        f"engine: {engine.solver.name} ({engine.reason})."
     )
 
 

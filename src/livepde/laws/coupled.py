@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.damping import Damping, Residual
+from livepde.laws.schur import LARGE, Blocks, BlockSolver
 from livepde.linalg import (
     Array,
     Assembler,
@@ -195,6 +196,18 @@ class CoupledStage:
         """The engine of the coupled matrix."""
         return self._assembled[0]
 
+    @cached_property
+    def by_blocks(self) -> BlockSolver | None:
+        """What solves a large system by blocks; None: the coupled matrix is factorised."""
+        if self.size < LARGE or isinstance(self.solver, BandedSolver):
+            return None
+        free = sp.diags_array(self.model.X.free)
+        mass = sp.csr_array(free @ self.model.mass @ free)
+        constant = (self.W @ free).count_nonzero() == 0  # S is M/h + theta R^T M_op R
+        plain = not self.auxiliary and not self.model.latent.generator.nnz and self.linear
+        symmetric = (constant and _is_symmetric(mass) and _is_symmetric(self.RMR), plain)
+        return BlockSolver(self.solver.pattern, self.n, self.split.R, mass, symmetric)
+
     @property
     def maps(self) -> dict[str, sp.csr_array]:
         """Block -> map of its data into the data of the coupled matrix."""
@@ -321,7 +334,7 @@ class CoupledStage:
     @cached_property
     def keeps(self) -> bool:
         """True if a factor is kept from stage to stage."""
-        return self._bilinear is not None
+        return self._bilinear is not None and self.by_blocks is None
 
     @cached_property
     def patience(self) -> int:
@@ -427,13 +440,18 @@ class _Equation:
         if metric is not None:
             data += stage.maps["G"] @ ((metric.spread / PULL) * stage.gram_data)
             data += stage.maps["J"] @ (metric.data / PULL)
-        factor: Factor = stage.solver.factorise(data)
+        large = stage.by_blocks
+        factor: Factor = (
+            large.factorise(data, self.h, self.theta) if large else stage.solver.factorise(data)
+        )
         if stage.auxiliary:
             factor = Leading(factor, stage.size, stage.size + stage.auxiliary)
         if sweep or metric is not None:
             return factor
         row = stage.slope(self.norms, self.Mr, self.mass_r)
-        if row.any():
+        if isinstance(factor, Blocks) and row.any():
+            factor = factor.bordered(self.Mr, row)
+        elif row.any():
             column = np.zeros_like(y)
             column[: stage.n] = self.Mr
             factor = _Bordered(factor, factor.solve(column), row)
@@ -568,3 +586,7 @@ def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
     coo = sp.coo_array(matrix)
     data: Array = (pattern or Pattern.of(matrix)).gather(coo.row, coo.col) @ coo.data
     return data
+
+
+def _is_symmetric(matrix: sp.csr_array) -> bool:
+    return bool(abs(matrix - matrix.T).max() <= 1e-12 * abs(matrix).max())

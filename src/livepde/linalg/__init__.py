@@ -5,7 +5,13 @@ from __future__ import annotations
 from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
 from livepde.linalg.blocks import BandedBlocks, BlockFactor
+from livepde.linalg.choice import Choice, analyse, choose
+from livepde.linalg.cholmod import CholmodSolver
+from livepde.linalg.kept import Costs, KeptSolver
+from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
+from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
+from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
@@ -17,30 +23,26 @@ __all__ = [
     "BandedBlocks",
     "BandedSolver",
     "BlockFactor",
+    "Choice",
+    "CholmodSolver",
+    "Costs",
     "Factor",
     "IntArray",
+    "KeptSolver",
     "Leading",
     "Mask",
+    "MultigridSolver",
+    "PardisoSolver",
     "Pattern",
     "PatternOperator",
     "Solver",
     "Sparse",
     "SuperLUSolver",
     "analyse",
+    "approximate_inverse",
+    "choose",
+    "conjugate_gradients",
+    "gmres",
     "positive_definite",
     "sandwich",
 ]
-
-WIDEST_BAND = 48
-
-
-def analyse(pattern: Pattern, *, symmetric: bool = False) -> Solver:
-    """Choose the engine for a pattern: the only place where this is decided.
-
-    Banded LU up to `WIDEST_BAND` diagonals on each side (every 1D problem), SuperLU beyond it.
-    `symmetric` promises that every matrix to come is symmetric positive definite.
-    """
-    banded = BandedSolver(pattern)
-    if max(banded.band) <= WIDEST_BAND:
-        return banded
-    return SuperLUSolver(pattern, symmetric)

@@ -45,6 +45,7 @@ class BandedSolver:
 
     pattern: Pattern
     name: str = "banded LU (LAPACK)"
+    definite: bool = False
 
     @cached_property
     def order(self) -> IntArray:

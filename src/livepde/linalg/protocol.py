@@ -31,6 +31,11 @@ class Solver(Protocol):
         """The sparsity pattern it is bound to."""
         ...
 
+    @property
+    def definite(self) -> bool:
+        """True if it refuses a matrix that is not positive definite, at the latest in a solve."""
+        ...
+
     def factorise(self, data: Array) -> Factor:
         """Factorise the matrix `pattern.matrix(data)`.
 

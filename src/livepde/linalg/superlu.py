@@ -49,6 +49,11 @@ class SuperLUSolver:
         """How the engine introduces itself."""
         return "SuperLU (SciPy)" + (", symmetric mode" if self.symmetric else "")
 
+    @property
+    def definite(self) -> bool:
+        """False: pivots may have any sign."""
+        return False
+
     def factorise(self, data: Array) -> SuperLUFactor:
         """Factorise; raises `LinearAlgebraError` for a singular or non-finite matrix."""
         if not np.isfinite(data).all():

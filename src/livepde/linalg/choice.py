@@ -1,0 +1,93 @@
+"""Which engine serves a sparsity pattern: the only place where this is decided.
+
+The measure is the band, the number of diagonals on each side after reverse Cuthill and McKee: about
+sqrt(n) in 2D and n^(2/3) in 3D, twice that for quadratic elements. The dense blocks of a sparse
+factor are about as large, whatever the dimension:
+
+    band          2D P1       3D P1       engine
+    to 48         2 000         300       banded LU
+    to 150       20 000       1 700       SuperLU
+    to 500      200 000      11 000       CHOLMOD or Pardiso if installed, else SuperLU
+    to 2500   5 000 000     120 000       CHOLMOD or Pardiso if installed, else multigrid
+    beyond                                multigrid
+
+Multigrid serves symmetric positive definite matrices; others are factorised, by Pardiso if it is
+installed, at any size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+from livepde.linalg.banded import BandedSolver
+from livepde.linalg.cholmod import CholmodSolver
+from livepde.linalg.multigrid import MultigridSolver
+from livepde.linalg.pardiso import PardisoSolver
+from livepde.linalg.pattern import Pattern
+from livepde.linalg.protocol import Solver
+from livepde.linalg.superlu import SuperLUSolver
+
+__all__ = ["Choice", "analyse", "choose"]
+
+WIDEST_BAND = 48  # of banded LU
+SMALL = 150  # up to here SuperLU is as fast as any
+WIDEST_SUPERLU = 500
+WIDEST_FACTOR = 2500
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """An engine bound to a pattern, and why it was chosen."""
+
+    solver: Solver
+    reason: str
+
+
+def analyse(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Solver:
+    """Return the engine for a pattern, as `choose` does."""
+    return choose(pattern, symmetric=symmetric, approximate=approximate).solver
+
+
+def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Choice:
+    """Choose the engine for a pattern, by its band and by what is installed.
+
+    Parameters
+    ----------
+    pattern
+        Of the matrices to come.
+    symmetric
+        Each will be symmetric positive definite.
+    approximate
+        Its `approximate_inverse` is all that is needed: multigrid serves from a band of 150 on.
+    """
+    banded = BandedSolver(pattern)
+    band = max(banded.band)
+    wide = f"a band of {band}"
+    if band <= WIDEST_BAND:
+        return Choice(banded, f"{wide}, at most {WIDEST_BAND}")
+    superlu = SuperLUSolver(pattern, symmetric)
+    if band <= SMALL:
+        return Choice(superlu, f"{wide}, at most {SMALL}")
+    most = SMALL if approximate else WIDEST_FACTOR
+    if symmetric and band > most:
+        return Choice(MultigridSolver(pattern), f"{wide}, more than {most}")
+    if symmetric and _installed("sksparse"):
+        return Choice(CholmodSolver(pattern), f"{wide}; scikit-sparse is installed")
+    if _installed("pypardiso"):
+        return Choice(PardisoSolver(pattern, symmetric), f"{wide}; pypardiso is installed")
+    if band <= WIDEST_SUPERLU:
+        return Choice(superlu, f"{wide}, at most {WIDEST_SUPERLU}")
+    if symmetric:
+        return Choice(
+            MultigridSolver(pattern),
+            f"{wide}, more than {WIDEST_SUPERLU}; neither scikit-sparse nor pypardiso is installed",
+        )
+    return Choice(
+        superlu,
+        f"{wide}; slow at this size, pip install 'livepde[solvers]' brings a faster one",
+    )
+
+
+def _installed(module: str) -> bool:
+    return find_spec(module) is not None

@@ -1,0 +1,143 @@
+"""Krylov methods that return to a stated tolerance, or say why they did not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from livepde.errors import LinearAlgebraError
+from livepde.linalg.types import Array
+
+__all__ = ["conjugate_gradients", "gmres"]
+
+Map = Callable[[Array], Array]
+
+
+def conjugate_gradients(
+    apply: Map, precondition: Map, b: Array, tolerance: float, limit: int, remedy: str
+) -> tuple[Array, int]:
+    """Solve with a symmetric positive definite matrix, for all right-hand sides at once.
+
+    Parameters
+    ----------
+    apply, precondition
+        Products with the matrix and with the approximate inverse, for arrays like b.
+    b
+        Shape (n,) or (n, k).
+    tolerance
+        Bound on the residual, relative to each right-hand side.
+    limit
+        At most this many iterations.
+    remedy
+        What to do if they do not suffice.
+
+    Returns
+    -------
+    x
+        The solution.
+    iterations
+        How many it took.
+
+    Raises
+    ------
+    LinearAlgebraError
+        The matrix or the preconditioner is not positive definite, or `limit` was reached.
+    """
+    x, r = np.zeros_like(b), b.copy()
+    goal = tolerance * np.linalg.norm(b, axis=0)
+    p, rz = np.zeros_like(b), np.ones(b.shape[1:])
+    for iteration in range(limit + 1):
+        left = np.linalg.norm(r, axis=0)
+        if np.all(left <= goal):
+            return x, iteration
+        z = precondition(r)
+        new = np.einsum("i...,i...->...", r, z)
+        p = z + _ratio(new, rz if iteration else np.full_like(rz, np.inf)) * p
+        Kp = apply(p)
+        curvature = np.einsum("i...,i...->...", p, Kp)
+        active = left > goal
+        if not (np.all(curvature[active] > 0) and np.all(new[active] > 0)):
+            raise LinearAlgebraError(
+                "The matrix is not positive definite to working precision: check the signs of the "
+                "forms, or take a smaller time step."
+            )
+        step = _ratio(new * active, curvature)
+        x += step * p
+        r -= step * Kp
+        rz = new
+    worst = float(np.max(_ratio(left, np.linalg.norm(b, axis=0))))
+    raise LinearAlgebraError(
+        f"{limit} iterations of conjugate gradients left a residual of {worst:.1e}, with "
+        f"{tolerance:.0e} asked for: {remedy}"
+    )
+
+
+def _ratio(a: Array, b: Array) -> Array:
+    """Return a/b, zero where b is."""
+    ratio: Array = np.divide(a, b, out=np.zeros_like(np.asarray(b, dtype=float)), where=b != 0)
+    return ratio
+
+
+def gmres(
+    apply: Map, precondition: Map, b: Array, tolerance: float, limit: int, remedy: str
+) -> tuple[Array, int]:
+    """Solve with any regular matrix, preconditioned from the left.
+
+    Unlike SciPy's it applies the preconditioner once for b and once in each iteration.
+
+    Parameters
+    ----------
+    apply, precondition
+        Products with the matrix and with the approximate inverse.
+    b
+        Shape (n,).
+    tolerance
+        Bound on the preconditioned residual, about the error, relative to that of x = 0.
+    limit
+        At most this many iterations; all directions are kept.
+    remedy
+        What to do if they do not suffice.
+
+    Returns
+    -------
+    x
+        The solution.
+    iterations
+        How many it took.
+
+    Raises
+    ------
+    LinearAlgebraError
+        A value is not finite, or `limit` was reached.
+    """
+    first = precondition(b)
+    size = float(np.linalg.norm(first))
+    if size == 0.0:
+        return first, 0
+    basis = [first / size]
+    H = np.zeros((limit + 1, limit))
+    unit = np.zeros(limit + 1)
+    unit[0] = 1.0
+    left = 1.0
+    for k in range(limit):
+        new = precondition(apply(basis[k]))
+        for j, vector in enumerate(basis):
+            H[j, k] = new @ vector
+            new -= H[j, k] * vector
+        H[k + 1, k] = np.linalg.norm(new)
+        if not np.isfinite(H[: k + 2, k]).all():
+            raise LinearAlgebraError(f"An iteration of GMRES is not finite: {remedy}")
+        part = H[: k + 2, : k + 1]
+        weights = np.linalg.lstsq(part, unit[: k + 2], rcond=None)[0]
+        left = float(np.linalg.norm(unit[: k + 2] - part @ weights))
+        if left <= tolerance:
+            x = sum(size * w * vector for w, vector in zip(weights, basis, strict=True))
+            return np.asarray(x), k + 1
+        if H[k + 1, k] == 0.0:
+            break
+        basis.append(new / H[k + 1, k])
+    raise LinearAlgebraError(
+        f"{limit} iterations of GMRES left a residual of {left:.1e}, with {tolerance:.0e} asked "
+        f"for: {remedy}"
+    )

@@ -1,0 +1,104 @@
+"""Pardiso of Intel's MKL by pypardiso: factors of large matrices."""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import LinearAlgebraError
+from livepde.linalg.pattern import Pattern
+from livepde.linalg.types import Array, IntArray
+
+__all__ = ["PardisoSolver"]
+
+POSITIVE_DEFINITE, GENERAL = 2, 11  # Pardiso's types of a matrix
+FACTORISE, REFACTORISE, SOLVE = 12, 22, 33  # its phases
+
+
+@dataclass(frozen=True, eq=False)
+class PardisoFactor:
+    """The factors that a handle of Pardiso holds; it goes back to the solver with this object."""
+
+    solver: PardisoSolver
+    handle: Any
+    matrix: sp.csr_array
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b."""
+        self.handle.set_phase(SOLVE)
+        x: Array = self.handle._call_pardiso(self.matrix, np.array(b, dtype=float, order="F"))
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class PardisoSolver:
+    """Sparse factors of one pattern, ordered once; needs pypardiso.
+
+    `symmetric` for symmetric positive definite matrices: a factor proves that its matrix is one.
+    pypardiso's own `solve` takes no symmetric storage and compares the whole matrix each time;
+    so its phases are called one by one.
+    """
+
+    pattern: Pattern
+    symmetric: bool = False
+    _idle: list[Any] = field(default_factory=list, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        weakref.finalize(self, _release, self._idle).atexit = False
+
+    @property
+    def name(self) -> str:
+        """How the engine introduces itself."""
+        return "Pardiso (MKL)" + (", symmetric positive definite" if self.symmetric else "")
+
+    @property
+    def definite(self) -> bool:
+        """True for symmetric matrices: their factor is that of Cholesky."""
+        return self.symmetric
+
+    @cached_property
+    def _stored(self) -> tuple[IntArray, Pattern]:
+        """Which data Pardiso gets, and where they stand: of a symmetric matrix the upper part."""
+        rows, cols = self.pattern.rows, self.pattern.indices
+        kept = np.flatnonzero(cols >= rows) if self.symmetric else np.arange(len(cols))
+        if len(np.unique(rows[cols == rows])) < self.pattern.shape[0] and self.symmetric:
+            raise LinearAlgebraError(
+                "The matrix is singular or not positive definite: a diagonal entry is missing."
+            )
+        return kept, Pattern.from_entries(rows[kept], cols[kept], self.pattern.shape)
+
+    def factorise(self, data: Array) -> PardisoFactor:
+        """Factorise; raises `LinearAlgebraError` for a singular or non-finite matrix."""
+        from pypardiso import PyPardisoSolver
+        from pypardiso.pardiso_wrapper import PyPardisoError
+
+        if not np.isfinite(data).all():
+            raise LinearAlgebraError("The matrix holds values that are not finite.")
+        kept, pattern = self._stored
+        matrix = pattern.matrix(data[kept])
+        known = bool(self._idle)
+        kind = POSITIVE_DEFINITE if self.symmetric else GENERAL
+        handle = self._idle.pop() if known else PyPardisoSolver(mtype=kind)
+        handle.set_phase(REFACTORISE if known else FACTORISE)
+        try:
+            handle._call_pardiso(matrix, np.zeros(len(matrix.indptr) - 1))
+        except PyPardisoError as error:
+            _release([handle])
+            n = pattern.shape[0]
+            raise LinearAlgebraError(
+                f"The {n} by {n} matrix is singular{' or not positive definite' * self.symmetric}: "
+                "check the model's forms, or take a smaller time step."
+            ) from error
+        factor = PardisoFactor(self, handle, matrix)
+        weakref.finalize(factor, self._idle.append, handle).atexit = False
+        return factor
+
+
+def _release(handles: list[Any]) -> None:
+    for handle in handles:
+        handle.free_memory(everything=True)
