@@ -254,13 +254,11 @@ def test_engine_is_chosen_by_the_band():
 @pytest.mark.parametrize(
     ("modules", "symmetric", "expected"),
     [
-        ("", True, ["SuperLU", "SuperLU", "SuperLU"]),
+        ("", True, ["SuperLU", "SuperLU", "multigrid"]),
         ("", False, ["SuperLU", "SuperLU", "SuperLU"]),
-        ("pyamg", True, ["SuperLU", "SuperLU", "multigrid"]),
-        ("pyamg", False, ["SuperLU", "SuperLU", "SuperLU"]),
-        ("pyamg pypardiso", True, ["SuperLU", "Pardiso", "Pardiso"]),
-        ("pyamg pypardiso", False, ["SuperLU", "Pardiso", "Pardiso"]),
-        ("pyamg pypardiso sksparse", True, ["SuperLU", "CHOLMOD", "CHOLMOD"]),
+        ("pypardiso", True, ["SuperLU", "Pardiso", "Pardiso"]),
+        ("pypardiso", False, ["SuperLU", "Pardiso", "Pardiso"]),
+        ("pypardiso sksparse", True, ["SuperLU", "CHOLMOD", "CHOLMOD"]),
     ],
 )
 def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
@@ -276,11 +274,10 @@ def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
         assert chosen.solver.name.startswith(name)
         assert str(band) in chosen.reason
         rough = choose(pattern, symmetric=symmetric, approximate=True).solver
-        expects_cycle = symmetric and "pyamg" in modules and band > 150
+        expects_cycle = symmetric and band > 150
         assert isinstance(rough, MultigridSolver) == (expects_cycle or name == "multigrid")
 
 
-@pytest.mark.skipif(find_spec("pyamg") is None, reason="pyamg not installed")
 def test_multigrid_iterations_do_not_grow_with_the_mesh():
     for n in (20, 60):
         A = grid(n)
