@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +14,7 @@ from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Pattern, analyse
-from livepde.stepping import ForwardStage, StepFailed, advance, simulate
+from livepde.stepping import ForwardStage, Parts, StepFailed, advance, simulate
 
 SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
 
@@ -217,9 +218,9 @@ class Equation:
 
 def test_newton_solves():
     equation = Equation([8.0, 27.0])
-    y = lp.Newton().solve(equation, np.array([2.5, 2.5]))
+    y = lp.Newton().solve(equation, np.array([2.5, 2.5])).y
     np.testing.assert_allclose(y, [2.0, 3.0], rtol=1e-9)
-    swept = lp.Newton().solve(Equation([8.0, 27.0]), np.array([2.5, 2.5]), lagged=True)
+    swept = lp.Newton().solve(Equation([8.0, 27.0]), np.array([2.5, 2.5]), lagged=True).y
     np.testing.assert_allclose(swept, [2.0, 3.0], rtol=1e-9)
 
 
@@ -265,9 +266,29 @@ class Cubic:
 def test_newton_begins_where_the_start_is_good(near, kept, made):
     equation = Cubic()
     start = np.array([5.6])
-    y = lp.Newton().solve(equation, start, lagged=True, near=np.array([near]), kept=kept)
+    exact = lp.Newton(share=0.0)
+    y = exact.solve(equation, start, lagged=True, near=np.array([near]), kept=kept).y
     np.testing.assert_allclose(y, 6.0, rtol=1e-7)
     assert equation.sweeps == made
+
+
+@pytest.mark.parametrize(("expected", "trusted", "updates"), [(0.02, 0.01, 1), (0.02, 1e-4, 2)])
+def test_newton_stops_at_a_share_of_what_the_start_missed(expected, trusted, updates):
+    """A factor that goes on at a hundredth: one update serves, if it is believed."""
+    newton, start, near = lp.Newton(share=0.03), np.array([5.6]), np.array([6.01])
+    kept = Slope(2.0 / 1.01)
+    found = newton.solve(
+        Cubic(), start, lagged=True, near=near, kept=kept, expected=expected, trusted=trusted
+    )
+    assert found.updates == updates
+    assert abs(found.y[0] - 6.0) < 0.03 * 0.01
+    assert found.missed == pytest.approx(0.01 / 6.0, rel=0.03)
+    assert (updates == 1) == math.isnan(found.rate)
+    exact = lp.Newton(share=0.0).solve(
+        Cubic(), start, lagged=True, near=near, kept=kept, expected=expected, trusted=trusted
+    )
+    assert exact.updates > updates
+    assert updates == 1 or found.rate == pytest.approx(exact.rate, rel=1e-3)
 
 
 @pytest.mark.parametrize("near", [5.5, 5.55])
@@ -275,9 +296,9 @@ def test_sweeps_choose_where_newton_goes_far(near):
     """From there Newton goes to 4, or far below."""
     equation, swept = Cubic(), Cubic()
     start = np.array([5.6])
-    y = lp.Newton().solve(equation, start, lagged=True, near=np.array([near]))
+    y = lp.Newton().solve(equation, start, lagged=True, near=np.array([near])).y
     assert equation.sweeps[:2] == [False, True]
-    assert np.array_equal(y, lp.Newton().solve(swept, start, lagged=True))
+    assert np.array_equal(y, lp.Newton().solve(swept, start, lagged=True).y)
     assert equation.sweeps[1:] == swept.sweeps
 
 
@@ -300,8 +321,8 @@ def test_newton_says_how_it_failed(equation, start, newton, code):
 def test_tolerance_is_relative_in_each_block():
     """State and parameter may differ by many orders of magnitude."""
     equation = Equation([1e-24, 1e24])
-    blocks = (slice(0, 1), slice(1, 2))
-    y = lp.Newton().solve(equation, np.array([1.3e-8, 1.1e8]), blocks)
+    parts = Parts(np.eye(2), (0.0, 0.0))
+    y = lp.Newton().solve(equation, np.array([1.3e-8, 1.1e8]), parts).y
     np.testing.assert_allclose(y, [1e-8, 1e8], rtol=1e-8)
 
 

@@ -230,6 +230,11 @@ class Model:
         return self.form_M.matrix("v", "u")
 
     @cached_property
+    def state_mass(self) -> sp.csr_array:
+        """L2 Gram matrix of the state, shape (n, n)."""
+        return self.bilinear(_product(self.state_space))
+
+    @cached_property
     def X(self) -> HilbertSpace:
         """State space with the inner product of M."""
         return HilbertSpace(self.mass, "X", self.state_space.fixed)
@@ -346,7 +351,7 @@ class Model:
     @cached_property
     def _projection(self) -> HilbertSpace:
         """The state with the L2 inner product."""
-        return HilbertSpace(self.bilinear(_product(self.state_space)), "L2", self.state_space.fixed)
+        return HilbertSpace(self.state_mass, "L2", self.state_space.fixed)
 
     def initial_directions(self, q: Array, directions: Array, moment: Moment = START) -> Array:
         """Return du_0/dq applied to columns of shape (m, k): shape (n, k); zero without initial."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,9 +25,11 @@ from livepde.linalg import (
 )
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import Newton, relative
+from livepde.stepping import Newton, Parts
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
+
+GROWN = 2.0  # times as large as when the rate of a factor was seen: see again
 
 PULL = 10.0  # theta h where the law tunes itself: r forgets within a step
 
@@ -96,21 +99,32 @@ class Warm:
     Attributes
     ----------
     missed
-        How far the start was from the solution, relative to the norms of u and q.
+        How far the start was from the solution, relative to u and q.
     y, u_alpha, h
         Point, data and step of the last Jacobian of Newton that was factorised, shapes (n + m,) and
         (n,); empty if none is kept.
+    age
+        Stages since then.
+    spent
+        Updates that these took beyond one each.
+    ageing, seen
+        How much of an update is left to the next one after a stage, for each stage of age, and the
+        `missed` with which that was measured.
     """
 
     missed: float
     y: Array
     u_alpha: Array
     h: float
+    age: int
+    spent: int
+    ageing: float
+    seen: float
 
     @classmethod
     def none(cls) -> Warm:
         """Return the value before any stage."""
-        return cls(np.inf, *NOTHING)
+        return cls(np.inf, *NOTHING, 0, 0, np.inf, 0.0)
 
 
 class CoupledStage:
@@ -141,8 +155,6 @@ class CoupledStage:
         self.gains = gains
         self.newton = newton
         self.n = model.X.dim
-        self.blocks = (slice(0, self.n), slice(self.n, self.n + model.Q.dim))
-        self.floors = (0.0, RESOLVED * float(np.linalg.norm(model.latent.deviations)))
         self.RT = sp.csr_array(split.R.T)
         self.RM = sp.csr_array(self.RT @ gains.M_op)
         self.RMR = sp.csr_array(self.RM @ split.R)
@@ -309,22 +321,46 @@ class CoupledStage:
         equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
         good = warm.missed <= self.newton.basin
-        y = self.newton.solve(
+        kept = good and warm.h == h
+        age = warm.age + 1 if kept else 1
+        solved = self.newton.solve(
             equation,
             start,
-            self.blocks,
-            floors=self.floors,
+            self.parts,
             lagged=True,
             near=near if good else None,
-            kept=self._factor(warm, moment) if good and warm.h == h else None,
+            kept=self._factor(warm, moment) if kept else None,
+            expected=warm.ageing * age,
+            trusted=GROWN * warm.seen,
         )
-        missed = relative(y - near, y, self.blocks, self.floors)
-        if not self.keeps or (equation.made is None and equation.count > self.patience):
-            return y, Warm(missed, *NOTHING)
-        if equation.made is None:
-            return y, Warm(missed, warm.y, warm.u_alpha, warm.h)
-        self._kept = equation.made
-        return y, Warm(missed, equation.made[0], u_alpha, h)
+        y, missed, ageing, seen = solved.y, solved.missed, warm.ageing, warm.seen
+        if math.isnan(missed):
+            missed = self._distance(y - near, y)
+        if not self.keeps:
+            return y, replace(Warm.none(), missed=missed)
+        if equation.made is not None:
+            self._kept = equation.made
+            return y, Warm(missed, equation.made[0], u_alpha, h, 0, 0, ageing, seen)
+        if not math.isnan(solved.rate):
+            ageing, seen = solved.rate / age, missed
+        spent = warm.spent + solved.updates - 1
+        if spent > self.patience:
+            return y, Warm(missed, *NOTHING, 0, 0, ageing, seen)
+        return y, Warm(missed, warm.y, warm.u_alpha, warm.h, age, spent, ageing, seen)
+
+    @cached_property
+    def parts(self) -> Parts:
+        """The state and what is observed of it, in L2 with lumped mass, and the parameter."""
+        state = self.model.state_mass.diagonal()
+        observed = state * self.split.R.diagonal()
+        weights = np.zeros((self.size, 3))
+        weights[: self.n, 0], weights[: self.n, 1], weights[self.n :, 2] = state, observed, 1.0
+        floor = RESOLVED * float(np.linalg.norm(self.model.latent.deviations))
+        return Parts(weights, (0.0, 0.0, floor))
+
+    def _distance(self, change: Array, y: Array) -> float:
+        pairs = zip(self.parts.squares(change), self.parts.scales(y), strict=True)
+        return max(math.sqrt(square / scale) for square, scale in pairs)
 
     def _equation(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> _Equation:
         if self._bilinear is not None:
@@ -338,7 +374,7 @@ class CoupledStage:
 
     @cached_property
     def patience(self) -> int:
-        """Updates of a stage by a kept factor, beyond which the next one makes its own."""
+        """Updates beyond one for each stage that a factor may cost before it is made again."""
         return 3 if isinstance(self.solver, BandedSolver) else 12
 
     def _factor(self, warm: Warm, moment: Moment) -> Factor:

@@ -69,6 +69,8 @@ class GradientWork:
         self.problem = problem
         self.smooths = smooths
         self.gains = gains
+        if problem.control.scheme.order > 1:  # it leaves out less than a first-order start misses
+            newton = replace(newton, share=0.0)
         self.newton = newton
         self.learning = learning
         self.probes = probes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.newton import Newton, StepFailed, relative
+from livepde.stepping.newton import Newton, Parts, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.state import ForwardStage, simulate
 
@@ -14,10 +14,11 @@ __all__ = [
     "ImplicitEuler",
     "Interval",
     "Newton",
+    "Parts",
     "Scheme",
+    "Solution",
     "Stage",
     "StepFailed",
     "advance",
-    "relative",
     "simulate",
 ]

@@ -11,7 +11,7 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["Newton", "StepFailed", "relative"]
+__all__ = ["Newton", "Parts", "Solution", "StepFailed"]
 
 
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
@@ -46,6 +46,61 @@ class StageEquation(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Parts of y whose errors are measured separately, since they have different units.
+
+    Attributes
+    ----------
+    weights
+        The squared norm of each part is the sum of weights times squares, shape (n, parts).
+    floors
+        Norm of each part below which it counts as this large: a part of nothing but rounding errors
+        has no relative accuracy.
+    """
+
+    weights: Array
+    floors: tuple[float, ...]
+
+    @classmethod
+    def whole(cls, size: int) -> Parts:
+        """Return one part, measured in the Euclidean norm."""
+        return cls(np.ones((size, 1)), (0.0,))
+
+    def squares(self, x: Array) -> list[float]:
+        """Return the squared norm of each part."""
+        squares: list[float] = ((x * x) @ self.weights).tolist()
+        return squares
+
+    def scales(self, y: Array) -> list[float]:
+        """Return the squared norms that errors of y are measured by; none is zero."""
+        pairs = zip(self.squares(y), self.floors, strict=True)
+        return [max(square, floor**2, 1e-300) for square, floor in pairs]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What the iteration found, and how it went.
+
+    Attributes
+    ----------
+    y
+        The solution.
+    updates
+        How many it took.
+    missed
+        The first update in the worst part of y, relative to it: how good `near` was; NaN if it was
+        not where the iteration began in the end.
+    rate
+        From there, the second update over the first, with the same factor; NaN if there are none.
+    """
+
+    y: Array
+    updates: int
+    missed: float
+    rate: float
+
+
 @dataclass(frozen=True)
 class Newton:
     """Lagged sweeps into the neighbourhood of the solution, then Newton with a kept factor.
@@ -57,7 +112,11 @@ class Newton:
     Parameters
     ----------
     tolerance
-        Bound on the estimated error of each block, relative to the block's norm.
+        Bound on the estimated error of each part of y, relative to its norm.
+    share
+        A stage that begins at a good prediction is solved to this share of what the prediction
+        missed, if that is more. A prediction follows the steps before: what it misses is about as
+        much as the time step itself leaves out. 0: always to `tolerance`.
     iterations
         At most this many updates.
     refresh
@@ -67,6 +126,7 @@ class Newton:
     """
 
     tolerance: float = 1e-7
+    share: float = 0.01
     iterations: int = 60
     refresh: float = 0.2
     basin: float = 3e-2
@@ -76,22 +136,20 @@ class Newton:
         self,
         equation: StageEquation,
         y: Array,
-        blocks: tuple[slice, ...] = (slice(None),),
+        parts: Parts | None = None,
         *,
-        floors: tuple[float, ...] = (),
         lagged: bool = False,
         near: Array | None = None,
         kept: Factor | None = None,
-    ) -> Array:
+        expected: float = math.inf,
+        trusted: float = math.inf,
+    ) -> Solution:
         """Return the solution, starting from y.
 
         Parameters
         ----------
-        blocks
-            Parts of y measured separately (state and parameter have different units).
-        floors
-            Norm of each block below which it counts as this large: a block of nothing but rounding
-            errors has no relative accuracy.
+        parts
+            What of y is measured separately; by default nothing.
         lagged
             Begin with lagged sweeps.
         near
@@ -101,6 +159,9 @@ class Newton:
         kept
             With `near`: the factor of a Jacobian not far away, with which Newton may begin. It is
             replaced as one of this stage would be.
+        expected, trusted
+            With `near`: the ratio of the second update to the first that is expected, if the first
+            is not larger than `trusted`, relative to y. It spares the second one where it is small.
 
         Raises
         ------
@@ -110,10 +171,12 @@ class Newton:
         factor = kept
         begin = start = y
         y = start if near is None else near
-        floors = floors or (0.0,) * len(blocks)
-        last, basin, sweeps = np.inf, self.basin, lagged and near is None
-        limit, stalled = np.inf if near is None else self.basin, 0
-        for _ in range(self.iterations):
+        parts = parts or Parts.whole(len(y))
+        last, basin, sweeps = math.inf, self.basin, lagged and near is None
+        limit, stalled = math.inf if near is None else self.basin, 0
+        miss = [0.0] * len(parts.floors)
+        missed = seen = math.nan
+        for count in range(1, self.iterations + 1):
             residual = equation.residual(y)
             try:
                 factor = factor or equation.factor(y, sweeps)
@@ -121,17 +184,25 @@ class Newton:
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
-            size = relative(update, new, blocks, floors)
-            if not math.isfinite(size):
+            squares, scales = parts.squares(update), parts.scales(new)
+            if not math.isfinite(sum(squares) + sum(scales)):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
-            ratio = size / last
+            size = _largest(squares, scales)
+            if count == 1 and near is not None:
+                missed, miss = size, [self.share**2 * square for square in squares]
+            # Updates are compared with what may be left of the error.
+            allowed = [max(self.tolerance**2 * s, m) for s, m in zip(scales, miss, strict=True)]
+            excess = _largest(squares, allowed)
+            ratio = excess / last
             if ratio >= 0.5 and size <= ROUNDING:
-                return new  # updates that no longer shrink down there are rounding errors
-            # The error left behind is about rate/(1 - rate) times the update; what converges slowly
-            # may only show later.
+                break  # updates that no longer shrink down there are rounding errors
+            if count == 2 and near is not None:
+                seen = ratio
+            # What converges slowly may only show later.
             rate = max(ratio, SLOWEST) if lagged else ratio
-            left = size * rate / (1.0 - rate) if 0.0 < ratio < 1.0 else np.inf
-            done = size == 0.0 or left <= self.tolerance
+            if math.isinf(last):
+                rate = min(expected, 1.0) if count == 1 and missed <= trusted else 1.0
+            done = excess * rate <= 1.0 - rate  # the error is rate/(1 - rate) times the update
             slow = ratio > self.refresh and not done
             if (
                 lagged
@@ -140,41 +211,36 @@ class Newton:
             ):
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
                 basin = 0.3 * basin if near is None else basin
-                y, factor, sweeps, near, last = begin, None, True, None, np.inf
-                limit, stalled = np.inf, 0
+                y, factor, sweeps, near, last = begin, None, True, None, math.inf
+                limit, stalled = math.inf, 0
+                miss, missed = [0.0] * len(miss), math.nan
+                seen = math.nan
                 continue
             if not sweeps and math.isinf(last):
                 limit = size
             y = new
             if done:
-                return y
-            last = size
+                break
+            last = excess
             stalled = stalled + 1 if sweeps and size > 0.9 else 0
             if sweeps and stalled == STALLED:
                 y = start  # sweeps that jump about lead nowhere: Newton from where they began
             if sweeps and (size <= basin or stalled == STALLED):
                 # Newton's first update may be larger: sweeps creep, Newton goes all the way.
-                begin, factor, sweeps, last = y, None, False, np.inf
+                begin, factor, sweeps, last = y, None, False, math.inf
             elif kept is not None and slow:
-                factor, kept, last = None, None, np.inf  # a factor of its own begins anew
+                factor, kept, last = None, None, math.inf  # a factor of its own begins anew
             elif sweeps or slow:
                 factor = None
-        raise StepFailed(
-            "not_converged",
-            f"{self.iterations} iterations left a relative update of {size:.1e}",
-        )
+        else:
+            raise StepFailed(
+                "not_converged",
+                f"{self.iterations} iterations left a relative update of {size:.1e}",
+            )
+        return Solution(new, count, missed, seen)
 
 
-def relative(
-    update: Array, y: Array, blocks: tuple[slice, ...], floors: tuple[float, ...]
-) -> float:
-    """Return the largest update of a block relative to the block, in Euclidean norms."""
-    worst = 0.0
-    for block, floor in zip(blocks, floors, strict=True):
-        change, size = update[block], y[block]
-        square = float(change @ change)
-        if not math.isfinite(square):  # max() would pass over a value that is not a number
-            return np.inf
-        if square != 0.0:
-            worst = max(worst, square / max(float(size @ size), floor**2, 1e-300))
-    return math.sqrt(worst)
+def _largest(squares: list[float], scales: list[float]) -> float:
+    """Return the largest of the norms, relative to scales; all are given by their squares."""
+    pairs = zip(squares, scales, strict=True)
+    return math.sqrt(max(square / max(scale, 1e-300) for square, scale in pairs))

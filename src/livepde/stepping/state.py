@@ -114,7 +114,7 @@ class ForwardStage:
             residual = system.matrix @ u - model.mass @ (c / h) + offset - model.F(moment)
             return u - system.factor.solve(residual * model.X.free)
         equation = _Equation(self, c, q, h, moment)
-        return self.newton.solve(equation, u)
+        return self.newton.solve(equation, u).y
 
     def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised Jacobian at a solved stage, for sensitivities."""
