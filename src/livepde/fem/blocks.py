@@ -280,24 +280,26 @@ class ScalarBlock(Block):
         self.size = 1 if isinstance(unknown, Scalar) else len(unknown.regions)
 
     def _indicators(self, measure: Measure) -> Array:
-        if isinstance(self.unknown, Scalar):
-            return np.ones((1, *measure.shape))
         masks = np.zeros((self.size, *measure.shape))
+        if isinstance(self.unknown, Scalar):
+            return masks + 1.0
         for mask, (name, region) in zip(masks, self.unknown.regions.items(), strict=True):
             if callable(region):
                 mask[:] = region(measure.points)
-            elif region in (measure.mesh.subdomains or {}):
+            else:
                 members = measure.cells
                 if members is None:
                     members = np.arange(measure.mesh.nelements)
                 mask[np.isin(members, measure.mesh.subdomains[region])] = 1.0
-            else:
-                raise SpaceError(
-                    f"Region '{name}': the mesh has no subdomain '{region}'; give a predicate on x."
-                )
         return masks
 
     def local(self, measure: Measure) -> Local:
+        regions = {} if isinstance(self.unknown, Scalar) else self.unknown.regions
+        for name, region in regions.items():
+            if not callable(region) and region not in (measure.mesh.subdomains or {}):
+                raise SpaceError(
+                    f"Region '{name}': the mesh has no subdomain '{region}'; give a predicate on x."
+                )
         return Local(
             self.dofs_on(measure), (("value", ()),), lambda _: self._indicators(measure)[None]
         )
@@ -609,7 +611,7 @@ class FieldBlock(Block):
         """Return the first of some points, shape (d, k), that does not lie in the mesh."""
         low, high = (corner[:, None] for corner in self.box)
         slack = 1e-12 * (high - low)
-        out = ((points < low - slack) | (points > high + slack)).any(axis=0)
+        out = ~((points >= low - slack) & (points <= high + slack)).all(axis=0)
         if out.any():
             return int(out.argmax())
         if len(low) > 1 and not self._inside(points):
