@@ -238,17 +238,6 @@ def test_derivatives_of_a_trilinear_form(name):
     np.testing.assert_allclose(form_A.data("v", "q", u=u), plain, atol=1e-10 * abs(plain).max())
 
 
-def test_large_tensors_are_not_stored(monkeypatch):
-    import livepde.fem.forms as forms
-
-    stored = CASES["quads Q1"].model()
-    monkeypatch.setattr(forms, "LARGEST_TENSOR", 10)
-    model = CASES["quads Q1"].model()
-    u = np.random.default_rng(6).standard_normal(model.X.dim)
-    assert model.form_A.tensor("v", "q") is None
-    np.testing.assert_allclose(model.A(u).matrix.data, stored.A(u).matrix.data, atol=1e-14)
-
-
 def test_affine_and_constant_are_found_out():
     mesh, element = line(6), ElementLineP1()
     cases = {

@@ -3,90 +3,210 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import spsolve
-from skfem import Basis, BilinearForm, FacetBasis, LinearForm, Mesh
-from skfem.element import DiscreteField, ElementQuadBFS
-from skfem.helpers import inner
+from skfem import Basis, Dofs, FacetBasis, MappingAffine, Mesh
+from skfem.element import DiscreteField, ElementH1, ElementQuadBFS
+from skfem.generic_utils import OrientedBoundary
+from skfem.quadrature import get_quadrature
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elements import own
 from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Scalars, Unknown, is_nodal
 from livepde.fem.periodic import tied
 from livepde.fem.place import Moment, Place
-from livepde.linalg import Array, IntArray
+from livepde.fem.scatter import scatter, shared
+from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
 __all__ = ["Block", "FieldBlock", "Local", "Measure", "ScalarBlock", "block_of"]
 
 JETS = ("value", "grad", "hess")
+KEPT = 300_000  # quadrature points up to which what is evaluated on them is kept
+PIECE = 30_000  # quadrature points of a piece of a larger measure
+PROJECTED = 1e-13  # residual of a projection that is found by iterations
+ITERATIONS = 1000
+SEARCHED = 5_000_000  # pairs of a point and a cell that are looked at together
+FINER = "give coefficients, or an element of first order."
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measure:
-    """Where a form is integrated: the whole mesh, a subdomain, or a boundary; with its order."""
+    """Where a form is integrated: the whole mesh, a subdomain, or a boundary; with its order.
+
+    Parameters
+    ----------
+    members
+        Which cells, or facets of a boundary, are part of it; default all.
+    thin
+        Only the first quadrature point of each, to see what an integrand is like.
+    """
 
     mesh: Mesh
     order: int
     name: str | None = None
+    members: IntArray | None = None
+    thin: bool = False
 
     @property
     def on_boundary(self) -> bool:
         """True if the name is one of a boundary."""
         return self.name is not None and self.name in (self.mesh.boundaries or {})
 
-    def basis(self, element: Any) -> Any:
-        """Return scikit-fem's basis of an element on this measure."""
-        element = own(element)
+    @cached_property
+    def _whole(self) -> IntArray | None:
+        """All cells or facets that the name stands for; None: all cells of the mesh."""
         if self.name is None:
-            return Basis(self.mesh, element, intorder=self.order)
-        if self.on_boundary:
-            return FacetBasis(self.mesh, element, facets=self.name, intorder=self.order)
-        if self.name in (self.mesh.subdomains or {}):
-            return Basis(self.mesh, element, elements=self.name, intorder=self.order)
+            return None
+        for named in (self.mesh.boundaries or {}, self.mesh.subdomains or {}):
+            if self.name in named:
+                found: IntArray = named[self.name]
+                return found
         known = [*(self.mesh.boundaries or {}), *(self.mesh.subdomains or {})]
         raise SpaceError(f"On('{self.name}', ...): the mesh names {known or 'nothing'}.")
 
+    @property
+    def _where(self) -> IntArray | None:
+        return self._whole if self.members is None else self.members
+
+    def on(self, cells: IntArray) -> Measure:
+        """Return the part of it on some cells of the mesh, or on their facets."""
+        mine = self.cells
+        mine = np.arange(self.mesh.nelements) if mine is None else mine
+        at = np.flatnonzero(np.isin(mine, cells))
+        where = self._where
+        return replace(self, members=mine[at] if where is None else _chosen(where, at))
+
+    @property
+    def kept(self) -> bool:
+        """True if it is so small that what is evaluated on it is kept."""
+        elements, points = self.shape
+        return elements * points <= KEPT
+
+    def pieces(self) -> Iterator[tuple[slice, Measure]]:
+        """Yield parts that are small enough to be evaluated at once, and which these are."""
+        elements, points = self.shape
+        if self.kept:
+            yield slice(0, elements), self
+            return
+        where, width = self._where, max(1, PIECE // points)
+        for start in range(0, elements, width):
+            at = slice(start, min(start + width, elements))
+            members = np.arange(at.start, at.stop) if where is None else _chosen(where, at)
+            yield at, replace(self, members=members)
+
     @cached_property
-    def _base(self) -> Any:
-        return self.basis(self.mesh.elem())
+    def _rule(self) -> tuple[Array, Array]:
+        """Points and weights on the reference cell or facet."""
+        mesh = self.mesh
+        X, W = get_quadrature(mesh.brefdom if self.on_boundary else mesh.refdom, self.order)
+        return (X[:, :1], W[:1]) if self.thin else (X, W)
+
+    @cached_property
+    def shape(self) -> tuple[int, int]:
+        """Number of elements and of quadrature points on each."""
+        where = self._where
+        return self.mesh.nelements if where is None else len(where), len(self._rule[1])
+
+    @cached_property
+    def mapping(self) -> Any:
+        """scikit-fem's mapping; one of its own for a part, which keeps nothing for other cells."""
+        mesh, where = self.mesh, self._where
+        if where is None and self.kept and not self.thin:
+            return mesh._mapping()
+        if mesh.affine and where is not None and not self.on_boundary:
+            return MappingAffine(mesh, where)
+        mapping = copy(mesh._mapping())
+        for name in [name for name in vars(mapping) if name.startswith("_")]:
+            delattr(mapping, name)  # what it has cached
+        return mapping
+
+    @cached_property
+    def _facets(self) -> FacetBasis:
+        """scikit-fem's basis of the mesh's own element on a boundary."""
+        return self.facets(own(self.mesh.elem()), self.mesh.dofs)
+
+    def facets(self, element: Any, dofs: Any) -> FacetBasis:
+        """Return scikit-fem's basis of an element on a boundary."""
+        where, rule = self._where, self._rule
+        options = {"mapping": self.mapping, "dofs": dofs, "disable_doflocs": True}
+        return FacetBasis(self.mesh, element, facets=where, quadrature=rule, **options)
+
+    @property
+    def cells(self) -> IntArray | None:
+        """The cells, on a boundary those behind its facets; None: all of the mesh."""
+        if not self.on_boundary:
+            return self._where
+        cells: IntArray = self._facets.tind
+        return cells
 
     @cached_property
     def points(self) -> Array:
         """Coordinates of the quadrature points, shape (d, elements, points)."""
-        x: Array = np.asarray(self._base.global_coordinates())
-        return x
+        if self.on_boundary:
+            return np.asarray(self._facets.global_coordinates())
+        return self.mapped(self._rule[0])
 
     @cached_property
     def weights(self) -> Array:
         """Quadrature weights, shape (elements, points)."""
-        return np.asarray(self._base.dx)
+        if self.on_boundary:
+            return np.asarray(self._facets.dx)
+        X, W = self._rule
+        dx: Array = np.abs(self.mapping.detDF(X, tind=self._where)) * W
+        return dx
 
     @cached_property
     def normal(self) -> Array | None:
         """Outward normals on a boundary."""
-        return np.asarray(self._base.normals) if self.on_boundary else None
+        return np.asarray(self._facets.normals) if self.on_boundary else None
 
     @cached_property
     def diameter(self) -> Array:
         """Largest distance of two vertices of each cell, shape (elements, 1)."""
-        cells = slice(None) if self._base.tind is None else self._base.tind
+        cells = slice(None) if self.cells is None else self.cells
         corners = self.mesh.p[:, self.mesh.t[:, cells]]
         distances = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=0)
         found: Array = distances.max(axis=(0, 1))[:, None]
         return found
 
+    def gbasis(self, element: Any, i: int) -> DiscreteField:
+        """Return a shape function of an element at the quadrature points of cells."""
+        field: DiscreteField = element.gbasis(self.mapping, self._rule[0], i, tind=self._where)[0]
+        return field
+
+    def lbasis(self, element: Any, count: int) -> Array | None:
+        """Return the values of all shape functions, (local, points), if all cells see the same."""
+        if self.on_boundary or not isinstance(element, ElementH1):
+            return None
+        X = self._rule[0]
+        values = [element.lbasis(X, i)[0] for i in range(count)]
+        return np.array([np.broadcast_to(value, X.shape[1:]) for value in values])
+
+    def mapped(self, X: Array) -> Array:
+        """Return where points of the reference cell lie, shape (d, elements, points)."""
+        x: Array = self.mapping.F(X, tind=self._where)
+        return x
+
     def place(self, moment: Moment) -> Place:
         """Return what an integrand sees as x at a moment."""
-        return Place(self.points, self.normal, moment, self.diameter)
+        return Place(self.points, self.normal, moment, lambda: self.diameter)
 
 
-@dataclass(frozen=True)
+def _chosen(members: IntArray, at: Any) -> IntArray:
+    """Return some of the members of a measure; facets keep their side."""
+    chosen: IntArray = np.asarray(members)[at]
+    if isinstance(members, OrientedBoundary):
+        chosen = OrientedBoundary(chosen, members.ori[at])
+    return chosen
+
+
 class Local:
     """Shape functions of a block on a measure.
 
@@ -96,19 +216,44 @@ class Local:
         Coefficient of each local shape function, shape (local, elements).
     parts
         What a form sees: (jet, tensor shape) in order, such as ("value", ()), ("grad", (d,)).
-    phi
-        Components of all parts, shape (components, local, elements, points).
+    components
+        Number of components of all parts.
     """
 
-    dofs: IntArray
-    parts: tuple[tuple[str, tuple[int, ...]], ...]
-    phi: Array
+    def __init__(
+        self,
+        dofs: IntArray,
+        parts: Sequence[tuple[str, tuple[int, ...]]],
+        evaluate: Callable[[str], Array],
+    ) -> None:
+        self.dofs = dofs
+        self.parts = tuple(parts)
+        self.sizes = [int(np.prod(tensor, dtype=int)) for _, tensor in parts]
+        self.components = sum(self.sizes)
+        self._evaluate = evaluate  # part -> shape (components of it, local, elements, points)
+        self._known: dict[str, Array] = {}
+
+    def part(self, name: str) -> Array:
+        """Return the components of a part, shape (components, local, elements, points)."""
+        if name not in self._known:
+            self._known[name] = self._evaluate(name)
+        return self._known[name]
+
+    @property
+    def phi(self) -> Array:
+        """Components of all parts, shape (components, local, elements, points)."""
+        return np.concatenate([self.part(name) for name, _ in self.parts])
 
 
 class Block(ABC):
     """One unknown of a function space."""
 
     size: int
+
+    def dofs_on(self, measure: Measure) -> IntArray:
+        """Return the coefficient of each local shape function, shape (local, elements)."""
+        numbers = np.arange(self.size, dtype=np.int32)[:, None]
+        return np.broadcast_to(numbers, (self.size, measure.shape[0]))
 
     @abstractmethod
     def local(self, measure: Measure) -> Local:
@@ -135,28 +280,29 @@ class ScalarBlock(Block):
         self.size = 1 if isinstance(unknown, Scalar) else len(unknown.regions)
 
     def _indicators(self, measure: Measure) -> Array:
-        _, elements, points = measure.points.shape
+        masks = np.zeros((self.size, *measure.shape))
         if isinstance(self.unknown, Scalar):
-            return np.ones((1, elements, points))
-        masks = np.zeros((self.size, elements, points))
+            return masks + 1.0
         for mask, (name, region) in zip(masks, self.unknown.regions.items(), strict=True):
             if callable(region):
                 mask[:] = region(measure.points)
-            elif region in (measure.mesh.subdomains or {}):
-                members = measure.basis(measure.mesh.elem()).tind
+            else:
+                members = measure.cells
                 if members is None:
                     members = np.arange(measure.mesh.nelements)
                 mask[np.isin(members, measure.mesh.subdomains[region])] = 1.0
-            else:
-                raise SpaceError(
-                    f"Region '{name}': the mesh has no subdomain '{region}'; give a predicate on x."
-                )
         return masks
 
     def local(self, measure: Measure) -> Local:
-        phi = self._indicators(measure)[None]
-        dofs = np.repeat(np.arange(self.size)[:, None], phi.shape[2], axis=1)
-        return Local(dofs, (("value", ()),), phi)
+        regions = {} if isinstance(self.unknown, Scalar) else self.unknown.regions
+        for name, region in regions.items():
+            if not callable(region) and region not in (measure.mesh.subdomains or {}):
+                raise SpaceError(
+                    f"Region '{name}': the mesh has no subdomain '{region}'; give a predicate on x."
+                )
+        return Local(
+            self.dofs_on(measure), (("value", ()),), lambda _: self._indicators(measure)[None]
+        )
 
     def jet(self, parts: Local, values: Array) -> Any:
         return values[0]
@@ -179,10 +325,12 @@ class NamesBlock(Block):
         self.size = len(self.names)
 
     def local(self, measure: Measure) -> Local:
-        phi = np.zeros((self.size, self.size, *measure.weights.shape))
-        phi[np.arange(self.size), np.arange(self.size)] = 1.0
-        dofs = np.repeat(np.arange(self.size)[:, None], phi.shape[2], axis=1)
-        return Local(dofs, tuple((name, ()) for name in self.names), phi)
+        def evaluate(name: str) -> Array:
+            phi = np.zeros((1, self.size, *measure.shape))
+            phi[0, self.names.index(name)] = 1.0
+            return phi
+
+        return Local(self.dofs_on(measure), [(name, ()) for name in self.names], evaluate)
 
     def jet(self, parts: Local, values: Array) -> dict[str, Array]:
         return dict(zip(self.names, values, strict=True))
@@ -199,21 +347,49 @@ class FieldBlock(Block):
 
     def __init__(self, field: Field) -> None:
         self.field = field
-        self.basis = Basis(field.mesh, own(field.element))
-        self._tie = tied(field, self.basis)
-        self.size = int(self._tie.max()) + 1
+        self.element = own(field.element)
+        self.dofs = Dofs(field.mesh, self.element)
+        self.dofs.element_dofs = shared(self.dofs.element_dofs)
+        self._tie = tied(field, self)
+        self.size = int(self.dofs.N if self._tie is None else self._tie.max() + 1)
+
+    def _tied(self, dofs: IntArray) -> IntArray:
+        """Return the coefficients that stand for those of scikit-fem."""
+        return dofs if self._tie is None else self._tie[dofs]
 
     @cached_property
     def element_dofs(self) -> IntArray:
         """Coefficient of each local shape function, shape (local, elements)."""
-        found: IntArray = self._tie[self.basis.element_dofs]
+        return self._tied(self.dofs.element_dofs)
+
+    def dofs_on(self, measure: Measure) -> IntArray:
+        cells = measure.cells
+        return self.element_dofs if cells is None else self.element_dofs[:, cells]
+
+    @cached_property
+    def places(self) -> Array:
+        """Where each of scikit-fem's coefficients sits, shape (d, coefficients)."""
+        mesh, element = self.field.mesh, self.element
+        found = np.zeros((mesh.dim(), int(self.dofs.N)))
+        for at, piece in Measure(mesh, 1).pieces():
+            x = piece.mapped(element.doflocs.T)
+            for i, dofs in enumerate(self.dofs.element_dofs[:, at]):
+                found[:, dofs] = x[:, :, i]
         return found
 
     @cached_property
     def doflocs(self) -> Array:
         """Where each coefficient sits, shape (d, size)."""
+        if self._tie is None:
+            return self.places
         _, first = np.unique(self._tie, return_index=True)
-        found: Array = self.basis.doflocs[:, first]
+        found: Array = self.places[:, first]
+        return found
+
+    def at(self, facets: Any = None, names: Sequence[str] | None = None) -> IntArray:
+        """Return scikit-fem's coefficients on facets, by default on all of the boundary."""
+        facets = self.field.mesh.normalize_facets(facets)
+        found: IntArray = self.dofs.get_facet_dofs(facets).all(names)
         return found
 
     @cached_property
@@ -223,43 +399,65 @@ class FieldBlock(Block):
         free = mesh.boundary_facets()
         for name in chain(*self.field.periodic):
             free = np.setdiff1d(free, mesh.boundaries[name])
-        found: IntArray = np.unique(self._tie[self.basis.get_dofs(facets=free).all()])
+        found: IntArray = np.unique(self._tied(self.at(free)))
         return found
 
     @cached_property
     def _spread(self) -> sp.csr_array:
         """The matrix from coefficients to those of scikit-fem, where sides are not tied."""
-        n = len(self._tie)
+        n = int(self.dofs.N)
+        if self._tie is None:
+            return sp.csr_array(sp.eye_array(n))
         return sp.csr_array((np.ones(n), (np.arange(n), self._tie)), shape=(n, self.size))
 
     @cached_property
+    def basis(self) -> Any:
+        """scikit-fem's basis with shape functions at all quadrature points of `measure`."""
+        return Basis(self.field.mesh, self.element, dofs=self.dofs)
+
+    @cached_property
+    def _one(self) -> DiscreteField:
+        """The first shape function in the first cell."""
+        first = Measure(self.field.mesh, 1, members=np.zeros(1, dtype=np.int64), thin=True)
+        return first.gbasis(self.element, 0)
+
+    @property
     def vector(self) -> bool:
         """True if the function has values in R^d."""
-        return np.ndim(self.basis.basis[0][0]) > 2
+        return np.ndim(self._one) > 2
+
+    @property
+    def bends(self) -> bool:
+        """True if the element has second derivatives."""
+        return self._one.hess is not None
 
     def local(self, measure: Measure) -> Local:
         if measure.mesh is not self.field.mesh:
             raise SpaceError(
                 "State and parameter fields must share one mesh object; their elements may differ."
             )
-        basis = measure.basis(self.field.element)
-        elements, points = measure.weights.shape
-        first = basis.basis[0][0]
-        parts, shapes = [], []
-        for jet in JETS:
-            part = np.asarray(first) if jet == "value" else getattr(first, jet)
-            if part is None:
-                continue
-            tensor = np.shape(part)[:-2]
-            parts.append((jet, tensor))
-            stack = np.empty((*tensor, basis.Nbfun, elements, points))
-            for i in range(basis.Nbfun):
-                phi = basis.basis[i][0]
-                array = np.asarray(phi) if jet == "value" else getattr(phi, jet)
-                stack[..., i, :, :] = array
-            shapes.append(stack.reshape(-1, basis.Nbfun, elements, points))
-        dofs: IntArray = self._tie[basis.element_dofs]
-        return Local(dofs, tuple(parts), np.concatenate(shapes))
+        jets = {name: _jet(self._one, name) for name in JETS}
+        parts = [(name, np.shape(jet)[:-2]) for name, jet in jets.items() if jet is not None]
+        dofs = self.dofs_on(measure)
+        functions: list[DiscreteField] = []
+
+        def evaluate(part: str) -> Array:
+            shape = (len(dofs), *measure.shape)
+            if part == "value" and not functions:
+                values = measure.lbasis(self.element, len(dofs))
+                if values is not None:
+                    return np.broadcast_to(values[:, None], shape)[None]
+            if not functions:
+                if measure.on_boundary:
+                    basis = measure.facets(self.element, self.dofs).basis
+                    functions.extend(function for (function,) in basis)
+                else:
+                    count = len(dofs)
+                    functions.extend(measure.gbasis(self.element, i) for i in range(count))
+            stack = np.stack([_jet(function, part) for function in functions], axis=-3)
+            return stack.reshape(-1, *shape)
+
+        return Local(dofs, parts, evaluate)
 
     def jet(self, parts: Local, values: Array) -> DiscreteField:
         arrays, start = {}, 0
@@ -290,17 +488,58 @@ class FieldBlock(Block):
         if self.field.transform is not None:  # a projection need not stay within the bounds
             nodes = self.doflocs
             return np.asarray(value(nodes) + 0.0 * nodes[0])
-        mass = BilinearForm(lambda u, v, w: inner(u, v)).assemble(self.basis)
-        rhs = LinearForm(lambda v, w: inner(value(w.x) + 0.0 * w.x[0], v)).assemble(self.basis)
-        tie = self._spread
-        found: Array = spsolve(sp.csc_array(tie.T @ mass @ tie), tie.T @ rhs)
+        return self.project(lambda piece: value(piece.points) + 0.0 * piece.points[0])
+
+    @cached_property
+    def measure(self) -> Measure:
+        """The mesh with the order of the mass matrix."""
+        return Measure(self.field.mesh, 2 * int(self.element.maxdeg))
+
+    def project(self, values: Callable[[Measure], Array]) -> Array:
+        """Return the coefficients of the L2 projection of a function.
+
+        Parameters
+        ----------
+        values
+            Its values at the quadrature points of a piece of `measure`, shape (..., elements,
+            points).
+        """
+        functional = np.zeros(self.size)
+        for _, piece in self.measure.pieces():
+            local = self.local(piece)
+            density = (values(piece) * piece.weights).reshape(-1, *piece.shape)
+            tested = np.einsum("kep,kiep->ie", density, local.part("value"))
+            np.add.at(functional, local.dofs.ravel(), tested.ravel())
+        if self.measure.kept:
+            return self._mass_factor.solve(functional)
+        mass = self._mass()
+        scale = mass.diagonal()
+        found, _ = conjugate_gradients(
+            mass.__matmul__, lambda r: r / scale, functional, PROJECTED, ITERATIONS, FINER
+        )
         return found
 
+    def _mass(self) -> sp.csr_array:
+        """Return the mass matrix, shape (size, size)."""
+        places = scatter([(self.element_dofs, self.element_dofs)], (self.size, self.size))
+        data = np.zeros(places.pattern.nnz)
+        for at, piece in self.measure.pieces():
+            phi = self.local(piece).part("value")
+            local = np.einsum("kiep,kjep->ije", phi * piece.weights, phi)
+            places.add(data, 0, at, local)
+        return places.pattern.matrix(data)
+
+    @cached_property
+    def _mass_factor(self) -> Factor:
+        mass = self._mass()
+        return analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
+
     def _value_dofs(self, name: str) -> IntArray:
-        dofs = self.basis.get_dofs() if name == "boundary" else self.basis.get_dofs(name)
         # Essential conditions fix values; derivative unknowns (u_x, u_n, ...) stay free.
         names = [n for n in (self.field.element.dofnames or []) if "_" not in n]
-        found: IntArray = np.unique(self._tie[dofs.all(names)])
+        found: IntArray = np.unique(
+            self._tied(self.at(None if name == "boundary" else name, names))
+        )
         return found
 
     def _slope_dofs(self, name: str, axis: int) -> IntArray:
@@ -314,7 +553,7 @@ class FieldBlock(Block):
         along = np.abs(ends[axis, 1] - ends[axis, 0])
         sides = np.asarray(sides)[across <= 1e-9 * along]
         names = [("u_x", "u_y")[axis]]
-        found: IntArray = np.unique(self._tie[self.basis.get_dofs(facets=sides).all(names)])
+        found: IntArray = np.unique(self._tied(self.at(sides, names)))
         return found
 
     @cached_property
@@ -366,15 +605,38 @@ class FieldBlock(Block):
 
     def contains(self, point: Array) -> bool:
         """Return true if a point, shape (d,), lies in the mesh."""
-        low, high = self.box
+        return self._outside(point[:, None]) is None
+
+    def _outside(self, points: Array) -> int | None:
+        """Return the first of some points, shape (d, k), that does not lie in the mesh."""
+        low, high = (corner[:, None] for corner in self.box)
         slack = 1e-12 * (high - low)
-        inside = bool(np.all(point >= low - slack) and np.all(point <= high + slack))
-        if inside and len(low) > 1:
-            try:
-                self.basis.mesh.element_finder()(*point[:, None])
-            except ValueError:
-                return False
-        return inside
+        out = ~((points >= low - slack) & (points <= high + slack)).all(axis=0)
+        if out.any():
+            return int(out.argmax())
+        if len(low) > 1 and not self._inside(points):
+            return next(k for k in range(points.shape[1]) if not self._inside(points[:, [k]]))
+        return None
+
+    def _inside(self, points: Array) -> bool:
+        try:
+            self._cells(points)
+        except ValueError:
+            return False
+        return True
+
+    def _cells(self, points: Array) -> IntArray:
+        """Return the cell of each point, shape (k,); ValueError if one lies outside of the mesh."""
+        mesh, whole = self.field.mesh, Measure(self.field.mesh, 1)
+        finder = mesh.element_finder(mapping=whole.mapping)
+        width = max(1, SEARCHED // mesh.nelements)  # points that may be sought in all cells
+        starts = range(0, points.shape[1], width)
+        try:
+            parts = [finder(*points[:, k : k + width]) for k in starts]
+        finally:
+            if not whole.kept:
+                vars(mesh).pop("_cached_tree", None)
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def probe(self, points: Array, what: str = "point") -> sp.csr_array:
         """Return the matrix that evaluates the function at points of shape (d, k)."""
@@ -384,13 +646,23 @@ class FieldBlock(Block):
             raise ObservationError(
                 f"{what}: coordinates of dimension {points.shape[0]}; the mesh has {len(low)}."
             )
-        for k, point in enumerate(points.T):
-            if not self.contains(point):
-                raise ObservationError(
-                    f"{what} {k} at {point.tolist()} lies outside of the mesh, which spans "
-                    f"{low.tolist()} to {high.tolist()}: check its coordinates and their unit."
-                )
-        return sp.csr_array(self.basis.probes(np.clip(points.T, low, high).T) @ self._spread)
+        if (lost := self._outside(points)) is not None:
+            raise ObservationError(
+                f"{what} {lost} at {points[:, lost].tolist()} lies outside of the mesh, which "
+                f"spans {low.tolist()} to {high.tolist()}: check its coordinates and their unit."
+            )
+        return self._evaluated(np.clip(points.T, low, high).T)
+
+    def _evaluated(self, points: Array) -> sp.csr_array:
+        cells = self._cells(points)
+        mapping = Measure(self.field.mesh, 1, members=cells).mapping
+        X = mapping.invF(points[:, :, None], tind=cells)
+        count = len(self.element_dofs)
+        phi = np.array([self.element.gbasis(mapping, X, i, tind=cells)[0] for i in range(count)])
+        rows = phi[0].size
+        each = self.element_dofs[:, np.tile(cells, rows // max(len(cells), 1))]
+        entries = (phi.ravel(), (np.tile(np.arange(rows), count), each.ravel()))
+        return sp.csr_array(entries, shape=(rows, self.size))
 
     @cached_property
     def at_vertices(self) -> sp.csr_array:
@@ -398,11 +670,16 @@ class FieldBlock(Block):
         element, mesh = self.field.element, self.field.mesh
         names = element.dofnames or []
         if element.nodal_dofs and names and names[0] == "u":  # a coefficient is the value there
-            dofs = self.basis.nodal_dofs[0]
+            dofs = self.dofs.nodal_dofs[0]
             entries = (np.ones(len(dofs)), (np.arange(len(dofs)), dofs))
-            values = sp.csr_array(entries, shape=(len(dofs), int(self.basis.N)))
+            values = sp.csr_array(entries, shape=(len(dofs), int(self.dofs.N)))
             return sp.csr_array(values @ self._spread)
         return self.probe(mesh.p, "vertex")
+
+
+def _jet(function: DiscreteField, name: str) -> Any:
+    """Return a part of a function by name, None where there is none."""
+    return np.asarray(function) if name == "value" else getattr(function, name)
 
 
 def _slope(g: Any, axis: int, width: float) -> Any:

@@ -19,29 +19,34 @@ the derivative from the user, and `check_model` tells when one is missing.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
 from dis import get_instructions
 from functools import cached_property
 from types import FunctionType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
 from livepde.fem.blocks import Measure
+from livepde.fem.elementwise import ElementProducts, ElementTensor
 from livepde.fem.fields import Integrand, On
 from livepde.fem.place import START, Inputs, Moment, Place
+from livepde.fem.scatter import Scatter, scatter
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern, PatternOperator
 
-__all__ = ["Form", "FormMatrices"]
+__all__ = ["Form", "FormMatrices", "Tensor"]
+
+Tensor: TypeAlias = sp.csr_array | ElementTensor
 
 STEP = 1e-30  # of the complex step: far below rounding, far above underflow
 SMALL = 1e-3  # share of a component's largest value or prior deviation: less is no scale
 SHIFT = 1e-3  # of a central difference of fourth order, relative: its errors are about 1e-13
-LARGEST_TENSOR = 20_000_000  # entries of a precomputed trilinear form; beyond it, quadrature
+LARGEST_TENSOR = 5_000_000  # products of local functions up to which a trilinear form is sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +55,34 @@ class _Term:
 
     integrand: Integrand
     measure: Measure
-    spaces: Mapping[str, LocalSpace]
+    over: Mapping[str, FunctionSpace]
+
+    @cached_property
+    def spaces(self) -> dict[str, LocalSpace]:
+        """Argument -> its space on the measure; one object for arguments of the same space."""
+        found = {id(space): space.local(self.measure) for space in self.over.values()}
+        return {key: found[id(space)] for key, space in self.over.items()}
+
+    def pieces(self) -> Iterator[tuple[slice, _Term]]:
+        """Yield the term on parts of the measure that can be evaluated at once, and which."""
+        if self.measure.kept:
+            yield slice(0, self.measure.shape[0]), self
+            return
+        for at, piece in self.measure.pieces():
+            yield at, replace(self, measure=piece)
+
+    def samples(self) -> Iterator[_Term]:
+        """Yield the term, on every element of the measure, to see what the integrand is like."""
+        thin = (
+            self if self.measure.kept else replace(self, measure=replace(self.measure, thin=True))
+        )
+        for _, piece in thin.pieces():
+            yield piece
 
     def evaluate(self, values: Mapping[str, Array], moment: Moment) -> tuple[Any, Place]:
         place = self.measure.place(moment)
         jets = [self.spaces[name].jets(array) for name, array in values.items()]
         return self.integrand(*jets, place), place
-
-    def weighted(self, density: Any, axes: tuple[int, ...]) -> Array:
-        """Return density times quadrature weights, broadcast to (axes..., E, P)."""
-        array = np.asarray(density) * self.measure.weights
-        return np.broadcast_to(array, (*axes, *self.measure.weights.shape))
 
 
 class FormMatrices(ABC):
@@ -139,9 +161,7 @@ class Form(FormMatrices):
         self.terms: list[_Term] = []
         for item in items:
             integrand, where = (item.form, item.name) if isinstance(item, On) else (item, None)
-            measure = Measure(mesh, order, where)
-            locals_ = {key: space.local(measure) for key, space in spaces.items()}
-            self.terms.append(_Term(integrand, measure, locals_))
+            self.terms.append(_Term(integrand, Measure(mesh, order, where), self.spaces))
         given = derivative if isinstance(derivative, Sequence) else [derivative] * len(items)
         if len(given) != len(items):
             raise ModelError(
@@ -149,12 +169,7 @@ class Form(FormMatrices):
             )
         self.derivatives = list(given)
         self._inputs = Inputs(dict.fromkeys(inputs, 1.0))
-        self._constants: dict[tuple[str, str], Array] = {}
-        self._offsets: dict[str, Array] = {}
-        self._slopes: dict[str, sp.csr_array] = {}
-        self._tensors: dict[tuple[str, str], sp.csr_array | None] = {}
-        self._patterns: dict[tuple[str, str], Pattern] = {}
-        self._gathers: dict[tuple[str, str], list[sp.csr_array]] = {}
+        self._forget()
         self._moving: list[bool] = []  # terms that read time or inputs, and the nonlinear argument
         self.uses: frozenset[str] = self._probe()
         self.parameter = parameter
@@ -162,35 +177,64 @@ class Form(FormMatrices):
         curved = {nonlinear} if self.linear_in_parameter else {nonlinear, parameter}
         self._curved = frozenset(key for key in curved if key is not None)
 
+    def _forget(self) -> None:
+        self._constants: dict[tuple[str, str], Array] = {}
+        self._offsets: dict[str, Array] = {}
+        self._slopes: dict[str, sp.csr_array] = {}
+        self._tensors: dict[tuple[str, str], Tensor | None] = {}
+        self._scatters: dict[tuple[str, str], Scatter] = {}
+        self._products: ElementProducts | None = None
+
+    def on(self, cells: IntArray) -> Form:
+        """Return the form integrated over some cells of the mesh, and over the facets they have.
+
+        Its functions are those of the whole mesh; its patterns hold what these cells couple.
+
+        Parameters
+        ----------
+        cells
+            Numbers of the cells.
+        """
+        part = copy(self)
+        part.terms = [replace(term, measure=term.measure.on(cells)) for term in self.terms]
+        part._operators = {}
+        part._forget()
+        return part
+
     def _probe(self) -> frozenset[str]:
         """Evaluate once: find errors early, and what of time and inputs the form reads."""
         rng = np.random.default_rng(0)
         used: set[str] = set()
         for term in self.terms:
-            values = {
-                key: rng.standard_normal((local.components, *local.shape))
-                for key, local in term.spaces.items()
-            }
-            try:
-                with np.errstate(all="ignore"):  # roots and logarithms of random numbers
-                    density, place = term.evaluate(values, Moment(0.0, self._inputs))
-                shape = np.broadcast_shapes(np.shape(density), term.measure.weights.shape)
-            except LivepdeError:
-                raise
-            except Exception as error:
-                raise ModelError(
-                    f"Form {self.name}({', '.join(self.spaces)}, x) failed at its first "
-                    f"evaluation: {type(error).__name__}: {error}"
-                ) from error
-            if shape != term.measure.weights.shape:
-                raise ModelError(
-                    f"Form {self.name}({', '.join(self.spaces)}, x) gave shape "
-                    f"{np.shape(density)} where a scalar per point is expected: is a dot(...) "
-                    "or a component index missing?"
-                )
-            used |= place.used
-            self._moving.append(bool(place.used) and self._mentions_state(term.integrand))
+            read = set().union(*(self._read(piece, rng) for piece in term.samples()))
+            used |= read
+            self._moving.append(bool(read) and self._mentions_state(term.integrand))
         return frozenset(used)
+
+    def _read(self, term: _Term, rng: np.random.Generator) -> set[str]:
+        """Evaluate a term at random values and return what of time and inputs it reads."""
+        values = {
+            key: rng.standard_normal((local.components, *local.shape))
+            for key, local in term.spaces.items()
+        }
+        try:
+            with np.errstate(all="ignore"):  # roots and logarithms of random numbers
+                density, place = term.evaluate(values, Moment(0.0, self._inputs))
+            shape = np.broadcast_shapes(np.shape(density), term.measure.shape)
+        except LivepdeError:
+            raise
+        except Exception as error:
+            raise ModelError(
+                f"Form {self.name}({', '.join(self.spaces)}, x) failed at its first "
+                f"evaluation: {type(error).__name__}: {error}"
+            ) from error
+        if shape != term.measure.shape:
+            raise ModelError(
+                f"Form {self.name}({', '.join(self.spaces)}, x) gave shape "
+                f"{np.shape(density)} where a scalar per point is expected: is a dot(...) "
+                "or a component index missing?"
+            )
+        return place.used
 
     @property
     def constant(self) -> bool:
@@ -227,7 +271,7 @@ class Form(FormMatrices):
         """Return true if the form is affine (linear, if homogeneous) in an argument."""
         rng = np.random.default_rng(1)
         probe = Moment(0.3, self._inputs)
-        for term in self.terms:
+        for term in (piece for whole in self.terms for piece in whole.samples()):
             values = {
                 key: rng.standard_normal((local.components, *local.shape))
                 for key, local in term.spaces.items()
@@ -277,7 +321,7 @@ class Form(FormMatrices):
 
     def _vector(self, slot: str, moment: Moment, coefficients: Mapping[str, Array]) -> Array:
         result = np.zeros(self.spaces[slot].dim)
-        for term in self.terms:
+        for term in (piece for whole in self.terms for _, piece in whole.pieces()):
             place = term.measure.place(moment)
             jets = [
                 local.unit_jets(0, 1)
@@ -285,29 +329,20 @@ class Form(FormMatrices):
                 else local.jets(local.values(coefficients[key]))
                 for key, local in term.spaces.items()
             ]
-            local = term.spaces[slot]
-            weighted = term.weighted(term.integrand(*jets, place), (local.components,))
-            result += local.evaluation_transposed @ weighted.ravel()
+            density = np.asarray(term.integrand(*jets, place))
+            result += term.spaces[slot].tested(density, term.measure.weights)
         return result
+
+    def _scatter(self, rows: str, cols: str) -> Scatter:
+        if (rows, cols) not in self._scatters:
+            i, j = self.spaces[rows], self.spaces[cols]
+            pairs = [(i.dofs_on(term.measure), j.dofs_on(term.measure)) for term in self.terms]
+            self._scatters[rows, cols] = scatter(pairs, (i.dim, j.dim))
+        return self._scatters[rows, cols]
 
     def pattern(self, rows: str, cols: str) -> Pattern:
         """Return the sparsity of the matrices `data(rows, cols)`."""
-        if (rows, cols) not in self._patterns:
-            pairs = [self._entries(term, rows, cols) for term in self.terms]
-            pattern = Pattern.from_entries(
-                np.concatenate([i for i, _ in pairs]),
-                np.concatenate([j for _, j in pairs]),
-                (self.spaces[rows].dim, self.spaces[cols].dim),
-            )
-            self._patterns[rows, cols] = pattern
-            self._gathers[rows, cols] = [pattern.gather(i, j) for i, j in pairs]
-        return self._patterns[rows, cols]
-
-    @staticmethod
-    def _entries(term: _Term, rows: str, cols: str) -> tuple[IntArray, IntArray]:
-        i, j = term.spaces[rows].dofs, term.spaces[cols].dofs
-        shape = (len(i), len(j), i.shape[1])
-        return np.broadcast_to(i[:, None], shape).ravel(), np.broadcast_to(j, shape).ravel()
+        return self._scatter(rows, cols).pattern
 
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
         """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`.
@@ -330,20 +365,32 @@ class Form(FormMatrices):
                     return product
         return self._quadrature(rows, cols, moment, coefficients)
 
-    def _quadrature(
-        self, rows: str, cols: str, moment: Moment, coefficients: Mapping[str, Array]
+    def product(
+        self, rows: str, cols: str, x: Array, moment: Moment = START, **coefficients: Array
     ) -> Array:
-        pattern = self.pattern(rows, cols)
-        result = np.zeros(pattern.nnz)
-        for term, gather, given in zip(
-            self.terms, self._gathers[rows, cols], self.derivatives, strict=True
-        ):
-            density = self._density(term, rows, cols, moment, coefficients, given)
-            r, c = term.spaces[rows], term.spaces[cols]
-            weighted = term.weighted(density, (r.components, c.components))
-            half = np.einsum("klep,kiep->liep", weighted, r.phi, optimize=False)
-            local = np.einsum("liep,ljep->ije", half, c.phi, optimize=False)
-            result += gather @ local.ravel()
+        third = [key for key in self.spaces if key not in (rows, cols)]
+        if len(third) == 1 and x.ndim == 1:
+            tensor = self.tensor(rows, cols)
+            if isinstance(tensor, ElementTensor):
+                return tensor.apply(coefficients[third[0]], x)
+        return super().product(rows, cols, x, moment, **coefficients)
+
+    def _quadrature(
+        self,
+        rows: str,
+        cols: str,
+        moment: Moment,
+        coefficients: Mapping[str, Array],
+        keep: bool = True,
+    ) -> Array:
+        places = self._scatter(rows, cols)
+        result = np.zeros(places.pattern.nnz)
+        for number, (whole, given) in enumerate(zip(self.terms, self.derivatives, strict=True)):
+            for at, term in whole.pieces():
+                density = self._density(term, rows, cols, moment, coefficients, given)
+                r, c = term.spaces[rows], term.spaces[cols]
+                local = r.paired(density, term.measure.weights, c)
+                places.add(result, number, at, local, keep or whole.measure.kept)
         return result
 
     def _density(
@@ -415,7 +462,7 @@ class Form(FormMatrices):
         whole = size.max(axis=(1, 2), keepdims=True)
         if key == self.parameter:
             unknowns = local.space.unknowns.values()
-            counts = [len(item.phi) for item in local.locals]
+            counts = [item.components for item in local.locals]
             std = np.repeat([float(item.std) for item in unknowns], counts)
             whole = np.maximum(whole, std[:, None, None])
         whole = np.where(whole > 0.0, whole, 1.0)
@@ -424,13 +471,15 @@ class Form(FormMatrices):
     def _constant(self, rows: str, cols: str) -> Array:
         """Return data(rows, cols) of an affine form at zero, computed once."""
         if (rows, cols) not in self._constants:
-            self._constants[rows, cols] = self._quadrature(rows, cols, START, {})
+            data = self._quadrature(rows, cols, START, {}, keep=False)
+            self._constants[rows, cols] = data if data.any() else np.broadcast_to(0.0, data.shape)
         return self._constants[rows, cols]
 
-    def tensor(self, rows: str, cols: str) -> sp.csr_array | None:
-        """Return the matrix T with data(rows, cols) = T @ (coefficients of the third argument).
+    def tensor(self, rows: str, cols: str) -> Tensor | None:
+        """Return T with data(rows, cols) = T @ (coefficients of the third argument).
 
-        None unless the form is trilinear and constant, and T is of reasonable size.
+        A sparse matrix, or for large meshes an `ElementTensor`. None unless the form is trilinear
+        and constant.
         """
         (third,) = [key for key in self.spaces if key not in (rows, cols)]
         if not self._trilinear:
@@ -439,37 +488,54 @@ class Form(FormMatrices):
             return None
         return self._tensor(rows, cols, third)
 
-    def _tensor(self, rows: str, cols: str, third: str) -> sp.csr_array | None:
-        if (rows, cols) in self._tensors:
-            return self._tensors[rows, cols]
-        size = sum(
-            int(np.prod([len(local.dofs) for local in term.spaces.values()]))
-            * term.measure.weights.shape[0]
-            for term in self.terms
-        )
-        if size > LARGEST_TENSOR:
-            self._tensors[rows, cols] = None
-            return None
-        pattern = self.pattern(rows, cols)
-        total = sp.csr_array((pattern.nnz, self.spaces[third].dim))
-        axes = {rows: 0, cols: 1, third: 2}
-        for term in self.terms:
+    def _tensor(self, rows: str, cols: str, third: str) -> Tensor | None:
+        if (rows, cols) not in self._tensors:
+            sizes = [
+                int(np.prod([len(space.dofs_on(term.measure)) for space in term.over.values()]))
+                * term.measure.shape[0]
+                for term in self.terms
+            ]
+            make = self._sparse if sum(sizes) <= LARGEST_TENSOR else self._elementwise
+            self._tensors[rows, cols] = make(rows, cols, third)
+        return self._tensors[rows, cols]
+
+    def _sparse(self, rows: str, cols: str, third: str) -> sp.csr_array:
+        places = self._scatter(rows, cols)
+        total = sp.csr_array((places.pattern.nnz, self.spaces[third].dim))
+        for number, term in enumerate(self.terms):
+            parts = [local for _, local in self._trilinear_parts(term, rows, cols, third)]
+            local = np.concatenate(parts, axis=-1)
+            at = np.broadcast_to(places.places(number)[:, :, None], local.shape).ravel()
+            dofs = self.spaces[third].dofs_on(term.measure)
+            n = np.broadcast_to(dofs, local.shape).ravel()
+            total = total + sp.csr_array((local.ravel(), (at, n)), shape=total.shape)
+        total = sp.csr_array(total)
+        total.eliminate_zeros()
+        return total
+
+    def _elementwise(self, rows: str, cols: str, third: str) -> ElementTensor | None:
+        if self._products is None:
+            order = tuple(self.spaces)
+            terms = (
+                (
+                    {key: space.dofs_on(term.measure) for key, space in term.over.items()},
+                    self._trilinear_parts(term, *order),
+                )
+                for term in self.terms
+            )
+            self._products = ElementProducts.of(order, terms)
+        return self._products.tensor(rows, cols, third, self._scatter(rows, cols))
+
+    def _trilinear_parts(
+        self, whole: _Term, first: str, second: str, third: str
+    ) -> Iterator[tuple[slice, Array]]:
+        """Yield the integrals over elements of all products of local functions, (i, j, n, E)."""
+        axes = {first: 0, second: 1, third: 2}
+        for at, term in whole.pieces():
             values = {key: local.units(axes[key], 3) for key, local in term.spaces.items()}
             density, _ = term.evaluate(values, START)
             if self.nonlinear is not None:
                 values[self.nonlinear] = 0.0 * values[self.nonlinear]
                 density = density - term.evaluate(values, START)[0]
-            r, c, t = term.spaces[rows], term.spaces[cols], term.spaces[third]
-            weighted = term.weighted(density, (r.components, c.components, t.components))
-            step = np.einsum("klmep,kiep->ilmep", weighted, r.phi, optimize=False)
-            step = np.einsum("ilmep,ljep->ijmep", step, c.phi, optimize=False)
-            local = np.einsum("ijmep,mnep->ijne", step, t.phi, optimize=False)
-            i = np.broadcast_to(r.dofs[:, None, None], local.shape).ravel()
-            j = np.broadcast_to(c.dofs[None, :, None], local.shape).ravel()
-            n = np.broadcast_to(t.dofs[None, None, :], local.shape).ravel()
-            entries = (local.ravel(), (pattern.positions(i, j), n))
-            total = total + sp.csr_array(entries, shape=total.shape)
-        total = sp.csr_array(total)
-        total.eliminate_zeros()
-        self._tensors[rows, cols] = total
-        return total
+            a, b, c = (term.spaces[key] for key in (first, second, third))
+            yield at, a.tripled(np.asarray(density), term.measure.weights, b, c)

@@ -20,8 +20,8 @@ __all__ = ["tied"]
 SLACK = 1e-6  # of the size of the mesh: how far apart two coefficients may be to count as one
 
 
-def tied(field: Field, basis: Any) -> IntArray:
-    """Return the coefficient that stands for each of scikit-fem's, shape (basis.N,).
+def tied(field: Field, block: Any) -> IntArray | None:
+    """Return the coefficient that stands for each of scikit-fem's; None: each for itself.
 
     Coefficients of a pair of periodic boundaries are tied if they are of one kind (value, slope)
     and in the same place up to the translation of one boundary to the other.
@@ -31,9 +31,9 @@ def tied(field: Field, basis: Any) -> IntArray:
     SpaceError
         The element has no coefficients on its sides, or those of two boundaries do not match.
     """
-    numbers: IntArray = np.arange(int(basis.N))
     if not field.periodic:
-        return numbers
+        return None
+    count = int(block.dofs.N)
     element = field.element
     if isinstance(element, ElementGlobal) and not isinstance(
         element, ElementLineHermite | ElementQuadBFS
@@ -42,9 +42,9 @@ def tied(field: Field, basis: Any) -> IntArray:
             f"periodic: {type(element).__name__} has normal derivatives, which change their sign "
             "from one side to the other; take `linear`, `quadratic` or `smooth`."
         )
-    pairs = [_matched(field, basis, *pair) for pair in field.periodic]
+    pairs = [_matched(field, block, *pair) for pair in field.periodic]
     i, j = (np.concatenate(side) for side in zip(*pairs, strict=True))
-    graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(len(numbers), len(numbers)))
+    graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(count, count))
     _, labels = connected_components(graph, directed=False)
     _, first, renumbered = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
@@ -52,12 +52,12 @@ def tied(field: Field, basis: Any) -> IntArray:
     return tie
 
 
-def _matched(field: Field, basis: Any, one: str, other: str) -> tuple[IntArray, IntArray]:
+def _matched(field: Field, block: Any, one: str, other: str) -> tuple[IntArray, IntArray]:
     names = dict.fromkeys(field.element.dofnames or [])
     what = f"periodic: '{one}' and '{other}'"
     i, j = [], []
     for name in names:
-        left, right = (np.asarray(basis.get_dofs(side).all([name])) for side in (one, other))
+        left, right = (block.at(side, [name]) for side in (one, other))
         if len(left) != len(right):
             raise SpaceError(
                 f"{what} have {len(left)} and {len(right)} coefficients '{name}': their meshes "
@@ -65,7 +65,7 @@ def _matched(field: Field, basis: Any, one: str, other: str) -> tuple[IntArray, 
             )
         if not len(left):
             continue
-        a, b = basis.doflocs[:, left], basis.doflocs[:, right]
+        a, b = block.places[:, left], block.places[:, right]
         shift = (b.mean(axis=1) - a.mean(axis=1))[:, None]
         found, nearest = cKDTree((a + shift).T).query(b.T)
         distance = float(np.max(found))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -62,7 +62,11 @@ class Place:
     """
 
     def __init__(
-        self, x: Array, normal: Array | None, moment: Moment, diameter: Array | None = None
+        self,
+        x: Array,
+        normal: Array | None,
+        moment: Moment,
+        diameter: Callable[[], Array] | None = None,
     ) -> None:
         self._x = x
         self._diameter = diameter
@@ -91,7 +95,7 @@ class Place:
         """Diameter of each cell, shape (elements, 1): for stabilisation and penalties."""
         if self._diameter is None:
             raise AttributeError("x.h exists where a form is integrated over cells or boundaries.")
-        return self._diameter
+        return self._diameter()
 
     @property
     def normal(self) -> Array:

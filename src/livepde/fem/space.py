@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.blocks import FieldBlock, Measure, block_of
+from livepde.fem.blocks import FieldBlock, Local, Measure, block_of
 from livepde.fem.fields import Unknown
 from livepde.fem.place import Moment
 from livepde.linalg import Array, IntArray
@@ -28,24 +28,45 @@ class Named(SimpleNamespace):
 
 
 class LocalSpace:
-    """A function space on one measure: evaluation operators and local shape functions."""
+    """A function space on one measure: values, and integrals against its shape functions.
+
+    On a measure that is kept all is done by sparse and dense products that are precomputed. On a
+    piece of a larger one nothing is: what a form does not ask for is not computed.
+    """
 
     def __init__(self, space: FunctionSpace, measure: Measure) -> None:
         self.space = space
+        self.kept = measure.kept and measure.members is None and not measure.thin
         self.locals = [block.local(measure) for block in space.blocks.values()]
-        self.shape = measure.weights.shape
-        counts = [len(local.phi) for local in self.locals]
-        widths = [len(local.dofs) for local in self.locals]
-        self.components = sum(counts)
-        self.dofs: IntArray = np.concatenate(
-            [local.dofs + start for local, start in zip(self.locals, space.starts, strict=True)]
-        )
-        self.phi = np.zeros((self.components, sum(widths), *self.shape))
+        self.shape = measure.shape
+        self.components = sum(local.components for local in self.locals)
+        self.dofs: IntArray = space.dofs_on(measure)
         self._units: dict[tuple[int, int], Any] = {}
-        first, left = 0, 0
-        for local, count, width in zip(self.locals, counts, widths, strict=True):
-            self.phi[first : first + count, left : left + width] = local.phi
-            first, left = first + count, left + width
+
+    @cached_property
+    def _owners(self) -> list[tuple[Local, slice, str, int]]:
+        """Of each component: its block, the block's local functions, its part, and which there."""
+        owners, left = [], 0
+        for local in self.locals:
+            columns = slice(left, left + len(local.dofs))
+            for (name, _), size in zip(local.parts, local.sizes, strict=True):
+                owners += [(local, columns, name, k) for k in range(size)]
+            left = columns.stop
+        return owners
+
+    def component(self, k: int) -> tuple[slice, Array]:
+        """Return which local functions a component has, and it: shape (local, elements, points)."""
+        local, columns, name, at = self._owners[k]
+        return columns, local.part(name)[at]
+
+    @cached_property
+    def phi(self) -> Array:
+        """All components of all local functions, shape (components, local, elements, points)."""
+        phi = np.zeros((self.components, len(self.dofs), *self.shape))
+        for k in range(self.components):
+            columns, values = self.component(k)
+            phi[k, columns] = values
+        return phi
 
     @cached_property
     def evaluation(self) -> sp.csr_array:
@@ -63,8 +84,68 @@ class LocalSpace:
 
     def values(self, coefficients: Array) -> Array:
         """Return the components of a function, shape (components, elements, points)."""
-        values: Array = (self.evaluation @ coefficients).reshape(self.components, *self.shape)
+        if self.kept:
+            values: Array = (self.evaluation @ coefficients).reshape(self.components, *self.shape)
+            return values
+        local = coefficients[self.dofs]
+        values = np.empty((self.components, *self.shape))
+        for k in range(self.components):
+            columns, phi = self.component(k)
+            np.einsum("ie,iep->ep", local[columns], phi, out=values[k])
         return values
+
+    def tested(self, density: Array, weights: Array) -> Array:
+        """Return the integrals of a density, shape (components, E, P), against all functions."""
+        if self.kept:
+            weighted = np.broadcast_to(density * weights, (self.components, *self.shape))
+            whole: Array = self.evaluation_transposed @ weighted.ravel()
+            return whole
+        local = np.zeros(self.dofs.shape)
+        for (k,), part in _parts(density, (self.components,)):
+            columns, phi = self.component(k)
+            local[columns] += np.einsum("ep,iep->ie", part * weights, phi)
+        result = np.zeros(self.space.dim)
+        np.add.at(result, self.dofs.ravel(), local.ravel())
+        return result
+
+    def paired(self, density: Array, weights: Array, other: LocalSpace) -> Array:
+        """Return the integrals of a density against all pairs of functions, shape (i, j, E).
+
+        Parameters
+        ----------
+        density
+            Shape (components, components of `other`, E, P).
+        """
+        shape = (self.components, other.components)
+        if self.kept:
+            weighted = np.broadcast_to(density * weights, (*shape, *self.shape))
+            half = np.einsum("klep,kiep->liep", weighted, self.phi, optimize=False)
+            whole: Array = np.einsum("liep,ljep->ije", half, other.phi, optimize=False)
+            return whole
+        result = np.zeros((len(self.dofs), *other.dofs.shape))
+        for (k, m), part in _parts(density, shape):
+            (rows, phi), (cols, psi) = self.component(k), other.component(m)
+            result[rows, cols] += np.einsum("iep,jep->ije", part * weights * phi, psi)
+        return result
+
+    def tripled(
+        self, density: Array, weights: Array, second: LocalSpace, third: LocalSpace
+    ) -> Array:
+        """Return the integrals of a density against all triples of functions, (i, j, n, E)."""
+        shape = (self.components, second.components, third.components)
+        if self.kept:
+            weighted = np.broadcast_to(density * weights, (*shape, *self.shape))
+            step = np.einsum("klmep,kiep->ilmep", weighted, self.phi, optimize=False)
+            step = np.einsum("ilmep,ljep->ijmep", step, second.phi, optimize=False)
+            whole: Array = np.einsum("ijmep,mnep->ijne", step, third.phi, optimize=False)
+            return whole
+        result = np.zeros((len(self.dofs), len(second.dofs), *third.dofs.shape))
+        for (k, l, m), part in _parts(density, shape):
+            at, phi = self.component(k)
+            (rows, psi), (cols, chi) = second.component(l), third.component(m)
+            both = np.einsum("iep,jep->ijep", part * weights * phi, psi)
+            result[at, rows, cols] += np.einsum("ijep,nep->ijne", both, chi)
+        return result
 
     def zeros(self) -> Array:
         """Return the components of the zero function."""
@@ -86,12 +167,22 @@ class LocalSpace:
         """Return what a form gets for component values of shape (components, ..., E, P)."""
         start, jets = 0, []
         for block, local in zip(self.space.blocks.values(), self.locals, strict=True):
-            stop = start + len(local.phi)
+            stop = start + local.components
             jets.append(block.jet(local, values[start:stop]))
             start = stop
         if self.space.single:
             return jets[0]
         return Named(**dict(zip(self.space.blocks, jets, strict=True)))
+
+
+def _parts(density: Array, axes: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Array]]:
+    """Yield the components of a density that are not zero: their numbers, and their values."""
+    density = np.asarray(density)
+    density = density.reshape((1,) * (len(axes) + 2 - density.ndim) + density.shape)
+    density = np.broadcast_to(density, axes + density.shape[len(axes) :])
+    for index in np.ndindex(axes):
+        if density[index].any():
+            yield index, density[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,8 +304,20 @@ class FunctionSpace:
             u[self.part(name)] = block.impose(u[self.part(name)], moment)
         return u
 
+    def dofs_on(self, measure: Measure) -> IntArray:
+        """Return the coefficient of each local function on a measure, shape (local, elements)."""
+        each: list[IntArray] = [block.dofs_on(measure) for block in self.blocks.values()]
+        if len(each) == 1:
+            (dofs,) = each
+            return dofs
+        return np.concatenate(
+            [dofs + np.int32(start) for dofs, start in zip(each, self.starts, strict=True)]
+        )
+
     def local(self, measure: Measure) -> LocalSpace:
-        """Return the space on a measure, built once: all forms share it."""
+        """Return the space on a measure; one that is kept is built once: all forms share it."""
+        if measure.members is not None or measure.thin or not measure.kept:
+            return LocalSpace(self, measure)
         key = (id(measure.mesh), measure.order, measure.name)
         if key not in self._locals:
             self._locals[key] = LocalSpace(self, measure)

@@ -265,9 +265,11 @@ class CoupledStage:
         if self.model.latent.generator.nnz:
             return None
         vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
-        if self.auxiliary or not self.constant_B or vq is None or vu is None or qu is None:
+        if self.auxiliary or not self.constant_B:
             return None
-        return _Bilinear(self, vq, vu, qu)
+        if isinstance(vq, sp.csr_array) and isinstance(vu, sp.csr_array):
+            return _Bilinear(self, vq, vu, qu) if isinstance(qu, sp.csr_array) else None
+        return None
 
     def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
         """Return the norms of r that a damping rule may use; r lies in the range of R."""

@@ -36,16 +36,16 @@ class Pattern:
     @classmethod
     def from_entries(cls, rows: IntArray, cols: IntArray, shape: tuple[int, int]) -> Pattern:
         """Return the pattern that holds every (row, column) given; repeated entries are merged."""
-        keys = np.unique(rows.astype(np.int64) * shape[1] + cols)
-        counts = np.bincount(keys // shape[1], minlength=shape[0])
-        indptr = np.concatenate(([0], np.cumsum(counts)))
-        return cls(shape, indptr.astype(np.int32), (keys % shape[1]).astype(np.int32))
+        entries = sp.coo_array((np.ones(len(rows), dtype=bool), (rows, cols)), shape=shape)
+        return cls.of(entries)
 
     @classmethod
     def of(cls, matrix: Sparse) -> Pattern:
         """Return the pattern of the stored entries of a sparse matrix."""
-        coo = sp.coo_array(matrix)
-        return cls.from_entries(coo.row, coo.col, coo.shape)
+        merged = sp.csr_array(matrix, copy=True)
+        merged.sum_duplicates()
+        indptr, indices = (part.astype(np.int32) for part in (merged.indptr, merged.indices))
+        return cls(merged.shape, indptr, indices)
 
     @property
     def nnz(self) -> int:
@@ -59,12 +59,15 @@ class Pattern:
 
     def positions(self, rows: IntArray, cols: IntArray) -> IntArray:
         """Return where in `data` the given entries stand; each must be in the pattern."""
-        keys = self.rows.astype(np.int64) * self.shape[1] + self.indices
-        wanted = rows.astype(np.int64) * self.shape[1] + cols
-        found: IntArray = np.searchsorted(keys, wanted)
-        if len(wanted) and (found.max() >= self.nnz or np.any(keys[found] != wanted)):
+        if not len(rows):
+            return np.zeros(0, dtype=np.int32)
+        numbers = np.arange(1, self.nnz + 1, dtype=np.int32)  # 0: not in the pattern
+        places = sp.csr_matrix((numbers, self.indices, self.indptr), shape=self.shape, copy=False)
+        inside = rows.max() < self.shape[0] and cols.max() < self.shape[1]
+        found: IntArray = np.asarray(places[rows, cols]).ravel() if inside else np.zeros(1, int)
+        if not found.all():
             raise IndexError("an entry lies outside of the sparsity pattern")
-        return found
+        return found - 1
 
     def matrix(self, data: Array) -> sp.csr_array:
         """Return the CSR matrix with these values; `data` and the structure are shared."""
@@ -82,8 +85,8 @@ class Pattern:
     def gather(self, rows: IntArray, cols: IntArray) -> sp.csr_array:
         """Return the 0/1 matrix that sums a list of entries into `data`, shape (nnz, entries)."""
         at = self.positions(rows, cols)
-        ones = np.ones(len(at))
-        return sp.csr_array((ones, (at, np.arange(len(at)))), shape=(self.nnz, len(at)))
+        each = np.arange(len(at), dtype=np.int32)
+        return sp.csr_array((np.ones(len(at)), (at, each)), shape=(self.nnz, len(at)))
 
 
 class PatternOperator:

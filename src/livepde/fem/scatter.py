@@ -1,0 +1,108 @@
+"""Where the entries of element matrices stand in a sparse matrix; shared by all that are alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from hashlib import blake2b
+from typing import Any
+from weakref import WeakValueDictionary
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.linalg import Array, IntArray, Pattern
+
+__all__ = ["Scatter", "scatter", "shared"]
+
+Pairs = Sequence[tuple[IntArray, IntArray]]
+_arrays: WeakValueDictionary[bytes, IntArray] = WeakValueDictionary()
+_known: WeakValueDictionary[bytes, Scatter] = WeakValueDictionary()
+
+
+def shared(array: IntArray) -> IntArray:
+    """Return an array that is equal to this one; the same object for all that are equal."""
+    key = _digest(array)
+    found = _arrays.get(key)
+    if found is None:
+        _arrays[key] = found = array
+    return found
+
+
+def scatter(pairs: Pairs, shape: tuple[int, int]) -> Scatter:
+    """Return the scatter of element matrices; the same object for all that are alike.
+
+    Parameters
+    ----------
+    pairs
+        Row and column of the local entries of each term, shapes (i, elements), (j, elements).
+    shape
+        Of the matrix.
+    """
+    key = _digest(np.array(shape), *(dofs for pair in pairs for dofs in pair))
+    found = _known.get(key)
+    if found is None:
+        _known[key] = found = Scatter(pairs, shape)
+    return found
+
+
+def _digest(*arrays: Any) -> bytes:
+    digest = blake2b()
+    for array in arrays:
+        digest.update(f"{array.dtype}{array.shape}{array.strides}".encode())
+        repeated = array[:, :1] if array.ndim == 2 and array.strides[1] == 0 else array
+        digest.update(np.ascontiguousarray(repeated).data)
+    return digest.digest()
+
+
+class Scatter:
+    """Adds the entries of element matrices, (i, j, elements), to the data of a sparse matrix.
+
+    Attributes
+    ----------
+    pattern
+        Of the matrix: every entry that an element has.
+    """
+
+    def __init__(self, pairs: Pairs, shape: tuple[int, int]) -> None:
+        self.pairs = list(pairs)
+        total = sp.csr_array(shape, dtype=bool)
+        for rows, cols in pairs:
+            left, right = _members(rows, shape[0]), _members(cols, shape[1])
+            total = total + sp.csr_array(left.T @ right)
+        self.pattern = Pattern.of(total)
+        self._places: dict[int, IntArray] = {}
+        self._lookup: Any = None
+
+    def add(self, data: Array, term: int, at: slice, local: Array, keep: bool = True) -> None:
+        """Add the entries of some elements of a term, shape (i, j, elements), to data.
+
+        Parameters
+        ----------
+        keep
+            Keep where the entries of this term stand: they will come again.
+        """
+        np.add.at(data, self._at(term, at, keep).ravel(), local.ravel())
+
+    def places(self, term: int) -> IntArray:
+        """Return where in the data the entries of a term stand, shape (i, j, elements)."""
+        if term not in self._places:
+            self._places[term] = self._at(term, slice(None), False)
+        return self._places[term]
+
+    def _at(self, term: int, at: slice, keep: bool) -> IntArray:
+        if keep or term in self._places:
+            return self.places(term)[:, :, at]
+        rows, cols = (dofs[:, at] for dofs in self.pairs[term])
+        found = np.empty((len(rows), *cols.shape), dtype=np.int32)
+        for i, row in enumerate(rows):
+            for j, col in enumerate(cols):
+                found[i, j] = self.pattern.positions(row, col)
+        return found
+
+
+def _members(dofs: IntArray, count: int) -> sp.csr_array:
+    """Return which coefficients each element has, shape (elements, count)."""
+    width, elements = dofs.shape
+    flat = np.ascontiguousarray(dofs.T, dtype=np.int32).ravel()
+    starts = np.arange(0, width * elements + 1, width, dtype=np.int32)
+    return sp.csr_array((np.ones(len(flat), dtype=bool), flat, starts), shape=(elements, count))

@@ -1,0 +1,220 @@
+"""Forms on large meshes, piece by piece and element by element: the numbers of small ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from problems import CASES
+from skfem import (
+    ElementLineHermite,
+    ElementQuad2,
+    ElementTetP1,
+    ElementTetP2,
+    ElementTriP1,
+    ElementTriP2,
+    ElementVector,
+    MeshQuad,
+    MeshTet,
+    MeshTri,
+)
+
+import livepde as lp
+from livepde.fem import Form, FunctionSpace, Moment, blocks, forms
+
+SLOTS = [("v", "u"), ("v", "q"), ("q", "u"), ("q", "v"), ("u", "q"), ("u", "v")]
+
+
+@pytest.fixture
+def pieces(monkeypatch):
+    """Return what makes all meshes large."""
+
+    def large():
+        monkeypatch.setattr(blocks, "KEPT", 0)
+        monkeypatch.setattr(blocks, "PIECE", 23)
+
+    return large
+
+
+def close(found, expected):
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def both(make, pieces):
+    """Return what `make` makes of a small mesh, and of one that counts as large."""
+    small = make()
+    pieces()
+    return small, make()
+
+
+def triangles():
+    mesh = MeshTri().refined(2).with_boundaries({"left": lambda x: x[0] == 0})
+    return mesh.with_subdomains({"core": lambda x: x[0] < 0.5})
+
+
+def quads():
+    mesh = MeshQuad().refined(2)
+    return MeshQuad(mesh.p + 0.05 * np.sin(7.0 * mesh.p[::-1]), mesh.t)  # no parallelograms
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_models_on_large_meshes(name, pieces):
+    def make():
+        return CASES[name].model(f=lambda x, t: np.exp(t * x[0]))
+
+    small, large = both(make, pieces)
+    rng = np.random.default_rng(0)
+    u, r = rng.standard_normal((2, small.X.dim))
+    q = rng.standard_normal(small.Q.dim)
+    close(large.mass.toarray(), small.mass.toarray())
+    close(large.Q.gram.toarray(), small.Q.gram.toarray())
+    close(large.F(Moment(0.7)), small.F(Moment(0.7)))
+    close(large.B(u), small.B(u))
+    values = {"q": q, "u": u, "v": r}
+    for rows, cols in (("v", "u"), ("v", "q"), ("q", "u")):
+        found = large.form_A.matrix(rows, cols, **values).toarray()
+        close(found, small.form_A.matrix(rows, cols, **values).toarray())
+    close(large.initial(lambda x: np.exp(x[0])), small.initial(lambda x: np.exp(x[0])))
+
+
+def nonlinear(mesh, element):
+    def make():
+        return lp.Model(
+            lp.Field(mesh, element),
+            {
+                "a": lp.Field(mesh, element),
+                "b": lp.Scalar(1.0),
+                "c": lp.Piecewise({"core": "core"}),
+            },
+            A=[
+                lambda q, u, v, x: (x.h * q.a**2 + q.b * x.t) * u**2 * v + q.c * v,
+                lp.On("left", lambda q, u, v, x: x.normal[0] * q.b * u**3 * v),
+                lp.On("core", lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v))),
+            ],
+            B=lambda u, v, x: np.exp(-u) * v,
+        )
+
+    return make
+
+
+@pytest.mark.parametrize("element", [ElementTriP1(), ElementTriP2()])
+def test_nonlinear_forms_with_boundaries_and_regions(element, pieces):
+    small, large = both(nonlinear(triangles(), element), pieces)
+    rng = np.random.default_rng(1)
+    u, v = rng.standard_normal((2, small.X.dim))
+    q = rng.standard_normal(small.Q.dim)
+    at, values = Moment(0.3), {"q": q, "u": u, "v": v}
+    assert large.form_A.uses == small.form_A.uses == {"t"}
+    assert not large.form_A.linear_in_parameter
+    for slots in [("v", "u"), ("v", "q"), ("q", "u"), ("u", "u"), ("q", "q")]:
+        found = large.form_A.matrix(*slots, at, **values)
+        close(found.toarray(), small.form_A.matrix(*slots, at, **values).toarray())
+    del values["v"]
+    close(large.form_A.vector("v", at, **values), small.form_A.vector("v", at, **values))
+
+
+def test_an_integrand_that_is_nonlinear_in_a_corner_only(pieces):
+    pieces()
+    mesh = MeshTri().refined(4)
+
+    def corner(u, v, x):
+        return u * v + ((x[0] > 0.9) & (x[1] > 0.9)) * u**2 * v
+
+    model = lp.Model(lp.Field(mesh, ElementTriP1()), lp.Scalar(), lambda q, u, v, x: q * v, corner)
+    assert not model.form_B.affine
+
+
+@pytest.mark.parametrize(
+    ("mesh", "state", "parameter"),
+    [
+        (MeshTri().refined(2), ElementTriP1(), ElementTriP1()),
+        (MeshTri().refined(2), ElementTriP2(), ElementTriP1()),
+        (quads(), ElementQuad2(), ElementQuad2()),
+        (MeshTet().refined(1), ElementTetP2(), ElementTetP1()),
+        (lp.interval(0, 1, 9), ElementLineHermite(), ElementLineHermite()),
+    ],
+)
+def test_trilinear_forms_element_by_element(mesh, state, parameter, monkeypatch):
+    def make():
+        return lp.Model(
+            lp.Field(mesh, state),
+            lp.Field(mesh, parameter),
+            A=lambda q, u, v, x: (1.0 + x[0]) * q * u * v + q * lp.dot(lp.grad(u), lp.grad(v)),
+        ).form_A
+
+    stored = make()
+    sparse = {slots: stored.tensor(*slots) for slots in SLOTS}
+    assert all(map(sp.issparse, sparse.values()))
+    monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
+    monkeypatch.setattr(blocks, "KEPT", 0)
+    monkeypatch.setattr(blocks, "PIECE", 60)
+    found = make()
+    rng = np.random.default_rng(2)
+    for rows, cols in SLOTS:
+        (third,) = {"q", "u", "v"} - {rows, cols}
+        w, x, y = (rng.standard_normal(found.spaces[key].dim) for key in (third, cols, rows))
+        T = found.tensor(rows, cols)
+        assert not sp.issparse(T)
+        close(T @ w, sparse[rows, cols] @ w)
+        matrix = stored.matrix(rows, cols, **{third: w})
+        close(T.apply(w, x), matrix @ x)
+        close(found.product(rows, cols, x, **{third: w}), matrix @ x)
+        close(T.applied_transposed(w, y), matrix.T @ y)
+
+
+def test_straight_triangles_share_one_tensor(monkeypatch):
+    monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
+    mesh = MeshTri().refined(3)
+    mesh = MeshTri(mesh.p + 0.01 * np.sin(9.0 * mesh.p[::-1]), mesh.t)
+    field = lp.Field(mesh, ElementTriP1())
+    form = lp.Model(field, field, A=lambda q, u, v, x: q * u * v).form_A
+    (term,) = form.tensor("v", "q").products.terms
+    assert term.tensors.shape == (3, 3, 3, 1)
+    assert form.tensor("q", "u").products is form.tensor("v", "q").products
+
+
+def test_patterns_of_equal_spaces_are_one_object():
+    mesh = MeshTri().refined(2)
+    one, other = (lp.Field(mesh, ElementTriP1()) for _ in range(2))
+    model = lp.Model(one, other, A=lambda q, u, v, x: q * u * v, B=lambda u, v, x: u * v)
+    pattern = model.form_A.pattern("v", "q")
+    assert model.form_A.pattern("v", "u") is pattern
+    assert model.form_M.pattern("v", "u") is pattern
+    assert model.form_B.pattern("v", "u") is pattern
+
+
+def test_forms_on_some_cells_add_up():
+    mesh = triangles()
+    space = FunctionSpace.of(lp.Field(mesh, ElementTriP2()), "u")
+    terms = [
+        lambda u, v, x: (1 + x[0]) * u**2 * v,
+        lp.On("left", lambda u, v, x: x[1] * u * v),
+        lp.On("core", lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v))),
+    ]
+    whole = Form("test", terms, {"u": space, "v": space}, mesh, 6, nonlinear="u")
+    inner = np.flatnonzero(mesh.p[:, mesh.t].mean(axis=1)[1] < 0.4)
+    outer = np.setdiff1d(np.arange(mesh.nelements), inner)
+    u = np.random.default_rng(3).standard_normal(space.dim)
+    parts = [whole.on(cells) for cells in (inner, outer)]
+    close(sum(part.vector("v", u=u) for part in parts), whole.vector("v", u=u))
+    matrices = [part.matrix("v", "u", u=u) for part in parts]
+    close(sum(matrices).toarray(), whole.matrix("v", "u", u=u).toarray())
+    assert matrices[0].nnz < whole.pattern("v", "u").nnz
+
+
+def test_vector_fields_and_points_on_large_meshes(pieces):
+    mesh, element = triangles(), ElementVector(ElementTriP1())
+    points = np.array([[0.31, 0.62, 0.9], [0.11, 0.43, 0.95]])
+
+    def make():
+        return FunctionSpace.of(lp.Field(mesh, element), "u").fields["u"]
+
+    def twist(x):
+        return np.array([x[1], -(x[0] ** 2)])
+
+    small, large = both(make, pieces)
+    close(large.interpolate(twist), small.interpolate(twist))
+    close(large.probe(points).toarray(), small.basis.probes(points).toarray())
+    close(large.doflocs, small.basis.doflocs)
+    with pytest.raises(lp.ObservationError, match=r"point 1 at \[1.5, 0.5\]"):
+        large.probe(np.array([[0.5, 1.5], [0.5, 0.5]]))
