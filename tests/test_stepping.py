@@ -333,9 +333,9 @@ def test_forward_stage_of_an_affine_model_is_one_factorisation():
     q = np.ones(model.Q.dim)
     u = np.random.default_rng(1).standard_normal(model.X.dim)
     first = forward.solve(u, q, 0.1, Moment(0.1))
-    kept = forward.system(q, 0.1, lp.Moment())
-    assert forward.system(q.copy(), 0.1, lp.Moment()) is kept
-    assert forward.system(2 * q, 0.1, lp.Moment()) is not kept
+    kept = forward.factor(q, 0.1, lp.Moment())
+    assert forward.factor(q.copy(), 0.1, lp.Moment()) is kept
+    assert forward.factor(2 * q, 0.1, lp.Moment()) is not kept
     # What is kept never changes the numbers.
     np.testing.assert_array_equal(ForwardStage(model).solve(u, q, 0.1, Moment(0.1)), first)
     # And it solves the equation.

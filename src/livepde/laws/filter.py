@@ -14,7 +14,7 @@ from livepde.laws.base import Problem
 from livepde.laws.consistency import Consistency
 from livepde.laws.level import NoiseLevel
 from livepde.linalg import Array
-from livepde.stepping import ForwardStage, Interval, StepFailed, advance
+from livepde.stepping import ForwardStage, Interval, Kept, StepFailed, advance
 
 __all__ = ["Filter", "Motion", "Point", "reduction"]
 
@@ -47,6 +47,8 @@ class Point:
         Logarithm of the likelihood of all samples so far, each given those before.
     age
         Time for which the unknowns have moved.
+    kept
+        What the last stage has left to the next.
     """
 
     u: Array
@@ -60,6 +62,7 @@ class Point:
     level: NoiseLevel
     evidence: float
     age: float = 0.0
+    kept: Kept = field(default_factory=Kept.none)
 
     def along(self, shift: Array) -> Array:
         """Return by how much the state is expected to move with a shift of a, shape (n,)."""
@@ -270,30 +273,37 @@ class Filter:
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
         """Return the filter at the end of an interval, substeps, and why it failed or None."""
-        model, end = self.problem.model, self.moved(point, interval.t1 - interval.t0)
-        at_end = self.directions(end)
+        end = self.moved(point, interval.t1 - interval.t0)
+        deviates = bool(end.du.any() or end.da.any())
+        kept = point.kept
+
+        def directions(at: Point) -> Array:
+            along: Array = self.directions(at) if deviates else self.Phi @ at.C
+            return along
+
+        at_end = directions(end)
 
         def stage(c: Array, t: float, h: float) -> Array:
-            moment, q, directions = interval.at(t), end.q, at_end
+            nonlocal kept
+            q, along = end.q, at_end
             if self.moves and t != interval.t1:
                 now = self.moved(point, t - interval.t0)
-                q, directions = now.q, self.directions(now)
-            u = self.forward.solve(c[:, 0], q, h, moment)
-            factor = self.forward.tangent(u, q, h, moment)
-            forcing = model.form_A.product("v", "q", directions, moment, u=u, q=q)
-            rhs = (model.mass @ c[:, 1:]) / h - forcing
-            return np.column_stack([u, factor.solve(rhs * model.X.free[:, None])])
+                q, along = now.q, directions(now)
+            y, kept = self.forward.advance(c, q, along, h, interval.at(t), kept)
+            return y
 
-        columns = np.column_stack([end.u, end.U, end.du])
+        deviation = [end.du] if deviates else []
+        columns = np.column_stack([end.u, end.U, *deviation])
         y, steps, failure = advance(self.problem.control, stage, columns, interval)
         if failure is None and not np.isfinite(y).all():
             failure = StepFailed("not_finite", "the prediction is not finite")
         if failure is not None:
             return point, steps, failure
-        U, C = y[:, 1:-1], end.C
+        r = end.U.shape[1]
+        U, C, du = y[:, 1 : 1 + r], end.C, y[:, 1 + r] if deviates else end.du
         if C.shape[1] > self.rank:
             U, C = _compressed(U, C, self.scale, self.rank)
-        return replace(end, u=y[:, 0], U=U, C=C, du=y[:, -1]), steps, None
+        return replace(end, u=y[:, 0], U=U, C=C, du=du, kept=kept), steps, None
 
     def updated(self, point: Point, interval: Interval, predicted: Array) -> tuple[Point, int]:
         """Return the filter after the sample, and how many values the gate refused."""

@@ -46,6 +46,7 @@ class BandedSolver:
     pattern: Pattern
     name: str = "banded LU (LAPACK)"
     definite: bool = False
+    price: float = 0.0
 
     @cached_property
     def order(self) -> IntArray:

@@ -38,6 +38,7 @@ class CholmodSolver:
     pattern: Pattern
     name: str = "CHOLMOD (scikit-sparse)"
     definite: bool = True
+    price: float = 20.0
 
     @cached_property
     def _order(self) -> Any:

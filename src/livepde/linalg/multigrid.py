@@ -53,6 +53,7 @@ class MultigridSolver:
     pattern: Pattern
     name: str = "multigrid (PyAMG), conjugate gradients"
     definite: bool = True
+    price: float = 1.0
 
     def factorise(self, data: Array) -> MultigridFactor:
         """Build the hierarchy; raises `LinearAlgebraError` for a non-finite or zero diagonal."""

@@ -46,6 +46,7 @@ class PardisoSolver:
 
     pattern: Pattern
     symmetric: bool = False
+    price: float = 4.0
     _idle: list[Any] = field(default_factory=list, init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -36,6 +36,14 @@ class Solver(Protocol):
         """True if it refuses a matrix that is not positive definite, at the latest in a solve."""
         ...
 
+    @property
+    def price(self) -> float:
+        """About how many solves a factorisation costs; 0: a factor is not worth keeping.
+
+        A stated number, not a measured one: nothing that is timed steers what is computed.
+        """
+        ...
+
     def factorise(self, data: Array) -> Factor:
         """Factorise the matrix `pattern.matrix(data)`.
 

@@ -43,6 +43,7 @@ class SuperLUSolver:
 
     pattern: Pattern
     symmetric: bool = False
+    price: float = 30.0
 
     @property
     def name(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from livepde.stepping.interval import Advance, Interval, advance
 from livepde.stepping.newton import Newton, Parts, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
-from livepde.stepping.state import ForwardStage, simulate
+from livepde.stepping.state import ForwardStage, Kept, simulate
 
 __all__ = [
     "Advance",
@@ -13,6 +13,7 @@ __all__ = [
     "ForwardStage",
     "ImplicitEuler",
     "Interval",
+    "Kept",
     "Newton",
     "Parts",
     "Scheme",

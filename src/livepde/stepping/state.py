@@ -2,37 +2,84 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
-from livepde.fem import Moment
+from livepde.fem import Inputs, Moment
 from livepde.linalg import Array, Assembler, Factor, Pattern, Solver, analyse
 from livepde.model import Model
 from livepde.stepping.interval import Advance, Interval, advance
 from livepde.stepping.newton import Newton, StepFailed
 
-__all__ = ["ForwardStage", "simulate"]
+__all__ = ["ForwardStage", "Kept", "simulate"]
+
+STATE = 1e-8  # relative error of the state that corrections with a kept factor leave
+TANGENTS = 1e-4  # of tangents: they steer the gain of a filter, not its state
+PASSES = 2  # corrections of the state by the factor of a q nearby; those of tangents are one less
+SLOW = 0.3  # a factor whose corrections leave more than this share of the error is made again
+LINEAR = 1e-12  # relative asymmetry that is rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """What a stage leaves to the next one: where its factor was made, and how the state moved.
+
+    The factor itself is made again from this where it is gone, after a restart say: the numbers
+    that follow are the same.
+
+    Attributes
+    ----------
+    q, h
+        Latent parameter, shape (m,), and step; q is empty if nothing is kept.
+    spent
+        Solves that stages have taken beyond those that a factor of a q nearby takes.
+    trend
+        Change of the state per unit of time, with which the next stage starts, shape (n,).
+    """
+
+    q: Array
+    h: float
+    spent: float
+    trend: Array
+
+    @classmethod
+    def none(cls) -> Kept:
+        """Return the value before any stage."""
+        return cls(np.zeros(0), 0.0, 0.0, np.zeros(0))
+
+
+class _At(NamedTuple):
+    """Where a matrix is taken."""
+
+    q: Array
+    h: float
+
+    def same(self, q: Array, h: float) -> bool:
+        return self.h == h and np.array_equal(self.q, q)
 
 
 class ForwardStage:
     """Solves M (u - c)/h + B(u) + A(u) q = F(t) for u, with Dirichlet values imposed.
 
     If B and A are affine in u with derivatives that read neither time nor inputs, the matrix is
-    factorised once for each (h, q) and a stage is one back-substitution. What is kept never changes
-    the numbers.
+    factorised once for each (h, q) and a stage is one back-substitution. That never changes the
+    numbers. `advance` solves for tangents, too, and keeps a factor while q and h change.
     """
 
     def __init__(self, model: Model, newton: Newton | None = None) -> None:
         self.model = model
         self.newton = newton or Newton()
-        self._kept: tuple[tuple[float, bytes], _System] | None = None
+        self._made: tuple[_At, Factor] | None = None
+        self._last: tuple[_At, _System] | None = None
+        self._rate: tuple[float, Array] | None = None
 
     @cached_property
     def _rows(self) -> tuple[Pattern, dict[str, sp.csr_array]]:
@@ -46,14 +93,37 @@ class ForwardStage:
         return whole.build()
 
     @cached_property
-    def _free(self) -> tuple[Solver, sp.csr_array, Array]:
-        """The engine, and the map from the data of the rows to the free part, completed by ones."""
+    def _free(self) -> tuple[Pattern, sp.csr_array, Array]:
+        """Pattern and map from the data of the rows to the free part, completed by ones."""
         model = self.model
         whole = Assembler(model.X.dim)
         whole.add("rows", self._rows[0], right=sp.diags_array(model.X.free))
         whole.add("fixed", Pattern.of(sp.eye_array(model.X.dim)))
         pattern, maps = whole.build()
-        return analyse(pattern), maps["rows"], maps["fixed"] @ (1.0 - model.X.free)
+        return pattern, maps["rows"], maps["fixed"] @ (1.0 - model.X.free)
+
+    @cached_property
+    def symmetric(self) -> bool:
+        """True if the matrix of a stage is symmetric whatever q: seen at one that is random."""
+        if not self.keeps:
+            return False
+        model, (pattern, rows, _) = self.model, self._free
+        some = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
+        inputs = Inputs(dict.fromkeys(model.channels, 1.0))
+        with np.errstate(all="ignore"):
+            data = rows @ self._data_at(model.latent.prior + some, 1.0, Moment(0.0, inputs))
+        matrix = pattern.matrix(data)
+        return bool(abs(matrix - matrix.T).max() <= LINEAR * abs(data).max())
+
+    @cached_property
+    def solver(self) -> Solver:
+        """The engine of the matrix of a stage."""
+        return analyse(self._free[0], symmetric=self.symmetric)
+
+    @cached_property
+    def _general(self) -> Solver:
+        """The engine of a symmetric matrix that is not positive definite."""
+        return analyse(self._free[0])
 
     def _data(self, u: Array, q: Array, h: float, moment: Moment) -> Array:
         model, maps = self.model, self._rows[1]
@@ -62,14 +132,40 @@ class ForwardStage:
         data += maps["A"] @ model.form_A.data("v", "u", moment, u=u, q=q)
         return data
 
+    def _data_at(self, q: Array, h: float, moment: Moment) -> Array:
+        """Return the same where they do not depend on u; what does not change is kept."""
+        model, maps = self.model, self._rows[1]
+        zero = np.zeros(model.X.dim)
+        if self._rate is None or self._rate[0] != h:
+            data = maps["M"] @ (model.mass.data / h)
+            data += maps["B"] @ model.form_B.data("v", "u", moment, u=zero)
+            self._rate = (h, data)
+        if self._slope is not None:
+            changing: Array = self._slope @ q
+        else:
+            changing = maps["A"] @ model.form_A.data("v", "u", moment, u=zero, q=q)
+        return changing + self._rate[1]
+
+    @cached_property
+    def _slope(self) -> sp.csr_array | None:
+        """Map from q to the data of d(A q)/du, where it is one."""
+        tensor = self.model.form_A.tensor("v", "u")
+        return None if tensor is None else sp.csr_array(self._rows[1]["A"] @ tensor)
+
     def jacobian(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised S = M/h + B'(u) + d(A(u) q)/du on the free coefficients."""
         return self._factorise(self._data(u, q, h, moment))
 
     def _factorise(self, data: Array) -> Factor:
-        solver, rows, fixed = self._free
+        _, rows, fixed = self._free
+        complete = rows @ data + fixed
         try:
-            return solver.factorise(rows @ data + fixed)
+            return self.solver.factorise(complete)
+        except LinearAlgebraError as error:
+            if not self.symmetric:
+                raise StepFailed("singular", str(error)) from error
+        try:  # not positive definite: q is far off, and the step may still be good
+            return self._general.factorise(complete)
         except LinearAlgebraError as error:
             raise StepFailed("singular", str(error)) from error
 
@@ -92,42 +188,178 @@ class ForwardStage:
 
     @property
     def keeps(self) -> bool:
-        """True if the matrix of a stage depends on h and q only: it is kept for the last ones."""
+        """True if the matrix of a stage depends on h and q only, and its factor is kept."""
         return self.model.affine and self.model.steady
 
-    def system(self, q: Array, h: float, moment: Moment) -> _System:
-        """Return matrix and factor, and B(0) + A(0) q if it is constant, for the last (q, h)."""
-        key = (h, q.tobytes())
-        if self._kept is None or self._kept[0] != key:
-            data = self._data(np.zeros(self.model.X.dim), q, h, moment)
+    def _system(self, q: Array, h: float, moment: Moment) -> _System:
+        """Return the matrix, and B(0) + A(0) q if it is constant, for the last (q, h)."""
+        if self._last is None or not self._last[0].same(q, h):
             offset = self._at_zero(q, moment) if self.model.constant else None
-            self._kept = (key, _System(self._rows[0].matrix(data), offset, self._factorise(data)))
-        return self._kept[1]
+            matrix = self._rows[0].matrix(self._data_at(q, h, moment))
+            self._last = (_At(q, h), _System(matrix, offset))
+        return self._last[1]
+
+    def factor(self, q: Array, h: float, moment: Moment) -> Factor:
+        """Return the factor of an affine model for (q, h), made unless it was the last one."""
+        if self._made is None or not self._made[0].same(q, h):
+            self._made = None  # two at once may be more than there is memory
+            self._made = (_At(q, h), self._factorise(self._data_at(q, h, moment)))
+        return self._made[1]
+
+    def _known(self, c: Array, system: _System, q: Array, h: float, moment: Moment) -> Array:
+        """Return the right-hand side of a stage of an affine model."""
+        offset = system.offset if system.offset is not None else self._at_zero(q, moment)
+        known: Array = self.model.mass @ (c / h) - offset + self.model.F(moment)
+        return known
 
     def solve(self, c: Array, q: Array, h: float, moment: Moment) -> Array:
         """Return u of one stage; raises `StepFailed`."""
-        model = self.model
-        u = model.impose(c, moment)
+        u = self.model.impose(c, moment)
         if self.keeps:
-            system = self.system(q, h, moment)
-            offset = system.offset if system.offset is not None else self._at_zero(q, moment)
-            residual = system.matrix @ u - model.mass @ (c / h) + offset - model.F(moment)
-            return u - system.factor.solve(residual * model.X.free)
+            system = self._system(q, h, moment)
+            residual = system.matrix @ u - self._known(c, system, q, h, moment)
+            factor = self.factor(q, h, moment)
+            return u - _solved(factor, residual * self.model.X.free)
         equation = _Equation(self, c, q, h, moment)
         return self.newton.solve(equation, u).y
 
     def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised Jacobian at a solved stage, for sensitivities."""
         if self.keeps:
-            return self.system(q, h, moment).factor
+            return self.factor(q, h, moment)
         return self.jacobian(u, q, h, moment)
+
+    def advance(
+        self, c: Array, q: Array, directions: Array, h: float, moment: Moment, kept: Kept
+    ) -> tuple[Array, Kept]:
+        """Return state and tangents at the end of a stage, and what it leaves to the next.
+
+        Where the matrix depends on q and h only, the factor of an earlier q corrects the solution
+        until the error is 1e-8 of the state, and 1e-4 of the tangents. It is made again where that
+        would cost more solves than a factorisation (`Solver.price`), counted from when it was made.
+
+        Parameters
+        ----------
+        c
+            The state where the stage begins, and tangents behind it, shape (n, 1 + r).
+        directions
+            How latent coefficients change along each tangent, shape (m, r).
+        kept
+            What the stage before has left.
+
+        Raises
+        ------
+        StepFailed
+            The stage has no solution that is found.
+        """
+        model, start = self.model, c[:, 1:]
+        if not self.keeps or not self.solver.price:
+            u = self.solve(c[:, 0], q, h, moment)
+            known = self._driven(u, start, q, directions, h, moment)
+            tangents = _solved(self.tangent(u, q, h, moment), known * model.X.free[:, None])
+            return np.column_stack([u, tangents]), kept
+        begin, at = c[:, 0], _At(q, h)
+        factor_at = _At(kept.q, kept.h) if len(kept.q) else at
+        guess = begin + h * kept.trend if len(kept.q) else begin
+        system = self._system(q, h, moment)
+        known = self._known(begin, system, q, h, moment)
+        corrected = _Corrections(self, system.matrix, at, moment, factor_at, kept.spent)
+        u = corrected.solve(model.impose(guess, moment), known, STATE, PASSES)
+        known = self._driven(u, start, q, directions, h, moment)
+        tangents = corrected.solve(start, known, TANGENTS, PASSES - 1)
+        left = Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
+        return np.column_stack([u, tangents]), left
+
+    def _driven(
+        self, u: Array, c: Array, q: Array, directions: Array, h: float, moment: Moment
+    ) -> Array:
+        """Return the right-hand sides of tangents, shape (n, r)."""
+        model = self.model
+        forcing = model.form_A.product("v", "q", directions, moment, u=u, q=q)
+        driven: Array = model.mass @ (c / h) - forcing
+        return driven
+
+
+class _Corrections:
+    """Solves with the matrix of one stage by the factor of another.
+
+    Attributes
+    ----------
+    factor_at
+        Where the factor was made that is used now.
+    spent
+        As for `Kept`.
+    """
+
+    def __init__(
+        self,
+        stage: ForwardStage,
+        matrix: sp.csr_array,
+        at: _At,
+        moment: Moment,
+        factor_at: _At,
+        spent: float,
+    ) -> None:
+        self.stage = stage
+        self.matrix = matrix
+        self.at = at
+        self.moment = moment
+        self.factor_at = factor_at
+        self.spent = spent
+
+    def solve(self, start: Array, b: Array, tolerance: float, passes: int) -> Array:
+        """Return x with matrix x = b on the free coefficients.
+
+        Parameters
+        ----------
+        start
+            What x is on the fixed ones, and about elsewhere, shape (n,) or (n, r).
+        tolerance
+            Bound on the error relative to x, both in the Euclidean norm over all columns: that does
+            not change where columns of a square root are rotated.
+        passes
+            Corrections that are as many as expected.
+        """
+        free = self.stage.model.X.free.reshape(-1, *[1] * (b.ndim - 1))
+        width = b[0].size
+        exact = self.at.same(*self.factor_at)
+        residual = (b - self.matrix @ start) * free
+        x, r, count = start, residual, 0
+        while True:
+            factor = self.stage.factor(*self.factor_at, self.moment)
+            update = _solved(factor, r)
+            x, count = x + update, count + 1
+            if exact:
+                return x
+            before, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
+            if before == 0.0:
+                return x
+            rate = float(np.linalg.norm(r)) / before
+            if rate <= SLOW:
+                left = float(np.linalg.norm(update) / np.linalg.norm(x)) * rate / (1.0 - rate)
+                more = 0.0 if left <= tolerance else math.log(tolerance / left) / math.log(rate)
+                spent = self.spent + width * max(count + more - passes, 0)
+                if left <= tolerance:
+                    self.spent = spent
+                    return x
+                if spent <= self.stage.solver.price:
+                    continue
+            # Keeping the factor has cost as much as a new one, or would.
+            self.factor_at, self.spent, exact = self.at, 0.0, True
+            x, r = start, residual
+
+
+def _solved(factor: Factor, b: Array) -> Array:
+    try:
+        return factor.solve(b)
+    except LinearAlgebraError as error:
+        raise StepFailed("singular", str(error)) from error
 
 
 @dataclass(frozen=True, eq=False)
 class _System:
     matrix: sp.csr_array
     offset: Array | None
-    factor: Factor
 
 
 @dataclass(frozen=True, eq=False)
