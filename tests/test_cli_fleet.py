@@ -255,8 +255,7 @@ def test_goes_on_separately_after_an_interruption(alike, monkeypatch, waiting):
         with pytest.raises(Killed):
             call(*FIRST, "again")
     assert runs.open(Path("again/a")).status == "running"
-    with Journal.open(Path("again/a") / JOURNAL) as journal:
-        assert (journal.accepted > 0) == (waiting == 500)
+    assert (Path("again/a") / JOURNAL).exists() == (waiting == 500)
     _, output = call(*FIRST, "again", "--resume", "--json")
     assert "3 separately: they had begun before (3)" in json.loads(output)["notes"][0]
     for name in "abc":

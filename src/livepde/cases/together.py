@@ -135,7 +135,6 @@ class Block:
             A journal cannot be written.
         """
         self._paths = list(paths)
-        self._create()
         table, stopping = self._tables[0], threading.Event()
         with stopped_by_signals(stopping, lambda: True):
             for t in table.t.tolist():
@@ -150,16 +149,6 @@ class Block:
                 if self._kept.size > WAITING:
                     self._write_all()
 
-    def _create(self) -> None:
-        """Make the journals."""
-        fleet = self.fleet
-        layout = layout_of(fleet.model, fleet.observed, fleet.withheld)
-        channels = fleet.identifier(0).channels
-        for path, one, table in zip(self._paths, self._each, self._tables, strict=True):
-            with Journal.create(path, channels, one.described(layout)) as journal:
-                for (kind, channel), number in table.remarks.items():
-                    journal.count(kind, channel, number)
-
     def _step(self, t: float) -> None:
         rows = np.array([table.values[self._taken] for table in self._tables])
         estimate = self.fleet.step(t, dict(zip(self._tables[0].names, rows.T, strict=True)))
@@ -171,11 +160,23 @@ class Block:
             self._events[k].append(event)
 
     def _write_all(self) -> None:
-        for k, path in enumerate(self._paths):
-            with Journal.open(path, write=True) as journal:
-                self._write(k, journal, self.fleet.identifier(k))
+        for k in range(len(self._each)):
+            identifier = self.fleet.identifier(k)
+            with self._journal(k, identifier) as journal:
+                self._write(k, journal, identifier)
         self._kept.clear()
         self._written = self._taken
+
+    def _journal(self, k: int, identifier: Identifier) -> Journal:
+        """Return the journal of a member: all of them at once would be too many open files."""
+        path, one = self._paths[k], self._each[k]
+        if self._written:
+            return Journal.open(path, write=True)
+        layout = layout_of(identifier.model, identifier.observed, identifier.withheld)
+        journal = Journal.create(path, identifier.channels, one.described(layout))
+        for (kind, channel), number in self._tables[k].remarks.items():
+            journal.count(kind, channel, number)
+        return journal
 
     def _write(self, k: int, journal: Journal, identifier: Identifier) -> None:
         """Add what waits to the journal of a member."""
@@ -193,7 +194,7 @@ class Block:
     def ended(self, k: int) -> Iterator[tuple[Identifier, Driven]]:
         """Complete the journal of a member; yield its identifier and run while it is open."""
         fleet, identifier = self.fleet, self.fleet.identifier(k)
-        with Journal.open(self._paths[k], write=True) as journal:
+        with self._journal(k, identifier) as journal:
             self._write(k, journal, identifier)
             result = Result(
                 fleet.model,

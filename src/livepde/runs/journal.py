@@ -541,6 +541,7 @@ def _reader_of_layouts() -> TypeAdapter[Layout]:
 def _fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
     """Make the tables of a new journal."""
     with connection:
+        connection.execute("BEGIN")  # one commit for all
         for command in SCHEMA:
             connection.execute(command)
         connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
