@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 
