@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import signal
 import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 from typer.testing import CliRunner
 
-from livepde import cli, runs
+from livepde import Fleet, cases, cli, runs
+from livepde.cases import together
 from livepde.cases.template import write_template
 from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
+from livepde.runs import JOURNAL, Journal
 
 TABLE = """name,data,unknowns.alpha.prior,law.noise
 plain,,,
@@ -122,11 +127,218 @@ def test_an_interruption_ends_all(here, monkeypatch):
     """Members after the one that was interrupted do not begin."""
     begun = []
 
-    def run(*arguments):
-        begun.append(arguments[-1].name)
+    def alone(self, member, prepared):
+        begun.append(member.name)
         return module.Ended(begun[-1], "interrupted" if len(begun) == 2 else "finished")
 
     module = sys.modules["livepde.cli.fleet"]
-    monkeypatch.setattr(module, "_run", run)
-    code, _ = call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
+    monkeypatch.setattr(module.Runs, "_alone", alone)
+    Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\nlast,\n")
+    code, _ = call(
+        "fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--separately"
+    )
     assert (code, begun) == (INTERRUPTED, ["plain", "warm"])
+
+
+# --- stepped together ----------------------------------------------------------------------------
+
+ALIKE = """name,data,initial
+a,,
+b,rod/other.csv,
+c,rod/third.csv,21 degC
+"""
+FIRST = ["fleet", "rod/case.toml", "--members", "rods.csv", "--out"]
+
+
+@pytest.fixture
+def alike(here):
+    """Three members that differ in data and start alone; with values that are missing."""
+    head, *rows = Path("rod/rod.csv").read_text().splitlines()
+    for name, shift in {"other": 0.1, "third": -0.2}.items():
+        changed = [head]
+        for k, row in enumerate(rows):
+            t, left, *inner, right = row.split(",")
+            inner = [f"{float(x) + shift * np.sin(k):.3f}" if x else "" for x in inner]
+            inner[k % 3] = "" if k % 5 == 3 else inner[k % 3]
+            changed.append(",".join([t, "" if k == 7 else left, *inner, right]))
+        Path(f"rod/{name}.csv").write_text("\n".join(changed) + "\n")
+    Path("rods.csv").write_text(ALIKE)
+    return here
+
+
+def equal(one: Path, other: Path) -> None:
+    """Hold two run directories against each other."""
+    mine, wanted = runs.open(one), runs.open(other)
+    assert {file.name for file in one.iterdir()} == {file.name for file in other.iterdir()}
+    assert mine.record.keys() == wanted.record.keys()
+    assert (mine.status, mine.notes, mine.settings) == (
+        wanted.status,
+        wanted.notes,
+        wanted.settings,
+    )
+    assert [check.name for check in mine.checks] == [check.name for check in wanted.checks]
+    same(mine.dataset, wanted.dataset)
+    with Journal.open(one / JOURNAL) as left, Journal.open(other / JOURNAL) as right:
+        same(left.dataset(), right.dataset())
+        assert (left.counts, left.events) == (right.counts, right.events)
+        assert (left.first.values, left.accepted) == (right.first.values, right.accepted)
+
+
+def same(one: xr.Dataset, other: xr.Dataset) -> None:
+    """Hold two datasets against each other: all is equal, numbers to rounding."""
+    xr.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-9)
+    for name in other.variables:
+        assert str(one[name].attrs) == str(other[name].attrs)
+    assert one.attrs == other.attrs
+
+
+def test_members_that_are_alike_step_together(alike):
+    """What each leaves is what a run of its own leaves."""
+    code, output = call(*FIRST, "rods", "--json")
+    assert code == 1  # the case expects more than so few samples can tell
+    assert json.loads(output)["notes"][0] == "Of 3 members 3 were stepped together."
+    _, output = call(*FIRST, "apart", "--separately", "--json")
+    assert "3 separately: as --separately says (3)" in json.loads(output)["notes"][0]
+    for name in "abc":
+        equal(Path("rods") / name, Path("apart") / name)
+    left, right = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("rods", "apart"))
+    pd.testing.assert_frame_equal(left, right, rtol=1e-7)
+
+
+def test_what_it_leaves_serves_other_commands(alike):
+    call(*FIRST, "rods")
+    call("report", "rods/b")
+    call("export", "rods/b", "b.csv", "b.html")
+    assert len(pd.read_csv("b.csv")) == 39
+    case = cases.load("rod/case.toml").prepare("rod/other.csv")
+    case.identifier.load("rods/b/checkpoint.npz")
+    run = runs.open(Path("rods/b"))
+    assert case.identifier.t == run.dataset["time"][-1]
+    estimate = case.identifier.estimate()
+    assert estimate.q[0] == run.dataset["alpha"][-1]
+    assert case.identifier.step(estimate.t + 20.0, list(case.stream)[-1].z).status.ok
+
+
+def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
+    """A journal that is written piece by piece is the same as one that is written at once."""
+    call(*FIRST, "rods")
+    monkeypatch.setattr(together, "WAITING", 500)
+    extend, pieces = Journal.extend, []
+
+    def told(journal, rows, state):
+        before = journal.accepted
+        extend(journal, rows, state)
+        pieces.append(journal.accepted - before)
+
+    monkeypatch.setattr(Journal, "extend", told)
+    call(*FIRST, "pieces")
+    assert len(pieces) > 3 * 2
+    assert sum(pieces) == 3 * 39
+    for name in "abc":
+        equal(Path("pieces") / name, Path("rods") / name)
+
+
+@pytest.mark.parametrize("waiting", [500, 10**9])
+def test_goes_on_separately_after_an_interruption(alike, monkeypatch, waiting):
+    """Whether it was stopped, or killed between two writings."""
+    call(*FIRST, "rods")
+    monkeypatch.setattr(together, "WAITING", waiting)
+    stepped = Fleet.step
+
+    def step(self, t, z, inputs=None):
+        if t == 400.0:
+            raise Killed
+        return stepped(self, t, z, inputs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Fleet, "step", step)
+        with pytest.raises(Killed):
+            call(*FIRST, "again")
+    assert runs.open(Path("again/a")).status == "running"
+    assert (Path("again/a") / JOURNAL).exists() == (waiting == 500)
+    _, output = call(*FIRST, "again", "--resume", "--json")
+    assert "3 separately: they had begun before (3)" in json.loads(output)["notes"][0]
+    for name in "abc":
+        same(runs.open(Path("again") / name).dataset, runs.open(Path("rods") / name).dataset)
+
+
+class Killed(BaseException):
+    """What a kill looks like from inside."""
+
+
+def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
+    stepped = Fleet.step
+
+    def step(self, t, z, inputs=None):
+        if t == 400.0:
+            signal.raise_signal(signal.SIGINT)
+        return stepped(self, t, z, inputs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Fleet, "step", step)
+        code, _ = call(*FIRST, "rods")
+    assert code == INTERRUPTED
+    table = pd.read_csv("rods/fleet.csv")
+    assert (table["status"] == "interrupted").all()
+    assert (table["samples"] == 21).all()
+    assert "Interrupted after 21 samples." in runs.open(Path("rods/c")).notes
+    call(*FIRST, "rods", "--resume")
+    assert (pd.read_csv("rods/fleet.csv")["samples"] == 39).all()
+
+
+def test_what_is_finished_is_not_run_again(alike, monkeypatch):
+    call(*FIRST, "rods")
+    table = pd.read_csv("rods/fleet.csv")
+    monkeypatch.setattr(cases.Prepared, "identifier", None)  # nobody asks for one
+    call(*FIRST, "rods", "--resume")
+    pd.testing.assert_frame_equal(pd.read_csv("rods/fleet.csv"), table)
+    _, output = call(*FIRST, "rods", "--resume", "--set", "law.noise=1 K", "--json")
+    assert "other settings" in output
+
+
+def test_says_why_members_are_run_separately(alike):
+    Path("rods.csv").write_text(
+        "name,data,initial,law.noise,law.replay\n"
+        "a,,,,\nb,rod/other.csv,,,\nshort,rod/warm.csv,,,\nnoisy,,,0.2 K,\n"
+        "p,,,,true\nq,rod/other.csv,,,true\nlost,rod/gap.csv,,,\n"
+    )
+    rows = Path("rod/rod.csv").read_text().splitlines()
+    time, _, *others = rows[1].split(",")
+    Path("rod/gap.csv").write_text("\n".join([rows[0], ",".join([time, "", *others]), *rows[2:]]))
+    code, output = call(*FIRST, "rods", "--json")
+    found = json.loads(output)
+    assert code == 1
+    assert found["notes"][0] == (
+        "Of 7 members 2 were stepped together, 5 separately: no other one has their settings and "
+        "sample times (2); replays and the test for jumps go back, each member to a time of its "
+        "own (2); an input has no value in their first sample (1)."
+    )
+    assert [row[1] for row in found["tables"][0]["rows"]] == ["finished"] * 6 + ["failed"]
+
+
+def test_a_step_that_fails_is_told_of_that_member_alone(alike):
+    """An event in its journal, a status in its dataset."""
+    rows = Path("rod/other.csv").read_text().splitlines()
+    time, _, *others = rows[12].split(",")
+    rows[12] = ",".join([time, "1e308", *others])  # the step overflows
+    Path("rod/other.csv").write_text("\n".join(rows) + "\n")
+    call(*FIRST, "rods")
+    call(*FIRST, "apart", "--separately")
+    for name in "abc":
+        equal(Path("rods") / name, Path("apart") / name)
+        with Journal.open(Path("rods") / name / JOURNAL) as journal:
+            assert bool(journal.events) == (name == "b")
+
+
+def test_a_sample_that_none_can_take_ends_all(alike):
+    """A gap in the times that is longer than a step may be divided."""
+    for name in ("rod", "other", "third"):
+        path = Path(f"rod/{name}.csv")
+        rows = path.read_text().splitlines()
+        rows[-1] = ",".join(["1e9", *rows[-1].split(",")[1:]])
+        path.write_text("\n".join(rows) + "\n")
+    call(*FIRST, "rods")
+    call(*FIRST, "apart", "--separately")
+    left, right = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("rods", "apart"))
+    assert left["status"].tolist() == ["failed"] * 3
+    pd.testing.assert_frame_equal(left, right, rtol=1e-7)

@@ -422,9 +422,12 @@ def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
 
 
 def test_the_benchmark_compares_equal_estimates():
-    outcome = benchmark(members=3)
-    faster, apart = outcome.checks
+    outcome = benchmark(members=3, runs=2)
+    faster, apart, ratio, different = outcome.checks
     assert apart.ok
+    assert different.ok
     assert faster.value > 0.0
+    assert ratio.value > 0.0
     ((_, low, middle, high),) = outcome.tables[0].rows
     assert low <= middle <= high
+    assert len(benchmark(members=2, runs=0).tables) == 1

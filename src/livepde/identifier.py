@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -123,6 +124,24 @@ class Identifier:
         self._samples = 0
         if not self.inputs:
             self._begin(self._inputs)
+
+    def placed(self, state: Any, t: float, z: Array, inputs: Array, samples: int) -> Identifier:
+        """Return an identifier of the same parts that stands elsewhere; for `Fleet.identifier`.
+
+        Parameters
+        ----------
+        state
+            Of the law; None before it has begun.
+        t, z, inputs
+            Time, measurements and input channels of the last accepted sample.
+        samples
+            How many were taken.
+        """
+        other = copy.copy(self)
+        other._state, other._t, other._z, other._samples = state, t, z, samples
+        begun = zip(self.inputs, inputs.tolist(), strict=True) if state is not None else ()
+        other._inputs = Inputs(dict(begun))
+        return other
 
     def _check_names(self) -> None:
         hidden = self.withheld.names if self.withheld else ()

@@ -125,25 +125,27 @@ class Layout:
         """Return records as a dataset; see `Result.to_xarray`."""
         kept = [(row.t, row.snapshot) for row in records if row.snapshot is not None]
         times = np.array([row.t for row in records], dtype=float)
-        data = xr.Dataset(
-            coords={
-                "time": ("time", times, {"units": self.time_unit}),
-                "snapshot": np.array([t for t, _ in kept]),
-                "sensor": list(self.sensors),
-                "withheld": list(self.withheld or ()),
-                **{
-                    axis: ("vertex", np.array(x), {"units": self.length_unit})
-                    for axis, x in self.coordinates.items()
-                },
-            }
-        )
-        for kind, corners in self.cells.items():
-            data[kind] = (("cell", "corner"), np.array(corners, dtype=np.int32))
+        coords: dict[str, Any] = {
+            "time": ("time", times, {"units": self.time_unit}),
+            "snapshot": np.array([t for t, _ in kept]),
+            "sensor": list(self.sensors),
+            "withheld": list(self.withheld or ()),
+            **{
+                axis: ("vertex", np.array(x), {"units": self.length_unit})
+                for axis, x in self.coordinates.items()
+            },
+        }
+        data: dict[str, Any] = {
+            kind: (("cell", "corner"), np.array(corners, dtype=np.int32))
+            for kind, corners in self.cells.items()
+        }
         numbers = np.reshape([row.numbers for row in records], (len(records), len(self.numbers)))
         for (name, attrs), values in zip(self.numbers.items(), numbers.T, strict=True):
             data[name] = ("time", values, dict(attrs))
-        self._add_snapshots(data, [snapshot for _, snapshot in kept])
-        self._add_errors(data, records)
+        data |= self._snapshots([snapshot for _, snapshot in kept])
+        if "correlation" in data:
+            coords["unknown"] = list(self.scalars)
+        data |= self._errors(records)
         flags = {
             "flag_values": list(range(len(STATUS_CODES))),
             "flag_meanings": " ".join(STATUS_CODES),
@@ -152,17 +154,21 @@ class Layout:
         steps = np.array([row.steps for row in records], dtype=np.int32)
         data["steps"] = ("time", steps, {"long_name": "substeps taken"})
         for name in dict.fromkeys(key for row in records for key in row.notes):
-            key = f"note_{name}" if name in data else name  # an unknown may have the same name
+            key = f"note_{name}" if name in data or name in coords else name  # of an unknown, say
             data[key] = ("time", np.array([row.notes.get(name, np.nan) for row in records]))
-        data.attrs.update(self.attrs)
-        data.attrs["fields"] = " ".join(self.fields)
-        data.attrs["scalars"] = "\n".join(self.scalars)
-        data.attrs["state"] = " ".join(self.state)
-        return data
+        about = {
+            **self.attrs,
+            "fields": " ".join(self.fields),
+            "scalars": "\n".join(self.scalars),
+            "state": " ".join(self.state),
+        }
+        return xr.Dataset(data, coords, about)
 
-    def _add_snapshots(self, data: xr.Dataset, kept: Sequence[Snapshot]) -> None:
+    def _snapshots(self, kept: Sequence[Snapshot]) -> dict[str, Any]:
+        """Return the variables of the fields."""
+        data: dict[str, Any] = {}
         if not kept:
-            return
+            return data
         for name in kept[0].profiles:
             values = np.array([snapshot.profiles[name] for snapshot in kept])
             unit = {"units": self.units.get(bare(name), "")}
@@ -172,19 +178,22 @@ class Layout:
             about = {"long_name": "modes that the data have told of", "of": count}
             data[f"{name}_modes"] = ("snapshot", told, about)
         last = kept[-1].correlation
-        if last is not None and len(self.scalars) > 1 and "correlation" not in data:
-            data.coords["unknown"] = list(self.scalars)
+        taken = "correlation" in data or "correlation" in self.numbers
+        if last is not None and len(self.scalars) > 1 and not taken:
             data["correlation"] = (("unknown", "other"), last)
+        return data
 
-    def _add_errors(self, data: xr.Dataset, records: Sequence[Record]) -> None:
+    def _errors(self, records: Sequence[Record]) -> dict[str, Any]:
+        """Return the variables of what was measured and not expected."""
         unit = {"units": self.sensor_unit}
         shape = (len(records), len(self.sensors))
         innovations = np.reshape([row.innovation for row in records], shape)
-        data["innovation"] = (("time", "sensor"), innovations, unit)
+        data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}
         if self.withheld is not None:
             shape = (len(records), len(self.withheld))
             errors = np.reshape([row.withheld_error for row in records], shape)
             data["withheld_error"] = (("time", "withheld"), errors, unit)
+        return data
 
 
 def bare(name: str) -> str:

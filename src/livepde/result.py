@@ -18,7 +18,15 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import STATUS_CODES, Layout, Record, Records, Snapshot
 
-__all__ = ["Estimate", "Result", "layout_of"]
+__all__ = [
+    "Estimate",
+    "Result",
+    "interval_ends",
+    "layout_of",
+    "unknown_of",
+    "variables",
+    "vertex_order",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +126,7 @@ class Estimate:
         std = self.q_std if self.q_std is not None else np.full_like(self.q, np.nan)
         if name in space.labels:
             k = space.labels[name]
-            low, high = _unknown(space, name).interval(self.q[k], std[k], level)
+            low, high = unknown_of(space, name).interval(self.q[k], std[k], level)
             return float(low), float(high)
         if name not in space.fields:
             raise ConfigurationError(
@@ -126,11 +134,11 @@ class Estimate:
                 f"{[*space.labels, *space.fields]}."
             )
         part = space.part(name)
-        ends: tuple[Array, Array] = _unknown(space, name).interval(self.q[part], std[part], level)
+        ends: tuple[Array, Array] = unknown_of(space, name).interval(self.q[part], std[part], level)
         return ends
 
 
-def _unknown(space: FunctionSpace, label: str) -> Any:
+def unknown_of(space: FunctionSpace, label: str) -> Any:
     """Return the unknown that a label belongs to."""
     return space.unknowns[label.split("[")[0]]
 
@@ -184,7 +192,7 @@ class Result:
         numbers: list[float] = []
         left = estimate.belief.left([*estimate.space.labels.values()])
         for (label, (value, std)), share in zip(estimate.parameters.items(), left, strict=True):
-            ends = _ends(label, _unknown(estimate.space, label), value, std)
+            ends = interval_ends(label, unknown_of(estimate.space, label), value, std)
             numbers += [value, std, *map(float, ends.values()), float(share)]
         return Record(
             estimate.t,
@@ -205,7 +213,7 @@ class Result:
             if len(left):
                 told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
         profiles = self._profiles(estimate).items()
-        order = _order(self.model)
+        order = vertex_order(self.model)
         ordered = {name: values[order] for name, values in profiles}
         return Snapshot(ordered, told, _correlation(estimate))
 
@@ -227,7 +235,7 @@ class Result:
             if std is not None:
                 found[f"{name}_std"] = std
                 unknown = self.model.parameter_space.unknowns[name]
-                found |= _ends(name, unknown, found[name], std)
+                found |= interval_ends(name, unknown, found[name], std)
         return found
 
     def to_xarray(self) -> xr.Dataset:
@@ -266,12 +274,12 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
     """Return what the numbers of the records of a run mean."""
     numbers: dict[str, dict[str, Any]] = {}
     for label in model.parameter_space.labels:
-        unknown = _unknown(model.parameter_space, label)
+        unknown = unknown_of(model.parameter_space, label)
         unit: dict[str, Any] = {"units": unknown.unit}
         numbers |= {label: {**unit, **_prior(unknown)}, f"{label}_std": unit}
-        numbers |= dict.fromkeys(_ends(label, unknown, 0.0, 0.0), unit)
+        numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
         numbers[f"{label}_left"] = {"long_name": "share of the prior deviation"}
-    points = model.mesh.p[:, _order(model)]
+    points = model.mesh.p[:, vertex_order(model)]
     components = model.state_space.fields.items()
     return Layout(
         time_unit=model.time_unit,
@@ -284,11 +292,11 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         units=_units(model),
         scalars=list(model.parameter_space.labels),
         fields=list(model.parameter_space.fields),
-        state=[key for name, block in components for key in _variables(name, block)],
+        state=[key for name, block in components for key in variables(name, block)],
     )
 
 
-def _order(model: Model) -> Any:
+def vertex_order(model: Model) -> Any:
     """In which order vertices are kept: along an interval, else as the mesh has them."""
     points = model.mesh.p
     return np.argsort(points[0]) if len(points) == 1 else slice(None)
@@ -298,11 +306,11 @@ def _units(model: Model) -> dict[str, str]:
     unknowns = {**model.state_space.unknowns, **model.parameter_space.unknowns}
     found = {name: unknown.unit for name, unknown in unknowns.items()}
     for name, block in model.state_space.fields.items():
-        found |= dict.fromkeys(_variables(name, block), found[name])
+        found |= dict.fromkeys(variables(name, block), found[name])
     return found
 
 
-def _variables(name: str, block: FieldBlock) -> list[str]:
+def variables(name: str, block: FieldBlock) -> list[str]:
     """Return the variables of a component: itself, or one for each direction of a vector."""
     if not block.vector:
         return [name]
@@ -311,12 +319,12 @@ def _variables(name: str, block: FieldBlock) -> list[str]:
 
 def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
     """Return the variables of a component with their values at the vertices."""
-    names = _variables(name, block)
+    names = variables(name, block)
     rows = values.reshape(len(names), -1)
     return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
 
 
-def _ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
+def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
     """Return the variables with the ends of 95 % intervals, unless they are +- 1.96 deviations."""
     if unknown.symmetric:
         return {}

@@ -1,8 +1,14 @@
-"""A fleet of rods stepped together against as many separate identifiers, pair by pair."""
+"""A fleet of rods against as many separate identifiers: a step, and the command with its runs."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
 from time import perf_counter
+from typing import TypeAlias
 
 import numpy as np
 
@@ -29,18 +35,76 @@ LENGTH = 5  # steps of a pair
 REPETITIONS = 7
 FASTER = 10.0  # times, at least: the promise
 EQUAL = 1e-8  # relative to the largest estimate: rounding
+SAMPLES = 1000  # of a run
+RUN = f"rod of {NODES} nodes, {SAMPLES} samples"
+COMMAND_FASTER = 4.0  # times, at least: what is written weighs as much as what is computed
+CASE = """\
+title = "A rod"
+equation = "heat"
+initial = 0.0
+boundary = {{ right = 0.0 }}
+
+[mesh]
+from = 0.0
+to = 1.0
+cells = {cells}
+
+[data]
+time = "time"
+
+[unknowns.alpha]
+prior = 0.5
+std = 0.25
+transform = "log"
+bounds = [0.0, inf]
+
+[unknowns.loss]
+prior = 0.5
+std = 0.5
+transform = "log"
+bounds = [0.0, inf]
+
+[channels]
+heated = {{ role = "boundary", column = "heated", at = "left" }}
+ambient = {{ role = "input", column = "ambient" }}
+{sensors}
+
+[law]
+kind = "sensitivity"
+"""
+
+Part: TypeAlias = tuple[Table, list[Check]]
 
 
-def fleet(members: int = 1000) -> Outcome:
-    """Time a step of a fleet against one of as many separate objects with the same data.
+def fleet(members: int = 1000, runs: int = 25) -> Outcome:
+    """Time a fleet of rods of 100 nodes, whose diffusivity and loss are unknown, heated at one end.
 
-    Rods of 100 nodes, whose diffusivity and loss are unknown, heated at one end.
+    Parameters
+    ----------
+    members
+        Rods whose step as blocks is held against one of as many separate objects.
+    runs
+        Rods that `livepde fleet` makes run directories of, together and separately; 0 for none.
     """
+    parts = [_steps(members), *([_commands(runs)] if runs else [])]
+    return Outcome(
+        tables=[table for table, _ in parts],
+        checks=[check for _, checks in parts for check in checks],
+        notes=[
+            "Steps: ratios of times taken in one process, one thread, one right after the other. "
+            "Commands: of processor times of `livepde fleet` with --jobs 1, from its start to its "
+            "end, run directories included."
+        ],
+    )
+
+
+def _steps(members: int) -> Part:
+    """Time a step of a fleet against one of as many separate objects with the same data."""
     model, sensors, law = _rod(), Points(SENSORS, noise=NOISE), SensitivityLaw()
     together = Fleet(model, sensors, law, members, u0=0.0)
     separate = [Identifier(model, sensors, law, u0=0.0) for _ in range(members)]
     ratios, apart = [], 0.0
-    samples = _samples(model, members)
+    samples = _samples(model, members, BEGIN + REPETITIONS * LENGTH)
     for k in range(REPETITIONS + 1):
         piece = samples[:BEGIN] if not k else samples[BEGIN + (k - 1) * LENGTH :][:LENGTH]
         start = perf_counter()
@@ -58,14 +122,63 @@ def fleet(members: int = 1000) -> Outcome:
     low, middle_ratio, high = np.quantile(ratios, (0.0, 0.5, 1.0))
     title = f"Separate objects over a fleet of {members}, {REPETITIONS} pairs of {LENGTH} steps"
     rows = [(f"rod of {NODES} nodes, 2 unknowns, 4 sensors", low, middle_ratio, high)]
-    return Outcome(
-        tables=[Table(title, ("time per step and rod", "min", "median", "max"), rows)],
-        checks=[
-            Check("fleet: times faster per step and rod", float(middle_ratio), FASTER, ">="),
-            Check("fleet: relative difference of the estimates", apart, EQUAL, "<="),
-        ],
-        notes=["Ratios of times taken in one process, one thread, one right after the other."],
+    table = Table(title, ("time per step and rod", "min", "median", "max"), rows)
+    return table, [
+        Check("fleet: times faster per step and rod", float(middle_ratio), FASTER, ">="),
+        Check("fleet: relative difference of the estimates", apart, EQUAL, "<="),
+    ]
+
+
+def _commands(members: int) -> Part:
+    """Time `livepde fleet` with members together against separately."""
+    import pandas as pd
+
+    with tempfile.TemporaryDirectory() as folder:
+        home = Path(folder)
+        _write_case(home, members)
+        seconds, found = [], []
+        for options in ((), ("--separately",)):
+            out = home / f"rods{len(options)}"
+            seconds.append(_taken(home, "--out", str(out), *options))
+            found.append(pd.read_csv(out / "fleet.csv").set_index("name"))
+        unknowns = found[1][["alpha", "loss"]]
+        apart = float((found[0][["alpha", "loss"]] / unknowns - 1.0).abs().to_numpy().max())
+    ratio = seconds[1] / seconds[0]
+    title = f"`livepde fleet --separately` over `livepde fleet`, {members} rods"
+    table = Table(title, ("processor time of the command", "ratio"), [(RUN, ratio)])
+    return table, [
+        Check("fleet command: times faster", ratio, COMMAND_FASTER, ">="),
+        Check("fleet command: relative difference of the estimates", apart, EQUAL, "<="),
+    ]
+
+
+def _write_case(home: Path, members: int) -> None:
+    """Write a case, a file of data for each rod, and the table of them."""
+    model = _rod()
+    names = [f"T_{100 * x:.0f}" for x in SENSORS]
+    sensors = "\n".join(
+        f'{name} = {{ role = "sensor", column = "{name}", at = {x}, noise = {NOISE} }}'
+        for name, x in zip(names, SENSORS, strict=True)
     )
+    (home / "case.toml").write_text(CASE.format(cells=NODES - 1, sensors=sensors))
+    samples = _samples(model, members, SAMPLES)
+    head = ",".join(["time", "heated", "ambient", *names])
+    rods = [f"rod{k:04d}" for k in range(members)]
+    for k, rod in enumerate(rods):
+        rows = [",".join(map(repr, [t, heated, 0.0, *z[k].tolist()])) for t, z, heated in samples]
+        (home / f"{rod}.csv").write_text("\n".join([head, *rows]) + "\n")
+    table = [f"{rod},{rod}.csv" for rod in rods]
+    (home / "rods.csv").write_text("\n".join(["name,data", *table]) + "\n")
+
+
+def _taken(home: Path, *options: str) -> float:
+    """Return the processor time of a command `livepde fleet`."""
+    command = [sys.executable, "-m", "livepde", "fleet", "case.toml", "--members", "rods.csv"]
+    before = os.times()
+    subprocess.run([*command, *options], cwd=home, check=True, stdout=subprocess.DEVNULL)
+    after = os.times()
+    spent = after.children_user - before.children_user
+    return spent + after.children_system - before.children_system
 
 
 def _rod() -> Model:
@@ -79,10 +192,10 @@ def _inputs(heated: float) -> dict[str, float]:
     return {"heated": heated, "ambient": 0.0}
 
 
-def _samples(model: Model, members: int) -> list[tuple[float, Array, float]]:
+def _samples(model: Model, members: int, count: int) -> list[tuple[float, Array, float]]:
     """Return time, measurements of all members, and the temperature of the heated end."""
     rng = np.random.default_rng(0)
-    times = [STEP * k for k in range(BEGIN + REPETITIONS * LENGTH + 1)]
+    times = [STEP * k for k in range(count + 1)]
 
     def heated(t: float) -> float:
         return float(np.sin(t) + np.sin(3.1 * t))

@@ -113,7 +113,10 @@ class Prepared:
     def layout(self) -> Layout:
         """What the records of a run mean: title, start, units and references are the case's."""
         who = self.identifier
-        found = layout_of(who.model, who.observed, who.withheld)
+        return self.described(layout_of(who.model, who.observed, who.withheld))
+
+    def described(self, found: Layout) -> Layout:
+        """Return a layout with what the case says beside model and sensors."""
         references = {
             label: {**found.numbers[label], "reference": value}
             for label, value in self.case.references.items()
@@ -390,6 +393,12 @@ class Case:
         DataError
             The data cannot be used; the message names file, row and column.
         """
+        prepared = self.read(source)
+        _ = prepared.identifier  # raises what does not fit together
+        return prepared
+
+    def read(self, source: str | Iterable[str] | None = None) -> Prepared:
+        """Return the case with its data, as `prepare` does, before an identifier is built."""
         data = read_data(self.frame, self.columns, self.clock, source)
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
@@ -397,9 +406,7 @@ class Case:
             raise DataError(f"{self.frame.path}: the data hold no sample between start and stop.")
         start = assimilation_start(self.frame, self.clock, data.origin)
         stream = data if isinstance(data, Table) else chain([first], samples)
-        prepared = Prepared(self, first, stream, start, data.origin)
-        _ = prepared.identifier  # raises what does not fit together
-        return prepared
+        return Prepared(self, first, stream, start, data.origin)
 
     @property
     def live(self) -> bool:

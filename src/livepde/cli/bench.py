@@ -62,17 +62,20 @@ def step(
 
 @bench.command()
 def fleet(
-    members: Annotated[int, typer.Option(min=1, help="How many rods.")] = 1000,
+    members: Annotated[int, typer.Option(min=1, help="How many rods step.")] = 1000,
+    runs: Annotated[
+        int, typer.Option(min=0, help="Rods of which run directories are made; 0 for none.")
+    ] = 25,
     as_json: JsonOption = False,
 ) -> None:
-    """Time a step of a fleet of rods against one of as many separate identifiers.
+    """Time a fleet of rods against as many separate identifiers: a step, and the command.
 
     Example:  livepde bench fleet --json
     """
     from livepde.bench.fleet import fleet as benchmark
 
-    command = ["livepde", "bench", "fleet", "--members", str(members)]
-    report_outcome(benchmark(members), command, as_json)
+    command = ["livepde", "bench", "fleet", "--members", str(members), "--runs", str(runs)]
+    report_outcome(benchmark(members, runs), command, as_json)
 
 
 @bench.command()

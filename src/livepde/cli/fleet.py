@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -19,13 +20,17 @@ from livepde.errors import ConfigurationError, DataError, LivepdeError
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
-    from livepde.runs import Table
+    from livepde.cases import Case, Prepared
+    from livepde.cases.together import Block
+    from livepde.runs import Check, Driven, Run, RunWriter, Table
 
 __all__ = ["fleet"]
 
 SUMMARY = "fleet.csv"
 NAME, DATA = "name", "data"  # columns of the table; every other one is a key of the case
+ASKED, GOES_ON = "as --separately says", "they had begun before"
 UNFIT = frozenset('/\\:*?"<>|')  # what names of folders do without
 
 
@@ -64,6 +69,8 @@ class Ended:
         Names of checks that failed.
     error
         Why it failed.
+    apart
+        Why it was run separately; empty if it was not.
     """
 
     name: str
@@ -72,6 +79,7 @@ class Ended:
     unknowns: dict[str, tuple[float, float]] = field(default_factory=dict)
     failed: tuple[str, ...] = ()
     error: str = ""
+    apart: str = ""
 
 
 def fleet(
@@ -99,13 +107,22 @@ def fleet(
             "--resume", help="Go on with the runs in --out; begin those that are not there."
         ),
     ] = False,
+    separately: Annotated[
+        bool,
+        typer.Option(
+            "--separately",
+            help="Step no members together: the numbers are those of 'livepde run' to the bit.",
+        ),
+    ] = False,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
 ) -> None:
     """Run a case for each row of a table: other data, other settings, a run directory each.
 
-    A run that fails does not end the others; its sentence stands in the summary, fleet.csv.
+    Members that differ in nothing but data and initial state are stepped together, many times
+    faster, where there are blocks for their case; the summary says why others are not. A run that
+    fails does not end the others; its sentence stands in the summary, fleet.csv.
 
     Example:  livepde fleet rod/case.toml --members rods.csv --out rods --jobs 4
     """
@@ -121,13 +138,14 @@ def fleet(
     for row in rows:
         if not resume and (folder / row.name).exists():
             refuse_taken(folder / row.name)
-    run = partial(_run, case, folder, allow_code, tuple(settings or ()), resume)
+    run = Runs(case, folder, allow_code, tuple(settings or ()), resume, separately)
     ended = _each(run, rows, jobs)
     summary = _summary(ended)
     folder.mkdir(parents=True, exist_ok=True)
     summary.to_csv(folder / SUMMARY, index=False)
     wrong = [item for item in ended if item.status == "failed" or item.failed]
-    notes = [f"{item.name}: {item.error}" for item in ended if item.error]
+    notes = [how] if (how := _how(ended)) else []
+    notes += [f"{item.name}: {item.error}" for item in ended if item.error]
     notes += [f"{item.name}: check failed: {check}" for item in ended for check in item.failed]
     if as_json:
         print_json([_table(summary)], [], notes, run=str(folder), failed=len(wrong))
@@ -169,63 +187,157 @@ def _read(path: Path) -> list[Member]:
     return rows
 
 
-def _each(run: Any, rows: Sequence[Member], jobs: int) -> list[Ended]:
+def _each(
+    run: Callable[[Sequence[Member]], list[Ended]], rows: Sequence[Member], jobs: int
+) -> list[Ended]:
     """Run all members, in so many processes."""
     if jobs == 1:
-        ended: list[Ended] = []
-        for row in rows:
-            ended.append(run(row))
-            if ended[-1].status == "interrupted":  # Ctrl-C ends all
-                break
-        return ended
+        return run(rows)
     try:
-        from joblib import Parallel, delayed, parallel_config
+        from joblib import Parallel, delayed, effective_n_jobs, parallel_config
     except ImportError as error:
         raise ConfigurationError(
             "--jobs needs joblib: pip install 'livepde[fleet]'; without it the runs follow each "
             "other."
         ) from error
     with parallel_config(backend="loky", inner_max_num_threads=1):
-        ended = Parallel(n_jobs=jobs)(delayed(run)(row) for row in rows)
-    return ended
+        count = min(effective_n_jobs(jobs), len(rows))
+        parts = Parallel(n_jobs=count)(delayed(run)(rows[k::count]) for k in range(count))
+    ended = {item.name: item for part in parts for item in part}
+    return [ended[row.name] for row in rows if row.name in ended]
 
 
-def _run(
-    case: Path,
-    folder: Path,
-    allow_code: bool,
-    settings: tuple[str, ...],
-    resume: bool,
-    member: Member,
-) -> Ended:
-    """Run one member as `livepde run` would."""
-    own = [*settings, *member.settings]
-    target = folder / member.name
-    command = ["livepde", "run", str(case), "--out", str(target)]
-    command += ["--data", member.data] if member.data else []
-    command += [word for text in own for word in ("--set", text)]
-    try:
-        loaded = load_case(case, allow_code, own)
-        write = partial(writer_of, loaded, target, own, resume, command)
-        with ExitStack() as stack:
-            source = member.data or None
-            writer, (prepared, driven) = batch(loaded, source, target, write, stack, quiet=True)
-            dataset, _, checks, _ = concluded(loaded, prepared, driven, writer)
-    except LivepdeError as error:
-        return Ended(member.name, "failed", error=str(error))
+@dataclass(frozen=True)
+class Runs:
+    """Runs the members of one process.
+
+    Attributes
+    ----------
+    case, folder, allow_code, settings, resume, separately
+        As given to the command.
+    """
+
+    case: Path
+    folder: Path
+    allow_code: bool
+    settings: tuple[str, ...]
+    resume: bool
+    separately: bool = False
+
+    def __call__(self, rows: Sequence[Member]) -> list[Ended]:
+        """Run members as `livepde run` would, as blocks where they can."""
+        from livepde.cases.together import blocks
+        from livepde.runs import RECORD
+
+        members = {row.name: row for row in rows}
+        ended: dict[str, Ended] = {}
+        ready: dict[str, Prepared] = {}
+        loaded: dict[tuple[str, ...], Case] = {}
+        for row in rows:
+            try:
+                if row.settings not in loaded:
+                    loaded[row.settings] = load_case(self.case, self.allow_code, self._own(row))
+                ready[row.name] = loaded[row.settings].read(row.data or None)
+            except LivepdeError as error:
+                ended[row.name] = Ended(row.name, "failed", error=str(error))
+        begun = {name for name in ready if self.resume and (self.folder / name / RECORD).exists()}
+        new = {name: one for name, one in ready.items() if name not in begun}
+        found, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
+        apart |= dict.fromkeys(begun, GOES_ON)
+        for block in found:
+            ended |= self._together(block, members)
+        for name, why in apart.items():
+            if any(item.status == "interrupted" for item in ended.values()):  # Ctrl-C ends all
+                break
+            ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
+        return [ended[row.name] for row in rows if row.name in ended]
+
+    def _own(self, member: Member) -> list[str]:
+        return [*self.settings, *member.settings]
+
+    def _command(self, member: Member) -> list[str]:
+        target = self.folder / member.name
+        command = ["livepde", "run", str(self.case), "--out", str(target)]
+        command += ["--data", member.data] if member.data else []
+        return command + [word for text in self._own(member) for word in ("--set", text)]
+
+    def _writer(self, member: Member, case: Case) -> RunWriter:
+        target, command = self.folder / member.name, self._command(member)
+        return writer_of(case, target, self._own(member), self.resume, command)
+
+    def _together(self, block: Block, members: Mapping[str, Member]) -> dict[str, Ended]:
+        """Run members as a block."""
+        from livepde.runs import JOURNAL
+
+        ended = {}
+        try:
+            writers = {
+                name: self._writer(members[name], one.case) for name, one in block.members.items()
+            }
+            block.run([self.folder / name / JOURNAL for name in writers])
+            for k, (name, writer) in enumerate(writers.items()):
+                with block.ended(k) as (identifier, driven):
+                    case = block.members[name].case
+                    dataset, _, checks, _ = concluded(case, identifier, driven, writer, draw=False)
+                ended[name] = _ended(name, driven, dataset, checks)
+        except LivepdeError as error:  # no room, say: it concerns all that are not through
+            for name in block.members.keys() - ended.keys():
+                ended[name] = Ended(name, "failed", error=str(error))
+        return ended
+
+    def _alone(self, member: Member, prepared: Prepared) -> Ended:
+        """Run one member, or find that it is through."""
+        case, name = prepared.case, member.name
+        target = self.folder / name
+        try:
+            through = self._through(member, prepared)
+            if through is not None:
+                return through
+            with ExitStack() as stack:
+                write = partial(self._writer, member, case)
+                writer, (_, driven) = batch(prepared, target, write, stack, quiet=True)
+                identifier = prepared.identifier
+                dataset, _, checks, _ = concluded(case, identifier, driven, writer, draw=False)
+        except LivepdeError as error:
+            return Ended(name, "failed", error=str(error))
+        return _ended(name, driven, dataset, checks)
+
+    def _through(self, member: Member, prepared: Prepared) -> Ended | None:
+        """Return how a run ended that has taken all of its samples before; None if it has not."""
+        from livepde import runs
+        from livepde.streams import Table as Samples
+
+        target, table = self.folder / member.name, prepared.stream
+        if not (self.resume and (target / runs.RECORD).exists() and isinstance(table, Samples)):
+            return None
+        run = runs.open(target)
+        if run.status != "finished" or run.record.get("samples") != len(table):
+            return None
+        run.refuse_other(self._command(member), prepared.case.text, self._own(member))
+        return _ended(member.name, run, run.dataset, run.checks)
+
+
+def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]) -> Ended:
     unknowns = {
         label: (float(dataset[label][-1]), float(dataset[f"{label}_std"][-1]))
         for label in filter(None, dataset.attrs["scalars"].split("\n"))
         if dataset.sizes["time"]
     }
-    return Ended(
-        member.name,
-        driven.status,
-        len(driven.result),
-        unknowns,
-        tuple(check.name for check in checks if not check.ok),
-        "" if driven.error is None else str(driven.error),
-    )
+    failed = tuple(check.name for check in checks if not check.ok)
+    error = getattr(run, "error", None)
+    samples = dataset.sizes["time"]
+    return Ended(name, run.status, samples, unknowns, failed, str(error) if error else "")
+
+
+def _how(ended: Sequence[Ended]) -> str:
+    """Return in one line which members were stepped together, and why others were not."""
+    apart = Counter(item.apart for item in ended if item.apart)
+    count = sum(apart.values())
+    together = sum(not item.apart and item.samples > 0 for item in ended)
+    parts = [f"{together} were stepped together"] if together else []
+    reasons = "; ".join(f"{why} ({number})" for why, number in apart.items())
+    parts += [f"{count} separately: {reasons}"] if apart else []
+    return f"Of {len(ended)} members {', '.join(parts)}." if parts else ""
 
 
 def _summary(ended: Sequence[Ended]) -> pd.DataFrame:

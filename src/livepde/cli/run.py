@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from enum import StrEnum
 from functools import partial
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from livepde.cases import Case, Prepared
+    from livepde.identifier import Identifier
     from livepde.runs import Check, Driven, RunWriter, Table
 
 __all__ = ["batch", "concluded", "run", "writer_of"]
@@ -157,12 +158,13 @@ def run(
             how = Beside(source, pace, listen, watch, token, estimates)
             writer, taken = beside(loaded, how, folder, write, stack)
         else:
-            writer, taken = batch(loaded, source, folder, write, stack, quiet=as_json)
+            writer, taken = batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
         if taken is None:
             writer.finish(status="interrupted", notes=["Ended before the first sample."])
             raise typer.Exit(INTERRUPTED)
         prepared, driven = taken
-        dataset, shown, checks, notes = concluded(loaded, prepared, driven, writer)
+        identifier = prepared.identifier
+        dataset, shown, checks, notes = concluded(loaded, identifier, driven, writer)
     if driven.error is not None:
         raise driven.error
     if as_json:
@@ -217,8 +219,7 @@ def writer_of(
 
 
 def batch(
-    loaded: Case,
-    source: str | Iterable[str] | None,
+    prepared: Prepared,
     folder: Path,
     write: Callable[[], RunWriter],
     stack: ExitStack,
@@ -229,7 +230,7 @@ def batch(
     from livepde.runs import JOURNAL, Journal, drive
     from livepde.streams import Table as Samples
 
-    prepared = loaded.prepare(source)
+    identifier = prepared.identifier  # what does not fit together raises, and nothing is written
     writer, path = write(), folder / JOURNAL
     table = prepared.stream if isinstance(prepared.stream, Samples) else None
     if path.exists():
@@ -239,20 +240,26 @@ def batch(
         for (kind, channel), number in (table.remarks if table else {}).items():
             journal.count(kind, channel, number)
     driven = drive(
-        prepared.identifier,
+        identifier,
         prepared.stream,
         progress=not quiet,
         total=len(table) if table else None,
-        fields_every=loaded.fields_every,
+        fields_every=prepared.case.fields_every,
         journal=journal,
     )
     return writer, (prepared, driven)
 
 
 def concluded(
-    loaded: Case, prepared: Prepared, driven: Driven, writer: RunWriter
+    loaded: Case, identifier: Identifier, driven: Driven, writer: RunWriter, *, draw: bool = True
 ) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
-    """Write what a run gave; return its dataset, tables, checks and notes."""
+    """Write what a run gave; return its dataset, tables, checks and notes.
+
+    Parameters
+    ----------
+    draw
+        With figures.
+    """
     from livepde.runs import arrivals, checks_of, doubts, tables
 
     dataset = driven.result.to_xarray()
@@ -260,30 +267,28 @@ def concluded(
     checks = checks_of(loaded.expected, dataset)
     notes = [*loaded.notes, *doubts(dataset)]
     if len(driven.result):
-        notes += _traded(prepared)
+        notes += _traded(loaded, identifier)
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
         notes.append(f"Stopped after {len(driven.result)} samples: {driven.error}")
-    err = terminal(err=True)
     writer.finish(
         status=driven.status,
         dataset=dataset,
-        identifier=prepared.identifier,
+        identifier=identifier,
         shown=shown,
         checks=checks,
         notes=notes,
-        figures=figures_of(dataset, loaded.title) if can_draw(err) else {},
+        figures=figures_of(dataset, loaded.title) if draw and can_draw(terminal(err=True)) else {},
     )
     return dataset, shown, checks, notes
 
 
-def _traded(prepared: Prepared) -> list[str]:
+def _traded(loaded: Case, identifier: Identifier) -> list[str]:
     """Return what a run's data tell only together."""
     from livepde.diagnostics import identifiability
     from livepde.laws import AutoLaw, SensitivityLaw
 
-    if not isinstance(prepared.case.law, AutoLaw | SensitivityLaw):
+    if not isinstance(loaded.law, AutoLaw | SensitivityLaw):
         return []
-    belief = prepared.identifier.latent_belief()
-    return identifiability(prepared.case.model, belief).sentences
+    return identifiability(loaded.model, identifier.latent_belief()).sentences

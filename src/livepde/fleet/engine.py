@@ -13,7 +13,7 @@ from livepde.fleet.span import Span
 from livepde.laws import Belief, Report, Status
 from livepde.linalg import Array
 
-__all__ = ["Engine", "FleetReport", "State", "reported"]
+__all__ = ["Beliefs", "Engine", "Factors", "FleetReport", "State", "reported"]
 
 State: TypeAlias = Any
 """What evolves: the arrays or values of an engine."""
@@ -64,6 +64,44 @@ def reported(reports: Sequence[Report]) -> FleetReport:
     return blank.with_members(dict(enumerate(reports)))
 
 
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """Square roots of the covariances of all members; see `livepde.laws.Belief`.
+
+    Attributes
+    ----------
+    q, u, prior
+        Shapes (members, m, r), (members, n, r) and (members, m, k).
+    inflation
+        Factor on all deviations, shape (members,).
+    """
+
+    q: Array
+    u: Array
+    prior: Array
+    inflation: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """What is believed of all members, of the physical parameter; see `livepde.laws.Belief`.
+
+    Attributes
+    ----------
+    q, u
+        Shapes (members, m) and (members, n).
+    q_std
+        Deviations of q, or None if the law has none.
+    factors
+        Covariances; None where members step separately, each with its own.
+    """
+
+    q: Array
+    u: Array
+    q_std: Array | None
+    factors: Factors | None = None
+
+
 class Engine(Protocol):
     """Steps all members. A state is a value: what was returned is not changed any more."""
 
@@ -83,11 +121,12 @@ class Engine(Protocol):
         """Return what the law believes of a member, in latent coefficients."""
         ...
 
-    def means(self, state: State) -> tuple[Array, Array, Array | None]:
-        """Return physical parameter, state, and the parameter's deviation if the law has one.
+    def beliefs(self, state: State) -> Beliefs:
+        """Return what the law believes of all members."""
+        ...
 
-        Shapes (members, m), (members, n) and (members, m).
-        """
+    def member(self, state: State, k: int) -> Any:
+        """Return the state of a member as the law itself has it."""
         ...
 
     def leaves(self, state: State) -> dict[str, Any]:

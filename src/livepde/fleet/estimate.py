@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from livepde.fem import FunctionSpace
+from livepde.fleet.engine import Beliefs
 from livepde.laws import Belief, Status
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import STATUS_CODES, Layout
@@ -28,10 +29,8 @@ class FleetEstimate:
         Time of the sample.
     members
         Their names.
-    q, u
-        Coefficients of parameter and state, shapes (members, m) and (members, n).
-    q_std
-        Standard deviations of q, or None if the law has none.
+    beliefs
+        Coefficients of parameter and state, and how well they are known.
     innovation, withheld_error
         As for `Estimate`, shapes (members, sensors) and (members, withheld).
     statuses
@@ -50,9 +49,7 @@ class FleetEstimate:
 
     t: float
     members: tuple[str, ...]
-    q: Array
-    u: Array
-    q_std: Array | None
+    beliefs: Beliefs
     innovation: Array
     withheld_error: Array
     statuses: tuple[Status, ...]
@@ -61,6 +58,21 @@ class FleetEstimate:
     held: Mapping[str, Array]
     space: FunctionSpace
     belief: Callable[[int], Belief]
+
+    @property
+    def q(self) -> Array:
+        """Coefficients of the parameter, shape (members, m)."""
+        return self.beliefs.q
+
+    @property
+    def u(self) -> Array:
+        """Coefficients of the state, shape (members, n)."""
+        return self.beliefs.u
+
+    @property
+    def q_std(self) -> Array | None:
+        """Standard deviations of q, or None if the law has none."""
+        return self.beliefs.q_std
 
     @property
     def ok(self) -> Mask:

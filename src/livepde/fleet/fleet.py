@@ -24,7 +24,7 @@ from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.fleet.separately import Separately
 from livepde.fleet.span import Span
 from livepde.fleet.together import Together
-from livepde.identifier import Identifier
+from livepde.identifier import MOST_SUBSTEPS, Identifier
 from livepde.laws import AnyLaw, Belief, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
@@ -213,6 +213,12 @@ class Fleet:
                 "sort the stream, and drop repeated samples."
             )
         values, held = self._filled(named)
+        longest = MOST_SUBSTEPS * self.problem.control.dt_max
+        if t - last > longest:
+            raise SampleError(
+                f"the sample at t = {t:g} is more than {longest:g} after t = {last:g}: check its "
+                "time, or take a longer dt_max."
+            )
         if self._state is None:
             self._begin(values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
@@ -252,16 +258,14 @@ class Fleet:
         held: dict[str, Array],
     ) -> FleetEstimate:
         state = self._state
-        q, u, std = self._engine.means(state)
+        beliefs = self._engine.beliefs(state)
         error = withheld
         if self.withheld is not None:
-            error = withheld - self._shown(self.withheld, u, q, span)
+            error = withheld - self._shown(self.withheld, beliefs.u, beliefs.q, span)
         return FleetEstimate(
             t=span.t1,
             members=self.members,
-            q=q,
-            u=u,
-            q_std=std,
+            beliefs=beliefs,
             innovation=measured - report.predicted,
             withheld_error=error,
             statuses=report.statuses,
@@ -280,6 +284,16 @@ class Fleet:
             return shown
         rows = [observed.predict(u[k], q[k], span.end(k)) for k in range(len(span))]
         return np.array(rows)
+
+    def identifier(self, member: str | int) -> Identifier:
+        """Return an identifier that goes on from where a member is, by name or number.
+
+        The fleet does not notice what becomes of it.
+        """
+        k = member if isinstance(member, int) else self.members.index(member)
+        state = None if self._state is None else self._engine.member(self._state, k)
+        t, z, inputs = float(self._t[k]), self._z[k].copy(), self._inputs[k]
+        return self._one.placed(state, t, z, inputs, self._samples)
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
         """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""

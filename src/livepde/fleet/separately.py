@@ -9,7 +9,7 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.fem import Moment
-from livepde.fleet.engine import FleetReport, reported
+from livepde.fleet.engine import Beliefs, FleetReport, reported
 from livepde.fleet.span import Span
 from livepde.laws import AnyLaw, Belief, Problem
 from livepde.linalg import Array
@@ -42,12 +42,15 @@ class Separately:
         belief: Belief = self.law.belief(self.work, state[k])
         return belief
 
-    def means(self, state: tuple[Any, ...]) -> tuple[Array, Array, Array | None]:
+    def beliefs(self, state: tuple[Any, ...]) -> Beliefs:
         beliefs = [self.problem.physical(self.believed(state, k)) for k in range(len(state))]
         stds = [belief.q_std for belief in beliefs]
         known = [std for std in stds if std is not None]
         q, u = (np.array([getattr(belief, name) for belief in beliefs]) for name in ("q", "u"))
-        return q, u, np.array(known) if known else None
+        return Beliefs(q, u, np.array(known) if known else None)
+
+    def member(self, state: tuple[Any, ...], k: int) -> Any:
+        return state[k]
 
     def leaves(self, state: tuple[Any, ...]) -> dict[str, Any]:
         return checkpoint.flatten(state)

@@ -11,7 +11,7 @@ import numpy as np
 
 from livepde.fem import Moment
 from livepde.fleet import innovations
-from livepde.fleet.engine import OK, FleetReport
+from livepde.fleet.engine import OK, Beliefs, Factors, FleetReport
 from livepde.fleet.span import Span
 from livepde.fleet.stack import Stack
 from livepde.fleet.stage import AffineStage, Moments
@@ -172,8 +172,8 @@ class Together:
         scales = Stack.of([state.scale for state in states])
         return TogetherState(now, Pasts.start(now, *sizes), scales)
 
-    def _member(self, state: TogetherState, k: int) -> SensitivityState:
-        """Return the state of one member as the law knows it."""
+    def member(self, state: TogetherState, k: int) -> SensitivityState:
+        """Return the state of a member as the law itself has it."""
         now, empty = state.now.member(k), self._template.samples
         return replace(
             self._template,
@@ -205,7 +205,7 @@ class Together:
         begun = {}
         initial = self.model.form_initial is not None
         for k in range(len(span)):
-            member = replace(self._member(state, k), initial=initial)
+            member = replace(self.member(state, k), initial=initial)
             begun[k] = self.law.begin(self.work, member, span.member(k))
         return self._put(state, begun)
 
@@ -213,7 +213,7 @@ class Together:
         new, report, able = self._ordinary(state, span, span.together)
         alone, reports = {}, {}
         for k in np.flatnonzero(~able).tolist():
-            member = self._member(state, k)
+            member = self.member(state, k)
             alone[k], reports[k] = self.law.step(self.work, member, span.member(k))
         return self._put(new, alone), report.with_members(reports)
 
@@ -431,16 +431,18 @@ class Together:
         return scales.changed({"low": new.low, "high": new.high, "first": new.first})
 
     def believed(self, state: TogetherState, k: int) -> Belief:
-        return self.law.belief(self.work, self._member(state, k))
+        return self.law.belief(self.work, self.member(state, k))
 
-    def means(self, state: TogetherState) -> tuple[Array, Array, Array | None]:
-        now, latent = state.now, self.model.latent
-        a = now["q"] + now["da"] @ self.work.Phi.T
+    def beliefs(self, state: TogetherState) -> Beliefs:
+        now, latent, Phi = state.now, self.model.latent, self.work.Phi
+        a = now["q"] + now["da"] @ Phi.T
         a = np.clip(a, *latent.bounds)
-        factor = self._tangent(a.T, self.work.Phi @ now["C"])
+        factor = self._tangent(a.T, Phi @ now["C"])
+        prior = self._tangent(a.T, np.broadcast_to(Phi, (len(a), *Phi.shape)))
         spread = innovations.inflation(_consistency(now))
         std = spread[:, None] * np.sqrt((factor**2).sum(axis=2))
-        return latent.value(a.T).T, now["u"] + now["du"], std
+        q = latent.value(a.T).T
+        return Beliefs(q, now["u"] + now["du"], std, Factors(factor, now["U"], prior, spread))
 
     def leaves(self, state: TogetherState) -> dict[str, Any]:
         pasts = state.pasts

@@ -156,18 +156,7 @@ class RunWriter:
         begun = (path / JOURNAL).is_file() or not (path / ESTIMATES).exists()
         if not (path / CASE).is_file() or not begun:
             raise RunError(f"{path} has no case and journal: it cannot be resumed.")
-        same = (path / CASE).read_text(encoding="utf-8") == case
-        if not same or run.settings != list(settings):
-            raise RunError(
-                f"{path} was run with another case or other settings: resume it with those, or "
-                "choose another folder."
-            )
-        named = _data_of(command)
-        if named != run.data_file:
-            raise RunError(
-                f"{path} was run with {_said(run.data_file)}, not with {_said(named)}: resume it "
-                "so, or choose another folder."
-            )
+        run.refuse_other(command, case, settings)
         resumed = [*run.record.get("resumed", []), {"at": _now(), "livepde": version}]
         record = run.record | {"status": "running", "resumed": resumed}
         writer = cls(path, {"command": _without_token(command)} | record)
@@ -311,6 +300,21 @@ class Run:
     def data_file(self) -> str | None:
         """What --data named when the run was made; None: the case's own, or standard input."""
         return _data_of(self.record.get("command", []))
+
+    def refuse_other(self, command: Sequence[str], case: str, settings: Sequence[str]) -> None:
+        """Raise `RunError` unless the run was made of this case, with these settings and data."""
+        same = (self.path / CASE).read_text(encoding="utf-8") == case
+        if not same or self.settings != list(settings):
+            raise RunError(
+                f"{self.path} was run with another case or other settings: resume it with those, "
+                "or choose another folder."
+            )
+        named = _data_of(command)
+        if named != self.data_file:
+            raise RunError(
+                f"{self.path} was run with {_said(self.data_file)}, not with {_said(named)}: "
+                "resume it so, or choose another folder."
+            )
 
     def arrivals(self) -> list[Table]:
         """Return the table of rows that were irregular, if any; of a run with a journal."""

@@ -20,11 +20,12 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
@@ -33,6 +34,9 @@ from filelock import FileLock, Timeout
 from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, Snapshot
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 __all__ = ["Event", "Journal", "Taken", "in_use", "log_of", "written"]
 
@@ -227,15 +231,33 @@ class Journal:
             Where its source stands after it, to go on from there.
         """
         row = np.array([values.get(name, np.nan) for name in self.channels])
+        self._enter(t, row, position)
+        self._write(self._db.commit)
+        return Taken(self._current, t, dict(zip(self.channels, row.tolist(), strict=True)))
+
+    def _enter(self, t: float, row: Array, position: str) -> None:
         cursor = self._execute(
             "INSERT INTO samples (t, channels, position) VALUES (?, ?, ?)",
             t,
             row.tobytes(),
             position,
         )
-        self._write(self._db.commit)
         self._current = int(cursor.lastrowid or 0)
-        return Taken(self._current, t, dict(zip(self.channels, row.tolist(), strict=True)))
+
+    def extend(self, rows: Iterable[tuple[Array, Record]], state: bytes) -> None:
+        """Keep samples with their estimates and the state after them: all of it, or nothing.
+
+        Parameters
+        ----------
+        rows
+            Values of the channels of each sample, and its estimate.
+        state
+            The identifier's.
+        """
+        for row, record in rows:
+            self._enter(record.t, row, "")
+            self.append(record)
+        self.checkpoint(state)  # commits
 
     def withdraw(self) -> None:
         """Forget the last sample, of which nothing could be made."""
@@ -506,14 +528,20 @@ def _unpacked(content: bytes) -> Snapshot:
 
 def _layout(text: str) -> Layout:
     """Return a layout from JSON, its types checked."""
+    return _reader_of_layouts().validate_json(text)
+
+
+@cache
+def _reader_of_layouts() -> TypeAdapter[Layout]:
     from pydantic import TypeAdapter
 
-    return TypeAdapter(Layout).validate_json(text)
+    return TypeAdapter(Layout)
 
 
 def _fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
     """Make the tables of a new journal."""
     with connection:
+        connection.execute("BEGIN")  # one commit for all
         for command in SCHEMA:
             connection.execute(command)
         connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())

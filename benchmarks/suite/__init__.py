@@ -1,0 +1,1 @@
+"""What asv follows from commit to commit: the numbers of `livepde bench`, ratios all of them."""

@@ -1,0 +1,92 @@
+"""Costs of steps, of memory, and of a fleet; `livepde bench` prints them with their bounds."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from typing import Any
+
+from livepde import GradientLaw, Identifier, ResidualDamping, SensitivityLaw
+from livepde.bench.fleet import fleet
+from livepde.bench.step import problem, step
+
+LAWS = ("gradient", "sensitivity")
+MODES = 10
+KIB = 1024  # bytes; what the system counts memory in
+
+
+class Step:
+    """A step of each law over a forward step of the same model: the dearest of its settings."""
+
+    params: Any = ((31, 1_000, 10_000), LAWS)
+    param_names = ("nodes", "law")
+    unit = "forward steps"
+
+    def setup_cache(self) -> dict[tuple[int, str], float]:
+        sizes, laws = self.params
+        found: dict[tuple[int, str], float] = {}
+        for size in sizes:
+            (table,) = step([size], [MODES]).tables
+            rows = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+            for law in laws:
+                ratios = [row["median"] for row in rows if row["law"].startswith(law)]
+                found[size, law] = max(ratios)
+        return found
+
+    def track_ratio(self, found: dict[tuple[int, str], float], nodes: int, law: str) -> float:
+        return found[nodes, law]
+
+
+class Memory:
+    """What an identification adds to a process that has imported livepde, per state unknown."""
+
+    params: Any = ((10_000,), LAWS)
+    param_names = ("nodes", "law")
+
+    def track_memory(self, nodes: int, law: str) -> float:
+        command = [sys.executable, __file__, str(nodes), law]
+        return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+
+    track_memory.unit = "kB per unknown"  # type: ignore[attr-defined]
+
+
+class Fleet:
+    """How many times cheaper a fleet of rods of 100 nodes is than separate identifiers."""
+
+    members, runs = 1000, 25
+    unit = "times"
+
+    def setup_cache(self) -> list[float]:
+        return [check.value for check in fleet(self.members, self.runs).checks]
+
+    def track_step(self, found: list[float]) -> float:
+        return found[0]
+
+    def track_command(self, found: list[float]) -> float:
+        return found[2]
+
+
+def _peak() -> float:
+    """Return the most memory that this process has had, in bytes."""
+    return KIB * float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
+def _spent(nodes: int, law: str) -> float:
+    """Return the kilobytes per state unknown that some steps have needed."""
+    before, given = _peak(), problem(nodes)
+    gradient = law == "gradient"
+    rule = GradientLaw(1e4, ResidualDamping(1.0)) if gradient else SensitivityLaw(MODES, 1e-3)
+    sensors = given.omega if gradient else given.points
+    matrix = sensors.matrix(given.model.state_space)
+    identifier = Identifier(given.model, sensors, rule, q0=0.0, u0=given.u0)
+    for k, (t, u) in enumerate(given.forward(given.q_true)):
+        if k:
+            identifier.step(t, matrix @ u)
+        if k == 5:
+            break
+    return (_peak() - before) / given.model.X.dim / 1000.0
+
+
+if __name__ == "__main__":
+    sys.stdout.write(f"{_spent(int(sys.argv[1]), sys.argv[2])}\n")

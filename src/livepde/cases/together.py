@@ -1,0 +1,210 @@
+"""Members of a fleet that differ in nothing but data and start: stepped as blocks.
+
+Each has a journal of its own, in which all stands that a separate run leaves there.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from livepde.cases.case import Case, Prepared
+from livepde.errors import DataError, LivepdeError, RunError
+from livepde.fleet import Fleet, Kept
+from livepde.identifier import Identifier
+from livepde.result import Result, layout_of
+from livepde.runs import Driven, Journal, stopped_by_signals
+from livepde.runs.journal import Event
+from livepde.streams import Table
+
+__all__ = ["Block", "blocks"]
+
+WAITING = 2**23  # numbers that wait to be written
+ALONE = "no other one has their settings and sample times"
+# Members may differ in how a channel is read, and in what is said about a run.
+READ = {"column", "columns", "unit", "valid", "missing", "wait", "repeated"}
+TOLD = {"title", "initial", "data", "intake", "reference", "expect", "variants"}
+
+
+def blocks(members: Mapping[str, Prepared]) -> tuple[list[Block], dict[str, str]]:
+    """Return members that can be stepped together, and of all others why they cannot.
+
+    Together go those whose cases differ in nothing but data, initial state and what is said about
+    them, and whose samples have the same times; if `Fleet` has blocks for them.
+
+    Parameters
+    ----------
+    members
+        Name -> case with its data.
+    """
+    alike: dict[tuple[str, float, bytes], dict[str, Prepared]] = {}
+    settings: dict[Case, str] = {}
+    apart: dict[str, str] = {}
+    for name, one in members.items():
+        if not isinstance(one.stream, Table):
+            apart[name] = "their samples come one at a time"
+            continue
+        if one.case not in settings:
+            settings[one.case] = _settings(one.case)
+        key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
+        alike.setdefault(key, {})[name] = one
+    found = []
+    for group in alike.values():
+        why = {name: reason for name, one in group.items() if (reason := _refuses(one))}
+        apart |= why
+        rest = {name: one for name, one in group.items() if name not in why}
+        if len(rest) < 2:
+            apart |= dict.fromkeys(rest, ALONE)
+            continue
+        block = Block(rest)
+        if block.fleet.together:
+            found.append(block)
+        else:
+            apart |= dict.fromkeys(rest, block.fleet.note)
+    return found, apart
+
+
+def _settings(case: Case) -> str:
+    """Return what members have in common if they step together, as text."""
+    unread = {"channels": {"__all__": READ}}
+    return case.frame.spec.model_dump_json(exclude={**dict.fromkeys(TOLD, True), **unread})
+
+
+def _refuses(one: Prepared) -> str:
+    """Return why a member cannot begin as others do; its own run tells the user."""
+    try:
+        _ = one.u0
+    except LivepdeError:
+        return "they cannot begin with their first sample"
+    values = dict(one.first.z) if isinstance(one.first.z, Mapping) else {}
+    missing = [
+        name for name in one.case.model.channels if not np.isfinite(values.get(name, np.nan))
+    ]
+    return "an input has no value in their first sample" if missing else ""
+
+
+class Block:
+    """Members that are stepped together.
+
+    Parameters
+    ----------
+    members
+        Name -> case with its data, at least one; of one model, with tables of the same times.
+    """
+
+    def __init__(self, members: Mapping[str, Prepared]) -> None:
+        self.members = dict(members)
+        self._each = list(self.members.values())
+        self._tables = [one.stream for one in self._each if isinstance(one.stream, Table)]
+        one = self._each[0]
+        case = one.case
+        self.fleet = Fleet(
+            case.model,
+            case.observation,
+            case.law,
+            list(self.members),
+            u0=[member.u0 for member in self._each],
+            t0=float(one.first.t),
+            withheld=case.withheld,
+            scheme=case.scheme,
+            dt_max=case.dt_max,
+            assimilate_from=one.assimilate_from,
+        )
+        self.status = "finished"
+        self.error: DataError | None = None
+        self._paths: list[Path] = []
+        self._kept = Kept(case.model, case.fields_every)
+        self._events: list[list[Event]] = [[] for _ in self._each]
+        self._taken = self._written = 0  # samples
+
+    def run(self, paths: Sequence[Path]) -> None:
+        """Take all samples; what was reached is kept also if it ends early.
+
+        Parameters
+        ----------
+        paths
+            Of new journals, one for each member. They grow from time to time; `ended` has the rest.
+
+        Raises
+        ------
+        RunError
+            A journal cannot be written.
+        """
+        self._paths = list(paths)
+        table, stopping = self._tables[0], threading.Event()
+        with stopped_by_signals(stopping, lambda: True):
+            for t in table.t.tolist():
+                if stopping.is_set():
+                    self.status = "interrupted"
+                    break
+                try:
+                    self._step(t)
+                except DataError as error:
+                    self.status, self.error = "failed", error
+                    break
+                if self._kept.size > WAITING:
+                    self._write_all()
+
+    def _step(self, t: float) -> None:
+        rows = np.array([table.values[self._taken] for table in self._tables])
+        estimate = self.fleet.step(t, dict(zip(self._tables[0].names, rows.T, strict=True)))
+        self._kept.add(estimate)
+        self._taken += 1
+        for k in np.flatnonzero(~estimate.ok).tolist():
+            status = estimate.statuses[k]
+            event = Event(float(self.fleet.t[k]), status.code, "", str(status))
+            self._events[k].append(event)
+
+    def _write_all(self) -> None:
+        for k in range(len(self._each)):
+            identifier = self.fleet.identifier(k)
+            with self._journal(k, identifier) as journal:
+                self._write(k, journal, identifier)
+        self._kept.clear()
+        self._written = self._taken
+
+    def _journal(self, k: int, identifier: Identifier) -> Journal:
+        """Return the journal of a member: all of them at once would be too many open files."""
+        path, one = self._paths[k], self._each[k]
+        if self._written:
+            return Journal.open(path, write=True)
+        layout = layout_of(identifier.model, identifier.observed, identifier.withheld)
+        journal = Journal.create(path, identifier.channels, one.described(layout))
+        for (kind, channel), number in self._tables[k].remarks.items():
+            journal.count(kind, channel, number)
+        return journal
+
+    def _write(self, k: int, journal: Journal, identifier: Identifier) -> None:
+        """Add what waits to the journal of a member."""
+        if journal.accepted != self._written:
+            raise RunError(f"{journal.path.parent} is being written by another process: stop it.")
+        table = self._tables[k]
+        columns = [table.names.index(name) for name in journal.channels]
+        rows = table.values[self._written : self._taken, columns]
+        for event in self._events[k]:
+            journal.note(event)
+        self._events[k].clear()
+        journal.extend(zip(rows, self._kept.records(k), strict=True), identifier.dump())
+
+    @contextmanager
+    def ended(self, k: int) -> Iterator[tuple[Identifier, Driven]]:
+        """Complete the journal of a member; yield its identifier and run while it is open."""
+        fleet, identifier = self.fleet, self.fleet.identifier(k)
+        with self._journal(k, identifier) as journal:
+            self._write(k, journal, identifier)
+            result = Result(
+                fleet.model,
+                fleet.observed,
+                fleet.withheld,
+                self._kept.fields_every,
+                journal,
+                layout=journal.layout,
+                count=journal.estimated,
+            )
+            if self._taken:
+                journal.keep(result.snapshot(identifier.estimate()))
+            yield identifier, Driven(result, journal, self.status, self.error)
