@@ -283,7 +283,7 @@ class ScalarBlock(Block):
         masks = np.zeros((self.size, *measure.shape))
         if isinstance(self.unknown, Scalar):
             return masks + 1.0
-        for mask, (name, region) in zip(masks, self.unknown.regions.items(), strict=True):
+        for mask, region in zip(masks, self.unknown.regions.values(), strict=True):
             if callable(region):
                 mask[:] = region(measure.points)
             else:

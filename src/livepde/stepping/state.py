@@ -150,7 +150,9 @@ class ForwardStage:
     def _slope(self) -> sp.csr_array | None:
         """Map from q to the data of d(A q)/du, where it is one."""
         tensor = self.model.form_A.tensor("v", "u")
-        return None if tensor is None else sp.csr_array(self._rows[1]["A"] @ tensor)
+        if not isinstance(tensor, sp.csr_array):  # none, or one of a large mesh
+            return None
+        return sp.csr_array(self._rows[1]["A"] @ tensor)
 
     def jacobian(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised S = M/h + B'(u) + d(A(u) q)/du on the free coefficients."""
