@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -126,7 +127,7 @@ class Newton:
     """
 
     tolerance: float = 1e-7
-    share: float = 0.01
+    share: float = 0.05
     iterations: int = 60
     refresh: float = 0.2
     basin: float = 3e-2
@@ -135,7 +136,7 @@ class Newton:
     def solve(
         self,
         equation: StageEquation,
-        y: Array,
+        y: Array | Callable[[], Array],
         parts: Parts | None = None,
         *,
         lagged: bool = False,
@@ -148,6 +149,8 @@ class Newton:
 
         Parameters
         ----------
+        y
+            The start, or a function that returns it: with `near` it may not be needed.
         parts
             What of y is measured separately; by default nothing.
         lagged
@@ -168,9 +171,8 @@ class Newton:
         StepFailed
             "not_converged", "not_finite" or "singular".
         """
-        factor = kept
-        begin = start = y
-        y = start if near is None else near
+        factor, given = kept, y
+        y = begin = start = _evaluated(given) if near is None else near
         parts = parts or Parts.whole(len(y))
         last, basin, sweeps = math.inf, self.basin, lagged and near is None
         limit, stalled = math.inf if near is None else self.basin, 0
@@ -210,7 +212,10 @@ class Newton:
                 and (size >= limit or (slow and near is not None and kept is None))
             ):
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
-                basin = 0.3 * basin if near is None else basin
+                if near is None:
+                    basin *= 0.3
+                else:
+                    begin = start = _evaluated(given)
                 y, factor, sweeps, near, last = begin, None, True, None, math.inf
                 limit, stalled = math.inf, 0
                 miss, missed = [0.0] * len(miss), math.nan
@@ -238,6 +243,10 @@ class Newton:
                 f"{self.iterations} iterations left a relative update of {size:.1e}",
             )
         return Solution(new, count, missed, seen)
+
+
+def _evaluated(start: Array | Callable[[], Array]) -> Array:
+    return start() if callable(start) else start
 
 
 def _largest(squares: list[float], scales: list[float]) -> float:
