@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,7 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.damping import Damping, Residual
-from livepde.laws.schur import LARGE, Blocks, BlockSolver
+from livepde.laws.schur import LARGE, Approximate, BlockSolver, Jacobian, narrow
 from livepde.linalg import (
     Array,
     Assembler,
@@ -30,11 +30,13 @@ from livepde.stepping import Newton, Parts, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
+SHARE = 0.5  # at least this of what its start missed may be left of a stage by blocks
+
 GROWN = 2.0  # times as large a first update as when the rate of a factor was seen: see again
 
 PULL = 10.0  # theta h where the law tunes itself: r forgets within a step
 
-__all__ = ["PULL", "CoupledStage", "Gains", "Kept", "Metric", "Warm"]
+__all__ = ["PULL", "BlockEquation", "CoupledStage", "Gains", "Kept", "Metric", "Warm"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,14 +238,9 @@ class CoupledStage:
     @cached_property
     def by_blocks(self) -> BlockSolver | None:
         """What solves a large system by blocks; None: the coupled matrix is factorised."""
-        if self.size < LARGE or isinstance(self.solver, BandedSolver):
+        if self.size < LARGE or narrow(sp.csr_array(self.model.mass + self.RMR)):
             return None
-        free = sp.diags_array(self.model.X.free)
-        mass = sp.csr_array(free @ self.model.mass @ free)
-        constant = (self.W @ free).count_nonzero() == 0  # S is M/h + theta R^T M_op R
-        plain = not self.auxiliary and not self.model.latent.generator.nnz and self.linear
-        symmetric = (constant and _is_symmetric(mass) and _is_symmetric(self.RMR), plain)
-        return BlockSolver(self.solver.pattern, self.n, self.split.R, mass, symmetric)
+        return BlockSolver(self)
 
     @property
     def maps(self) -> dict[str, sp.csr_array]:
@@ -288,6 +285,8 @@ class CoupledStage:
     def _bilinear(self) -> _Bilinear | None:
         form = self.model.form_A
         if self.model.latent.generator.nnz:
+            return None
+        if self.by_blocks is not None:
             return None
         vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
         if self.auxiliary or not self.constant_B:
@@ -352,12 +351,16 @@ class CoupledStage:
         equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
         good, follows = warm.missed <= self.newton.basin, warm.h == h
+        newton, blocks = self.newton, self.by_blocks
+        if blocks is not None:
+            blocks.begin(self._block(blocks, warm.kept, moment) if len(warm.kept.y) else None)
+            newton = replace(newton, share=max(newton.share, SHARE) if newton.share else 0.0)
         used, factor, age = None, None, 1
         if good:
-            used = near + (warm.trend @ self.members) * warm.miss if follows else near
+            used = near + self._spread(warm.trend) * warm.miss if follows else near
             if warm.kept.h == h:
                 factor, age = self._factor(warm.kept, moment), warm.kept.age + 1
-        solved = self.newton.solve(
+        solved = newton.solve(
             equation,
             begin,
             self.parts,
@@ -380,42 +383,42 @@ class CoupledStage:
 
     def _keep(self, kept: Kept, equation: _Equation, solved: Solution, age: int) -> Kept:
         """Return what becomes of the factor after a stage."""
-        ageing, seen = kept.ageing, kept.seen
+        ageing, seen, blocks = kept.ageing, kept.seen, self.by_blocks
+        if blocks is not None and blocks.made is not None:
+            return Kept(blocks.made.at, equation.u_alpha, equation.h, 0, 0, ageing, seen)
         if equation.made is not None:
             self._made = equation.made
             return Kept(equation.made[0], equation.u_alpha, equation.h, 0, 0, ageing, seen)
         if not math.isnan(solved.rate):
             ageing, seen = solved.rate / age, solved.missed
-        spent = kept.spent + solved.updates - 1
+        spent = kept.spent + solved.updates - 1 + (sum(blocks.iterations) if blocks else 0)
         if spent > self.patience:
             return Kept.none(ageing, seen)
         return Kept(kept.y, kept.u_alpha, kept.h, age, spent, ageing, seen)
 
     def _trend(self, miss: Array, before: Array) -> Array:
         """Return by how much two misses that follow each other agree, shape (3,)."""
-        weights = self.parts.weights
-        state, observed, q = ((miss * before) @ weights).tolist()
-        state0, observed0, q0 = ((before * before) @ weights).tolist()
+        state, observed, q = self.parts.products(miss, before)
+        state0, observed0, q0 = self.parts.products(before, before)
         pairs = (state - observed, state0 - observed0), (observed, observed0), (q, q0)
         return np.array([min(max(a / b, -1.0), 1.0) if b > 0.0 else 0.0 for a, b in pairs])
 
-    @cached_property
-    def members(self) -> Array:
-        """How much each coefficient belongs to P u, R u and q, shape (3, n + m)."""
-        members = np.zeros((3, self.size))
-        members[1, : self.n] = self.split.R.diagonal()
-        members[0, : self.n] = 1.0 - members[1, : self.n]
-        members[2, self.n :] = 1.0
-        return members
+    def _spread(self, trend: Array) -> Array:
+        """Return the number of its part for each coefficient: of P u, R u and q."""
+        observed = self.split.R.diagonal()
+        state = trend[0] + (trend[1] - trend[0]) * observed
+        return np.concatenate([state, np.full(self.size - self.n, trend[2])])
 
     @cached_property
     def parts(self) -> Parts:
         """The state and what is observed of it, in L2 with lumped mass, and the parameter."""
         mass = self.model.state_mass.diagonal()
-        weights = np.zeros((self.size, 3))
-        weights[: self.n, 0], weights[: self.n, 1] = mass, mass * self.members[1, : self.n]
-        weights[self.n :, 2] = 1.0
+        state = np.stack([mass, mass * self.split.R.diagonal()], axis=1)
         floor = RESOLVED * float(np.linalg.norm(self.model.latent.deviations))
+        if self.by_blocks is not None:
+            return _Lean(state, (0.0, floor))
+        weights = np.zeros((self.size, 3))
+        weights[: self.n, :2], weights[self.n :, 2] = state, 1.0
         return Parts(weights, (0.0, 0.0, floor))
 
     def _size(self, change: Array, y: Array) -> float:
@@ -424,6 +427,8 @@ class CoupledStage:
         return max(math.sqrt(square / scale) for square, scale in pairs)
 
     def _equation(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> _Equation:
+        if self.by_blocks is not None:
+            return BlockEquation(self.by_blocks, c, h, moment, u_alpha)
         if self._bilinear is not None:
             return _BilinearEquation(self._bilinear, self, c, h, moment, u_alpha)
         return _Equation(self, c, h, moment, u_alpha)
@@ -431,20 +436,54 @@ class CoupledStage:
     @cached_property
     def keeps(self) -> bool:
         """True if a factor is kept from stage to stage."""
-        return self._bilinear is not None and self.by_blocks is None
+        return self._bilinear is not None if self.by_blocks is None else self.model.constant
 
     @cached_property
     def patience(self) -> int:
         """Updates beyond one for each stage that a factor may cost before it is made again."""
+        if self.by_blocks is not None:
+            return self.by_blocks.patience
         return 3 if isinstance(self.solver, BandedSolver) else 12
 
     def _factor(self, kept: Kept, moment: Moment) -> Factor:
         """Return the factor that is kept, made again if this stage has another."""
+        if self.by_blocks is not None:
+            return self._block(self.by_blocks, kept, moment)
         if self._made is None or self._made[0] is not kept.y:
             equation = self._equation(np.zeros_like(kept.y), kept.h, moment, kept.u_alpha)
             equation.residual(kept.y)
             self._made = (kept.y, equation.factor(kept.y, False))
         return self._made[1]
+
+    def _block(self, blocks: BlockSolver, kept: Kept, moment: Moment) -> Approximate:
+        """Return the same of a stage by blocks."""
+        if blocks.last is None or blocks.last.at is not kept.y:
+            equation = BlockEquation(blocks, np.zeros_like(kept.y), kept.h, moment, kept.u_alpha)
+            equation.residual(kept.y)
+            blocks.last = equation.jacobian(kept.y, False).approximate()
+        return blocks.last
+
+
+@dataclass(frozen=True, eq=False)
+class _Lean(Parts):
+    """The state and the parameter, without an array for each part; weights of shape (n, 2).
+
+    What may be left is a share of the larger of the relative misses, in both parts: q is not known
+    better than the time step lets u be known.
+    """
+
+    def squares(self, x: Array) -> list[float]:
+        state, _, q = self.products(x, x)
+        return [state, q]
+
+    def products(self, x: Array, y: Array) -> list[float]:
+        n = len(self.weights)
+        state, observed = ((x[:n] * y[:n]) @ self.weights).tolist()
+        return [state, observed, float(x[n:] @ y[n:])]
+
+    def allowed(self, share: float, missed: list[float], scales: list[float]) -> list[float]:
+        worst = max(square / scale for square, scale in zip(missed, scales, strict=True))
+        return [share**2 * worst * scale for scale in scales]
 
 
 class _Equation:
@@ -475,9 +514,9 @@ class _Equation:
         self.r = r = stage.split.R @ u - self.u_alpha
         self.w = w = u if g.at_estimate else u - r  # u_alpha + P u, since P = I - R
         self.Mr, self.mass_r = stage.RM @ r, stage.RT @ (model.mass @ r)
-        A = model.form_A.matrix("v", "q", self.moment, u=w, q=q)
+        self.A = A = model.form_A.matrix("v", "q", self.moment, u=w, q=q)
         C = A @ q if stage.linear else model.form_A.vector("v", self.moment, u=w, q=q)
-        flux = model.B(w, self.moment) + C + g.nu * (stage.PNP @ u) - self.source
+        flux = model.B(w, self.moment) + C + (g.nu and g.nu * (stage.PNP @ u)) - self.source
         rate = (u - self.c[:n]) / self.h
         drive = (q - self.c[n:]) / (g.gain * self.h) + (g.sigma / g.gain) * q
         if model.latent.generator.nnz:
@@ -537,18 +576,13 @@ class _Equation:
         if metric is not None:
             data += stage.maps["G"] @ ((metric.spread / PULL) * stage.gram_data)
             data += stage.maps["J"] @ (metric.data / PULL)
-        large = stage.by_blocks
-        factor: Factor = (
-            large.factorise(data, self.h, self.theta) if large else stage.solver.factorise(data)
-        )
+        factor: Factor = stage.solver.factorise(data)
         if stage.auxiliary:
             factor = Leading(factor, stage.size, stage.size + stage.auxiliary)
         if sweep or metric is not None:
             return factor
         row = stage.slope(self.norms, self.Mr, self.mass_r)
-        if isinstance(factor, Blocks) and row.any():
-            factor = factor.bordered(self.Mr, row)
-        elif row.any():
+        if row.any():
             column = np.zeros_like(y)
             column[: stage.n] = self.Mr
             factor = _Bordered(factor, factor.solve(column), row)
@@ -646,6 +680,39 @@ class _BilinearEquation(_Equation):
         return data
 
 
+class BlockEquation(_Equation):
+    """The same equation, its Jacobian by blocks."""
+
+    def __init__(
+        self, blocks: BlockSolver, c: Array, h: float, moment: Moment, u_alpha: Array
+    ) -> None:
+        super().__init__(blocks.stage, c, h, moment, u_alpha)
+        self.blocks = blocks
+
+    def weights(self) -> tuple[float, sp.csr_array | None]:
+        """Return what multiplies G_Q in the Jacobian, and what is added to it."""
+        g, metric = self.stage.gains, self.metric
+        if metric is None:
+            return (1.0 / self.h + g.sigma) / g.gain, None
+        return metric.spread / PULL, sp.csr_array(metric.information / PULL)
+
+    def residual(self, y: Array) -> Array:
+        out = super().residual(y)
+        self.blocks.A = self.A
+        return out
+
+    def factor(self, y: Array, sweep: bool) -> Factor:
+        return self.jacobian(y, sweep)
+
+    def jacobian(self, y: Array, sweep: bool) -> Jacobian:
+        """Return the Jacobian at the y of the last `residual`."""
+        K = self.blocks.linearise(self, y, sweep)
+        if sweep or self.metric is not None:
+            return K
+        row = self.stage.slope(self.norms, self.Mr, self.mass_r)
+        return K.bordered(self.Mr, row) if row.any() else K
+
+
 @dataclass(frozen=True, eq=False)
 class _Bordered:
     """K + b a^T by Sherman and Morrison, from the factor of K: theta depends on all of r."""
@@ -669,7 +736,3 @@ def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
     coo = sp.coo_array(matrix)
     data: Array = (pattern or Pattern.of(matrix)).gather(coo.row, coo.col) @ coo.data
     return data
-
-
-def _is_symmetric(matrix: sp.csr_array) -> bool:
-    return bool(abs(matrix - matrix.T).max() <= 1e-12 * abs(matrix).max())

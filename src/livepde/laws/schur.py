@@ -1,35 +1,52 @@
-"""Large coupled stages: GMRES, preconditioned by factors of the state block and of a Schur block.
+"""Large coupled stages by blocks: factors of the state block and of a sparse Schur block.
 
 The Jacobian of a stage of `livepde.laws.coupled` is
 
-    K = [[S, A], [-A^T R - ..., G]],    G = G_Q/(gain h) + ...
+    K = [[S, A], [-A^T R - ..., G]],    G = G_Q/(gain h) + ...,
 
-and its Schur complement G + (A^T R + ...) S^{-1} A is dense. With D, the lumped mass over h, in the
-place of S it is sparse,
+and no matrix of all of it is ever formed: its blocks have the patterns of the forms. The Schur
+complement G + A^T R S^{-1} A is dense. With D, the lumped mass times 1/h + theta, in the place of S
+it is sparse,
 
     C = G + A^T R D^{-1} R^T A,
 
-and [[S, 0], [-A^T R - ..., C]] is the preconditioner: a solve with a factor of S and one with that
-of C. D^{-1} is the better in the place of S^{-1} the smoother what it is applied to and the shorter
-h; the larger the gain, the more this counts.
+and an approximate solution with K is one solve with S and one with C,
 
-The factors are kept while that pays (`livepde.linalg.Costs`). That changes how many iterations it
-takes, not to which tolerance.
+    u = S^{-1} b_u,    q = C^{-1} (b_q + A^T R u),    u - R D^{-1} R^T A q.
+
+D^{-1} is the better in the place of S^{-1} the smoother what it is applied to and the shorter h;
+the larger the gain, the more this counts. Of a field q that A does not differentiate, C has the
+pattern of G_Q: what A^T R D^{-1} R^T A has beyond it goes to the diagonal, and so does what
+A^T R S^{-1} A does to constants beyond that, as where q beside the observed part changes the flux
+into it. Smooth functions hardly miss the difference.
+
+Where sensors see coefficients, R selects some of them, and only the others take part in B(w) and
+A(w) q:
+
+    S = [[S_uu, M_uo/h], [S_ou, S_oo]]        u: not observed, o: observed
+
+is not symmetric, but S_uu and S_oo are, if B and A(.) q are. Without M_uo/h, S is solved by a
+factor of each of the two, as cheaply as the matrix of the forward model. What is left then is large
+only where the two meet: in a strip of a few nodes S u + A q = b_u is solved once more (`_Seam`).
+
+That serves Newton as a kept factor (`Approximate`): an update takes off all but 1e-2 to 1e-3 of the
+error. Where it takes off too little, GMRES solves with K itself (`Jacobian`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
+from livepde.fem import Field
 from livepde.linalg import (
     Array,
-    Costs,
+    BandedSolver,
     Factor,
     IntArray,
     Pattern,
@@ -39,199 +56,398 @@ from livepde.linalg import (
     gmres,
 )
 
-__all__ = ["LARGE", "BlockSolver", "Blocks"]
+if TYPE_CHECKING:
+    from livepde.laws.coupled import BlockEquation, CoupledStage
+
+__all__ = ["LARGE", "Approximate", "BlockSolver", "Jacobian", "narrow"]
 
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-2  # of u and of q, relative to their first approximation: Newton goes on from there
-ITERATIONS = 60  # each keeps a vector; with factors that need more, new ones are cheaper
+ITERATIONS = 60  # each keeps a vector
+PATIENCE = 12  # iterations of GMRES beyond which factors of another point are made again
+SPENT = 24  # updates and iterations: about what new factors cost
+ROUNDING = 1e-12  # asymmetry of a symmetric matrix, relative to its largest entry
+ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
+LAYERS = 8  # neighbours on either side of where observed coefficients meet others
 REMEDY = "take a smaller gain or a smaller time step."
+
+
+def narrow(matrix: sp.csr_array) -> bool:
+    """Return true if a matrix of this pattern is solved as a banded one."""
+    return isinstance(analyse(Pattern.of(matrix)), BandedSolver)
 
 
 class BlockSolver:
     """Solves the coupled systems of a stage by blocks.
 
-    Parameters
-    ----------
-    pattern
-        Of the coupled matrix.
-    n
-        Number of coefficients of u, the leading unknowns.
-    R
-        Projection on the observed part of the state, shape (n, n).
-    mass
-        Mass matrix on the free coefficients, shape (n, n).
-    symmetric
-        Which of S and C are symmetric positive definite.
-
     Attributes
     ----------
-    iterations
-        Of each solve with the factors at hand.
-    costs
-        Of these factors.
     tolerance
-        To which systems are solved.
-    cycles
-        C is not factorised where a cycle of multigrid is cheaper; false after one was not enough.
+        To which systems are solved by GMRES.
+    iterations
+        Of those of a stage.
+    A
+        A(w) at the last residual.
+    made, last
+        Factors made in a stage, and those of this stage or an earlier one.
     """
 
-    def __init__(
-        self,
-        pattern: Pattern,
-        n: int,
-        R: sp.csr_array,
-        mass: sp.csr_array,
-        symmetric: tuple[bool, bool],
-    ) -> None:
-        self.pattern = pattern
-        self.n = n
-        self.R = R
-        self.observed = R.diagonal()
-        self.symmetric = symmetric
-        lumped = np.asarray(abs(mass).sum(axis=1)).ravel()
-        self.lumped = np.where(lumped > 0.0, lumped, 1.0)  # fixed coefficients have no mass
-        self.iterations: list[int] = []
-        self._factors: tuple[Factor, Factor] | None = None
-        self.costs = Costs(0.0, ITERATIONS)
+    def __init__(self, stage: CoupledStage) -> None:
+        self.stage = stage
         self.tolerance = TOLERANCE
-        self.cycles = True
-        self._schur: Solver | None = None
-
-    @cached_property
-    def _blocks(self) -> dict[str, tuple[IntArray, Pattern]]:
-        """Which data of the whole are those of a block, and its pattern."""
-        n, size = self.n, self.pattern.shape[0]
-        rows, cols = self.pattern.rows, self.pattern.indices
-        parts = {"u": (rows < n, cols < n, 0, n), "q": (rows >= n, cols >= n, n, size - n)}
-        blocks: dict[str, tuple[IntArray, Pattern]] = {}
-        for i, (mine, _, row, height) in parts.items():
-            for j, (_, theirs, col, width) in parts.items():
-                at = np.flatnonzero(mine & theirs)
-                inner = Pattern.from_entries(rows[at] - row, cols[at] - col, (height, width))
-                blocks[i + j] = (at, inner)
-        return blocks
-
-    def block(self, data: Array, name: str) -> sp.csr_array:
-        """Return the block "uu", "uq", "qu" or "qq" of the matrix with these data."""
-        at, pattern = self._blocks[name]
-        return pattern.matrix(data[at])
-
-    @cached_property
-    def _state(self) -> Solver:
-        return analyse(self._blocks["uu"][1], symmetric=self.symmetric[0])
-
-    def factorise(self, data: Array, h: float, theta: float) -> Blocks:
-        """Return what solves with the coupled matrix.
-
-        Parameters
-        ----------
-        data
-            In the order of `pattern`.
-        h, theta
-            The state follows its equation at about the rate 1/h, and theta more where observed.
-        """
-        if not np.isfinite(data).all():
-            raise LinearAlgebraError("The matrix holds values that are not finite.")
-        return Blocks(self, data, 1.0 / h + theta * self.observed)
-
-    def factors(self, data: Array, rate: Array, renew: bool) -> tuple[Factor, Factor]:
-        """Return the factors of S and C: the kept ones, or new ones where they are due."""
-        if self._factors is None or renew or self.costs.due:
-            start = perf_counter()
-            S = self._state.factorise(data[self._blocks["uu"][0]])
-            A = sp.csr_array(self.R.T @ self.block(data, "uq"))
-            D = sp.diags_array(1.0 / (self.lumped * rate))
-            C = sp.csr_array(self.block(data, "qq") + A.T @ D @ A)
-            C.sort_indices()
-            self._factors = S, self._engine(Pattern.of(C)).factorise(C.data)
-            self.costs, self.iterations = Costs(perf_counter() - start, ITERATIONS), []
-        return self._factors
-
-    def _engine(self, pattern: Pattern) -> Solver:
-        """Return the engine of C; its pattern may change, since sums drop what is zero."""
-        last = self._schur
-        if last is None or not (
-            np.array_equal(last.pattern.indptr, pattern.indptr)
-            and np.array_equal(last.pattern.indices, pattern.indices)
-        ):
-            last = analyse(pattern, symmetric=self.symmetric[1], approximate=self.cycles)
-        self._schur = last
-        return last
+        self.iterations: list[int] = []
+        self._solvers: dict[str, tuple[Solver, bool]] = {}
+        self.made: Approximate | None = None
+        self.last: Approximate | None = None
+        self.A = sp.csr_array((stage.n, stage.model.Q.dim))
 
     @property
-    def engines(self) -> tuple[str, str]:
-        """Names of the engines of S and C; the latter is known once it was needed."""
-        return self._state.name, "" if self._schur is None else self._schur.name
+    def patience(self) -> int:
+        """Updates and iterations, beyond one update for each stage, that renew the factors."""
+        return SPENT
 
-    def without_cycles(self) -> None:
-        """Factorise C from now on."""
-        self.cycles, self._schur = False, None
+    def begin(self, kept: Approximate | None) -> None:
+        """Begin a stage with the factors of an earlier one."""
+        self.last, self.made, self.iterations = kept, None, []
 
-    def account(self, iterations: int, seconds: float) -> None:
-        """Take note of a solve."""
-        self.iterations.append(iterations)
-        self.costs.add(iterations, seconds)
+    def current(self, K: Jacobian, renew: bool = False) -> Approximate:
+        """Return the factors of this stage, by default those at hand; else those of K."""
+        if self.last is None or renew:
+            self.made = self.last = K.approximate()
+        return self.last
+
+    @cached_property
+    def lumped(self) -> Array:
+        """Lumped mass on the free coefficients, one on the fixed ones, shape (n,)."""
+        free = self.stage.model.X.free
+        rows = np.asarray(abs(masked(self.stage.model.mass, free, free)).sum(axis=1)).ravel()
+        return np.where(rows > 0.0, rows, 1.0)
+
+    @cached_property
+    def parts(self) -> tuple[IntArray, IntArray] | None:
+        """Coefficients that are not observed, and those that are; None: S is solved as a whole."""
+        R, W = self.stage.split.R, self.stage.W
+        observed, free = R.diagonal(), self.stage.model.X.free
+        selects = R.nnz == np.count_nonzero(observed) and bool(np.isin(observed, (0, 1)).all())
+        if not selects or not masked(W, np.ones(len(free)), free).data.any():
+            return None
+        return np.flatnonzero(observed == 0.0), np.flatnonzero(observed)
+
+    def linearise(self, equation: BlockEquation, y: Array, sweep: bool) -> Jacobian:
+        """Return K at the y of the last residual; in a sweep without what r adds to it."""
+        stage, form = self.stage, self.stage.model.form_A
+        model, g, n, h = stage.model, stage.gains, stage.n, equation.h
+        w, r, q, at = equation.w, equation.r, y[n:], equation.moment
+        free, free_q = model.X.free, stage.free_q
+        flux = model.form_B.matrix("v", "u", at, u=w) + form.matrix("v", "u", at, u=w, q=q)
+        S = masked(sp.csr_array(model.mass / h), free, free) + masked(
+            _product(flux, stage.W), free, free
+        )
+        if equation.theta:
+            S = S + equation.theta * stage.RMR
+        if g.nu:
+            S = S + masked(g.nu * stage.PNP, free, free)
+        S = sp.csr_array(S + sp.diags_array(1.0 - free))
+        A = masked(form.matrix("v", "q", at, u=w, q=q), free, free_q)
+        back, curved = None, None
+        if not sweep:
+            back = masked(form.matrix("q", "u", at, u=w, v=r, q=q), free_q, np.ones(n))
+            if not stage.linear:
+                curved = masked(form.matrix("q", "q", at, u=w, v=r, q=q), free_q, free_q)
+        rate = 1.0 / h + equation.theta * np.abs(stage.split.R.diagonal())
+        return Jacobian(self, y, S, A, self._metric(equation), self.lumped * rate, back, curved)
+
+    def _metric(self, equation: BlockEquation) -> sp.csr_array:
+        """Return G on the free coefficients, with its auxiliary unknowns."""
+        stage, g = self.stage, self.stage.gains
+        model, rest = stage.model, np.zeros(self.stage.auxiliary)
+        free = np.concatenate([stage.free_q, 1.0 - rest])
+        scale, information = equation.weights()
+        G = stage.gram * scale
+        if model.latent.generator.nnz:
+            K = sp.block_diag([model.latent.generator, sp.csr_array((len(rest), len(rest)))])
+            G = G - stage.gram @ (sp.csr_array(K) / g.gain)
+        if information is not None:
+            G = G + _widened(information, len(rest))
+        return sp.csr_array(masked(sp.csr_array(G), free, free) + sp.diags_array(1.0 - free))
+
+    def approximate(self, K: Jacobian) -> Approximate:
+        """Factorise S and C."""
+        stage, state = self.stage, self._state(K.S)
+        seen = sp.csr_array(stage.split.R.T @ K.A)
+        product = sp.csr_array(seen.T @ sp.diags_array(1.0 / K.rates) @ seen)
+        parts = list(stage.model.latent.parts.values())
+        if len(parts) == 1 and isinstance(parts[0].unknown, Field) and not stage.auxiliary:
+            narrower = _restricted(product, stage.gram)
+            if narrower is not None:
+                constant = stage.free_q
+                more = seen.T @ state.solve(K.A @ constant) - product @ constant
+                product = sp.csr_array(narrower + sp.diags_array(np.maximum(more, 0.0)))
+        C = sp.csr_array(K.G + _widened(product, stage.auxiliary))
+        schur = self._factorise("C", C, True)
+        return Approximate(self, K.at, state, schur, K.rates, self._seam(K))
+
+    def _seam(self, K: Jacobian) -> _Seam | None:
+        if not len(self.strip):
+            return None
+        S = sp.csr_array(K.S[self.strip])
+        factor = self._factorise("S, between", sp.csr_array(S[:, self.strip]))
+        return _Seam(self.strip, factor, S, sp.csr_array(K.A[self.strip]))
+
+    def _state(self, S: sp.csr_array) -> Factor:
+        if self.parts is None:
+            return self._factorise("S", S)
+        unseen, seen = self.parts
+        bottom = sp.csr_array(S[seen])
+        return _Triangle(
+            self.parts,
+            self._factorise("S, not observed", sp.csr_array(S[unseen][:, unseen])),
+            self._factorise("S, observed", sp.csr_array(bottom[:, seen])),
+            sp.csr_array(bottom[:, unseen]),
+        )
+
+    @cached_property
+    def strip(self) -> IntArray:
+        """Coefficients less than so many neighbours away from where observed ones meet others."""
+        if self.parts is None:
+            return np.zeros(0, dtype=np.int64)
+        unseen, _ = self.parts
+        links = abs(self.stage.model.mass)
+        free = self.stage.model.X.free
+        other = np.zeros(len(free))
+        other[unseen] = free[unseen]
+        near = (links @ other) * self.stage.split.R.diagonal()
+        for _ in range(LAYERS):
+            near = links @ (near > 0.0)
+        return np.flatnonzero((near > 0.0) & (free > 0.0))
+
+    def _factorise(self, name: str, matrix: sp.csr_array, approximate: bool = False) -> Factor:
+        """Return the factor of a matrix, by an engine for symmetric ones if it is positive."""
+        matrix.sort_indices()
+        if not np.isfinite(matrix.data).all():
+            raise LinearAlgebraError("The matrix holds values that are not finite.")
+        if _is_symmetric(matrix):
+            try:
+                return self._solver(name, matrix, True, approximate).factorise(matrix.data)
+            except LinearAlgebraError:  # it is indefinite
+                pass
+        return self._solver(name, matrix, False, approximate).factorise(matrix.data)
+
+    def _solver(
+        self, name: str, matrix: sp.csr_array, symmetric: bool, approximate: bool
+    ) -> Solver:
+        """Return the engine of a matrix, analysed again only where its pattern has changed."""
+        solver, kind = self._solvers.get(name, (None, symmetric))
+        if (
+            solver is None
+            or kind != symmetric
+            or not np.array_equal(solver.pattern.indptr, matrix.indptr)
+            or not np.array_equal(solver.pattern.indices, matrix.indices)
+        ):
+            pattern = Pattern(matrix.shape, matrix.indptr.copy(), matrix.indices.copy())
+            solver = analyse(pattern, symmetric=symmetric, approximate=approximate)
+            self._solvers[name] = solver, symmetric
+        return solver
+
+    @property
+    def engines(self) -> dict[str, str]:
+        """Names of the engines of the blocks that were factorised."""
+        return {name: solver.name for name, (solver, _) in self._solvers.items()}
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
-    """A coupled matrix, with the rate of each equation of the state; as a `Factor`.
+class Jacobian:
+    """K at a point, as a `Factor`.
 
-    `border` = (b, a) adds b a^T to the state block.
+    Attributes
+    ----------
+    at
+        The point y, shape (n + m,).
+    S, A, G
+        Its blocks on free coefficients; G with its auxiliary unknowns behind.
+    rates
+        Lumped mass times the rate of each equation of the state, shape (n,).
+    back, curved
+        Derivatives of A(w)^T r in w and in q; None if they are held or zero.
+    border
+        (b, a): b a^T is added to S.
     """
 
     solver: BlockSolver
-    data: Array
-    rate: Array
+    at: Array
+    S: sp.csr_array
+    A: sp.csr_array
+    G: sp.csr_array
+    rates: Array
+    back: sp.csr_array | None
+    curved: sp.csr_array | None
     border: tuple[Array, Array] | None = None
 
-    def bordered(self, column: Array, row: Array) -> Blocks:
-        """Return this matrix with column row^T, of shape (n, n), added to the state block."""
+    def bordered(self, column: Array, row: Array) -> Jacobian:
+        """Return K with column row^T, of shape (n, n), added to S."""
         return replace(self, border=(column, row))
 
-    def _apply(self, x: Array) -> Array:
-        product: Array = self.solver.pattern.matrix(self.data) @ x
+    def apply(self, x: Array) -> Array:
+        """Return K x, auxiliary unknowns behind (u, q)."""
+        stage = self.solver.stage
+        n, size = stage.n, stage.size
+        u, q = x[:n], x[n:size]
+        out = np.empty_like(x)
+        out[:n] = self.S @ u + self.A @ q
         if self.border is not None:
             column, row = self.border
-            n = self.solver.n
-            product[:n] += column * float(row @ x[:n])
-        return product
+            out[:n] += column * float(row @ u)
+        out[n:] = self.G @ x[n:]
+        coupling: Array = self.A.T @ (stage.split.R @ u)
+        if self.back is not None:
+            moved: Array = stage.W @ (stage.model.X.free * u)
+            coupling += self.back @ moved
+        if self.curved is not None:
+            coupling += self.curved @ q
+        out[n:size] -= coupling
+        return out
 
     def solve(self, b: Array) -> Array:
-        """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
+        """Return x with K x = b to the tolerance; raises `LinearAlgebraError`.
+
+        The factors at hand precondition, made at another point perhaps; where they do not serve,
+        new ones.
+        """
+        solver = self.solver
         try:
-            return self._solve(b, renew=False)
+            return self._solve(b, solver.current(self), ITERATIONS if solver.made else PATIENCE)
         except LinearAlgebraError:
-            pass
-        try:
-            return self._solve(b, renew=True)
-        except LinearAlgebraError:
-            if not self.solver.cycles:
-                raise
-        self.solver.without_cycles()
-        return self._solve(b, renew=True)
+            return self._solve(b, solver.current(self, renew=True), ITERATIONS)
 
-    def _solve(self, b: Array, renew: bool) -> Array:
-        solver, n = self.solver, self.solver.n
-        S, C = map(approximate_inverse, solver.factors(self.data, self.rate, renew))
-        coupling = solver.block(self.data, "qu")
+    def approximate(self) -> Approximate:
+        """Return K by factors of its blocks."""
+        return self.solver.approximate(self)
 
-        def precondition(r: Array) -> Array:
-            u = S(r[:n])
-            return np.concatenate([u, C(r[n:] - coupling @ u)])
-
+    def _solve(self, b: Array, approximate: Approximate, limit: int) -> Array:
+        solver, stage = self.solver, self.solver.stage
+        n, size = stage.n, stage.size
+        padded = np.zeros(size + stage.auxiliary)
+        padded[:size] = b
         scale: Array | None = None
 
         def scaled(r: Array) -> Array:
             nonlocal scale
-            z = precondition(r)
+            z = approximate.whole(r)
             if scale is None:  # u and q count the same
-                sizes = [float(np.linalg.norm(part)) or 1.0 for part in (z[:n], z[n:])]
-                scale = np.repeat(1.0 / np.array(sizes), [n, len(b) - n])
+                sizes = [float(np.linalg.norm(part)) or 1.0 for part in (z[:n], z[n:size])]
+                counts = [n, len(z) - n]
+                scale = np.repeat(1.0 / np.array(sizes), counts)
             z *= scale
             return z
 
-        start = perf_counter()
-        x, iterations = gmres(self._apply, scaled, b, solver.tolerance, ITERATIONS, REMEDY)
-        solver.account(iterations, perf_counter() - start)
+        x, iterations = gmres(self.apply, scaled, padded, solver.tolerance, limit, REMEDY)
+        solver.iterations.append(iterations)
+        return x[:size]
+
+
+@dataclass(frozen=True, eq=False)
+class Approximate:
+    """The approximate inverse of K by factors of S and C, as a `Factor`."""
+
+    blocks: BlockSolver
+    at: Array
+    state: Factor
+    schur: Factor
+    rates: Array
+    seam: _Seam | None
+
+    def solve(self, b: Array) -> Array:
+        """Return an approximate solution (u, q), shape (n + m,)."""
+        stage = self.blocks.stage
+        size = stage.size
+        padded = np.zeros(size + stage.auxiliary)
+        padded[:size] = b
+        return self.whole(padded)[:size]
+
+    def whole(self, b: Array) -> Array:
+        """Return the same with auxiliary unknowns behind, of b and of the solution."""
+        stage, A = self.blocks.stage, self.blocks.A
+        n, size, R, free_q = stage.n, stage.size, stage.split.R, stage.free_q
+        x = np.empty_like(b)
+        u = approximate_inverse(self.state)(b[:n])
+        right = b[n:].copy()
+        right[: size - n] += free_q * (A.T @ (R @ u))
+        x[n:] = approximate_inverse(self.schur)(right)
+        seen: Array = R.T @ (A @ (free_q * x[n:size]))
+        x[:n] = u - R @ (seen / self.rates)
+        if self.seam is not None:
+            self.seam.mend(b[:n], x[:n], x[n:size])
+        for fixed in (stage.model.X.fixed, n + stage.model.Q.fixed):
+            x[fixed] = b[fixed]  # which factors that iterate would leave to their tolerance
         return x
+
+
+@dataclass(frozen=True, eq=False)
+class _Seam:
+    """Where observed coefficients meet others: there S u + A q = b is solved once more."""
+
+    at: IntArray
+    factor: Factor
+    S: sp.csr_array
+    A: sp.csr_array
+
+    def mend(self, b: Array, u: Array, q: Array) -> None:
+        """Change u, in place."""
+        u[self.at] += self.factor.solve(b[self.at] - self.S @ u - self.A @ q)
+
+
+@dataclass(frozen=True, eq=False)
+class _Triangle:
+    """S without M_uo/h: the unobserved part first."""
+
+    parts: tuple[IntArray, IntArray]
+    unseen: Factor
+    seen: Factor
+    link: sp.csr_array
+
+    def solve(self, b: Array) -> Array:
+        """Return x with S x = b."""
+        unseen, seen = self.parts
+        x = np.empty_like(b)
+        first = approximate_inverse(self.unseen)(b[unseen])
+        x[unseen] = first
+        x[seen] = approximate_inverse(self.seen)(b[seen] - self.link @ first)
+        return x
+
+
+def masked(matrix: sp.csr_array, rows: Array, cols: Array) -> sp.csr_array:
+    """Return diag(rows) matrix diag(cols), with the same pattern."""
+    data = matrix.data * np.repeat(rows, np.diff(matrix.indptr)) * cols[matrix.indices]
+    return sp.csr_array((data, matrix.indices, matrix.indptr), matrix.shape)
+
+
+def _product(matrix: sp.csr_array, W: sp.csr_array) -> sp.csr_array:
+    """Return matrix W; with the same pattern if W is diagonal."""
+    diagonal = W.diagonal()
+    if W.nnz == np.count_nonzero(diagonal):
+        return masked(matrix, np.ones(len(diagonal)), diagonal)
+    return sp.csr_array(matrix @ W)
+
+
+def _widened(matrix: sp.csr_array, more: int) -> sp.csr_array:
+    """Return a square matrix with zero rows and columns behind."""
+    if not more:
+        return matrix
+    return sp.csr_array(sp.block_diag([matrix, sp.csr_array((more, more))]))
+
+
+def _restricted(matrix: sp.csr_array, to: sp.csr_array) -> sp.csr_array | None:
+    """Return the entries of a matrix in the pattern of another, the rest added to the diagonal.
+
+    None where the rest has entries of both signs: then the matrix acts as derivatives do.
+    """
+    pattern = sp.csr_array((np.ones(to.nnz), to.indices, to.indptr), to.shape)
+    kept = sp.csr_array(matrix * pattern)
+    rest = matrix.sum(axis=1) - kept.sum(axis=1)
+    if np.abs(matrix.data).sum() - np.abs(kept.data).sum() > ONE_SIGN * np.abs(rest).sum():
+        return None
+    return sp.csr_array(kept + sp.diags_array(rest))
+
+
+def _is_symmetric(matrix: sp.csr_array) -> bool:
+    return bool(abs(matrix - matrix.T).max() <= ROUNDING * abs(matrix).max())

@@ -70,8 +70,16 @@ class Parts:
 
     def squares(self, x: Array) -> list[float]:
         """Return the squared norm of each part."""
-        squares: list[float] = ((x * x) @ self.weights).tolist()
-        return squares
+        return self.products(x, x)
+
+    def products(self, x: Array, y: Array) -> list[float]:
+        """Return the inner product in each part."""
+        products: list[float] = ((x * y) @ self.weights).tolist()
+        return products
+
+    def allowed(self, share: float, missed: list[float], scales: list[float]) -> list[float]:
+        """Return how much of each part may be left, from what was missed of it, all squared."""
+        return [share**2 * square for square in missed]
 
     def scales(self, y: Array) -> list[float]:
         """Return the squared norms that errors of y are measured by; none is zero."""
@@ -191,7 +199,7 @@ class Newton:
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
             size = _largest(squares, scales)
             if count == 1 and near is not None:
-                missed, miss = size, [self.share**2 * square for square in squares]
+                missed, miss = size, parts.allowed(self.share, squares, scales)
             # Updates are compared with what may be left of the error.
             allowed = [max(self.tolerance**2 * s, m) for s, m in zip(scales, miss, strict=True)]
             excess = _largest(squares, allowed)
