@@ -300,8 +300,7 @@ class Jacobian:
         out[n:] = self.G @ x[n:]
         coupling: Array = self.A.T @ (stage.split.R @ u)
         if self.back is not None:
-            moved: Array = stage.W @ (stage.model.X.free * u)
-            coupling += self.back @ moved
+            coupling += np.asarray(self.back @ (stage.W @ (stage.model.X.free * u)))
         if self.curved is not None:
             coupling += self.curved @ q
         out[n:size] -= coupling
@@ -373,7 +372,7 @@ class Approximate:
         right = b[n:].copy()
         right[: size - n] += free_q * (A.T @ (R @ u))
         x[n:] = approximate_inverse(self.schur)(right)
-        seen: Array = R.T @ (A @ (free_q * x[n:size]))
+        seen = np.asarray(R.T @ (A @ (free_q * x[n:size])))
         x[:n] = u - R @ (seen / self.rates)
         if self.seam is not None:
             self.seam.mend(b[:n], x[:n], x[n:size])
