@@ -109,7 +109,7 @@ def problem(size: int, dimension: int = 2) -> Model:
         parameter=Field(mesh, linear(mesh), inner="H1"),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: dot(grad(u), grad(v)),
-        f=lambda x, t: 10.0 * (1.0 + x[0]),
+        f=10.0,
     )
 
 

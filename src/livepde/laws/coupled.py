@@ -32,6 +32,8 @@ RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as thi
 
 SHARE = 0.5  # at least this of what its start missed may be left of a stage by blocks
 
+AGES = 8.0  # stages in which what factors of blocks leave of an error doubles, as long as unseen
+
 GROWN = 2.0  # times as large a first update as when the rate of a factor was seen: see again
 
 PULL = 10.0  # theta h where the law tunes itself: r forgets within a step
@@ -367,7 +369,7 @@ class CoupledStage:
             lagged=True,
             near=used,
             kept=factor,
-            expected=warm.kept.ageing * age,
+            expected=warm.kept.ageing * self._wear(age),
             trusted=GROWN * warm.kept.seen,
         )
         y = solved.y
@@ -381,6 +383,13 @@ class CoupledStage:
         y[: self.n] = self.model.impose(y[: self.n], moment)
         return y
 
+    def _wear(self, age: int) -> float:
+        """Return how much more a factor of an age leaves of an error than a new one.
+
+        One of blocks is approximate from the start.
+        """
+        return float(age) if self.by_blocks is None else 1.0 + age / AGES
+
     def _keep(self, kept: Kept, equation: _Equation, solved: Solution, age: int) -> Kept:
         """Return what becomes of the factor after a stage."""
         ageing, seen, blocks = kept.ageing, kept.seen, self.by_blocks
@@ -390,7 +399,7 @@ class CoupledStage:
             self._made = equation.made
             return Kept(equation.made[0], equation.u_alpha, equation.h, 0, 0, ageing, seen)
         if not math.isnan(solved.rate):
-            ageing, seen = solved.rate / age, solved.missed
+            ageing, seen = solved.rate / self._wear(age), solved.missed
         spent = kept.spent + solved.updates - 1 + (sum(blocks.iterations) if blocks else 0)
         if spent > self.patience:
             return Kept.none(ageing, seen)
