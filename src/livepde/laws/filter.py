@@ -420,7 +420,8 @@ def reduction(
             mass = model.parameter_mass[part, part]
             phi, _ = inner.modes(count, mass)
             if modes == "auto":
-                phi = phi[:, : _enough(phi, inner.variance, mass.diagonal())]
+                weights = mass.diagonal()
+                phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
         else:
             phi = np.eye(item.size) * item.unknown.latent_std
         blocks.append(np.kron(np.eye(item.evolution.copies), phi))
@@ -432,10 +433,10 @@ def reduction(
     return Phi, tuple(motions)
 
 
-def _enough(phi: Array, variance: Array, mass: Array) -> int:
+def _enough(phi: Array, mass: Array, variance: float) -> int:
     """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
     held = np.cumsum(mass @ phi**2)
-    short = int((held < (1.0 - LEFT_OUT) * (mass @ variance)).sum())
+    short = int((held < (1.0 - LEFT_OUT) * variance).sum())
     return min(short + 1, len(held))
 
 
