@@ -28,6 +28,7 @@ Direct = Callable[[Any, Place], Any]
 STEP = 1e-30  # of the complex step
 DEPENDENT = 1e-12  # eigenvalues of G G* below this share of the largest count as zero
 ROUNDING = 1e-14  # entries of G below this share of the largest of their row count as zero
+LARGEST_PROJECTION = 100_000_000  # entries of R
 LARGEST_MEMO = 64  # splits kept for different patterns of missing samples
 
 
@@ -357,6 +358,12 @@ class Observed:
             inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
         else:
+            if (support := len(np.unique(tangent.indices))) * n > LARGEST_PROJECTION:
+                raise ObservationError(
+                    f"R, the projection on what these sensors see, has {n} rows with {support} "
+                    "entries each, too many to be stored. At this size observe a Subdomain, of "
+                    "which R is diagonal, or use SensitivityLaw, which needs no R."
+                )
             rows = tangent.toarray()
             representers = rows.T if self.observation.nodal else self.X.riesz(rows.T)
             values, vectors = np.linalg.eigh(rows @ representers)
