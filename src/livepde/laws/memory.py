@@ -126,9 +126,9 @@ class Learning:
             self.pattern = Pattern.of(sp.csr_array(ones.T @ ones))
         elif model.Q.dim > MOST_DENSE:
             raise LawError(
-                "GradientLaw: gain='auto' keeps a dense matrix of all unknowns where sensors read no "
-                f"coefficients; {model.Q.dim} are too many, up to {MOST_DENSE} are possible. Give "
-                "a number for gain, observe a Subdomain, or use SensitivityLaw."
+                "GradientLaw: gain='auto' keeps a dense matrix of all unknowns where sensors read "
+                f"no coefficients; {model.Q.dim} are too many, up to {MOST_DENSE} are possible. "
+                "Give a number for gain, observe a Subdomain, or use SensitivityLaw."
             )
         else:
             self.pattern = Pattern.of(sp.csr_array(np.ones((model.Q.dim, model.Q.dim))))
