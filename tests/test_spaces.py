@@ -245,3 +245,18 @@ def test_fewer_variances_are_solved_for_in_larger_fields(monkeypatch: pytest.Mon
         patched.setattr(spaces, "SOLVED", 100)  # 69 of 289
         some = int(np.isclose(model.Q.variance, exact, rtol=1e-9).sum())
     assert 69 <= some < 80
+
+
+def test_large_well_conditioned_spaces_need_no_factor(monkeypatch: pytest.MonkeyPatch):
+    def make():
+        return reaction(MeshTri().refined(5), ElementTriP1(), q_dirichlet={"boundary": 0.0})
+
+    direct = make()
+    factors = direct.X.factor, direct.Q.factor
+    monkeypatch.setattr(spaces, "LARGE", 500)
+    found = make()
+    b = np.random.default_rng(0).standard_normal((direct.X.dim, 3))
+    for one, other in ((found.X, direct.X), (found.Q, direct.Q)):
+        np.testing.assert_allclose(one.riesz(b), other.riesz(b), rtol=1e-8, atol=1e-9)
+    assert type(found.X.factor) is not type(factors[0])  # L2
+    assert type(found.Q.factor) is type(factors[1])  # H1

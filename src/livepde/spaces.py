@@ -18,6 +18,7 @@ from livepde.linalg import (
     Leading,
     Pattern,
     analyse,
+    conjugate_gradients,
     positive_definite,
 )
 
@@ -30,6 +31,8 @@ SOLVED = 1000  # coefficients whose prior variance is computed; that of others l
 FEWEST_SOLVED = 64  # of a large space
 BLOCK = 250  # right-hand sides solved at once,
 ENTRIES = 2_500_000  # and at most so many numbers of them
+ITERATED = 1e-12  # residual of the Riesz map of a large space, where iterations do:
+FEW = 50  # at most so many
 PROBES = 16  # random vectors of a trace
 PRECISE = 1e-8  # relative error of the modes of a large space
 
@@ -98,7 +101,9 @@ class HilbertSpace:
 
     @cached_property
     def factor(self) -> Factor:
-        """Factorised `tangent_gram`."""
+        """Factorised `tangent_gram`; of a large, well-conditioned one, as of L2, iterations."""
+        if (iterated := self._iterated()) is not None:
+            return iterated
         pattern = Pattern.of(self.tangent_gram)
         singular = (
             f"The Gram matrix of {self.name} is singular: its inner product does not see every "
@@ -130,6 +135,18 @@ class HilbertSpace:
                 "terms of its inner product."
             )
         return factor
+
+    def _iterated(self) -> Factor | None:
+        """Return conjugate gradients that see only the diagonal, where few iterations do."""
+        diagonal = self.tangent_gram.diagonal()
+        if self.dim <= LARGE or not np.all(diagonal > 0.0):
+            return None
+        probe = np.random.default_rng(0).standard_normal(self.dim) * np.sqrt(diagonal)
+        try:
+            _Diagonal(self.tangent_gram, diagonal, FEW).solve(probe)
+        except LinearAlgebraError:
+            return None
+        return _Diagonal(self.tangent_gram, diagonal, 10 * FEW)
 
     def inner(self, x: Array, y: Array) -> float:
         """Return (x, y) = x^T G y for coefficient vectors of shape (n,)."""
@@ -274,6 +291,27 @@ class HilbertSpace:
         # Eigenvectors have no sign of their own: fix it, so that runs can be compared.
         phi *= np.sign(phi[np.abs(phi).argmax(axis=0), np.arange(count)])
         return phi, values[order]
+
+
+@dataclass(frozen=True, eq=False)
+class _Diagonal:
+    """Conjugate gradients with a diagonal preconditioner, in the place of a factor."""
+
+    matrix: sp.csr_array
+    diagonal: Array
+    limit: int
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b to a relative residual of 1e-12; raises `LinearAlgebraError`."""
+        scale = self.diagonal if b.ndim == 1 else self.diagonal[:, None]
+        return conjugate_gradients(
+            self.matrix.__matmul__,
+            lambda r: r / scale,
+            b,
+            ITERATED,
+            self.limit,
+            "take a mesh whose cells differ less in size and shape.",
+        )[0]
 
 
 class BorderedSpace(HilbertSpace):
