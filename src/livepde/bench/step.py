@@ -27,7 +27,7 @@ from livepde.stepping import Advance, ImplicitEuler, simulate
 
 __all__ = ["MODES", "SIZES", "step"]
 
-SIZES = (31, 1_000, 10_000)  # nodes
+SIZES = (31, 1_000, 10_000, 100_000)  # nodes
 MODES = (1, 10, 50)  # reduced unknowns of the sensitivity law
 LONGEST_ROD = 1_000  # nodes of the rod; more are those of a square
 GAINS = ((1.0, 0.1), (1e2, 0.1), (1e4, 0.1), (1e4, 1.0))  # gain and c_1 of the gradient law
@@ -79,7 +79,7 @@ class Problem:
 
 def problem(size: int) -> Problem:
     """Return the paper's example with so many nodes, or the same on a square if there are many."""
-    steps, pairs = (90, 15) if size <= 100 else (20, 9) if size <= LONGEST_ROD else (6, 3)
+    steps, pairs = (90, 15) if size <= 100 else (20, 9) if size <= LONGEST_ROD else (12, 3)
     if size <= LONGEST_ROD:
         model, omega = seed.build(nodes=size)
         points = Points(np.linspace(0.1, 0.9, SENSORS).tolist())
