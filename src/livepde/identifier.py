@@ -354,6 +354,8 @@ class Identifier:
 
     def _filled(self, named: dict[str, float]) -> tuple[Inputs, tuple[str, ...]]:
         """Return all inputs; a missing one holds its last value."""
+        if not self.inputs:
+            return self._inputs, ()
         values, held, last = {}, [], dict(self._inputs)
         for name in self.inputs:
             value = named.get(name, np.nan)
@@ -451,6 +453,9 @@ def _number(value: Any, what: str) -> float:
 
 
 def _array(z: Any, observed: Observed) -> Array:
+    if type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,):
+        if np.isfinite(z).all():
+            return z.copy()
     if (
         np.asarray(z).dtype.kind in "USb"
         if not isinstance(z, list | tuple)

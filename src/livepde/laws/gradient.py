@@ -222,7 +222,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         self, work: GradientWork, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         model, observed = work.problem.model, work.problem.observed
-        z0, z1 = (observed.linearised(z, state.u) for z in (interval.z0, interval.z1))
+        z0 = observed.linearised(interval.z0, state.u)
+        z1 = observed.linearised(interval.z1, state.u)
         if z1 is not interval.z1:  # a nonlinear sensor
             interval = replace(interval, z0=z0, z1=z1)
         rest, excitation = self.rest, state.excitation
@@ -260,7 +261,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             metric = learning.metric(state.learned, spread, state.q, length)
 
         n = model.X.dim
-        known = resting == state.resting and np.array_equal(interval.present, state.present)
+        known = resting == state.resting and interval.present.tobytes() == state.present.tobytes()
         warm = state.warm if known else Warm.none()
         # When the observed part of the state was looked at last, and what it was.
         looked = (interval.t0, state.u_alpha) if known and alpha == 0.0 else (np.inf, zero)

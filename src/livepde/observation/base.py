@@ -252,6 +252,11 @@ class Observed:
         G.eliminate_zeros()
         return G
 
+    @cached_property
+    def _shown(self) -> IntArray | None:
+        """Which coefficient each sensor shows, if every one shows one as it is."""
+        return self.G.indices if _is_selection(self.G) else None
+
     @property
     def linear(self) -> bool:
         """True if z = G u, or `linearised` makes it so: what projections and the gradient law need.
@@ -270,7 +275,7 @@ class Observed:
         moment
             Time and input channels.
         """
-        z: Array = self.G @ u
+        z: Array = self.G @ u if self._shown is None else u[self._shown]
         direct = self._direct(moment)
         return z if direct is None else z + direct @ q
 
