@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -208,7 +209,7 @@ class Identifier:
             of a moving sensor may be missing, and is not held.
         """
         t = _number(t, "time t")
-        if np.isnan(t):
+        if math.isnan(t):
             raise SampleError("time t is NaN; give the time of the sample.")
         measured, withheld, named = self._parse(z, inputs or {})
         values, held = self._filled(named)
@@ -331,7 +332,7 @@ class Identifier:
     ) -> tuple[Array, Array, dict[str, float]]:
         """Return assimilated values, withheld values, and inputs, all checked."""
         hidden = self.withheld.names if self.withheld else ()
-        if isinstance(z, Mapping):
+        if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             unknown = [name for name in (*z, *inputs) if name not in self.channels]
             if unknown:
                 raise SampleError(
@@ -439,6 +440,8 @@ class Identifier:
 
 def _number(value: Any, what: str) -> float:
     """Return a float; None is missing (NaN)."""
+    if type(value) is float and math.isfinite(value):
+        return value
     if value is None:
         return np.nan
     if isinstance(value, str | bytes | bool):

@@ -26,7 +26,7 @@ from livepde.linalg import (
 )
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import Newton, Parts, Solution
+from livepde.stepping import TINY, Newton, Parts, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
@@ -370,7 +370,7 @@ class CoupledStage:
         y = solved.y
         miss = y - near
         trend = self._trend(miss, warm.miss) if follows else np.zeros(3)
-        missed = self._size(miss, y) if math.isnan(solved.missed) else solved.missed
+        missed = self.parts.relative(miss, y) if math.isnan(solved.missed) else solved.missed
         kept = self._keep(warm.kept, equation, solved, age) if self.keeps else warm.kept
         return y, Warm(missed, miss, trend, h, kept)
 
@@ -415,13 +415,8 @@ class CoupledStage:
         weights = np.zeros((self.size, 3))
         weights[: self.n, 0], weights[: self.n, 1] = mass, mass * self.members[1, : self.n]
         weights[self.n :, 2] = 1.0
-        floor = RESOLVED * float(np.linalg.norm(self.model.latent.deviations))
-        return Parts(weights, (0.0, 0.0, floor))
-
-    def _size(self, change: Array, y: Array) -> float:
-        """Return the size of a change of y, relative to it, in its worst part."""
-        pairs = zip(self.parts.squares(change), self.parts.scales(y), strict=True)
-        return max(math.sqrt(square / scale) for square, scale in pairs)
+        floor = RESOLVED**2 * float((self.model.latent.deviations**2).sum())
+        return Parts(weights, (TINY, TINY, floor))
 
     def _equation(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> _Equation:
         if self._bilinear is not None:
@@ -654,14 +649,17 @@ class _Bordered:
     column: Array
     row: Array
 
+    @cached_property
+    def _scaled(self) -> Array:
+        pivot = 1.0 + float(self.row @ self.column[: len(self.row)])
+        if pivot == 0.0:
+            raise LinearAlgebraError("The damped system is singular: take less damping.")
+        return self.row / pivot
+
     def solve(self, b: Array) -> Array:
         """Return the solution for a right-hand side."""
         x = self.inner.solve(b)
-        n = len(self.row)
-        pivot = 1.0 + float(self.row @ self.column[:n])
-        if pivot == 0.0:
-            raise LinearAlgebraError("The damped system is singular: take less damping.")
-        return x - self.column * (float(self.row @ x[:n]) / pivot)
+        return x - self.column * (self._scaled @ x[: len(self.row)])
 
 
 def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
