@@ -456,9 +456,9 @@ def _number(value: Any, what: str) -> float:
 
 
 def _array(z: Any, observed: Observed) -> Array:
-    if type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,):
-        if np.isfinite(z).all():
-            return z.copy()
+    usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
+    if usual and np.isfinite(z).all():
+        return np.array(z)
     if (
         np.asarray(z).dtype.kind in "USb"
         if not isinstance(z, list | tuple)

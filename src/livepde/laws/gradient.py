@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.base import Belief, Law, Problem, Report, Status
+from livepde.laws.base import Belief, Law, Notes, Problem, Report, Status
 from livepde.laws.coupled import PULL, CoupledStage, Gains, Warm
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
@@ -305,7 +306,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         rate = end - y
         rate[:n] -= found.u - state.u_alpha if known else coupled.split.project(rate[:n])
         rate /= length
-        notes = {"residual": model.X.norm(r)}
+        notes: dict[str, float | Callable[[], float]] = {"residual": lambda: model.X.norm(r)}
         if resting:
             notes |= {"at_rest": 1.0}
         if regularises:
@@ -318,7 +319,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         moved = (u, q, found.u, rate, warm, interval.present, resting, excitation)
         if learning is None or not isinstance(state, LearningState):
             after = GradientState(*moved)
-            return after, Report(Status(), predicted, steps, notes)
+            return after, Report(Status(), predicted, steps, Notes(notes))
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
         if held:
@@ -328,7 +329,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
         after = LearningState(*moved, learned, balance or state.balance)
-        return after, Report(Status(), predicted, steps, notes)
+        return after, Report(Status(), predicted, steps, Notes(notes))
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

@@ -214,7 +214,7 @@ class Newton:
                 rate = min(expected, 1.0) if count == 1 and missed <= trusted else 1.0
             done = excess * rate <= 1.0 - rate  # the error is rate/(1 - rate) times the update
             # A kept factor that needs one or two more is not replaced now.
-            ends = kept is not None and excess * rate**3 <= 1.0 - rate
+            ends = kept is not None and count <= 2 and excess * rate**3 <= 1.0 - rate
             slow = ratio > self.refresh and not (done or ends)
             if (
                 lagged
