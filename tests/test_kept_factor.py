@@ -56,7 +56,7 @@ def test_a_kept_factor_is_made_again_after_a_restart(plate, tmp_path):
     for sample in samples[1:8]:
         whole.step(*sample)
         half.step(*sample)
-    assert len(whole._state.warm.y)
+    assert len(whole._state.warm.kept.y)
     half.save(tmp_path / "half.npz")
     again = fresh()
     again.load(tmp_path / "half.npz")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -25,17 +26,15 @@ from livepde.linalg import (
 )
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import Newton, Parts
+from livepde.stepping import TINY, Newton, Parts, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
-GROWN = 2.0  # times as large as when the rate of a factor was seen: see again
+GROWN = 2.0  # times as large a first update as when the rate of a factor was seen: see again
 
 PULL = 10.0  # theta h where the law tunes itself: r forgets within a step
 
-NOTHING = (np.zeros(0), np.zeros(0), 0.0)  # kept
-
-__all__ = ["PULL", "CoupledStage", "Gains", "Metric", "Warm"]
+__all__ = ["PULL", "CoupledStage", "Gains", "Kept", "Metric", "Warm"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,29 +89,26 @@ class Metric:
 
 
 @dataclass(frozen=True, eq=False)
-class Warm:
-    """What a stage leaves to the next one: how good its start was, and where its factor was made.
+class Kept:
+    """A factor that goes from stage to stage: where it was made, and how it serves.
 
     The factor itself is made again from this where it is gone, after a restart say: the numbers
     that follow are the same.
 
     Attributes
     ----------
-    missed
-        How far the start was from the solution, relative to u and q.
     y, u_alpha, h
-        Point, data and step of the last Jacobian of Newton that was factorised, shapes (n + m,) and
-        (n,); empty if none is kept.
+        Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
     age
         Stages since then.
     spent
         Updates that these took beyond one each.
     ageing, seen
-        How much of an update is left to the next one after a stage, for each stage of age, and the
-        `missed` with which that was measured.
+        By how much more each stage of age makes the second update, relative to the first, and how
+        large the first was when that was seen, relative to y. Of the factor before, until it is
+        seen again.
     """
 
-    missed: float
     y: Array
     u_alpha: Array
     h: float
@@ -122,9 +118,38 @@ class Warm:
     seen: float
 
     @classmethod
+    def none(cls, ageing: float = math.inf, seen: float = 0.0) -> Kept:
+        """Return the value without a factor."""
+        return cls(np.zeros(0), np.zeros(0), 0.0, 0, 0, ageing, seen)
+
+
+@dataclass(frozen=True, eq=False)
+class Warm:
+    """What a stage leaves to the next one: how good its start was, and its factor.
+
+    Attributes
+    ----------
+    missed
+        How far `near`, as it was used, was from the solution, relative to u and q.
+    miss, trend
+        By what `near`, as it was given, missed it, shape (n + m,); and how much of the miss before
+        that is: in the unobserved and the observed part of u, and in q, shape (3,).
+    h
+        Step of that stage; 0 before any.
+    kept
+        The factor.
+    """
+
+    missed: float
+    miss: Array
+    trend: Array
+    h: float
+    kept: Kept
+
+    @classmethod
     def none(cls) -> Warm:
         """Return the value before any stage."""
-        return cls(np.inf, *NOTHING, 0, 0, np.inf, 0.0)
+        return cls(math.inf, np.zeros(0), np.zeros(3), 0.0, Kept.none())
 
 
 class CoupledStage:
@@ -163,7 +188,7 @@ class CoupledStage:
         self.W = sp.csr_array(sp.eye_array(self.n)) if gains.at_estimate else split.P
         self.free_q = model.Q.free
         self._constant: tuple[float, Array] | None = None
-        self._kept: tuple[Array, Factor] | None = None
+        self._made: tuple[Array, Factor] | None = None
         # G_Q, or where that is dense a sparse matrix of which it is the Schur complement: then
         # the Jacobian has auxiliary unknowns behind q.
         self.gram = model.Q.augmented
@@ -293,7 +318,7 @@ class CoupledStage:
         h: float,
         moment: Moment,
         u_alpha: Array,
-        start: Array,
+        start: Array | Callable[[], Array],
         metric: Metric | None = None,
         near: Array | None = None,
         warm: Warm | None = None,
@@ -307,62 +332,91 @@ class CoupledStage:
         u_alpha
             G^+ z at the stage's time, shape (n,).
         start
-            Where the iteration starts, shape (n + m,); it does not change the result.
+            Where the iteration starts, shape (n + m,), or a function that returns it; it does not
+            change the result.
         metric
             In the place of G_Q/gain (with gain = inf) and of the damping rule.
         near
             A start that follows the steps before more closely, shape (n + m,). If it was good at
-            the stage before, Newton begins there without sweeps.
+            the stage before, Newton begins there without sweeps, moved by what it is expected to
+            miss.
         warm
-            What the stage before has left: how good `near` was, and the factor that was kept.
+            What the stage before has left.
         """
         warm = warm or Warm.none()
-        near = start if near is None else near
-        for y in (start, near):
-            y[: self.n] = self.model.impose(y[: self.n], moment)
+
+        def begin() -> Array:
+            return self._imposed(start() if callable(start) else start, moment)
+
+        near = begin() if near is None else self._imposed(near, moment)
         equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
-        good = warm.missed <= self.newton.basin
-        kept = good and warm.h == h
-        age = warm.age + 1 if kept else 1
+        good, follows = warm.missed <= self.newton.basin, warm.h == h
+        used, factor, age = None, None, 1
+        if good:
+            used = near + (warm.trend @ self.members) * warm.miss if follows else near
+            if warm.kept.h == h:
+                factor, age = self._factor(warm.kept, moment), warm.kept.age + 1
         solved = self.newton.solve(
             equation,
-            start,
+            begin,
             self.parts,
             lagged=True,
-            near=near if good else None,
-            kept=self._factor(warm, moment) if kept else None,
-            expected=warm.ageing * age,
-            trusted=GROWN * warm.seen,
+            near=used,
+            kept=factor,
+            expected=warm.kept.ageing * age,
+            trusted=GROWN * warm.kept.seen,
         )
-        y, missed, ageing, seen = solved.y, solved.missed, warm.ageing, warm.seen
-        if math.isnan(missed):
-            missed = self._distance(y - near, y)
-        if not self.keeps:
-            return y, replace(Warm.none(), missed=missed)
+        y = solved.y
+        miss = y - near
+        trend = self._trend(miss, warm.miss) if follows else np.zeros(3)
+        missed = self.parts.relative(miss, y) if math.isnan(solved.missed) else solved.missed
+        kept = self._keep(warm.kept, equation, solved, age) if self.keeps else warm.kept
+        return y, Warm(missed, miss, trend, h, kept)
+
+    def _imposed(self, y: Array, moment: Moment) -> Array:
+        y[: self.n] = self.model.impose(y[: self.n], moment)
+        return y
+
+    def _keep(self, kept: Kept, equation: _Equation, solved: Solution, age: int) -> Kept:
+        """Return what becomes of the factor after a stage."""
+        ageing, seen = kept.ageing, kept.seen
         if equation.made is not None:
-            self._kept = equation.made
-            return y, Warm(missed, equation.made[0], u_alpha, h, 0, 0, ageing, seen)
+            self._made = equation.made
+            return Kept(equation.made[0], equation.u_alpha, equation.h, 0, 0, ageing, seen)
         if not math.isnan(solved.rate):
-            ageing, seen = solved.rate / age, missed
-        spent = warm.spent + solved.updates - 1
+            ageing, seen = solved.rate / age, solved.missed
+        spent = kept.spent + solved.updates - 1
         if spent > self.patience:
-            return y, Warm(missed, *NOTHING, 0, 0, ageing, seen)
-        return y, Warm(missed, warm.y, warm.u_alpha, warm.h, age, spent, ageing, seen)
+            return Kept.none(ageing, seen)
+        return Kept(kept.y, kept.u_alpha, kept.h, age, spent, ageing, seen)
+
+    def _trend(self, miss: Array, before: Array) -> Array:
+        """Return by how much two misses that follow each other agree, shape (3,)."""
+        weights = self.parts.weights
+        state, observed, q = ((miss * before) @ weights).tolist()
+        state0, observed0, q0 = ((before * before) @ weights).tolist()
+        pairs = (state - observed, state0 - observed0), (observed, observed0), (q, q0)
+        return np.array([min(max(a / b, -1.0), 1.0) if b > 0.0 else 0.0 for a, b in pairs])
+
+    @cached_property
+    def members(self) -> Array:
+        """How much each coefficient belongs to P u, R u and q, shape (3, n + m)."""
+        members = np.zeros((3, self.size))
+        members[1, : self.n] = self.split.R.diagonal()
+        members[0, : self.n] = 1.0 - members[1, : self.n]
+        members[2, self.n :] = 1.0
+        return members
 
     @cached_property
     def parts(self) -> Parts:
         """The state and what is observed of it, in L2 with lumped mass, and the parameter."""
-        state = self.model.state_mass.diagonal()
-        observed = state * self.split.R.diagonal()
+        mass = self.model.state_mass.diagonal()
         weights = np.zeros((self.size, 3))
-        weights[: self.n, 0], weights[: self.n, 1], weights[self.n :, 2] = state, observed, 1.0
-        floor = RESOLVED * float(np.linalg.norm(self.model.latent.deviations))
-        return Parts(weights, (0.0, 0.0, floor))
-
-    def _distance(self, change: Array, y: Array) -> float:
-        pairs = zip(self.parts.squares(change), self.parts.scales(y), strict=True)
-        return max(math.sqrt(square / scale) for square, scale in pairs)
+        weights[: self.n, 0], weights[: self.n, 1] = mass, mass * self.members[1, : self.n]
+        weights[self.n :, 2] = 1.0
+        floor = RESOLVED**2 * float((self.model.latent.deviations**2).sum())
+        return Parts(weights, (TINY, TINY, floor))
 
     def _equation(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> _Equation:
         if self._bilinear is not None:
@@ -379,13 +433,13 @@ class CoupledStage:
         """Updates beyond one for each stage that a factor may cost before it is made again."""
         return 3 if isinstance(self.solver, BandedSolver) else 12
 
-    def _factor(self, warm: Warm, moment: Moment) -> Factor:
-        """Return the factor that a stage has left, made again if this is not its stage."""
-        if self._kept is None or self._kept[0] is not warm.y:
-            equation = self._equation(np.zeros_like(warm.y), warm.h, moment, warm.u_alpha)
-            equation.residual(warm.y)
-            self._kept = (warm.y, equation.factor(warm.y, False))
-        return self._kept[1]
+    def _factor(self, kept: Kept, moment: Moment) -> Factor:
+        """Return the factor that is kept, made again if this stage has another."""
+        if self._made is None or self._made[0] is not kept.y:
+            equation = self._equation(np.zeros_like(kept.y), kept.h, moment, kept.u_alpha)
+            equation.residual(kept.y)
+            self._made = (kept.y, equation.factor(kept.y, False))
+        return self._made[1]
 
 
 class _Equation:
@@ -500,18 +554,20 @@ class _Equation:
 class _Bilinear:
     """Precomputed products for a bilinear A and an affine B, both constant in time.
 
-    A residual is then three sparse products instead of a dozen.
+    A residual is then five products with sparse matrices of fixed structure.
 
     Attributes
     ----------
-    coupling
-        w -> data of the block matrix [0, A(w); -A(w)^T, 0].
+    coupling, operator
+        w -> data of A(w) on the free coefficients, and the operator that takes them.
     lagged, jacobian
         w, and (w, q, r) -> data of the part of the stage's Jacobian that changes.
     linear
-        h -> the linear part of the residual, stacked above R, R^T M_op R and R^T M R.
-    known
-        (u_alpha, c/h) -> what they contribute to that stack.
+        (y, u_alpha, (y - c)/h) -> the linear part of the residual, stacked above r.
+    observed
+        r -> R^T M_op r above R^T M r.
+    offset
+        B(0) on the free coefficients.
     """
 
     def __init__(
@@ -519,40 +575,27 @@ class _Bilinear:
     ) -> None:
         model, g, maps, n, m = stage.model, stage.gains, stage.maps, stage.n, stage.model.Q.dim
         free, free_q = sp.diags_array(model.X.free), sp.diags_array(stage.free_q)
-        R, W = stage.split.R, stage.W
         pattern = model.form_A.pattern("v", "q")
-        whole = Assembler(n + m)
-        whole.add("A", pattern, free, free_q, at=(0, n))
-        whole.add("A", pattern, -free_q, free, at=(n, 0), transposed=True)
-        block, block_maps = whole.build()
-        self.coupling = sp.csr_array(block_maps["A"] @ vq)
-        self.block = block.operator()
+        kept = model.X.free[pattern.rows] * stage.free_q[pattern.indices]
+        self.coupling = sp.csr_array(sp.diags_array(kept) @ vq)
+        self.operator = pattern.operator()
         self.lagged = sp.csr_array(sp.hstack([maps["A"] @ vq, maps["Au"] @ vu]))
         self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Aq"] @ qu]))
         zero = np.zeros(n)
         B = model.form_B.matrix("v", "u", u=zero)
         self.offset = model.B(zero) * model.X.free
         gram = sp.csr_array(free_q @ stage.gram / g.gain)
-        gram.eliminate_zeros()  # all of it if a metric stands in its place
-        moving = sp.block_diag([free @ model.mass, gram])
-        state = free @ (B @ W + g.nu * stage.PNP)
-        mass = stage.RT @ model.mass
-        observed = sp.vstack([R, stage.RM @ R, mass @ R])
-        rest = sp.block_array([[sp.block_diag([state, g.sigma * gram])], [_widened(observed, m)]])
-        rate = sp.vstack([moving, sp.csr_array((observed.shape[0], n + m))])
-        self._pattern = Pattern.of(abs(rate) + abs(rest))
-        self._rate_data = stored(rate, self._pattern)
-        self._rest_data = stored(rest, self._pattern)
-        self._linear: tuple[float, sp.csr_array] | None = None
-        fed = sp.csr_array((n, n)) if g.at_estimate else -(free @ B)  # what u_alpha adds to B(w)
-        data = sp.vstack([fed, sp.csr_array((m, n)), sp.eye_array(n), stage.RM, mass])
-        self.known = sp.csr_array(sp.hstack([data, rate]))
-
-    def linear(self, h: float) -> sp.csr_array:
-        """Return the linear stack for a step h, kept for the last one."""
-        if self._linear is None or self._linear[0] != h:
-            self._linear = (h, self._pattern.matrix(self._rate_data / h + self._rest_data))
-        return self._linear[1]
+        state = sp.csr_array(free @ (B @ stage.W + g.nu * stage.PNP))
+        fed = sp.csr_array((n, n)) if g.at_estimate else free @ B  # what u_alpha adds to B(w)
+        none, wide = sp.csr_array((m, n)), sp.csr_array((n, m))
+        rows = [
+            [state, wide, fed, free @ model.mass, wide],
+            [none, g.sigma * gram, none, none, gram],
+            [stage.split.R, wide, -sp.eye_array(n), sp.csr_array((n, n)), wide],
+        ]
+        self.linear = sp.csr_array(sp.block_array(rows))
+        self.linear.eliminate_zeros()
+        self.observed = sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass]))
 
 
 class _BilinearEquation(_Equation):
@@ -569,22 +612,24 @@ class _BilinearEquation(_Equation):
     ) -> None:
         super().__init__(stage, c, h, moment, u_alpha)
         self.products = products
-        self.linear = products.linear(h)
-        self.known = products.known @ np.concatenate([u_alpha, c / h])
-        self.known[: stage.n] += self.source * stage.model.X.free - products.offset
+        self.known = self.source * stage.model.X.free - products.offset
 
     def residual(self, y: Array) -> Array:
-        n, size = self.stage.n, len(y)
+        n, size, products = self.stage.n, len(y), self.products
         self.count += 1
-        stack = self.linear @ y - self.known
-        self.r = r = stack[size : size + n]
-        self.Mr, self.mass_r = stack[size + n : size + 2 * n], stack[size + 2 * n :]
-        self.w = w = y[:n] if self.stage.gains.at_estimate else y[:n] - r
-        coupling = self.products.block
-        coupling.set(self.products.coupling @ w)
-        out: Array = stack[:size] + coupling.apply(np.concatenate([r, y[n:]]))
-        out[:n] += self.pull()
-        out[n:] += self.learned(y) * self.stage.free_q
+        u, q = y[:n], y[n:]
+        stack = products.linear @ np.concatenate((y, self.u_alpha, (y - self.c) / self.h))
+        self.r = r = stack[size:]
+        self.w = w = u if self.stage.gains.at_estimate else u - r
+        observed = products.observed @ r
+        self.Mr, self.mass_r = observed[:n], observed[n:]
+        A = products.operator
+        A.set(products.coupling @ w)
+        out: Array = stack[:size]
+        out[:n] += A.apply(q) + self.pull() - self.known
+        out[n:] -= A.apply_transposed(r)
+        if self.metric is not None:
+            out[n:] += self.learned(y) * self.stage.free_q
         return out
 
     def changing(self, y: Array, sweep: bool) -> Array:
@@ -596,11 +641,6 @@ class _BilinearEquation(_Equation):
         return data
 
 
-def _widened(matrix: sp.csr_array, columns: int) -> sp.csr_array:
-    """Return the matrix with zero columns added on the right."""
-    return sp.csr_array(sp.hstack([matrix, sp.csr_array((matrix.shape[0], columns))]))
-
-
 @dataclass(frozen=True, eq=False)
 class _Bordered:
     """K + b a^T by Sherman and Morrison, from the factor of K: theta depends on all of r."""
@@ -609,14 +649,17 @@ class _Bordered:
     column: Array
     row: Array
 
+    @cached_property
+    def _scaled(self) -> Array:
+        pivot = 1.0 + float(self.row @ self.column[: len(self.row)])
+        if pivot == 0.0:
+            raise LinearAlgebraError("The damped system is singular: take less damping.")
+        return self.row / pivot
+
     def solve(self, b: Array) -> Array:
         """Return the solution for a right-hand side."""
         x = self.inner.solve(b)
-        n = len(self.row)
-        pivot = 1.0 + float(self.row @ self.column[:n])
-        if pivot == 0.0:
-            raise LinearAlgebraError("The damped system is singular: take less damping.")
-        return x - self.column * (float(self.row @ x[:n]) / pivot)
+        return x - self.column * (self._scaled @ x[: len(self.row)])
 
 
 def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:

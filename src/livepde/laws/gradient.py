@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.base import Belief, Law, Problem, Report, Status
+from livepde.laws.base import Belief, Law, Notes, Problem, Report, Status
 from livepde.laws.coupled import PULL, CoupledStage, Gains, Warm
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
@@ -22,6 +23,7 @@ from livepde.stepping import Interval, Newton, advance
 
 __all__ = ["GradientLaw", "GradientState"]
 
+SAME = 1e-9  # of a step: times that are the same but for rounding
 HOLD = 1e12  # times heavier is a prior that keeps q where it is
 
 
@@ -29,17 +31,16 @@ HOLD = 1e12  # times heavier is a prior that keeps q where it is
 class GradientState:
     """Estimates u^ and q^, shapes (n,) and (m,), and how fast they moved.
 
-    `rate` is the last change of (P u^, q^) per unit of time, shape (n + m,), `r` the last residual
-    and `r_rate` its change: where the next iteration starts. `warm` is what it starts with, and
-    `present`, shape (sensors,), and `resting` tell with which stage that was made. `excitation` is
-    what `Rest` goes by.
+    `u_alpha` is the observed part of the state, shape (n,), and `rate` the last change of
+    (u^ - u_alpha, q^) per unit of time, shape (n + m,): where the next iteration starts. `warm` is
+    what it starts with, and `present`, shape (sensors,), and `resting` tell with which stage that
+    was made. `excitation` is what `Rest` goes by.
     """
 
     u: Array
     q: Array
+    u_alpha: Array
     rate: Array
-    r: Array
-    r_rate: Array
     warm: Warm
     present: Array
     resting: bool
@@ -203,7 +204,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
     def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
         rate, zero = np.zeros(len(u0) + len(q0)), np.zeros(len(u0))
         present = np.zeros(work.problem.observed.size, dtype=bool)
-        fresh = (u0, q0, rate, zero, zero, Warm.none(), present, False, Excitation.none())
+        fresh = (u0, q0, zero, rate, Warm.none(), present, False, Excitation.none())
         if work.learning is not None:
             balance = Balance.none(work.problem.observed.size, len(u0))
             return LearningState(*fresh, work.learning.init(q0), balance)
@@ -222,7 +223,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         self, work: GradientWork, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         model, observed = work.problem.model, work.problem.observed
-        z0, z1 = (observed.linearised(z, state.u) for z in (interval.z0, interval.z1))
+        z0 = observed.linearised(interval.z0, state.u)
+        z1 = observed.linearised(interval.z1, state.u)
         if z1 is not interval.z1:  # a nonlinear sensor
             interval = replace(interval, z0=z0, z1=z1)
         rest, excitation = self.rest, state.excitation
@@ -259,23 +261,33 @@ class GradientLaw(Law[GradientWork, GradientState]):
             spread = learning.spread(state.learned, seen, length) * (HOLD if waits else 1.0)
             metric = learning.metric(state.learned, spread, state.q, length)
 
-        known = resting == state.resting and np.array_equal(interval.present, state.present)
+        n = model.X.dim
+        known = resting == state.resting and interval.present.tobytes() == state.present.tobytes()
         warm = state.warm if known else Warm.none()
+        # When the observed part of the state was looked at last, and what it was.
+        looked = (interval.t0, state.u_alpha) if known and alpha == 0.0 else (np.inf, zero)
 
         def stage(c: Array, t: float, h: float) -> Array:
-            nonlocal found, warm
+            nonlocal found, warm, looked
             found = reconstruct(t)
             # The observed part moves with the data, the rest as in the step before.
-            start = c + h * state.rate
-            if regularises or alpha > 0.0:
-                start[: model.X.dim] += found.u - reconstruct(t - h).u
+            if abs(t - h - looked[0]) <= SAME * h:
+                moved = found.u - looked[1]
+            elif regularises or alpha > 0.0:
+                moved = found.u - reconstruct(t - h).u
             else:
-                start[: model.X.dim] += (
-                    coupled.split.inverse @ interval.change(t - h, t)[interval.present]
-                )
-            near = start.copy()
-            near[: model.X.dim] += h * state.r_rate
+                change = interval.change(t - h, t)[interval.present]
+                moved = coupled.split.inverse @ change
+            near = c + h * state.rate
+            near[:n] += moved
+
+            def start() -> Array:  # without the change of r
+                begin = near.copy()
+                begin[:n] -= coupled.split.project(h * state.rate[:n])
+                return begin
+
             y, warm = coupled.solve(c, h, interval.at(t), found.u, start, metric, near, warm)
+            looked = (t, found.u)
             return y
 
         y = np.concatenate([state.u, state.q])
@@ -289,14 +301,12 @@ class GradientLaw(Law[GradientWork, GradientState]):
                 Status.of(failure), work.problem.predict(state.u, state.q, interval.end)
             )
         lower, upper = model.latent.bounds
-        u, q = end[: model.X.dim], end[model.X.dim :].clip(lower, upper)
-        observed_u = coupled.split.R @ u
+        u, q = end[:n], np.minimum(np.maximum(end[n:], lower), upper)
+        r = coupled.split.project(u) - found.u
         rate = end - y
-        rate[: model.X.dim] -= observed_u - coupled.split.R @ state.u
+        rate[:n] -= found.u - state.u_alpha if known else coupled.split.project(rate[:n])
         rate /= length
-        r = observed_u - found.u
-        r_rate = (r - state.r) / length if known else zero
-        notes = {"residual": model.X.norm(r)}
+        notes: dict[str, float | Callable[[], float]] = {"residual": lambda: model.X.norm(r)}
         if resting:
             notes |= {"at_rest": 1.0}
         if regularises:
@@ -306,10 +316,10 @@ class GradientLaw(Law[GradientWork, GradientState]):
         predicted = work.problem.predict(u, q, interval.end)
         if rest is not None and work.probes is not None:
             excitation = rest.add(excitation, work.probes(u - r, q, interval.end))
-        moved = (u, q, rate, r, r_rate, warm, interval.present, resting, excitation)
+        moved = (u, q, found.u, rate, warm, interval.present, resting, excitation)
         if learning is None or not isinstance(state, LearningState):
             after = GradientState(*moved)
-            return after, Report(Status(), predicted, steps, notes)
+            return after, Report(Status(), predicted, steps, Notes(notes))
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
         if held:
@@ -319,7 +329,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
         after = LearningState(*moved, learned, balance or state.balance)
-        return after, Report(Status(), predicted, steps, notes)
+        return after, Report(Status(), predicted, steps, Notes(notes))
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

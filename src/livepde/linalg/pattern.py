@@ -11,6 +11,8 @@ from livepde.linalg.types import Array, IntArray, Sparse
 
 __all__ = ["Pattern", "PatternOperator", "sandwich"]
 
+DENSE = 10_000  # entries up to which a dense product is faster than a sparse one
+
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
@@ -90,18 +92,33 @@ class Pattern:
 
 
 class PatternOperator:
-    """Products with a matrix whose data change: nothing is built again."""
+    """Products with a matrix whose data change: nothing is built again, a small one is dense."""
 
     def __init__(self, pattern: Pattern) -> None:
-        self._matrix = pattern.matrix(np.zeros(pattern.nnz))
+        rows, cols = pattern.shape
+        self._places: IntArray | None = None
+        if rows * cols <= DENSE:
+            self._places = pattern.rows.astype(np.intp) * cols + pattern.indices
+            self._dense = np.zeros((rows, cols))
+            return
+        empty = np.zeros(pattern.nnz)
+        self._matrix, self._transposed = pattern.matrix(empty), pattern.transposed(empty)
 
     def set(self, data: Array) -> None:
         """Use these values from now on."""
-        self._matrix.data = data
+        if self._places is not None:
+            self._dense.put(self._places, data)
+        else:
+            self._matrix.data = self._transposed.data = data
 
     def apply(self, x: Array) -> Array:
         """Return the product with x."""
-        product: Array = self._matrix @ x
+        product: Array = (self._matrix if self._places is None else self._dense) @ x
+        return product
+
+    def apply_transposed(self, x: Array) -> Array:
+        """Return the product of the transpose with x."""
+        product: Array = self._transposed @ x if self._places is None else x @ self._dense
         return product
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment, Named, Place, Scalars
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.observation.reconstruction import (
     Pseudoinverse,
     Reconstructed,
@@ -146,6 +146,23 @@ class Split:
         """A basis of N(G)^perp, shape (n, k)."""
         return self.inverse.toarray() if self.vectors is None else self.vectors
 
+    @cached_property
+    def _diagonal(self) -> Array | None:
+        """Diagonal of R if that is all of it."""
+        alone = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
+        return self.R.diagonal() if alone else None
+
+    @cached_property
+    def _selected(self) -> IntArray | None:
+        """Which coefficient each present sensor shows, if every one shows one as it is."""
+        selects = self.vectors is None and _is_selection(sp.csr_array(self.inverse.T))
+        return sp.csr_array(self.inverse.T).indices if selects else None
+
+    def project(self, u: Array) -> Array:
+        """Return R u."""
+        projected: Array = self.R @ u if self._diagonal is None else self._diagonal * u
+        return projected
+
     def reconstruct(self, z: Array, boundary: Array) -> Array:
         """Return the observed part R u* = G^+ z of the state in X, shape (n,).
 
@@ -159,7 +176,11 @@ class Split:
         known = z[self.present]
         if boundary.any():
             known = known - self.G @ boundary
-        part: Array = self.inverse @ known
+        if self._selected is None:
+            part: Array = self.inverse @ known
+            return part
+        part = np.zeros(len(boundary))
+        part[self._selected] = known
         return part
 
 
@@ -232,6 +253,11 @@ class Observed:
         G.eliminate_zeros()
         return G
 
+    @cached_property
+    def _shown(self) -> IntArray | None:
+        """Which coefficient each sensor shows, if every one shows one as it is."""
+        return self.G.indices if _is_selection(self.G) else None
+
     @property
     def linear(self) -> bool:
         """True if z = G u, or `linearised` makes it so: what projections and the gradient law need.
@@ -250,7 +276,7 @@ class Observed:
         moment
             Time and input channels.
         """
-        z: Array = self.G @ u
+        z: Array = self.G @ u if self._shown is None else u[self._shown]
         direct = self._direct(moment)
         return z if direct is None else z + direct @ q
 

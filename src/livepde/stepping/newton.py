@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,13 +12,15 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["Newton", "Parts", "Solution", "StepFailed"]
+__all__ = ["TINY", "Newton", "Parts", "Solution", "StepFailed"]
 
 
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
 
 SLOWEST = 0.1  # rate at which a kept factor of a stage with sweeps is expected to go on
+
+TINY = 1e-300  # what is zero counts as this large
 
 STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
 
@@ -55,8 +58,8 @@ class Parts:
     weights
         The squared norm of each part is the sum of weights times squares, shape (n, parts).
     floors
-        Norm of each part below which it counts as this large: a part of nothing but rounding errors
-        has no relative accuracy.
+        Squared norm of each part below which it counts as this large, > 0: a part of nothing but
+        rounding errors has no relative accuracy.
     """
 
     weights: Array
@@ -65,17 +68,17 @@ class Parts:
     @classmethod
     def whole(cls, size: int) -> Parts:
         """Return one part, measured in the Euclidean norm."""
-        return cls(np.ones((size, 1)), (0.0,))
+        return cls(np.ones((size, 1)), (TINY,))
 
     def squares(self, x: Array) -> list[float]:
         """Return the squared norm of each part."""
         squares: list[float] = ((x * x) @ self.weights).tolist()
         return squares
 
-    def scales(self, y: Array) -> list[float]:
-        """Return the squared norms that errors of y are measured by; none is zero."""
-        pairs = zip(self.squares(y), self.floors, strict=True)
-        return [max(square, floor**2, 1e-300) for square, floor in pairs]
+    def relative(self, change: Array, y: Array) -> float:
+        """Return the size of a change of y, relative to it, in its worst part."""
+        pairs = zip(self.squares(change), self.squares(y), self.floors, strict=True)
+        return math.sqrt(max(square / max(scale, floor) for square, scale, floor in pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +129,7 @@ class Newton:
     """
 
     tolerance: float = 1e-7
-    share: float = 0.01
+    share: float = 0.05
     iterations: int = 60
     refresh: float = 0.2
     basin: float = 3e-2
@@ -135,7 +138,7 @@ class Newton:
     def solve(
         self,
         equation: StageEquation,
-        y: Array,
+        y: Array | Callable[[], Array],
         parts: Parts | None = None,
         *,
         lagged: bool = False,
@@ -148,6 +151,8 @@ class Newton:
 
         Parameters
         ----------
+        y
+            The start, or a function that returns it: with `near` it may not be needed.
         parts
             What of y is measured separately; by default nothing.
         lagged
@@ -168,13 +173,12 @@ class Newton:
         StepFailed
             "not_converged", "not_finite" or "singular".
         """
-        factor = kept
-        begin = start = y
-        y = start if near is None else near
+        factor, given = kept, y
+        y = begin = start = _evaluated(given) if near is None else near
         parts = parts or Parts.whole(len(y))
         last, basin, sweeps = math.inf, self.basin, lagged and near is None
         limit, stalled = math.inf if near is None else self.basin, 0
-        miss = [0.0] * len(parts.floors)
+        strict, miss = max(self.tolerance, 1e-150) ** 2, [0.0] * len(parts.floors)
         missed = seen = math.nan
         for count in range(1, self.iterations + 1):
             residual = equation.residual(y)
@@ -184,15 +188,21 @@ class Newton:
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
-            squares, scales = parts.squares(update), parts.scales(new)
+            squares, scales = parts.squares(update), parts.squares(new)
             if not math.isfinite(sum(squares) + sum(scales)):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
-            size = _largest(squares, scales)
             if count == 1 and near is not None:
-                missed, miss = size, [self.share**2 * square for square in squares]
-            # Updates are compared with what may be left of the error.
-            allowed = [max(self.tolerance**2 * s, m) for s, m in zip(scales, miss, strict=True)]
-            excess = _largest(squares, allowed)
+                miss = [self.share**2 * square for square in squares]
+            # Updates are relative to y, and compared with what may be left of the error.
+            size = excess = 0.0
+            for square, scale, floor, m in zip(squares, scales, parts.floors, miss, strict=True):
+                if square > 0.0:
+                    scale = max(scale, floor)
+                    size = max(size, square / scale)
+                    excess = max(excess, square / max(strict * scale, m))
+            size, excess = math.sqrt(size), math.sqrt(excess)
+            if count == 1 and near is not None:
+                missed = size
             ratio = excess / last
             if ratio >= 0.5 and size <= ROUNDING:
                 break  # updates that no longer shrink down there are rounding errors
@@ -203,14 +213,19 @@ class Newton:
             if math.isinf(last):
                 rate = min(expected, 1.0) if count == 1 and missed <= trusted else 1.0
             done = excess * rate <= 1.0 - rate  # the error is rate/(1 - rate) times the update
-            slow = ratio > self.refresh and not done
+            # A kept factor that needs one or two more is not replaced now.
+            ends = kept is not None and count <= 2 and excess * rate**3 <= 1.0 - rate
+            slow = ratio > self.refresh and not (done or ends)
             if (
                 lagged
                 and not sweeps
                 and (size >= limit or (slow and near is not None and kept is None))
             ):
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
-                basin = 0.3 * basin if near is None else basin
+                if near is None:
+                    basin *= 0.3
+                else:
+                    begin = start = _evaluated(given)
                 y, factor, sweeps, near, last = begin, None, True, None, math.inf
                 limit, stalled = math.inf, 0
                 miss, missed = [0.0] * len(miss), math.nan
@@ -240,7 +255,5 @@ class Newton:
         return Solution(new, count, missed, seen)
 
 
-def _largest(squares: list[float], scales: list[float]) -> float:
-    """Return the largest of the norms, relative to scales; all are given by their squares."""
-    pairs = zip(squares, scales, strict=True)
-    return math.sqrt(max(square / max(scale, 1e-300) for square, scale in pairs))
+def _evaluated(start: Array | Callable[[], Array]) -> Array:
+    return start() if callable(start) else start
