@@ -47,3 +47,59 @@ def test_a_fleet_is_held_against_separate_runs(costs, monkeypatch):
     found = suite.setup_cache()
     assert suite.track_step(found) > 0.0
     assert suite.track_command(found) > 0.0
+
+
+# --- the page of costs ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(monkeypatch):
+    pytest.importorskip("matplotlib", reason="the extra 'plots' is not installed")
+    monkeypatch.syspath_prepend(str(FOLDER.parent / "docs"))
+    sys.modules.pop("performance", None)
+    return importlib.import_module("performance")
+
+
+def output(ratio: float, *, nodes: int, ok: bool = True) -> str:
+    """Return what `livepde bench step --json` prints."""
+    law = "gradient, gain 1, c1 0.1"
+    check = {"name": f"{nodes}", "value": ratio, "bound": 3.0, "sense": "<=", "ok": ok}
+    table = {
+        "title": "Steps",
+        "columns": ["nodes", "law", "min", "median", "max", "bound"],
+        "rows": [
+            [nodes, law, ratio, ratio, ratio, 3.0],
+            [nodes, "sensitivity", 1.0, 2.0, 3.0, None],
+        ],
+    }
+    content = {"command": "livepde bench step", "checks": [check], "tables": [table], "notes": []}
+    return json.dumps(content)
+
+
+def test_the_page_of_costs_shows_all_that_was_measured(page, tmp_path):
+    folder = tmp_path / "performance"
+    folder.mkdir()
+    (folder / "step.json").write_text(output(4.25, nodes=31))
+    (folder / "step-again.json").write_text(output(2.75, nodes=31))
+    (folder / "step-large.json").write_text(output(2.5, nodes=1_000))
+    table = {"title": "Memory", "columns": ["nodes", "kB per unknown"], "rows": [[1_000, 1.5]]}
+    found = {"command": "livepde bench scale", "checks": [], "tables": [table], "notes": []}
+    (folder / "scale.json").write_text(json.dumps(found))
+    page.write(tmp_path)
+    text = (tmp_path / "performance.md").read_text()
+    assert "| 31 | gradient, gain 1, c1 0.1 | 2.75 | 2.75 | 2.75 | 3 |" in text
+    assert "| 1000 | sensitivity | 1 | 2 | 3 | – |" in text
+    assert "4.25" not in text  # measured again
+    assert text.count("livepde bench step\n") == 2  # title and command
+    assert {"step.png", "memory.png"} <= {file.name for file in folder.iterdir()}
+    assert page.remembered({"scale": found}) == {"scale": [(1_000, 1.5)]}
+
+
+def test_what_a_benchmark_prints_is_kept(page, tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "MEASURED", tmp_path / "performance")
+    page.measure(["step"], [12])
+    found = json.loads((tmp_path / "performance" / "step.json").read_text())
+    assert {row["nodes"] for row in page.rows_of(found)} == {12}
+    assert len({row["law"] for row in page.rows_of(found)}) > 3
+    with pytest.raises(SystemExit, match="no JSON"):
+        page.measure(["nonsense"], [])

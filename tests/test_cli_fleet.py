@@ -50,6 +50,14 @@ def call(*arguments: str) -> tuple[int, str]:
     return result.exit_code, result.stdout
 
 
+@pytest.fixture
+def processes():
+    """Processes of joblib stay, in the folder where they began: each test has its own."""
+    loky = pytest.importorskip("joblib.externals.loky", reason="'fleet' is not installed")
+    yield
+    loky.get_reusable_executor().shutdown(wait=True)
+
+
 def alone(out: str, *options: str) -> pd.Series:
     """Return the estimates of `livepde run`."""
     call("run", "rod/case.toml", "--out", out, "--json", *options)
@@ -88,8 +96,8 @@ def test_goes_on_with_what_is_there(here):
     assert [row[0] for row in rows[1]] == ["plain", "warm"]
 
 
+@pytest.mark.usefixtures("processes")
 def test_in_several_processes(here):
-    pytest.importorskip("joblib", reason="the extra 'fleet' is not installed")
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "one")
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "two", "--jobs", "2")
     one, two = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("one", "two"))
@@ -203,6 +211,16 @@ def test_members_that_are_alike_step_together(alike):
         equal(Path("rods") / name, Path("apart") / name)
     left, right = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("rods", "apart"))
     pd.testing.assert_frame_equal(left, right, rtol=1e-7)
+
+
+@pytest.mark.usefixtures("processes")
+def test_each_process_steps_its_part_together(alike):
+    Path("rods.csv").write_text(ALIKE + "d,rod/third.csv,\n")
+    call(*FIRST, "one")
+    _, output = call(*FIRST, "two", "--jobs", "2", "--json")
+    assert json.loads(output)["notes"][0] == "Of 4 members 4 were stepped together."
+    for name in "abcd":
+        equal(Path("two") / name, Path("one") / name)
 
 
 def test_what_it_leaves_serves_other_commands(alike):

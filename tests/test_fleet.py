@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from problems import laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from livepde.bench.fleet import fleet as benchmark
-from livepde.fleet import innovations
+from livepde.fleet import Kept, innovations
 from livepde.laws.consistency import Consistency
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern
 from livepde.models import heat
+from livepde.result import Result
 
 SENSORS = lp.Points({"T_1": 0.3, "T_2": 0.5, "T_3": 0.8}, noise=0.02)
 POSITIVE = {"transform": "log", "bounds": (0.0, np.inf)}
@@ -419,6 +421,70 @@ def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
     for k in (0, 2, 5):
         dense = pattern.matrix(data[k]).toarray()
         np.testing.assert_allclose(x[:, k], np.linalg.solve(dense, right[:, k].T).T, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
+    """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
+    model = MODELS[name]()
+    fleet = lp.Fleet(model, SENSORS, LAWS["gate, noise"], 3, withheld=lp.Points({"hidden": 0.4}))
+    kept = Kept(model, 4)
+    results = [Result(model, fleet.observed, fleet.withheld, 4) for _ in range(3)]
+    for t, z, inputs in samples(fleet, 9):
+        estimate = fleet.step(t, z, inputs)
+        kept.add(estimate)
+        for k, result in enumerate(results):
+            result.add(estimate.member(k))
+    assert kept.size > 0
+    for k, result in enumerate(results):
+        wanted = result.layout.dataset(list(result.records))
+        assert wanted.sizes["snapshot"] == 3
+        found = result.layout.dataset(list(kept.records(k)))
+        xr.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
+    kept.clear()
+    assert (kept.size, list(kept.records(0))) == (0, [])
+
+
+def test_members_that_step_separately_are_not_kept_as_arrays():
+    fleet = lp.Fleet(rod(), SENSORS, lp.SensitivityLaw(replay=lp.Replay()), 2)
+    estimate = fleet.step(*samples(fleet, 5)[0])
+    with pytest.raises(lp.ConfigurationError, match="separately"):
+        Kept(fleet.model).add(estimate)
+
+
+@pytest.mark.parametrize("law", ["plain", "drift", "gate, noise"])
+def test_an_identifier_goes_on_from_where_a_member_is(law):
+    fleet = lp.Fleet(rod(), SENSORS, LAWS[law], ["a", "b"])
+    stream = samples(fleet, 24)
+    for sample in stream[:12]:
+        fleet.step(*sample)
+    alone = fleet.identifier("b")
+    assert alone.t == fleet.t[1]
+    again = fleet.identifier(1)
+    again.restore(alone.dump())
+    for t, z, inputs in stream[12:]:
+        estimate = fleet.step(t, z, inputs)
+        given = {name: float(values[1]) for name, values in inputs.items()}
+        one = alone.step(t, z[1], given)
+        np.testing.assert_allclose(estimate.q[1], one.q, rtol=1e-9)
+        np.testing.assert_allclose(estimate.u[1], one.u, rtol=1e-9, atol=1e-12)
+        np.testing.assert_array_equal(one.q, again.step(t, z[1], given).q)
+
+
+def test_an_identifier_of_a_fleet_that_has_not_begun():
+    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2)
+    t, z, inputs = samples(fleet, 5)[0]
+    given = {name: float(values[0]) for name, values in inputs.items()}
+    one = fleet.identifier(0).step(t, z[0], given)
+    np.testing.assert_allclose(fleet.step(t, z, inputs).q[0], one.q, rtol=1e-9)
+
+
+def test_a_leap_of_too_many_substeps_is_refused():
+    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, dt_max=0.1)
+    t, z, inputs = samples(fleet, 5)[0]
+    fleet.step(t, z, inputs)
+    with pytest.raises(lp.SampleError, match="longer dt_max"):
+        fleet.step(1e6, z, inputs)
 
 
 def test_the_benchmark_compares_equal_estimates():

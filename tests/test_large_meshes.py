@@ -20,7 +20,10 @@ from skfem import (
 )
 
 import livepde as lp
+from livepde.diagnostics import Spaces, stopping
 from livepde.fem import Form, FunctionSpace, Moment, blocks, forms
+from livepde.laws import memory
+from livepde.observation import base, reconstruction
 
 SLOTS = [("v", "u"), ("v", "q"), ("q", "u"), ("q", "v"), ("u", "q"), ("u", "v")]
 
@@ -218,3 +221,76 @@ def test_vector_fields_and_points_on_large_meshes(pieces):
     close(large.doflocs, small.basis.doflocs)
     with pytest.raises(lp.ObservationError, match=r"point 1 at \[1.5, 0.5\]"):
         large.probe(np.array([[0.5, 1.5], [0.5, 0.5]]))
+
+
+def square(cells=12):
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
+    return lp.Model(
+        lp.Field(mesh, ElementTriP1(), dirichlet={"boundary": 0.0}),
+        lp.Field(mesh, ElementTriP1(), inner="H1"),
+        A=lambda q, u, v, x: q * u * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+        f=lambda x, t: np.exp(-t) * x[0],
+    )
+
+
+@pytest.mark.parametrize(
+    ("law", "sensors"),
+    [
+        (lp.GradientLaw(10.0), lp.Subdomain(lambda x: x[0] < 0.6)),
+        (lp.SensitivityLaw(modes=4, noise=1e-3), lp.Points([(0.3, 0.4), (0.7, 0.6)])),
+    ],
+)
+def test_estimates_on_large_meshes(law, sensors, pieces, monkeypatch):
+    def make():
+        model = square()
+        u = model.initial(lambda x: x[0] * (1 - x[0]) * x[1] * (1 - x[1]))
+        identifier = lp.Identifier(model, sensors, law, q0=0.5, u0=u)
+        G = identifier.observed.G
+        for k in range(4):
+            estimate = identifier.step(0.1 * k, (1.0 - 0.2 * k) * (G @ u))
+            assert estimate.status.ok
+        return estimate
+
+    def large():
+        pieces()
+        monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
+
+    small, found = both(make, large)
+    np.testing.assert_allclose(found.u, small.u, rtol=0, atol=1e-8 * np.abs(small.u).max())
+    np.testing.assert_allclose(found.q, small.q, rtol=0, atol=1e-7 * np.abs(small.q).max())
+
+
+def test_what_would_be_a_dense_matrix_of_a_field_is_refused(monkeypatch):
+    model = square()
+    averages = lp.Averages({"left": lambda x: x[0] < 0.5, "right": lambda x: x[0] >= 0.5})
+    monkeypatch.setattr(memory, "MOST_DENSE", 100)
+    with pytest.raises(lp.LawError, match="169 are too many, up to 100"):
+        lp.Identifier(model, averages, lp.GradientLaw("auto"))
+    lp.Identifier(model, lp.Full(), lp.GradientLaw("auto"))
+    monkeypatch.setattr(base, "LARGEST_PROJECTION", 10_000)
+    with pytest.raises(lp.ObservationError, match="169 rows with 121 entries each"):
+        lp.Identifier(model, averages, lp.GradientLaw(1.0))
+    lp.Identifier(model, averages, lp.SensitivityLaw(noise=0.1, modes=3))
+    monkeypatch.setattr(reconstruction, "MOST_SENSORS", 100)
+    smooth = lp.Full(reconstruction=lp.observation.Tikhonov("V", 0.1)).bind(
+        model.state_space, model.X, model.parameter_space
+    )
+    with pytest.raises(lp.ObservationError, match=r"121 sensors; .* up to 100"):
+        smooth.reconstruct(np.ones(smooth.size))
+
+
+def test_the_noise_of_many_sensors_is_sampled(monkeypatch):
+    model = square(24)
+    observed = lp.Full().bind(model.state_space, model.X, model.parameter_space)
+    spaces = Spaces(model, observed)
+    std = 0.01 * (1.0 + np.arange(observed.size) / observed.size)
+    exact = stopping.noise_size(spaces, std)
+    monkeypatch.setattr(stopping, "MOST_SENSORS", 100)
+    found = stopping.noise_size(spaces, std)
+    for name in ("X", "VX", "V"):
+        assert getattr(found, name) == pytest.approx(getattr(exact, name), rel=0.03)
+    assert found.X != exact.X
+    monkeypatch.setattr(stopping, "MOST_COLUMNS", 100)
+    with pytest.raises(lp.ConfigurationError, match="529 sensors, up to 100"):
+        stopping.reconstruction_matrix(observed)

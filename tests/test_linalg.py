@@ -16,7 +16,6 @@ from livepde.linalg import (
     Assembler,
     BandedSolver,
     CholmodSolver,
-    KeptSolver,
     MultigridSolver,
     PardisoSolver,
     Pattern,
@@ -26,7 +25,6 @@ from livepde.linalg import (
     choose,
     conjugate_gradients,
     gmres,
-    kept,
     positive_definite,
     sandwich,
 )
@@ -210,35 +208,6 @@ def test_krylov_methods_say_what_to_do_if_they_do_not_converge(method):
     b = np.random.default_rng(0).standard_normal(900)
     with pytest.raises(LinearAlgebraError, match=r"3 iterations.*take a smaller step"):
         method(A.__matmul__, np.copy, b, 1e-10, 3, "take a smaller step")
-
-
-@pytest.mark.parametrize("symmetric", [True, False])
-def test_a_kept_factor_serves_matrices_that_have_moved(symmetric, monkeypatch):
-    A, B = grid(20, reaction=1.0), grid(20, reaction=1.3)
-    b = np.random.default_rng(0).standard_normal((400, 2))
-    solver = KeptSolver(SuperLUSolver(Pattern.of(A), symmetric), symmetric=symmetric)
-    first = solver.factorise(A.data)
-    np.testing.assert_allclose(A @ first.solve(b), b, atol=1e-12)
-    made = []
-    renew = KeptSolver._renew
-    monkeypatch.setattr(
-        KeptSolver, "_renew", lambda self, data: [made.append(data), renew(self, data)][1]
-    )
-    solver.costs.factor = np.inf  # a new factor never pays
-    moved = solver.factorise(B.data)
-    for _ in range(3):
-        np.testing.assert_allclose(B @ moved.solve(b), b, atol=1e-8)
-        np.testing.assert_allclose(A @ first.solve(b), b, atol=1e-12)
-    assert not made
-    assert solver.costs.extra > 0.0
-    solver.costs.factor = 0.0  # it has paid long since
-    np.testing.assert_allclose(B @ moved.solve(b), b, atol=1e-12)
-    assert [data is B.data for data in made] == [True]
-    assert solver.costs.extra == 0.0
-    solver.costs.factor = np.inf
-    monkeypatch.setattr(kept, "ITERATIONS", 1)  # not enough: a new factor after all
-    np.testing.assert_allclose(A @ first.solve(b), b, atol=1e-12)
-    assert len(made) == 2
 
 
 def test_engine_is_chosen_by_the_band():

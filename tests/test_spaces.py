@@ -213,3 +213,50 @@ def test_prior_variances_of_large_fields_are_interpolated(monkeypatch: pytest.Mo
         assert 0.0 < missed.mean() < 0.03
         assert abs(found.sum() / exact.sum() - 1.0) < 0.03
         assert (found[model.Q.fixed] == 0.0).all()
+
+
+def test_modes_and_total_variance_of_large_fields(monkeypatch: pytest.MonkeyPatch):
+    model = reaction(MeshTri().refined(5), ElementTriP1(), q_dirichlet={"boundary": 0.0})
+    Q, mass = model.Q, model.parameter_mass
+    free = np.flatnonzero(Q.free)
+    exact = np.zeros(Q.dim)
+    exact[free] = np.diag(np.linalg.inv(Q.gram.toarray()[np.ix_(free, free)]))
+    weights = mass.diagonal()
+    phi, variance = Q.modes(12, mass)
+    monkeypatch.setattr(spaces, "LARGE", 500)
+    found, again = Q.modes(12, mass)
+    np.testing.assert_allclose(again, variance, rtol=1e-7)
+    np.testing.assert_allclose(found.T @ (Q.gram @ found), np.eye(12), atol=1e-9)
+    for modes in (phi[:, :0], phi):
+        held = weights @ (modes**2).sum(axis=1)
+        rest = weights @ exact - held
+        left = Q.spread(weights, modes) - held
+        assert left != rest
+        assert abs(left - rest) < 0.1 * rest
+    assert Q.spread(weights, phi) == Q.spread(weights, phi)
+
+
+def test_fewer_variances_are_solved_for_in_larger_fields(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(spaces, "LARGE", 200)
+    monkeypatch.setattr(spaces, "FEWEST_SOLVED", 10)
+    model = reaction(MeshTri().refined(4), ElementTriP1())
+    exact = np.diag(np.linalg.inv(model.Q.gram.toarray()))
+    with monkeypatch.context() as patched:
+        patched.setattr(spaces, "SOLVED", 100)  # 69 of 289
+        some = int(np.isclose(model.Q.variance, exact, rtol=1e-9).sum())
+    assert 69 <= some < 80
+
+
+def test_large_well_conditioned_spaces_need_no_factor(monkeypatch: pytest.MonkeyPatch):
+    def make():
+        return reaction(MeshTri().refined(5), ElementTriP1(), q_dirichlet={"boundary": 0.0})
+
+    direct = make()
+    factors = direct.X.factor, direct.Q.factor
+    monkeypatch.setattr(spaces, "LARGE", 500)
+    found = make()
+    b = np.random.default_rng(0).standard_normal((direct.X.dim, 3))
+    for one, other in ((found.X, direct.X), (found.Q, direct.Q)):
+        np.testing.assert_allclose(one.riesz(b), other.riesz(b), rtol=1e-8, atol=1e-9)
+    assert type(found.X.factor) is not type(factors[0])  # L2
+    assert type(found.Q.factor) is type(factors[1])  # H1

@@ -14,7 +14,7 @@ from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Pattern, analyse
-from livepde.stepping import ForwardStage, Parts, StepFailed, advance, simulate
+from livepde.stepping import TINY, ForwardStage, Parts, StepFailed, advance, simulate
 
 SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
 
@@ -321,7 +321,7 @@ def test_newton_says_how_it_failed(equation, start, newton, code):
 def test_tolerance_is_relative_in_each_block():
     """State and parameter may differ by many orders of magnitude."""
     equation = Equation([1e-24, 1e24])
-    parts = Parts(np.eye(2), (0.0, 0.0))
+    parts = Parts(np.eye(2), (TINY, TINY))
     y = lp.Newton().solve(equation, np.array([1.3e-8, 1.1e8]), parts).y
     np.testing.assert_allclose(y, [1e-8, 1e8], rtol=1e-8)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -208,7 +209,7 @@ class Identifier:
             of a moving sensor may be missing, and is not held.
         """
         t = _number(t, "time t")
-        if np.isnan(t):
+        if math.isnan(t):
             raise SampleError("time t is NaN; give the time of the sample.")
         measured, withheld, named = self._parse(z, inputs or {})
         values, held = self._filled(named)
@@ -331,7 +332,7 @@ class Identifier:
     ) -> tuple[Array, Array, dict[str, float]]:
         """Return assimilated values, withheld values, and inputs, all checked."""
         hidden = self.withheld.names if self.withheld else ()
-        if isinstance(z, Mapping):
+        if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             unknown = [name for name in (*z, *inputs) if name not in self.channels]
             if unknown:
                 raise SampleError(
@@ -354,6 +355,8 @@ class Identifier:
 
     def _filled(self, named: dict[str, float]) -> tuple[Inputs, tuple[str, ...]]:
         """Return all inputs; a missing one holds its last value."""
+        if not self.inputs:
+            return self._inputs, ()
         values, held, last = {}, [], dict(self._inputs)
         for name in self.inputs:
             value = named.get(name, np.nan)
@@ -437,6 +440,8 @@ class Identifier:
 
 def _number(value: Any, what: str) -> float:
     """Return a float; None is missing (NaN)."""
+    if type(value) is float and math.isfinite(value):
+        return value
     if value is None:
         return np.nan
     if isinstance(value, str | bytes | bool):
@@ -451,6 +456,9 @@ def _number(value: Any, what: str) -> float:
 
 
 def _array(z: Any, observed: Observed) -> Array:
+    usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
+    if usual and np.isfinite(z).all():
+        return np.array(z)
     if (
         np.asarray(z).dtype.kind in "USb"
         if not isinstance(z, list | tuple)

@@ -201,7 +201,7 @@ class Result:
             estimate.withheld_error,
             STATUS_CODES.index(estimate.status.code),
             estimate.steps,
-            estimate.notes,
+            dict(estimate.notes),
             self.snapshot(estimate) if keeps else None,
         )
 

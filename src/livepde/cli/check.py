@@ -150,9 +150,9 @@ def _show_wiring(console: Console, case: Case) -> None:
 def _show_model(console: Console, case: Case) -> None:
     model = case.model
     console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.frame.equation.formula)}")
-    from livepde.linalg import choose
+    from livepde.stepping import ForwardStage
 
-    engine = choose(model.form_M.pattern("v", "u"))
+    engine = ForwardStage(model).engine
     console.print(
         f"State: {model.X.dim} coefficients; parameter: {model.Q.dim}; "
         f"law: {type(case.law).__name__}; scheme: {type(case.scheme).__name__}; "

@@ -18,6 +18,7 @@ from livepde.spaces import HilbertSpace
 
 __all__ = ["Excitation", "ExcitationState", "Spectrum"]
 
+ENTRIES = 5_000_000  # numbers of a block of states
 DENSE = 1000  # parameters up to which the sum over windows is kept as a matrix
 
 
@@ -177,6 +178,10 @@ class Excitation:
 
     def _gramian(self, integral: sp.csr_array, x: Array) -> Array:
         """Return S* S x with S = R M^{-1} integral: Q -> X, as dual vectors of Q."""
+        width = max(1, ENTRIES // integral.shape[0])
+        if x.ndim == 2 and x.shape[1] > width:
+            starts = range(0, x.shape[1], width)
+            return np.hstack([self._gramian(integral, x[:, k : k + width]) for k in starts])
         X, R = self.spaces.model.X, self.spaces.split.R
         image = R @ X.riesz(integral @ x)
         back: Array = integral.T @ X.riesz(R.T @ (self.spaces.model.mass @ image))

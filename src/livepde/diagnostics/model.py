@@ -134,7 +134,7 @@ class _Point:
 def _densities(form: Form, moment: Moment, **coefficients: Array) -> Array:
     """Return the weighted integrand at all quadrature points: the form without any shortcut."""
     found = []
-    for term in form.terms:
+    for term in (piece for whole in form.terms for _, piece in whole.pieces()):
         values = {key: local.values(coefficients[key]) for key, local in term.spaces.items()}
         density, _ = term.evaluate(values, moment)
         weights = term.measure.weights

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from livepde.diagnostics.bounds import TwinTracker, bounds, conditions
 from livepde.diagnostics.constants import Spaces, constants
@@ -151,7 +152,7 @@ class OnlineTracker:
         self.last: Estimate | None = None
         self.noise = identifier.observed.noise if noise is None else noise
         self._every = 1
-        self._matrices: dict[int, Array] = {}
+        self._matrices: dict[int, Array | sp.csr_array] = {}
         self._sizes: dict[int, Norms] = {}
 
     def add(self, estimate: Estimate, sample: Sample) -> None:
@@ -207,9 +208,7 @@ class OnlineTracker:
                 self._matrices.clear()
                 self._sizes.clear()
             self._matrices[key] = (
-                reconstruction_matrix(observed, alpha)
-                if alpha > 0
-                else observed.split().inverse.toarray()
+                reconstruction_matrix(observed, alpha) if alpha > 0 else observed.split().inverse
             )
         matrix = self._matrices[key]
         noise = None if callable(self.noise) else self._sizes.get(key)

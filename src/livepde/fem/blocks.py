@@ -455,7 +455,7 @@ class FieldBlock(Block):
                     count = len(dofs)
                     functions.extend(measure.gbasis(self.element, i) for i in range(count))
             stack = np.stack([_jet(function, part) for function in functions], axis=-3)
-            return stack.reshape(-1, *shape)
+            return stack.reshape(int(np.prod(stack.shape[:-3])), *shape)
 
         return Local(dofs, parts, evaluate)
 
@@ -488,26 +488,29 @@ class FieldBlock(Block):
         if self.field.transform is not None:  # a projection need not stay within the bounds
             nodes = self.doflocs
             return np.asarray(value(nodes) + 0.0 * nodes[0])
-        return self.project(lambda piece: value(piece.points) + 0.0 * piece.points[0])
+        return self._projected(lambda at, piece: value(piece.points) + 0.0 * piece.points[0])
 
     @cached_property
     def measure(self) -> Measure:
         """The mesh with the order of the mass matrix."""
         return Measure(self.field.mesh, 2 * int(self.element.maxdeg))
 
-    def project(self, values: Callable[[Measure], Array]) -> Array:
+    def project(self, values: Array) -> Array:
         """Return the coefficients of the L2 projection of a function.
 
         Parameters
         ----------
         values
-            Its values at the quadrature points of a piece of `measure`, shape (..., elements,
-            points).
+            Its values at the points of `measure`, of as many numbers as these have.
         """
+        grid = values.reshape(-1, *self.measure.shape)
+        return self._projected(lambda at, piece: grid[:, at])
+
+    def _projected(self, values: Callable[[slice, Measure], Array]) -> Array:
         functional = np.zeros(self.size)
-        for _, piece in self.measure.pieces():
+        for at, piece in self.measure.pieces():
             local = self.local(piece)
-            density = (values(piece) * piece.weights).reshape(-1, *piece.shape)
+            density = (values(at, piece) * piece.weights).reshape(-1, *piece.shape)
             tested = np.einsum("kep,kiep->ie", density, local.part("value"))
             np.add.at(functional, local.dofs.ravel(), tested.ravel())
         if self.measure.kept:

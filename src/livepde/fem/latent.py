@@ -222,7 +222,7 @@ class Composed(FormMatrices):
         super().__init__()
         self.form = form
         self.latent = latent
-        self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array]] = {}
+        self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array | None]] = {}
 
     @property
     def affine(self) -> bool:
@@ -257,10 +257,13 @@ class Composed(FormMatrices):
         """Return the sparsity of the matrices `data(rows, cols)`."""
         return self._mapped(rows, cols)[0]
 
-    def _mapped(self, rows: str, cols: str) -> tuple[Pattern, sp.csr_array]:
-        """Return the pattern, and the map of the data of the form in q."""
+    def _mapped(self, rows: str, cols: str) -> tuple[Pattern, sp.csr_array | None]:
+        """Return the pattern, and the map of the data of the form in q; None: the same data."""
         if (rows, cols) not in self._maps:
             inner, V, dim = self.form.pattern(rows, cols), self.latent.V, self.latent.dim
+            if (rows, cols) != ("q", "q") and dim == self.latent.space.dim:  # no harmonics
+                self._maps[rows, cols] = (inner, None)
+                return self._maps[rows, cols]
             left = sp.csr_array(V.T) if rows == "q" else sp.eye_array(inner.shape[0])
             right = V if cols == "q" else sp.eye_array(inner.shape[1])
             i, j, weights = sandwich(left, inner, right)
@@ -274,16 +277,18 @@ class Composed(FormMatrices):
         """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`."""
         pattern, mapped = self._mapped(rows, cols)
         physical = self._physical(coefficients)
-        data: Array = mapped @ self.form.data(rows, cols, moment, **physical)
+        data = self.form.data(rows, cols, moment, **physical)
+        if mapped is not None:
+            data = mapped @ data
         if "q" not in (rows, cols):
             return data
         a = coefficients.get("q", np.zeros(self.latent.dim))
         if not self.latent.linear:
             slopes = self.latent.slopes(a)
             if rows == "q":
-                data *= slopes[pattern.rows]
+                data = data * slopes[pattern.rows]
             if cols == "q":
-                data *= slopes[pattern.indices]
+                data = data * slopes[pattern.indices]
         if rows == cols == "q":
             test = {key: value for key, value in physical.items() if key != "v"}
             force = self.form.matrix("v", "q", moment, **test).T @ physical["v"]

@@ -71,7 +71,6 @@ class Scatter:
             total = total + sp.csr_array(left.T @ right)
         self.pattern = Pattern.of(total)
         self._places: dict[int, IntArray] = {}
-        self._lookup: Any = None
 
     def add(self, data: Array, term: int, at: slice, local: Array, keep: bool = True) -> None:
         """Add the entries of some elements of a term, shape (i, j, elements), to data.
@@ -86,18 +85,21 @@ class Scatter:
     def places(self, term: int) -> IntArray:
         """Return where in the data the entries of a term stand, shape (i, j, elements)."""
         if term not in self._places:
-            self._places[term] = self._at(term, slice(None), False)
+            rows, cols = self.pairs[term]
+            found = np.empty((len(rows), *cols.shape), dtype=np.int32)
+            for i, row in enumerate(rows):
+                for j, col in enumerate(cols):
+                    found[i, j] = self.pattern.positions(row, col)
+            self._places[term] = found
         return self._places[term]
 
     def _at(self, term: int, at: slice, keep: bool) -> IntArray:
         if keep or term in self._places:
             return self.places(term)[:, :, at]
         rows, cols = (dofs[:, at] for dofs in self.pairs[term])
-        found = np.empty((len(rows), *cols.shape), dtype=np.int32)
-        for i, row in enumerate(rows):
-            for j, col in enumerate(cols):
-                found[i, j] = self.pattern.positions(row, col)
-        return found
+        shape = (len(rows), *cols.shape)
+        i, j = np.broadcast_to(rows[:, None], shape), np.broadcast_to(cols, shape)
+        return self.pattern.positions(i.ravel(), j.ravel()).reshape(shape)
 
 
 def _members(dofs: IntArray, count: int) -> sp.csr_array:

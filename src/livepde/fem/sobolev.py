@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.special import gamma
 from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
 
 from livepde.errors import SpaceError
 from livepde.fem.shapes import ddot, dot, grad, hess
-from livepde.linalg import Array
+from livepde.linalg import Array, Pattern, analyse
 
 __all__ = ["Sobolev"]
 
@@ -168,7 +168,9 @@ def _largest(M: sp.csr_array, K: sp.csr_array) -> float:
     if M.shape[0] < 3:
         return float(np.linalg.eigvals(np.linalg.solve(M.toarray(), K.toarray())).real.max())
     start = np.random.default_rng(0).standard_normal(M.shape[0])
-    value = eigsh(K, k=1, M=sp.csc_array(M), v0=start, tol=0.05, return_eigenvectors=False)
+    factor = analyse(Pattern.of(M), symmetric=True).factorise(sp.csr_array(M).sorted_indices().data)
+    inverse = LinearOperator(M.shape, matvec=factor.solve, dtype=float)
+    value = eigsh(K, k=1, M=M, Minv=inverse, v0=start, tol=0.05, return_eigenvectors=False)
     return 1.2 * float(value[0])
 
 

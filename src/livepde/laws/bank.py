@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import comb
 
@@ -295,7 +296,7 @@ class AutoLaw(Law[Bank, AutoState]):
         if noise is None:
             return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
         begun = replace(self._initial(work, state.start), noise=noise)
-        notes: dict[str, float] = {}
+        notes: Mapping[str, float] = {}
         first = waiting.first(work.channels)
         if first.present.any():
             begun = self.begin(work, begun, first)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, TypeVar
@@ -15,7 +16,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import Advance, Interval, StepFailed
 
-__all__ = ["Belief", "Law", "Problem", "Report", "Status"]
+__all__ = ["Belief", "Law", "Notes", "Problem", "Report", "Status"]
 
 REMEDIES = {
     "ok": "",
@@ -179,6 +180,30 @@ def _deviation(factor: Array, inflation: float) -> Array:
     return std
 
 
+class Notes(Mapping[str, float]):
+    """Numbers worth keeping; those given by a function are computed when they are looked at.
+
+    >>> notes = Notes({"alpha": 2.0, "residual": lambda: 3.0})
+    >>> dict(notes)
+    {'alpha': 2.0, 'residual': 3.0}
+    """
+
+    def __init__(self, values: Mapping[str, float | Callable[[], float]]) -> None:
+        self._values = dict(values)
+
+    def __getitem__(self, name: str) -> float:
+        value = self._values[name]
+        if callable(value):
+            value = self._values[name] = value()
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
 @dataclass(frozen=True, eq=False)
 class Report:
     """What a step tells beside the new state.
@@ -199,7 +224,7 @@ class Report:
     status: Status
     predicted: Array
     steps: int = 0
-    notes: dict[str, float] = field(default_factory=dict)
+    notes: Mapping[str, float] = field(default_factory=dict)
 
 
 Work = TypeVar("Work")

@@ -26,7 +26,7 @@ from livepde.linalg import (
 )
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import Newton, Parts, Solution
+from livepde.stepping import TINY, Newton, Parts, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
@@ -375,7 +375,7 @@ class CoupledStage:
         y = solved.y
         miss = y - near
         trend = self._trend(miss, warm.miss) if follows else np.zeros(3)
-        missed = self._size(miss, y) if math.isnan(solved.missed) else solved.missed
+        missed = self.parts.relative(miss, y) if math.isnan(solved.missed) else solved.missed
         kept = self._keep(warm.kept, equation, solved, age) if self.keeps else warm.kept
         return y, Warm(missed, miss, trend, h, kept)
 
@@ -423,17 +423,12 @@ class CoupledStage:
         """The state and what is observed of it, in L2 with lumped mass, and the parameter."""
         mass = self.model.state_mass.diagonal()
         state = np.stack([mass, mass * self.split.R.diagonal()], axis=1)
-        floor = RESOLVED * float(np.linalg.norm(self.model.latent.deviations))
+        floor = RESOLVED**2 * float((self.model.latent.deviations**2).sum())
         if self.by_blocks is not None:
-            return _Lean(state, (0.0, floor))
+            return _Lean(state, (TINY, floor))
         weights = np.zeros((self.size, 3))
         weights[: self.n, :2], weights[self.n :, 2] = state, 1.0
-        return Parts(weights, (0.0, 0.0, floor))
-
-    def _size(self, change: Array, y: Array) -> float:
-        """Return the size of a change of y, relative to it, in its worst part."""
-        pairs = zip(self.parts.squares(change), self.parts.scales(y), strict=True)
-        return max(math.sqrt(square / scale) for square, scale in pairs)
+        return Parts(weights, (TINY, TINY, floor))
 
     def _equation(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> _Equation:
         if self.by_blocks is not None:
@@ -491,8 +486,9 @@ class _Lean(Parts):
         return [state, observed, float(x[n:] @ y[n:])]
 
     def allowed(self, share: float, missed: list[float], scales: list[float]) -> list[float]:
-        worst = max(square / scale for square, scale in zip(missed, scales, strict=True))
-        return [share**2 * worst * scale for scale in scales]
+        floored = [max(scale, floor) for scale, floor in zip(scales, self.floors, strict=True)]
+        worst = max(square / scale for square, scale in zip(missed, floored, strict=True))
+        return [share**2 * worst * scale for scale in floored]
 
 
 class _Equation:
@@ -730,14 +726,17 @@ class _Bordered:
     column: Array
     row: Array
 
+    @cached_property
+    def _scaled(self) -> Array:
+        pivot = 1.0 + float(self.row @ self.column[: len(self.row)])
+        if pivot == 0.0:
+            raise LinearAlgebraError("The damped system is singular: take less damping.")
+        return self.row / pivot
+
     def solve(self, b: Array) -> Array:
         """Return the solution for a right-hand side."""
         x = self.inner.solve(b)
-        n = len(self.row)
-        pivot = 1.0 + float(self.row @ self.column[:n])
-        if pivot == 0.0:
-            raise LinearAlgebraError("The damped system is singular: take less damping.")
-        return x - self.column * (float(self.row @ x[:n]) / pivot)
+        return x - self.column * (self._scaled @ x[: len(self.row)])
 
 
 def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:

@@ -21,6 +21,8 @@ __all__ = ["Filter", "Motion", "Point", "reduction"]
 ROUNDING = 1e-9  # share of a variance that is none
 LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
 MOST_MODES = 60  # of a field with modes="auto"
+GAIN = 1e-4  # relative error of a square root of the covariance: it steers the gain only
+ESTIMATE = 1e-8  # of the estimated deviation of the state
 BLOCK = 32  # columns that LAPACK's QR takes at once
 
 
@@ -275,7 +277,7 @@ class Filter:
         """Return the filter at the end of an interval, substeps, and why it failed or None."""
         end = self.moved(point, interval.t1 - interval.t0)
         deviates = bool(end.du.any() or end.da.any())
-        kept = point.kept
+        kept, tolerance = point.kept, ESTIMATE if deviates else GAIN
 
         def directions(at: Point) -> Array:
             along: Array = self.directions(at) if deviates else self.Phi @ at.C
@@ -289,7 +291,7 @@ class Filter:
             if self.moves and t != interval.t1:
                 now = self.moved(point, t - interval.t0)
                 q, along = now.q, directions(now)
-            y, kept = self.forward.advance(c, q, along, h, interval.at(t), kept)
+            y, kept = self.forward.advance(c, q, along, h, interval.at(t), kept, tolerance)
             return y
 
         deviation = [end.du] if deviates else []
@@ -420,7 +422,8 @@ def reduction(
             mass = model.parameter_mass[part, part]
             phi, _ = inner.modes(count, mass)
             if modes == "auto":
-                phi = phi[:, : _enough(phi, inner.variance, mass.diagonal())]
+                weights = mass.diagonal()
+                phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
         else:
             phi = np.eye(item.size) * item.unknown.latent_std
         blocks.append(np.kron(np.eye(item.evolution.copies), phi))
@@ -432,10 +435,10 @@ def reduction(
     return Phi, tuple(motions)
 
 
-def _enough(phi: Array, variance: Array, mass: Array) -> int:
+def _enough(phi: Array, mass: Array, variance: float) -> int:
     """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
     held = np.cumsum(mass @ phi**2)
-    short = int((held < (1.0 - LEFT_OUT) * (mass @ variance)).sum())
+    short = int((held < (1.0 - LEFT_OUT) * variance).sum())
     return min(short + 1, len(held))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.base import Belief, Law, Problem, Report, Status
+from livepde.laws.base import Belief, Law, Notes, Problem, Report, Status
 from livepde.laws.coupled import PULL, CoupledStage, Gains, Warm
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.memory import Learned, Learning
@@ -222,7 +223,8 @@ class GradientLaw(Law[GradientWork, GradientState]):
         self, work: GradientWork, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         model, observed = work.problem.model, work.problem.observed
-        z0, z1 = (observed.linearised(z, state.u) for z in (interval.z0, interval.z1))
+        z0 = observed.linearised(interval.z0, state.u)
+        z1 = observed.linearised(interval.z1, state.u)
         if z1 is not interval.z1:  # a nonlinear sensor
             interval = replace(interval, z0=z0, z1=z1)
         rest, excitation = self.rest, state.excitation
@@ -260,7 +262,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             metric = learning.metric(state.learned, spread, state.q, length)
 
         n = model.X.dim
-        known = resting == state.resting and np.array_equal(interval.present, state.present)
+        known = resting == state.resting and interval.present.tobytes() == state.present.tobytes()
         warm = state.warm if known else Warm.none()
         # When the observed part of the state was looked at last, and what it was.
         looked = (interval.t0, state.u_alpha) if known and alpha == 0.0 else (np.inf, zero)
@@ -304,7 +306,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         rate = end - y
         rate[:n] -= found.u - state.u_alpha if known else coupled.split.project(rate[:n])
         rate /= length
-        notes = {"residual": model.X.norm(r)}
+        notes: dict[str, float | Callable[[], float]] = {"residual": lambda: model.X.norm(r)}
         if resting:
             notes |= {"at_rest": 1.0}
         if regularises:
@@ -317,7 +319,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         moved = (u, q, found.u, rate, warm, interval.present, resting, excitation)
         if learning is None or not isinstance(state, LearningState):
             after = GradientState(*moved)
-            return after, Report(Status(), predicted, steps, notes)
+            return after, Report(Status(), predicted, steps, Notes(notes))
         seen = learning.coupling(coupled.split, u - r, q, interval.end)
         learned = state.learned
         if held:
@@ -327,7 +329,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
         after = LearningState(*moved, learned, balance or state.balance)
-        return after, Report(Status(), predicted, steps, notes)
+        return after, Report(Status(), predicted, steps, Notes(notes))
 
     def belief(self, work: GradientWork, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

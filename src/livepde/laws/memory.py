@@ -52,8 +52,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
+from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled import PULL, Metric, stored
+from livepde.laws.coupled import PULL, Metric
 from livepde.linalg import Array, Pattern
 from livepde.model import Model
 from livepde.observation import Split
@@ -63,6 +64,7 @@ __all__ = ["Learned", "Learning"]
 PROBES = 8  # random vectors for the trace
 FORGETS = 2.0  # power of time that weighs a sample in the mean of S
 FADES = 1.0  # power of time that weighs a sample in J
+MOST_DENSE = 4000  # unknowns of which J may be dense
 RESOLUTION = 1e7  # largest ratio of information to prior: deviations of 1 in 3000
 _RHO = 1.0 / (1.0 + PULL)
 _TURNS = (1.0 + _RHO) / (_RHO**2 * (1.0 - _RHO))
@@ -122,6 +124,12 @@ class Learning:
             A = model.form_A.pattern("v", "q")
             ones = A.matrix(np.ones(A.nnz))
             self.pattern = Pattern.of(sp.csr_array(ones.T @ ones))
+        elif model.Q.dim > MOST_DENSE:
+            raise LawError(
+                "GradientLaw: gain='auto' keeps a dense matrix of all unknowns where sensors read "
+                f"no coefficients; {model.Q.dim} are too many, up to {MOST_DENSE} are possible. "
+                "Give a number for gain, observe a Subdomain, or use SensitivityLaw."
+            )
         else:
             self.pattern = Pattern.of(sp.csr_array(np.ones((model.Q.dim, model.Q.dim))))
 
@@ -155,6 +163,15 @@ class Learning:
         information = self.pattern.matrix(learned.information)
         return Metric(spread, information, learned.information, shift)
 
+    def _stored(self, gained: sp.csr_array) -> Array:
+        """Return the data of what J gains, in the order of its pattern."""
+        gained.sum_duplicates()
+        if gained.nnz == self.pattern.nnz:  # no entry of the pattern is missing
+            return gained.data
+        data, coo = np.zeros(self.pattern.nnz), gained.tocoo()
+        data[self.pattern.positions(coo.row, coo.col)] = coo.data
+        return data
+
     def _product(self, coupling: sp.csr_array, one: Array, other: Array) -> float:
         """Return the inner product of two r as far as q can see them."""
         return float((coupling.T @ one) @ self.model.Q.riesz(coupling.T @ other))
@@ -187,7 +204,7 @@ class Learning:
         gained = sp.csr_array(coupling.T @ sp.diags_array(h * self.weights) @ coupling)
         return replace(
             learned,
-            information=faded * learned.information + stored(gained, self.pattern),
+            information=faded * learned.information + self._stored(gained),
             spread=spread,
             noise=kept * learned.noise + h * noise,
             seen=kept * learned.seen + h * trace,

@@ -361,7 +361,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         level = state.now.level
         for temper in range(guards.temperings + 1):
             tempered = {"tempered": 1.0} if temper else {}
-            begin = replace(state.now, level=level.times(TEMPER**temper))
+            begin = replace(state.now, level=level.times(TEMPER**temper), kept=point.kept)
             if temper:
                 point, _ = self._filter(work, begin, interval)
             if np.abs(point.da - begin.da).max(initial=0.0) <= guards.reach:  # cheaper to see
@@ -399,7 +399,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
 
         if not astray(report):
             return replace(new, scale=scale), report
-        older = work.recentred(state.past.older)
+        older = replace(work.recentred(state.past.older), kept=new.now.kept)
         known = [*state.past.samples.intervals(work.problem.channels), interval]
         silent = [item.silent for item in known]
         for start in (work.loosened(older, 1.0), work.fresh(older)):
@@ -445,7 +445,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             past = state.past
             known = [*past.samples.intervals(work.problem.channels), interval]
             before = max(len(known) - jumps.onset(state.watch, e, usual), 0)
-            point, status = work.recentred(past.older), Status()
+            point, status = replace(work.recentred(past.older), kept=new.now.kept), Status()
             for earlier in known[:before]:
                 point, found = self._filter(work, point, earlier)
                 point, status = work.recentred(point), found.status
@@ -537,7 +537,8 @@ def _next(work: Filter, state: SensitivityState) -> Array:
 
 def _placed(work: Filter, state: SensitivityState, q: Array, first: Moment) -> Point:
     """Return the filter at the start of the window, linear about q."""
-    start, model = replace(state.start, level=state.now.level), work.problem.model
+    start = replace(state.start, level=state.now.level, kept=state.now.kept)
+    model = work.problem.model
     shift = work.reduced(q - start.q)
     if state.initial:
         initial = model.initial_directions(q, work.Phi, first)

@@ -7,7 +7,7 @@ from livepde.linalg.banded import BandedSolver
 from livepde.linalg.blocks import BandedBlocks, BlockFactor
 from livepde.linalg.choice import Choice, analyse, choose
 from livepde.linalg.cholmod import CholmodSolver
-from livepde.linalg.kept import Costs, KeptSolver
+from livepde.linalg.kept import Costs
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
 from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
@@ -28,7 +28,6 @@ __all__ = [
     "Costs",
     "Factor",
     "IntArray",
-    "KeptSolver",
     "Leading",
     "Mask",
     "MultigridSolver",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.linalg.pattern import Pattern, sandwich
-from livepde.linalg.types import IntArray, Sparse
+from livepde.linalg.types import Array, IntArray, Sparse
 
 __all__ = ["Assembler"]
 
@@ -20,7 +23,7 @@ class Assembler:
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._blocks: dict[str, list[tuple[IntArray, IntArray, sp.csr_array]]] = {}
+        self._blocks: dict[str, list[_Block]] = {}
 
     def add(
         self,
@@ -32,27 +35,93 @@ class Assembler:
         transposed: bool = False,
     ) -> None:
         """Add a block; the same name may be added at several places, also as left @ K^T @ right."""
-        shape = inner.shape[::-1] if transposed else inner.shape
-        left = sp.eye_array(shape[0]) if left is None else left
-        right = sp.eye_array(shape[1]) if right is None else right
-        if transposed:
-            cols, rows, weights = sandwich(sp.csr_array(right).T, inner, sp.csr_array(left).T)
-        else:
-            rows, cols, weights = sandwich(left, inner, right)
-        self._blocks.setdefault(name, []).append((rows + at[0], cols + at[1], weights))
+        block = _Block(inner, left, right, at, transposed)
+        known = (other for group in self._blocks.values() for other in group)
+        same = next((other for other in known if other.alike(block)), block)
+        self._blocks.setdefault(name, []).append(same)
 
     def build(self) -> tuple[Pattern, dict[str, sp.csr_array]]:
-        """Return the pattern of the whole and, for each name, the map of its data."""
-        pieces = [piece for group in self._blocks.values() for piece in group]
-        diagonal = np.arange(self.size)
-        rows = np.concatenate([diagonal, *(rows for rows, _, _ in pieces)])
-        cols = np.concatenate([diagonal, *(cols for _, cols, _ in pieces)])
+        """Return the pattern of the whole and, for each name, the map of its data.
+
+        Blocks with the same pattern and factors have one map.
+        """
+        blocks = {id(block): block for group in self._blocks.values() for block in group}
+        entries = [block.entries for block in blocks.values()]
+        diagonal = np.arange(self.size, dtype=np.int32)
+        rows = np.concatenate([diagonal, *(rows for rows, _, _ in entries)])
+        cols = np.concatenate([diagonal, *(cols for _, cols, _ in entries)])
         pattern = Pattern.from_entries(rows, cols, (self.size, self.size))
+        parts = {key: block.mapped(pattern) for key, block in blocks.items()}
         maps = {}
         for name, group in self._blocks.items():
-            parts = [pattern.gather(r, c) @ weights for r, c, weights in group]
-            total = parts[0]
-            for part in parts[1:]:
-                total = total + part
-            maps[name] = sp.csr_array(total)
+            total = parts[id(group[0])]
+            for block in group[1:]:
+                total = sp.csr_array(total + parts[id(block)])
+            maps[name] = total
         return pattern, maps
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """left @ K @ right or left @ K^T @ right, with K of a pattern."""
+
+    inner: Pattern
+    left: Sparse | None
+    right: Sparse | None
+    at: tuple[int, int]
+    transposed: bool
+
+    def alike(self, other: _Block) -> bool:
+        """Return true if the other is made of the same objects."""
+        pairs = zip(*((b.inner, b.left, b.right) for b in (self, other)), strict=True)
+        same = (self.at, self.transposed) == (other.at, other.transposed)
+        return same and all(mine is theirs for mine, theirs in pairs)
+
+    @cached_property
+    def entries(self) -> tuple[IntArray, IntArray, sp.csr_array]:
+        """Rows and columns in the whole, and their values from the data of K."""
+        shape = self.inner.shape[::-1] if self.transposed else self.inner.shape
+        left = sp.eye_array(shape[0]) if self.left is None else self.left
+        right = sp.eye_array(shape[1]) if self.right is None else self.right
+        rows, cols, weights = self._scaled(left, right) or self._product(left, right)
+        return rows + np.int32(self.at[0]), cols + np.int32(self.at[1]), weights
+
+    def _scaled(
+        self, left: Sparse, right: Sparse
+    ) -> tuple[IntArray, IntArray, sp.csr_array] | None:
+        """Return the entries if both factors are diagonal: nothing is added up then."""
+        a, b = _diagonal(left), _diagonal(right)
+        if a is None or b is None:
+            return None
+        rows, cols = self.inner.rows, self.inner.indices
+        if self.transposed:
+            rows, cols = cols, rows
+        scale = a[rows] * b[cols]
+        kept = np.flatnonzero(scale).astype(np.int32)
+        starts = np.arange(len(kept) + 1, dtype=np.int32)
+        shape = (len(kept), self.inner.nnz)
+        return rows[kept], cols[kept], sp.csr_array((scale[kept], kept, starts), shape=shape)
+
+    def _product(self, left: Sparse, right: Sparse) -> tuple[IntArray, IntArray, sp.csr_array]:
+        if self.transposed:
+            a, b = sp.csr_array(right).T, sp.csr_array(left).T
+            cols, rows, weights = sandwich(a, self.inner, b)
+        else:
+            rows, cols, weights = sandwich(left, self.inner, right)
+        return rows, cols, weights
+
+    def mapped(self, pattern: Pattern) -> sp.csr_array:
+        """Return the map from the data of K to those of the whole."""
+        rows, cols, weights = self.entries
+        return sp.csr_array(pattern.gather(rows, cols) @ weights)
+
+
+def _diagonal(matrix: Sparse) -> Array | None:
+    """Return the diagonal of a matrix that has no other entries, else None."""
+    if matrix.shape[0] != matrix.shape[1]:
+        return None
+    coo = sp.coo_array(matrix)
+    if not np.array_equal(coo.row, coo.col):
+        return None
+    found: Array = matrix.diagonal()
+    return found

@@ -37,16 +37,17 @@ class PardisoFactor:
 
 @dataclass(frozen=True, eq=False)
 class PardisoSolver:
-    """Sparse factors of one pattern, ordered once; needs pypardiso.
+    """Sparse factors of one pattern; needs pypardiso.
 
-    `symmetric` for symmetric positive definite matrices: a factor proves that its matrix is one.
+    `symmetric` for symmetric positive definite matrices: a factor proves that its matrix is one,
+    and the pattern is ordered once. The order of others depends on their values, and is made anew
+    for each: what a factor gives must not depend on what was factorised before.
     pypardiso's own `solve` takes no symmetric storage and compares the whole matrix each time;
     so its phases are called one by one.
     """
 
     pattern: Pattern
     symmetric: bool = False
-    price: float = 4.0
     _idle: list[Any] = field(default_factory=list, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -56,6 +57,11 @@ class PardisoSolver:
     def name(self) -> str:
         """How the engine introduces itself."""
         return "Pardiso (MKL)" + (", symmetric positive definite" if self.symmetric else "")
+
+    @property
+    def price(self) -> float:
+        """About how many solves a factorisation costs."""
+        return 4.0 if self.symmetric else 15.0
 
     @property
     def definite(self) -> bool:
@@ -85,7 +91,7 @@ class PardisoSolver:
         known = bool(self._idle)
         kind = POSITIVE_DEFINITE if self.symmetric else GENERAL
         handle = self._idle.pop() if known else PyPardisoSolver(mtype=kind)
-        handle.set_phase(REFACTORISE if known else FACTORISE)
+        handle.set_phase(REFACTORISE if known and self.symmetric else FACTORISE)
         try:
             handle._call_pardiso(matrix, np.zeros(len(matrix.indptr) - 1))
         except PyPardisoError as error:

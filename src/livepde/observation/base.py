@@ -28,6 +28,7 @@ Direct = Callable[[Any, Place], Any]
 STEP = 1e-30  # of the complex step
 DEPENDENT = 1e-12  # eigenvalues of G G* below this share of the largest count as zero
 ROUNDING = 1e-14  # entries of G below this share of the largest of their row count as zero
+LARGEST_PROJECTION = 100_000_000  # entries of R
 LARGEST_MEMO = 64  # splits kept for different patterns of missing samples
 
 
@@ -252,6 +253,11 @@ class Observed:
         G.eliminate_zeros()
         return G
 
+    @cached_property
+    def _shown(self) -> IntArray | None:
+        """Which coefficient each sensor shows, if every one shows one as it is."""
+        return self.G.indices if _is_selection(self.G) else None
+
     @property
     def linear(self) -> bool:
         """True if z = G u, or `linearised` makes it so: what projections and the gradient law need.
@@ -270,7 +276,7 @@ class Observed:
         moment
             Time and input channels.
         """
-        z: Array = self.G @ u
+        z: Array = self.G @ u if self._shown is None else u[self._shown]
         direct = self._direct(moment)
         return z if direct is None else z + direct @ q
 
@@ -378,6 +384,12 @@ class Observed:
             inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
         else:
+            if (support := len(np.unique(tangent.indices))) * n > LARGEST_PROJECTION:
+                raise ObservationError(
+                    f"R, the projection on what these sensors see, has {n} rows with {support} "
+                    "entries each, too many to be stored. At this size observe a Subdomain, of "
+                    "which R is diagonal, or use SensitivityLaw, which needs no R."
+                )
             rows = tangent.toarray()
             representers = rows.T if self.observation.nodal else self.X.riesz(rows.T)
             values, vectors = np.linalg.eigh(rows @ representers)

@@ -24,7 +24,7 @@ from scipy.optimize import brentq
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, ddot, dot, grad, hess
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 
 if TYPE_CHECKING:
     from livepde.observation.base import Observed
@@ -43,6 +43,7 @@ __all__ = [
 
 SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
 ROOT = 1e-10  # relative accuracy of that alpha
+MOST_SENSORS = 10_000  # of a dense decomposition
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +236,7 @@ class Tikhonov(Reconstruction):
 
     Costs one dense generalised eigendecomposition for each set of present sensors, of the size of
     the smaller of their number and N(G)^perp, and one product with a matrix of that size for each
-    sample: meant for up to a few thousand sensors.
+    sample: meant for up to a few thousand sensors, and refused beyond 10 000.
 
     Parameters
     ----------
@@ -297,6 +298,11 @@ class Spectral(Reconstructor):
     def __init__(self, config: Tikhonov, observed: Observed, present: Array) -> None:
         self.config = config
         self.present = present
+        if (count := int(present.sum())) > MOST_SENSORS:
+            raise ObservationError(
+                f"Tikhonov: {count} sensors; it decomposes a dense matrix of them and takes up to "
+                f"{MOST_SENSORS}. Observe fewer points or averages, or leave out reconstruction=."
+            )
         self.G = sp.csr_array(observed.G[np.flatnonzero(present)])
         self.weights = weights(observed, present)
         self.level = noise_level(observed, present, self.weights)
@@ -305,7 +311,8 @@ class Spectral(Reconstructor):
         self.size = basis.shape[1]
         if self.size == 0:
             return
-        seen = np.linalg.cholesky(self.weights).T @ (self.G @ basis)
+        self.root = np.linalg.cholesky(self.weights.toarray()).T
+        seen = self.root @ (self.G @ basis)
         fit = seen.T @ seen
         cost = basis.T @ (penalty @ basis)
         cost = (cost + cost.T) / 2
@@ -319,7 +326,6 @@ class Spectral(Reconstructor):
         self.fitted = (self.G @ self.phi).T @ self.weights
         self.pulled = sp.csr_array(penalty.T) @ self.phi
         self.image = np.linalg.qr(seen)[0]
-        self.root = np.linalg.cholesky(self.weights).T
 
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
         known = z[self.present] - self.G @ boundary
@@ -358,26 +364,25 @@ class Spectral(Reconstructor):
         return delta, rule.choose(misfit, delta, self.rho)
 
 
-def weights(observed: Observed, present: Array) -> Array:
+def weights(observed: Observed, present: Array) -> sp.csr_array:
     """Return the Gram matrix of Z for the sensors present (see `Tikhonov`)."""
     if observed.observation.nodal:
         inverse = observed.split(present).inverse
-        gram: Array = (inverse.T @ observed.X.gram @ inverse).toarray()
-        return gram
+        return sp.csr_array(inverse.T @ observed.X.gram @ inverse)
     if observed.noise is None:
-        return np.eye(int(present.sum()))
-    return np.diag(observed.noise[present] ** -2.0)
+        return sp.csr_array(sp.eye_array(int(present.sum())))
+    return sp.csr_array(sp.diags_array(observed.noise[present] ** -2.0))
 
 
-def noise_level(observed: Observed, present: Array, gram: Array) -> float | None:
+def noise_level(observed: Observed, present: Array, gram: sp.csr_array) -> float | None:
     """Return delta, the root mean square of ||noise||_Z, or None if the noise is not known."""
     if observed.noise is None:
         return None
-    return float(np.sqrt(np.diag(gram) @ observed.noise[present] ** 2))
+    return float(np.sqrt(gram.diagonal() @ observed.noise[present] ** 2))
 
 
-def _norm(z: Array, gram: Array) -> float:
-    return float(np.sqrt(max(float(z @ gram @ z), 0.0)))
+def _norm(z: Array, gram: sp.csr_array) -> float:
+    return float(np.sqrt(max(float(z @ (gram @ z)), 0.0)))
 
 
 class _Inside:
@@ -390,20 +395,21 @@ class _Inside:
                 "Tikhonov: norm 'V' and forms know states of one component; take norm='X'."
             )
         self.block: FieldBlock = self.space.component()[0]
-        self.mask = np.ones(self.block.element_dofs.shape[1])
+        self.cells: Mask | None = None  # all
         if observed.observation.nodal:
             known = np.zeros(self.block.size, dtype=bool)
             known[np.flatnonzero(np.abs(basis).any(axis=1))] = True
             known[self.block.fixed] = True
-            self.mask = known[self.block.element_dofs].all(axis=0).astype(float)
+            self.cells = np.asarray(known[self.block.element_dofs].all(axis=0))
 
     def matrix(self, integrand: Any) -> sp.csr_array:
         """Assemble a symmetric form (u, v, x) over the elements inside."""
-        mask = self.mask[:, None]
         field = self.block.field
         order = field.quadrature or 2 * int(field.element.maxdeg)
         pair = {"u": self.space, "v": self.space}
-        form = Form("norm", lambda u, v, x: mask * integrand(u, v, x), pair, field.mesh, order)
+        form = Form("norm", integrand, pair, field.mesh, order)
+        if self.cells is not None:
+            form = form.on(np.flatnonzero(self.cells))
         if not form.constant:
             raise ObservationError("Tikhonov: the norm may not depend on time or inputs.")
         return form.matrix("v", "u")
@@ -411,13 +417,14 @@ class _Inside:
     @cached_property
     def bends(self) -> bool:
         """True if the element has second derivatives."""
-        return self.block.basis.basis[0][0].hess is not None
+        return self.block.bends
 
     @cached_property
     def inner(self) -> Any:
         """Coefficients of which every element is inside, and that no boundary of the mesh holds."""
         touched = np.zeros(self.block.size, dtype=bool)
-        touched[self.block.element_dofs[:, self.mask == 0.0]] = True
+        if self.cells is not None:
+            touched[self.block.element_dofs[:, ~self.cells]] = True
         touched[self.block.boundary] = True
         return ~touched
 

@@ -105,15 +105,16 @@ class Averages(Observation):
                 f"Averages: region '{name}' is '{where}'; the mesh names {known or 'nothing'}."
             )
         measure = Measure(mesh, 2 * int(element.maxdeg), where)
-        weights = measure.weights
-        if not isinstance(region, str):
-            weights = region(measure.points) * weights
-        size = float(weights.sum())
+        size, row = 0.0, np.zeros(block.size)
+        for _, piece in measure.pieces():
+            weights = piece.weights
+            if not isinstance(region, str):
+                weights = region(piece.points) * weights
+            size += float(weights.sum())
+            local = block.local(piece)
+            np.add.at(row, local.dofs, (local.part("value")[0] * weights).sum(axis=-1))
         if size <= 0:
             raise ObservationError(f"Averages: region '{name}' holds no part of the mesh.")
-        local = block.local(measure)
-        row = np.zeros(block.size)
-        np.add.at(row, local.dofs, (local.phi[0] * weights).sum(axis=-1))
         return row / size
 
 

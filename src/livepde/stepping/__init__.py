@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.newton import Newton, Parts, Solution, StepFailed
+from livepde.stepping.newton import TINY, Newton, Parts, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.state import ForwardStage, Kept, simulate
 
 __all__ = [
+    "TINY",
     "Advance",
     "Alexander2",
     "ForwardStage",

@@ -114,7 +114,7 @@ class Advance:
     def count(self, interval: Interval) -> int:
         """Return the number of even substeps of an interval."""
         ratio = (interval.t1 - interval.t0) / self.dt_max
-        return max(1, int(np.ceil(ratio * (1 - 1e-12))))
+        return max(1, math.ceil(ratio * (1 - 1e-12)))
 
 
 def _width(t: float, stop: float) -> float:

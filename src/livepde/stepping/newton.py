@@ -12,13 +12,15 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["Newton", "Parts", "Solution", "StepFailed"]
+__all__ = ["TINY", "Newton", "Parts", "Solution", "StepFailed"]
 
 
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
 
 SLOWEST = 0.1  # rate at which a kept factor of a stage with sweeps is expected to go on
+
+TINY = 1e-300  # what is zero counts as this large
 
 STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
 
@@ -56,8 +58,8 @@ class Parts:
     weights
         The squared norm of each part is the sum of weights times squares, shape (n, parts).
     floors
-        Norm of each part below which it counts as this large: a part of nothing but rounding errors
-        has no relative accuracy.
+        Squared norm of each part below which it counts as this large, > 0: a part of nothing but
+        rounding errors has no relative accuracy.
     """
 
     weights: Array
@@ -66,7 +68,7 @@ class Parts:
     @classmethod
     def whole(cls, size: int) -> Parts:
         """Return one part, measured in the Euclidean norm."""
-        return cls(np.ones((size, 1)), (0.0,))
+        return cls(np.ones((size, 1)), (TINY,))
 
     def squares(self, x: Array) -> list[float]:
         """Return the squared norm of each part."""
@@ -81,10 +83,10 @@ class Parts:
         """Return how much of each part may be left, from what was missed of it, all squared."""
         return [share**2 * square for square in missed]
 
-    def scales(self, y: Array) -> list[float]:
-        """Return the squared norms that errors of y are measured by; none is zero."""
-        pairs = zip(self.squares(y), self.floors, strict=True)
-        return [max(square, floor**2, 1e-300) for square, floor in pairs]
+    def relative(self, change: Array, y: Array) -> float:
+        """Return the size of a change of y, relative to it, in its worst part."""
+        pairs = zip(self.squares(change), self.squares(y), self.floors, strict=True)
+        return math.sqrt(max(square / max(scale, floor) for square, scale, floor in pairs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +186,7 @@ class Newton:
         parts = parts or Parts.whole(len(y))
         last, basin, sweeps = math.inf, self.basin, lagged and near is None
         limit, stalled = math.inf if near is None else self.basin, 0
-        miss = [0.0] * len(parts.floors)
+        strict, miss = max(self.tolerance, 1e-150) ** 2, [0.0] * len(parts.floors)
         missed = seen = math.nan
         for count in range(1, self.iterations + 1):
             residual = equation.residual(y)
@@ -194,15 +196,21 @@ class Newton:
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
-            squares, scales = parts.squares(update), parts.scales(new)
+            squares, scales = parts.squares(update), parts.squares(new)
             if not math.isfinite(sum(squares) + sum(scales)):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
-            size = _largest(squares, scales)
             if count == 1 and near is not None:
-                missed, miss = size, parts.allowed(self.share, squares, scales)
-            # Updates are compared with what may be left of the error.
-            allowed = [max(self.tolerance**2 * s, m) for s, m in zip(scales, miss, strict=True)]
-            excess = _largest(squares, allowed)
+                miss = parts.allowed(self.share, squares, scales)
+            # Updates are relative to y, and compared with what may be left of the error.
+            size = excess = 0.0
+            for square, scale, floor, m in zip(squares, scales, parts.floors, miss, strict=True):
+                if square > 0.0:
+                    scale = max(scale, floor)
+                    size = max(size, square / scale)
+                    excess = max(excess, square / max(strict * scale, m))
+            size, excess = math.sqrt(size), math.sqrt(excess)
+            if count == 1 and near is not None:
+                missed = size
             ratio = excess / last
             if ratio >= 0.5 and size <= ROUNDING:
                 break  # updates that no longer shrink down there are rounding errors
@@ -213,7 +221,9 @@ class Newton:
             if math.isinf(last):
                 rate = min(expected, 1.0) if count == 1 and missed <= trusted else 1.0
             done = excess * rate <= 1.0 - rate  # the error is rate/(1 - rate) times the update
-            slow = ratio > self.refresh and not done
+            # A kept factor that needs one or two more is not replaced now.
+            ends = kept is not None and count <= 2 and excess * rate**3 <= 1.0 - rate
+            slow = ratio > self.refresh and not (done or ends)
             if (
                 lagged
                 and not sweeps
@@ -255,9 +265,3 @@ class Newton:
 
 def _evaluated(start: Array | Callable[[], Array]) -> Array:
     return start() if callable(start) else start
-
-
-def _largest(squares: list[float], scales: list[float]) -> float:
-    """Return the largest of the norms, relative to scales; all are given by their squares."""
-    pairs = zip(squares, scales, strict=True)
-    return math.sqrt(max(square / max(scale, 1e-300) for square, scale in pairs))

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array, Assembler, Factor, Pattern, Solver, analyse
+from livepde.linalg import Array, Assembler, Choice, Factor, Pattern, Solver, analyse, choose
 from livepde.model import Model
 from livepde.stepping.interval import Advance, Interval, advance
 from livepde.stepping.newton import Newton, StepFailed
@@ -22,7 +22,6 @@ from livepde.stepping.newton import Newton, StepFailed
 __all__ = ["ForwardStage", "Kept", "simulate"]
 
 STATE = 1e-8  # relative error of the state that corrections with a kept factor leave
-TANGENTS = 1e-4  # of tangents: they steer the gain of a filter, not its state
 PASSES = 2  # corrections of the state by the factor of a q nearby; those of tangents are one less
 SLOW = 0.3  # a factor whose corrections leave more than this share of the error is made again
 LINEAR = 1e-12  # relative asymmetry that is rounding
@@ -116,9 +115,14 @@ class ForwardStage:
         return bool(abs(matrix - matrix.T).max() <= LINEAR * abs(data).max())
 
     @cached_property
+    def engine(self) -> Choice:
+        """The engine of the matrix of a stage, and why it was chosen."""
+        return choose(self._free[0], symmetric=self.symmetric)
+
+    @property
     def solver(self) -> Solver:
         """The engine of the matrix of a stage."""
-        return analyse(self._free[0], symmetric=self.symmetric)
+        return self.engine.solver
 
     @cached_property
     def _general(self) -> Solver:
@@ -232,13 +236,20 @@ class ForwardStage:
         return self.jacobian(u, q, h, moment)
 
     def advance(
-        self, c: Array, q: Array, directions: Array, h: float, moment: Moment, kept: Kept
+        self,
+        c: Array,
+        q: Array,
+        directions: Array,
+        h: float,
+        moment: Moment,
+        kept: Kept,
+        tolerance: float = STATE,
     ) -> tuple[Array, Kept]:
         """Return state and tangents at the end of a stage, and what it leaves to the next.
 
         Where the matrix depends on q and h only, the factor of an earlier q corrects the solution
-        until the error is 1e-8 of the state, and 1e-4 of the tangents. It is made again where that
-        would cost more solves than a factorisation (`Solver.price`), counted from when it was made.
+        until the error of the state is 1e-8 of its norm. It is made again where that would cost
+        more solves than a factorisation (`Solver.price`), counted from when it was made.
 
         Parameters
         ----------
@@ -248,6 +259,8 @@ class ForwardStage:
             How latent coefficients change along each tangent, shape (m, r).
         kept
             What the stage before has left.
+        tolerance
+            Bound on the error of the tangents, relative to the norm of all of them.
 
         Raises
         ------
@@ -268,7 +281,7 @@ class ForwardStage:
         corrected = _Corrections(self, system.matrix, at, moment, factor_at, kept.spent)
         u = corrected.solve(model.impose(guess, moment), known, STATE, PASSES)
         known = self._driven(u, start, q, directions, h, moment)
-        tangents = corrected.solve(start, known, TANGENTS, PASSES - 1)
+        tangents = corrected.solve(start, known, tolerance, PASSES - 1)
         left = Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
         return np.column_stack([u, tangents]), left
 
@@ -278,7 +291,7 @@ class ForwardStage:
         """Return the right-hand sides of tangents, shape (n, r)."""
         model = self.model
         forcing = model.form_A.product("v", "q", directions, moment, u=u, q=q)
-        driven: Array = model.mass @ (c / h) - forcing
+        driven: Array = (model.mass @ c) / h - forcing
         return driven
 
 

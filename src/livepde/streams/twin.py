@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 from livepde.errors import ConfigurationError
 from livepde.fem import Moment
@@ -33,7 +34,7 @@ class Noise(ABC):
     """Gaussian noise, independent from channel to channel and from sample to sample."""
 
     @abstractmethod
-    def std(self, z: Array, weights: Array) -> Array:
+    def std(self, z: Array, weights: Array | sp.csr_array) -> Array:
         """Return the standard deviation of each channel for exact data z, shape (sensors,).
 
         Parameters
@@ -63,9 +64,9 @@ class RelativeNoise(Noise):
                 f"RelativeNoise: level must be a number >= 0, 0.01 for 1 %; got {self.level}."
             )
 
-    def std(self, z: Array, weights: Array) -> Array:
-        size = float(np.sqrt(max(float(z @ weights @ z), 0.0)))
-        std: Array = self.level * size / np.sqrt(len(z) * np.diag(weights))
+    def std(self, z: Array, weights: Array | sp.csr_array) -> Array:
+        size = float(np.sqrt(max(float(z @ (weights @ z)), 0.0)))
+        std: Array = self.level * size / np.sqrt(len(z) * weights.diagonal())
         return std
 
 
@@ -83,7 +84,7 @@ class AbsoluteNoise(Noise):
                 f"{self.deviation!r}."
             )
 
-    def std(self, z: Array, weights: Array) -> Array:
+    def std(self, z: Array, weights: Array | sp.csr_array) -> Array:
         given = np.asarray(self.deviation, dtype=float)
         if given.shape not in ((), z.shape):
             raise ConfigurationError(
@@ -198,7 +199,7 @@ class Twin:
         rng = np.random.default_rng(self.seed)
         for t, z in zip(self.times, self.exact_data, strict=True):
             if self.noise is not None:
-                z = z + self.noise.std(z, self.weights) * rng.standard_normal(len(z))
+                z = z + self.noise.std(z, self._gram) * rng.standard_normal(len(z))
             yield Sample(float(t), z.copy(), self._inputs(float(t)) or None)
 
     def _inputs(self, t: float) -> Mapping[str, float]:
@@ -218,11 +219,15 @@ class Twin:
 
         ||z||_Z = ||G^+ z||_X where z are coefficients of the state on omega, else Euclidean.
         """
+        weights: Array = self._gram.toarray()
+        return weights
+
+    @cached_property
+    def _gram(self) -> sp.csr_array:
         if not self.observation.nodal:
-            return np.eye(self.observed.size)
+            return sp.csr_array(sp.eye_array(self.observed.size))
         inverse = self.observed.split().inverse
-        gram: Array = (inverse.T @ self.model.mass @ inverse).toarray()
-        return gram
+        return sp.csr_array(inverse.T @ self.model.mass @ inverse)
 
     @cached_property
     def q(self) -> Array:
@@ -274,15 +279,12 @@ class Twin:
         fine = self.fine.state_space
         evaluate = {}
         for name, block in space.fields.items():
-            points = np.asarray(block.basis.global_coordinates())
+            points = block.measure.points
             probe = fine.probe(points.reshape(len(points), -1), of="" if space.single else name)
             evaluate[name] = probe
 
         def moved(u: Array) -> Array:
-            parts = [
-                block.interpolate(lambda x, E=evaluate[name]: (E @ u).reshape(x[0].shape))
-                for name, block in space.fields.items()
-            ]
+            parts = [block.project(evaluate[name] @ u) for name, block in space.fields.items()]
             return np.concatenate(parts)
 
         return tuple(

@@ -1,0 +1,237 @@
+"""Measure what docs/performance.md shows, with: python docs/performance.py [step scale ...].
+
+Runs benchmarks of livepde, keeps what they print as JSON in docs/performance/, and makes page and
+figures of all that is there. `--draw` measures nothing: so files of longer runs can be added by
+hand, as `livepde bench step --size 1000000 --json > docs/performance/step-1e6.json`. Of a row that
+stands in several files the last one, by name, is shown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from livepde.plots import PALETTE, figure
+from livepde.runs import Check, Table
+from livepde.runs.directory import markdown
+
+DOCS = Path(__file__).resolve().parent
+MEASURED = DOCS / "performance"
+SUITE = DOCS.parent / "benchmarks" / "suite" / "costs.py"
+BENCHES = ("step", "memory", "scale", "mpi", "fleet")
+SIZED = ("step", "scale")  # take --size
+MEMORY_SIZES = (10_000, 40_000)
+LAWS = ("gradient", "sensitivity")
+PER_UNKNOWN = "kB per unknown"  # columns whose name has this are drawn as memory
+MARKERS = "osD^vP*X"
+
+Row = Mapping[str, Any]
+
+PAGE = """\
+# What it costs
+
+A step of an identification against one of a simulation, and the memory that it takes, against the
+size of the mesh. Costs are ratios of processor times taken in one process, pair by pair: they hold
+on any machine, up to some ten per cent from run to run. Bounds stand in the code beside what they
+bound; `--json` prints them, and its exit code is 1 if one fails.
+
+The page, its figures and the numbers behind them (`docs/performance/*.json`) are made by
+`python docs/performance.py`.
+
+![One step over one forward step](performance/step.png)
+
+*Solid: the median of the pairs. Dashed, in the same colour: what was promised. The forward step is
+an implicit Euler step of the same model with a known parameter, its matrix factorised once.*
+"""
+MEMORY = """\
+![Memory per state unknown](performance/memory.png)
+
+*What an identification adds to a process that has imported livepde, the forward model included, per
+state unknown.*
+"""
+
+
+def measure(names: Iterable[str], sizes: Sequence[int]) -> None:
+    """Run benchmarks, and keep what they print."""
+    MEASURED.mkdir(exist_ok=True)
+    for name in names:
+        sys.stderr.write(f"measures: {name}\n")
+        if name == "memory":
+            content = _memory(sizes or MEMORY_SIZES)
+        else:
+            chosen = [word for size in sizes for word in ("--size", str(size))]
+            command = ["bench", name, *(chosen if name in SIZED else []), "--json"]
+            content = _printed(command)
+        (MEASURED / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
+def _printed(command: Sequence[str]) -> dict[str, Any]:
+    """Return what a command of livepde prints; a check that fails is none of our business."""
+    words = [sys.executable, "-m", "livepde", *command]
+    done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False)
+    try:
+        found: dict[str, Any] = json.loads(done.stdout)
+    except json.JSONDecodeError:
+        raise SystemExit(f"livepde {' '.join(command)} has printed no JSON") from None
+    return found
+
+
+def _memory(sizes: Sequence[int]) -> dict[str, Any]:
+    rows = []
+    for size in sizes:
+        for law in LAWS:
+            command = [sys.executable, str(SUITE), str(size), law]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            rows.append([size, law, float(done.stdout)])
+    table = Table("Memory of an identification", ("nodes", "law", PER_UNKNOWN), rows)
+    command = "python benchmarks/suite/costs.py NODES LAW"
+    return {"command": command, "checks": [], "tables": [table.to_dict()], "notes": []}
+
+
+def merged(contents: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return several outputs of one benchmark as one: rows and checks by their first cells."""
+    commands: list[str] = []
+    tables: dict[str, dict[str, Any]] = {}
+    checks: dict[str, Any] = {}
+    notes: dict[str, None] = {}
+    for content in contents:
+        commands.append(content["command"])
+        checks |= {item["name"]: item for item in content["checks"]}
+        notes |= dict.fromkeys(content["notes"])
+        for table in content["tables"]:
+            into = tables.setdefault(table["title"], {**table, "rows": {}})
+            keys = max(1, sum(name in ("nodes", "law", "c1", "gain") for name in table["columns"]))
+            into["rows"] |= {tuple(row[:keys]): row for row in table["rows"]}
+    for table in tables.values():
+        table["rows"] = list(table["rows"].values())
+    return {
+        "commands": list(dict.fromkeys(commands)),
+        "tables": list(tables.values()),
+        "checks": list(checks.values()),
+        "notes": list(notes),
+    }
+
+
+def rows_of(content: Mapping[str, Any]) -> list[Row]:
+    """Return all rows with the names of their columns, by size."""
+    rows = [
+        dict(zip(table["columns"], row, strict=True))
+        for table in content["tables"]
+        for row in table["rows"]
+    ]
+    return sorted((row for row in rows if "nodes" in row), key=lambda row: row["nodes"])
+
+
+def costs(rows: Sequence[Row]) -> Figure:
+    """Draw ratios against nodes: a panel for each law, a line for each of its settings."""
+    drawn, panels = figure(1, len(LAWS))
+    for ax, law in zip(panels, LAWS, strict=True):
+        settings = dict.fromkeys(row["law"] for row in rows if row["law"].startswith(law))
+        for k, setting in enumerate(settings):
+            mine = [row for row in rows if row["law"] == setting]
+            nodes, colour = [row["nodes"] for row in mine], PALETTE[k % len(PALETTE)]
+            style = {"color": colour, "marker": MARKERS[k % len(MARKERS)]}
+            label = setting.removeprefix(f"{law}, ")
+            ax.plot(nodes, [row["median"] for row in mine], label=label, **style)
+            bounds = [(row["nodes"], row["bound"]) for row in mine if row["bound"] is not None]
+            if bounds:
+                ax.plot(*zip(*bounds, strict=True), "--", color=colour, marker="_", ms=14)
+        _finished(ax, f"{law} law", "step over forward step")
+    return drawn
+
+
+def memory(lines: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
+    """Draw memory per unknown against nodes."""
+    drawn, (ax,) = figure()
+    for k, (label, points) in enumerate(lines.items()):
+        style = {"color": PALETTE[k % len(PALETTE)], "marker": MARKERS[k % len(MARKERS)]}
+        ax.plot(*zip(*points, strict=True), label=label, **style)
+    _finished(ax, "memory", PER_UNKNOWN)
+    return drawn
+
+
+def remembered(contents: Mapping[str, Mapping[str, Any]]) -> dict[str, list[tuple[float, float]]]:
+    """Return label -> (nodes, memory per unknown), of all benchmarks that tell it."""
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for name, content in contents.items():
+        for row in rows_of(content):
+            for column, value in row.items():
+                if PER_UNKNOWN in column and value is not None:
+                    label = str(row.get("law", name))
+                    lines.setdefault(label, []).append((row["nodes"], value))
+    return lines
+
+
+def _finished(ax: Axes, title: str, what: str) -> None:
+    ax.set(xscale="log", title=title, xlabel="nodes", ylabel=what)
+    ax.set_ylim(bottom=0.0)
+    ax.grid(True, alpha=0.3, linewidth=0.6, which="both")
+    ax.spines[["top", "right"]].set_visible(False)
+    if ax.lines:
+        ax.legend(fontsize="small", frameon=False)
+
+
+def section(name: str, content: Mapping[str, Any]) -> str:
+    """Return what a benchmark has printed as a part of the page."""
+    shown = [Table(item["title"], item["columns"], item["rows"]) for item in content["tables"]]
+    checks = [
+        Check(
+            item["name"],
+            float("nan") if item["value"] is None else item["value"],
+            tuple(item["bound"]) if isinstance(item["bound"], list) else item["bound"],
+            item["sense"],
+        )
+        for item in content["checks"]
+    ]
+    title = f"livepde bench {name}" if name != "memory" else "Memory"
+    text = markdown(title, shown, checks, content["notes"]).replace("| None |", "| – |")
+    lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
+    commands = "\n".join(content["commands"])
+    return "\n".join([lines[0], "", f"```\n{commands}\n```", *lines[1:]]) + "\n"
+
+
+def write(folder: Path = DOCS) -> None:
+    """Make page and figures of what was measured."""
+    contents: dict[str, dict[str, Any]] = {}
+    for name in BENCHES:
+        files = [folder / "performance" / f"{name}.json"]
+        files += sorted((folder / "performance").glob(f"{name}-*.json"))
+        found = [json.loads(path.read_text()) for path in files if path.exists()]
+        if found:
+            contents[name] = merged(found)
+    parts = [PAGE]
+    if "step" in contents:
+        costs(rows_of(contents["step"])).savefig(folder / "performance" / "step.png", dpi=120)
+    lines = remembered(contents)
+    if lines:
+        memory(lines).savefig(folder / "performance" / "memory.png", dpi=120)
+        parts.append(MEMORY)
+    parts += [section(name, content) for name, content in contents.items()]
+    (folder / "performance.md").write_text("\n".join(parts))
+
+
+def main() -> None:
+    """Measure, and write the page."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("names", nargs="*", help=f"of {', '.join(BENCHES)}; default all")
+    options.add_argument("--size", type=int, action="append", default=[], help="nodes; repeat it")
+    options.add_argument("--draw", action="store_true", help="measure nothing")
+    given = options.parse_args()
+    unknown = [name for name in given.names if name not in BENCHES]
+    if unknown:
+        options.error(f"there is no benchmark '{unknown[0]}'; there are {', '.join(BENCHES)}")
+    if not given.draw:
+        measure(given.names or BENCHES, given.size)
+    write()
+
+
+if __name__ == "__main__":
+    main()

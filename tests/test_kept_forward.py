@@ -1,0 +1,208 @@
+"""A factor of the forward model that is kept while the parameter moves."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import livepde as lp
+from livepde.errors import LinearAlgebraError
+from livepde.linalg import (
+    BandedSolver,
+    Choice,
+    CholmodSolver,
+    MultigridSolver,
+    PardisoSolver,
+    Pattern,
+    SuperLUSolver,
+)
+from livepde.stepping import ForwardStage, Kept
+from livepde.stepping import state as state_module
+
+H = 0.1
+
+
+def square(cells=50, wind=0.0):
+    """Heat conduction with an unknown reaction, and with wind if that is not 0."""
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
+    return lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"left": 0.0}),
+        lp.Field(mesh, lp.linear(mesh), inner="H1"),
+        A=lambda q, u, v, x: q * u * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)) + wind * lp.grad(u)[0] * v,
+        f=lambda x, t: 1.0 + t,
+    )
+
+
+@pytest.fixture(scope="module")
+def model():
+    return square()
+
+
+def bump(model, size):
+    return model.initial_parameter(lambda x: size * np.sin(3.0 * x[0]) * (0.3 + x[-1]))
+
+
+def begun(model):
+    """State and tangents at the start, and directions of the parameter."""
+    rng = np.random.default_rng(0)
+    free = model.X.free[:, None]
+    directions = np.column_stack([bump(model, 1.0), np.ones(model.Q.dim)])
+    tangents = 0.1 * np.cumsum(rng.standard_normal((model.X.dim, 2)), axis=0) / model.X.dim
+    return np.hstack([free, tangents * free]), directions
+
+
+class Counted(ForwardStage):
+    """Counts its factorisations."""
+
+    made = 0
+
+    def _factorise(self, data):
+        self.made += 1
+        return super()._factorise(data)
+
+
+def go(model, parameters, tolerance=1e-8, kept_from_start=True):
+    """Return what each stage gives, the stage, and what it has left."""
+    forward, kept, found = Counted(model), Kept.none(), []
+    c, directions = begun(model)
+    for k, q in enumerate(parameters):
+        moment = lp.Moment(H * (k + 1))
+        c, kept = forward.advance(c, q, directions, H, moment, kept, tolerance)
+        found.append(c)
+        kept = kept if kept_from_start else Kept.none()
+    return found, forward, kept
+
+
+@pytest.mark.parametrize("wind", [0.0, 5.0])
+def test_a_kept_factor_gives_what_one_for_each_parameter_gives(wind):
+    model = square(wind=wind)
+    parameters = [bump(model, 1.0 + 0.02 * k) for k in range(6)]
+    kept, once, _ = go(model, parameters)
+    fresh, each, _ = go(model, parameters, kept_from_start=False)
+    assert once.symmetric == (wind == 0.0)
+    assert (once.made, each.made) == (1, 6)
+    for mine, other in zip(kept, fresh, strict=True):
+        for part in (slice(0, 1), slice(1, 3)):
+            missed = np.linalg.norm(mine[:, part] - other[:, part])
+            assert missed < 5e-8 * np.linalg.norm(other[:, part])
+    assert not np.array_equal(kept[-1], fresh[-1])
+
+
+def test_tangents_may_be_less_accurate_than_the_state(model):
+    parameters = [bump(model, 1.0 + 0.2 * (k > 0)) for k in range(4)]
+    fresh, _, _ = go(model, parameters, kept_from_start=False)
+    missed, spent = [], []
+    for tolerance in (1e-3, 1e-8):
+        found, forward, kept = go(model, parameters, tolerance)
+        assert forward.made == 1
+        state, tangents = (found[-1][:, p] - fresh[-1][:, p] for p in (slice(0, 1), slice(1, 3)))
+        assert np.linalg.norm(state) < 5e-8 * np.linalg.norm(fresh[-1][:, :1])
+        missed.append(np.linalg.norm(tangents) / np.linalg.norm(fresh[-1][:, 1:]))
+        spent.append(kept.spent)
+    assert missed[1] < 5e-8 < missed[0] < 5e-3
+    assert spent[0] < spent[1]
+
+
+def test_a_factor_is_made_again_where_the_parameter_jumps(model):
+    near, far = bump(model, 1.0), bump(model, 40.0)
+    found, forward, kept = go(model, [near, near, far, far])
+    fresh, _, _ = go(model, [near, near, far, far], kept_from_start=False)
+    assert forward.made == 2
+    assert np.array_equal(kept.q, far)
+    assert kept.spent == 0.0
+    np.testing.assert_allclose(found[-1], fresh[-1], atol=1e-12)
+
+
+def test_a_factor_is_made_again_once_it_has_cost_a_new_one(model):
+    """Each stage takes a few solves more than with the factor of a parameter nearby."""
+    forward, kept, spent = Counted(model), Kept.none(), []
+    c, directions = begun(model)
+    parameters = [bump(model, 1.0), *[bump(model, 1.2)] * 20]
+    for k, q in enumerate(parameters):
+        c, kept = forward.advance(c, q, directions, H, lp.Moment(H * (k + 1)), kept)
+        spent.append(kept.spent)
+    renewed = spent.index(0.0, 2)
+    assert np.all(np.diff(spent[:renewed]) >= 0)
+    assert 0.7 * forward.solver.price < spent[renewed - 1] <= forward.solver.price
+    assert forward.made == 2
+    assert spent[renewed:] == [0.0] * (21 - renewed)
+
+
+def test_banded_factors_are_not_kept():
+    mesh = lp.interval(0.0, 1.0, 30)
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh)),
+        lp.Field(mesh, lp.linear(mesh)),
+        A=lambda q, u, v, x: q * u * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    _, forward, kept = go(model, [bump(model, s) for s in (1.0, 1.1, 1.2)])
+    assert isinstance(forward.solver, BandedSolver)
+    assert forward.made == 3
+    assert not len(kept.q)
+
+
+ENGINES = {
+    "superlu": (None, lambda pattern: SuperLUSolver(pattern, symmetric=True)),
+    "cholmod": ("sksparse.cholmod", CholmodSolver),
+    "pardiso": ("pypardiso", lambda pattern: PardisoSolver(pattern, symmetric=True)),
+    "pardiso, general": ("pypardiso", PardisoSolver),
+    "multigrid": (None, MultigridSolver),
+}
+
+
+@pytest.mark.parametrize("engine", list(ENGINES))
+def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
+    model, engine, monkeypatch
+):
+    module, make = ENGINES[engine]
+    if module:
+        pytest.importorskip(module)
+    monkeypatch.setattr(
+        state_module, "choose", lambda pattern, symmetric=False: Choice(make(pattern), "a test")
+    )
+    points = lp.Points([(x, y) for x in (0.2, 0.5, 0.8) for y in (0.3, 0.7)])
+    exact, times = bump(model, 1.0), [H * k for k in range(13)]
+    G = points.matrix(model.state_space)
+    control = lp.Advance(lp.ImplicitEuler())
+    samples = [(t, G @ u) for t, u in lp.simulate(model, exact, 0.0, times, control)]
+
+    def identifier():
+        return lp.Identifier(model, points, lp.SensitivityLaw(modes=3, noise=1e-3), q0=0.0, u0=0.0)
+
+    whole, resumed = identifier(), identifier()
+    for sample in samples[1:7]:
+        whole.step(*sample)
+    if engine != "multigrid":  # whose hierarchy costs about as much as a solve
+        at = whole._state.now.kept.q
+        assert len(at)
+        assert not np.array_equal(at, whole._state.now.q)
+    resumed.restore(whole.dump())
+    for sample in samples[7:]:
+        one, other = whole.step(*sample), resumed.step(*sample)
+        np.testing.assert_array_equal(one.q, other.q)
+        np.testing.assert_array_equal(one.u, other.u)
+        np.testing.assert_array_equal(one.belief.q_factor, other.belief.q_factor)
+
+
+def test_a_matrix_that_is_not_positive_definite_is_still_solved(model):
+    """A reaction that grows faster than the step resolves."""
+    q = bump(model, -400.0)
+    c, _ = begun(model)
+    forward = ForwardStage(model)
+    u = forward.solve(c[:, 0], q, H, lp.Moment(H))
+    residual = model.mass @ (u - c[:, 0]) / H + model.B(u) + model.A(u)(q) - model.F(lp.Moment(H))
+    np.testing.assert_allclose(residual * model.X.free, 0.0, atol=1e-10)
+
+
+def test_superlu_refuses_what_it_cannot_factorise_without_pivots():
+    rng = np.random.default_rng(0)
+    dense = rng.standard_normal((50, 50))
+    dense += dense.T
+    np.fill_diagonal(dense, 1e-13)
+    matrix, x = sp.csr_array(dense), rng.standard_normal(50)
+    pattern = Pattern.of(matrix)
+    with pytest.raises(LinearAlgebraError, match="not positive definite"):
+        SuperLUSolver(pattern, symmetric=True).factorise(matrix.data)
+    found = SuperLUSolver(pattern).factorise(matrix.data).solve(dense @ x)
+    np.testing.assert_allclose(found, x, atol=1e-10)
