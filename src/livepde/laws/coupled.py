@@ -412,8 +412,19 @@ class CoupledStage:
         pairs = (state - observed, state0 - observed0), (observed, observed0), (q, q0)
         return np.array([min(max(a / b, -1.0), 1.0) if b > 0.0 else 0.0 for a, b in pairs])
 
+    @cached_property
+    def members(self) -> Array:
+        """How much each coefficient belongs to P u, R u and q, shape (3, n + m)."""
+        members = np.zeros((3, self.size))
+        members[1, : self.n] = self.split.R.diagonal()
+        members[0, : self.n] = 1.0 - members[1, : self.n]
+        members[2, self.n :] = 1.0
+        return members
+
     def _spread(self, trend: Array) -> Array:
         """Return the number of its part for each coefficient: of P u, R u and q."""
+        if self.by_blocks is None:
+            return np.asarray(trend @ self.members)
         observed = self.split.R.diagonal()
         state = trend[0] + (trend[1] - trend[0]) * observed
         return np.concatenate([state, np.full(self.size - self.n, trend[2])])
