@@ -13,7 +13,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.laws.guards import Scale
 from livepde.laws.past import Past, Samples
-from livepde.laws.rest import Excitation, Probes
+from livepde.laws.rest import Excitation, Probes, pairs
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
 from livepde.stepping import ForwardStage, Interval
@@ -340,9 +340,9 @@ def test_probes_see_the_same_by_assembly_in_every_unit():
     w, q = np.random.default_rng(0).standard_normal((2, model.X.dim))
     seen = probes(w, q, lp.Moment(0.0))
     assert probes.fixed is not None
-    probes.fixed = None
+    probes.fixed, probes.pairs = None, pairs(model, split)
     np.testing.assert_allclose(probes(w, q, lp.Moment(0.0)), seen, rtol=1e-10)
-    np.testing.assert_allclose([e @ model.Q.dual(e) for e in probes.e.T], 1.0)
+    np.testing.assert_allclose([e @ model.Q.dual(e) for e in probes.pairs[1].T], 1.0)
 
 
 def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):

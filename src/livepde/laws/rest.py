@@ -15,6 +15,7 @@ both together are taken for a rest.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,33 +126,46 @@ class Probes:
 
     def __init__(self, model: Model, split: Split) -> None:
         self.form = model.form_A
-        rng = np.random.default_rng(0)
-        extent = float(np.ptp(model.mesh.p, axis=1).max())
-        mass = model.bilinear(mass_form)
-        smooth = mass + extent**2 * (model.bilinear(h1_form) - mass)
-        parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
-        space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
-        root = np.sqrt(mass.diagonal())[:, None]
-        white = root * rng.standard_normal((model.X.dim, PROBES))
-        self.p = split.R @ space.riesz(split.R.T @ white)
-        self.e = model.Q.riesz(rng.standard_normal((model.Q.dim, PROBES)))
-        for part in (item.part for item in model.latent.parts.values()):
-            for e in self.e.T:
-                alone = np.zeros_like(e)
-                alone[part] = e[part]
-                size = float(alone @ model.Q.dual(alone))
-                e[part] /= np.sqrt(size) if size > 0.0 else 1.0
-        vq, qu = self.form.tensor("v", "q"), self.form.tensor("q", "u")
         self.fixed: Array | None = None
+        self.pairs = p, e = pairs(model, split)
+        vq, qu = self.form.tensor("v", "q"), self.form.tensor("q", "u")
         if vq is not None and qu is not None:
             pattern = self.form.pattern("q", "u")
-            rows = [pattern.matrix(qu @ p).T @ e for p, e in zip(self.p.T, self.e.T, strict=True)]
+            rows = [pattern.matrix(qu @ one).T @ other for one, other in zip(p.T, e.T, strict=True)]
             self.fixed = np.array(rows)
+            self.pairs = np.zeros((0, PROBES)), np.zeros((0, PROBES))  # no longer needed
 
     def __call__(self, w: Array, q: Array, moment: Moment) -> Array:
         """Return what the pairs see, shape (PROBES,)."""
         if self.fixed is not None:
             return self.fixed @ w
+        p, e = self.pairs
         A = self.form.matrix("v", "q", moment, u=w, q=q)
-        seen: Array = ((A @ self.e) * self.p).sum(axis=0)
+        seen: Array = ((A @ e) * p).sum(axis=0)
         return seen
+
+
+def pairs(model: Model, split: Split) -> tuple[Array, Array]:
+    """Return p and e of the probes, shapes (n, PROBES) and (m, PROBES)."""
+    rng = np.random.default_rng(0)
+    p = _smooth(model, split, rng)
+    # A copy of the space: the factor of a large one is not kept.
+    found = copy(model.Q).riesz(rng.standard_normal((model.Q.dim, PROBES)))
+    for part in (item.part for item in model.latent.parts.values()):
+        for e in found.T:
+            alone = np.zeros_like(e)
+            alone[part] = e[part]
+            size = float(alone @ model.Q.dual(alone))
+            e[part] /= np.sqrt(size) if size > 0.0 else 1.0
+    return p, found
+
+
+def _smooth(model: Model, split: Split, rng: np.random.Generator) -> Array:
+    extent = float(np.ptp(model.mesh.p, axis=1).max())
+    mass = model.bilinear(mass_form)
+    smooth = mass + extent**2 * (model.bilinear(h1_form) - mass)
+    parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
+    space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
+    root = np.sqrt(mass.diagonal())[:, None]
+    white = root * rng.standard_normal((model.X.dim, PROBES))
+    return np.asarray(split.R @ space.riesz(split.R.T @ white))

@@ -113,6 +113,7 @@ class BlockSolver:
     def current(self, K: Jacobian, renew: bool = False) -> Approximate:
         """Return the factors of this stage, by default those at hand; else those of K."""
         if self.last is None or renew:
+            self.last = None  # its memory, first
             self.made = self.last = K.approximate()
         return self.last
 
@@ -184,7 +185,7 @@ class BlockSolver:
                 more = seen.T @ state.solve(K.A @ constant) - product @ constant
                 product = sp.csr_array(narrower + sp.diags_array(np.maximum(more, 0.0)))
         C = sp.csr_array(K.G + _widened(product, stage.auxiliary))
-        schur = self._factorise("C", C)
+        schur = self._factorise("C", C, approximate=True)
         return Approximate(self, K.at, state, schur, K.rates, self._seam(K))
 
     def _seam(self, K: Jacobian) -> _Seam | None:
@@ -221,19 +222,21 @@ class BlockSolver:
             near = links @ (near > 0.0)
         return np.flatnonzero((near > 0.0) & (free > 0.0))
 
-    def _factorise(self, name: str, matrix: sp.csr_array) -> Factor:
+    def _factorise(self, name: str, matrix: sp.csr_array, approximate: bool = False) -> Factor:
         """Return the factor of a matrix, by an engine for symmetric ones if it is positive."""
         matrix.sort_indices()
         if not np.isfinite(matrix.data).all():
             raise LinearAlgebraError("The matrix holds values that are not finite.")
         if _is_symmetric(matrix):
             try:
-                return self._solver(name, matrix, True).factorise(matrix.data)
+                return self._solver(name, matrix, True, approximate).factorise(matrix.data)
             except LinearAlgebraError:  # it is indefinite
                 pass
-        return self._solver(name, matrix, False).factorise(matrix.data)
+        return self._solver(name, matrix, False, approximate).factorise(matrix.data)
 
-    def _solver(self, name: str, matrix: sp.csr_array, symmetric: bool) -> Solver:
+    def _solver(
+        self, name: str, matrix: sp.csr_array, symmetric: bool, approximate: bool
+    ) -> Solver:
         """Return the engine of a matrix, analysed again only where its pattern has changed."""
         solver, kind = self._solvers.get(name, (None, symmetric))
         if (
@@ -243,7 +246,7 @@ class BlockSolver:
             or not np.array_equal(solver.pattern.indices, matrix.indices)
         ):
             pattern = Pattern(matrix.shape, matrix.indptr.copy(), matrix.indices.copy())
-            solver = analyse(pattern, symmetric=symmetric)
+            solver = analyse(pattern, symmetric=symmetric, approximate=approximate)
             self._solvers[name] = solver, symmetric
         return solver
 
@@ -314,7 +317,8 @@ class Jacobian:
         try:
             return self._solve(b, solver.current(self), ITERATIONS if solver.made else PATIENCE)
         except LinearAlgebraError:
-            return self._solve(b, solver.current(self, renew=True), ITERATIONS)
+            pass  # and let go of the factors that did not serve, before others are made
+        return self._solve(b, solver.current(self, renew=True), ITERATIONS)
 
     def approximate(self) -> Approximate:
         """Return K by factors of its blocks."""

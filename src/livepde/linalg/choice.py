@@ -59,7 +59,7 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
     symmetric
         Each will be symmetric positive definite.
     approximate
-        Its `approximate_inverse` is all that is needed: multigrid serves from a band of 150 on.
+        Its `approximate_inverse` is all that is needed: multigrid serves from a band of 500 on.
     """
     banded = BandedSolver(pattern)
     band = max(banded.band)
@@ -69,7 +69,7 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
     superlu = SuperLUSolver(pattern, symmetric)
     if band <= SMALL:
         return Choice(superlu, f"{wide}, at most {SMALL}")
-    most = SMALL if approximate else WIDEST_FACTOR
+    most = WIDEST_SUPERLU if approximate else WIDEST_FACTOR
     if symmetric and band > most:
         return Choice(MultigridSolver(pattern), f"{wide}, more than {most}")
     if symmetric and _installed("sksparse"):
