@@ -243,7 +243,7 @@ def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
         assert chosen.solver.name.startswith(name)
         assert str(band) in chosen.reason
         rough = choose(pattern, symmetric=symmetric, approximate=True).solver
-        expects_cycle = symmetric and band > 150
+        expects_cycle = symmetric and band > 500
         assert isinstance(rough, MultigridSolver) == (expects_cycle or name == "multigrid")
 
 

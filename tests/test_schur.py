@@ -122,7 +122,7 @@ def test_iterations_with_new_factors(monkeypatch):
     """To 1e-8, on two meshes: they hardly depend on the mesh."""
     monkeypatch.setattr(coupled, "LARGE", 1)
     monkeypatch.setattr(choice, "WIDEST_BAND", 10)
-    outcome = scale.iterations((1100, 2500))
+    outcome = scale.iterations((1600, 2500))
     assert len(outcome.checks) == 2 * len(scale.ITERATIONS)
     assert [check.name for check in outcome.checks if not check.ok] == []
     assert all("LU" in row[4] and row[5] for row in outcome.tables[0].rows)

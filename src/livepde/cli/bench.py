@@ -82,20 +82,37 @@ def fleet(
 def scale(
     size: Annotated[
         list[int] | None,
-        typer.Option(min=4, help="Number of nodes, default 2500 and 10000. Repeat for more."),
+        typer.Option(
+            min=2500, help="Nodes of the square, default 10000 and 100000. Repeat for more."
+        ),
     ] = None,
+    cube: Annotated[
+        list[int] | None, typer.Option(min=8000, help="Nodes of a cube. Repeat for more.")
+    ] = None,
+    gain: Annotated[
+        list[float] | None,
+        typer.Option(help="Gain of the law, default 1, 100 and 10000. Repeat for more."),
+    ] = None,
+    million: Annotated[
+        bool, typer.Option(help="Only the run with a million nodes: 100 steps, minutes, 3 GB.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Count the iterations of the coupled step of large problems, at several gains.
+    """Time a step of the gradient law for large fields against one forward step.
 
-    Example:  livepde bench scale --size 100000
+    Example:  livepde bench scale --size 100000 --gain 100
     """
-    from livepde.bench.scale import SIZES
-    from livepde.bench.scale import scale as benchmark
+    from livepde.bench import scale as benchmark
 
     command = ["livepde", "bench", "scale"]
     command += [word for nodes in size or () for word in ("--size", str(nodes))]
-    report_outcome(benchmark(size or SIZES), command, as_json)
+    command += [word for nodes in cube or () for word in ("--cube", str(nodes))]
+    command += [word for value in gain or () for word in ("--gain", str(value))]
+    if million:
+        report_outcome(benchmark.million(), [*command, "--million"], as_json)
+        return
+    outcome = benchmark.scale(size or benchmark.SIZES, gain or benchmark.GAINS, cube or ())
+    report_outcome(outcome, command, as_json)
 
 
 @bench.command()

@@ -187,7 +187,8 @@ class CoupledStage:
         self.RT = sp.csr_array(split.R.T)
         self.RM = sp.csr_array(self.RT @ gains.M_op)
         self.RMR = sp.csr_array(self.RM @ split.R)
-        self.PNP = sp.csr_array(split.P.T @ gains.N_op @ split.P)
+        N_op = gains.N_op if gains.nu else sp.csr_array(gains.N_op.shape)
+        self.PNP = sp.csr_array(split.P.T @ N_op @ split.P)
         # dw/du: the part of w that is estimated.
         self.W = sp.csr_array(sp.eye_array(self.n)) if gains.at_estimate else split.P
         self.free_q = model.Q.free

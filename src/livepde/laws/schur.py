@@ -15,10 +15,9 @@ and an approximate solution with K is one solve with S and one with C,
     u = S^{-1} b_u,    q = C^{-1} (b_q + A^T R u),    u - R D^{-1} R^T A q.
 
 D^{-1} is the better in the place of S^{-1} the smoother what it is applied to and the shorter h;
-the larger the gain, the more this counts. Of a field q that A does not differentiate, C has the
-pattern of G_Q: what A^T R D^{-1} R^T A has beyond it goes to the diagonal, and so does what
-A^T R S^{-1} A does to constants beyond that, as where q beside the observed part changes the flux
-into it. Smooth functions hardly miss the difference.
+the larger the gain, the more this counts. Of a field q that A does not differentiate, the diagonal
+matrix that does to constants what A^T R S^{-1} A does takes the place of that product: smooth
+functions hardly miss the difference, and rough ones are ruled by G_Q.
 
 Where sensors see coefficients, R selects some of them, and only the others take part in B(w) and
 A(w) q:
@@ -174,19 +173,22 @@ class BlockSolver:
 
     def approximate(self, K: Jacobian) -> Approximate:
         """Factorise S and C."""
-        stage, state = self.stage, self._state(K.S)
-        seen = sp.csr_array(stage.split.R.T @ K.A)
-        product = sp.csr_array(seen.T @ sp.diags_array(1.0 / K.rates) @ seen)
-        parts = list(stage.model.latent.parts.values())
-        if len(parts) == 1 and isinstance(parts[0].unknown, Field) and not stage.auxiliary:
-            narrower = _restricted(product, stage.gram)
-            if narrower is not None:
-                constant = stage.free_q
-                more = seen.T @ state.solve(K.A @ constant) - product @ constant
-                product = sp.csr_array(narrower + sp.diags_array(np.maximum(more, 0.0)))
-        C = sp.csr_array(K.G + _widened(product, stage.auxiliary))
+        state = self._state(K.S)
+        C = sp.csr_array(K.G + _widened(self._information(K, state), self.stage.auxiliary))
         schur = self._factorise("C", C, approximate=True)
         return Approximate(self, K.at, state, schur, K.rates, self._seam(K))
+
+    def _information(self, K: Jacobian, state: Factor) -> sp.csr_array:
+        """Return what stands for A^T R S^{-1} A in C."""
+        stage, R = self.stage, self.stage.split.R
+        parts = list(stage.model.latent.parts.values())
+        if len(parts) == 1 and isinstance(parts[0].unknown, Field):
+            image = K.A @ stage.free_q
+            if np.abs(K.A.data).sum() <= ONE_SIGN * np.abs(image).sum():
+                seen = K.A.T @ (R @ state.solve(image))
+                return sp.csr_array(sp.diags_array(np.maximum(seen, 0.0)))
+        forces = sp.csr_array(R.T @ K.A)
+        return sp.csr_array(forces.T @ sp.diags_array(1.0 / K.rates) @ forces)
 
     def _seam(self, K: Jacobian) -> _Seam | None:
         if not len(self.strip):
@@ -435,19 +437,6 @@ def _widened(matrix: sp.csr_array, more: int) -> sp.csr_array:
     if not more:
         return matrix
     return sp.csr_array(sp.block_diag([matrix, sp.csr_array((more, more))]))
-
-
-def _restricted(matrix: sp.csr_array, to: sp.csr_array) -> sp.csr_array | None:
-    """Return the entries of a matrix in the pattern of another, the rest added to the diagonal.
-
-    None where the rest has entries of both signs: then the matrix acts as derivatives do.
-    """
-    pattern = sp.csr_array((np.ones(to.nnz), to.indices, to.indptr), to.shape)
-    kept = sp.csr_array(matrix * pattern)
-    rest = matrix.sum(axis=1) - kept.sum(axis=1)
-    if np.abs(matrix.data).sum() - np.abs(kept.data).sum() > ONE_SIGN * np.abs(rest).sum():
-        return None
-    return sp.csr_array(kept + sp.diags_array(rest))
 
 
 def _is_symmetric(matrix: sp.csr_array) -> bool:
