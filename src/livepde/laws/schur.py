@@ -67,7 +67,7 @@ PATIENCE = 12  # iterations of GMRES beyond which factors of another point are m
 SPENT = 24  # updates and iterations: about what new factors cost
 ROUNDING = 1e-12  # asymmetry of a symmetric matrix, relative to its largest entry
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
-LAYERS = 8  # neighbours on either side of where observed coefficients meet others
+LAYERS = 4  # neighbours on either side of where observed coefficients meet others
 REMEDY = "take a smaller gain or a smaller time step."
 
 
