@@ -128,6 +128,48 @@ def test_a_factor_is_made_again_once_it_has_cost_a_new_one(model):
     assert spent[renewed:] == [0.0] * (21 - renewed)
 
 
+def test_a_factor_is_kept_while_the_process_rests():
+    """What corrections leave there is rounding, whose rate tells nothing."""
+    steady = square_at_rest()
+    forward, kept = Counted(steady), Kept.none()
+    c, directions = np.zeros((steady.X.dim, 3)), np.zeros((steady.Q.dim, 2))
+    c[:, 0] = 1.0
+    for k in range(6):
+        q = bump(steady, 1.0 + 0.1 * k)
+        c, kept = forward.advance(c, q, directions, H, lp.Moment(H * (k + 1)), kept)
+        assert kept.spent == 0.0
+    assert forward.made == 1
+    np.testing.assert_allclose(c[:, 0], 1.0, atol=1e-12)
+
+
+def test_errors_are_small_beside_slow_changes(model):
+    """A state that changes by 1e-6 in a step is not left where it was."""
+    h, parameters = 1e-6, [bump(model, 1.0), bump(model, 1e3)]
+    c, directions = begun(model)
+    forward, kept = Counted(model), Kept.none()
+    for q in parameters:
+        before = c
+        c, kept = forward.advance(c, q, directions, h, lp.Moment(h), kept, 1e-2)
+    fresh, _ = ForwardStage(model).advance(
+        before, parameters[1], directions, h, lp.Moment(h), Kept.none()
+    )
+    assert forward.made == 1
+    for part in (slice(0, 1), slice(1, 3)):
+        change = np.linalg.norm(fresh[:, part] - before[:, part])
+        assert np.linalg.norm(c[:, part] - fresh[:, part]) < 2e-2 * change
+
+
+def square_at_rest():
+    """A constant state that no unknown moves."""
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
+    return lp.Model(
+        lp.Field(mesh, lp.linear(mesh)),
+        lp.Field(mesh, lp.linear(mesh)),
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
 def test_banded_factors_are_not_kept():
     mesh = lp.interval(0.0, 1.0, 30)
     model = lp.Model(
