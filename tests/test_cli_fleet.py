@@ -289,6 +289,10 @@ class Killed(BaseException):
 
 
 def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
+    """Others do not begin."""
+    others = "d,,,0.1 K\ne,rod/other.csv,,0.1 K\nf,,,0.2 K\n"
+    lines = [line + "," for line in ALIKE.splitlines()[1:]]
+    Path("rods.csv").write_text("\n".join(["name,data,initial,law.noise", *lines, others]))
     stepped = Fleet.step
 
     def step(self, t, z, inputs=None):
@@ -301,11 +305,13 @@ def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
         code, _ = call(*FIRST, "rods")
     assert code == INTERRUPTED
     table = pd.read_csv("rods/fleet.csv")
+    assert table["name"].tolist() == ["a", "b", "c"]
     assert (table["status"] == "interrupted").all()
     assert (table["samples"] == 21).all()
     assert "Interrupted after 21 samples." in runs.open(Path("rods/c")).notes
     call(*FIRST, "rods", "--resume")
-    assert (pd.read_csv("rods/fleet.csv")["samples"] == 39).all()
+    table = pd.read_csv("rods/fleet.csv")
+    assert (len(table), table["samples"].unique().tolist()) == (6, [39])
 
 
 def test_what_is_another_run_is_refused_alone(alike):

@@ -247,11 +247,10 @@ class Runs:
         found, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
         apart |= dict.fromkeys(begun, GOES_ON)
         for block in found:
-            ended |= self._together(block, members)
+            ended |= self._together(block, members) if not _interrupted(ended) else {}
         for name, why in apart.items():
-            if any(item.status == "interrupted" for item in ended.values()):  # Ctrl-C ends all
-                break
-            ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
+            if not _interrupted(ended):
+                ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
         return [ended[row.name] for row in rows if row.name in ended]
 
     def _own(self, member: Member) -> list[str]:
@@ -325,6 +324,11 @@ class Runs:
         if run.status != "finished" or run.record.get("samples") != len(table):
             return None
         return _ended(member.name, run, run.dataset, run.checks)
+
+
+def _interrupted(ended: Mapping[str, Ended]) -> bool:
+    """Return whether Ctrl-C has ended a run, and with it all."""
+    return any(item.status == "interrupted" for item in ended.values())
 
 
 def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]) -> Ended:
