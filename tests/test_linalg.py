@@ -130,6 +130,11 @@ ENGINES = [
 DEFINITE = ("symmetric", "cholmod", "pardiso symmetric", "multigrid")
 
 
+def test_whether_a_matrix_is_symmetric_may_be_told_by_numpy():
+    solver = SuperLUSolver(Pattern.of(sp.eye_array(3, format="csr")), symmetric=np.False_)
+    np.testing.assert_array_equal(solver.factorise(np.full(3, 2.0)).solve(np.ones(3)), 0.5)
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("seed", range(3))
 def test_engines_agree_with_dense_algebra(engine, seed):
