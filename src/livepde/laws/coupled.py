@@ -23,6 +23,7 @@ from livepde.linalg import (
     Pattern,
     Solver,
     analyse,
+    compact,
 )
 from livepde.model import Model
 from livepde.observation import Split
@@ -337,9 +338,9 @@ class CoupledStage:
         metric
             In the place of G_Q/gain (with gain = inf) and of the damping rule.
         near
-            A start that follows the steps before more closely, shape (n + m,). If it was good at
-            the stage before, Newton begins there without sweeps, moved by what it is expected to
-            miss.
+            A start that follows the steps before more closely, shape (n + m,); zero where all
+            Dirichlet values are. If it was good at the stage before, Newton begins there without
+            sweeps, moved by what it is expected to miss.
         warm
             What the stage before has left.
         """
@@ -348,7 +349,10 @@ class CoupledStage:
         def begin() -> Array:
             return self._imposed(start() if callable(start) else start, moment)
 
-        near = begin() if near is None else self._imposed(near, moment)
+        if near is None:
+            near = begin()
+        elif not self.model.homogeneous:
+            near = self._imposed(near, moment)
         equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
         good, follows = warm.missed <= self.newton.basin, warm.h == h
@@ -595,7 +599,7 @@ class _Bilinear:
         ]
         self.linear = sp.csr_array(sp.block_array(rows))
         self.linear.eliminate_zeros()
-        self.observed = sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass]))
+        self.observed = compact(sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass])))
 
 
 class _BilinearEquation(_Equation):
