@@ -370,6 +370,7 @@ class CoupledStage:
             kept=factor,
             expected=warm.kept.ageing * age,
             trusted=GROWN * warm.kept.seen,
+            shares=self._shares(warm.trend) if follows else None,
         )
         y = solved.y
         miss = y - near
@@ -377,6 +378,12 @@ class CoupledStage:
         missed = self.parts.relative(miss, y) if math.isnan(solved.missed) else solved.missed
         kept = self._keep(warm.kept, equation, solved, age) if self.keeps else warm.kept
         return y, Warm(missed, miss, trend, h, kept)
+
+    @staticmethod
+    def _shares(trend: Array) -> tuple[float, float, float]:
+        """Return in which of `parts` misses are errors of the time step, and not noise."""
+        unobserved, observed, q = trend.tolist()
+        return max(unobserved, observed, 0.0), max(observed, 0.0), max(q, 0.0)
 
     def _imposed(self, y: Array, moment: Moment) -> Array:
         y[: self.n] = self.model.impose(y[: self.n], moment)
