@@ -442,7 +442,7 @@ class CoupledStage:
     @cached_property
     def patience(self) -> int:
         """Updates beyond one for each stage that a factor may cost before it is made again."""
-        return 3 if isinstance(self.solver, BandedSolver) else 12
+        return 2 if isinstance(self.solver, BandedSolver) else 12
 
     def _factor(self, kept: Kept, moment: Moment) -> Factor:
         """Return the factor that is kept, made again if this stage has another."""
