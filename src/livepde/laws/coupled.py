@@ -23,6 +23,7 @@ from livepde.linalg import (
     Pattern,
     Solver,
     analyse,
+    compact,
 )
 from livepde.model import Model
 from livepde.observation import Split
@@ -337,9 +338,9 @@ class CoupledStage:
         metric
             In the place of G_Q/gain (with gain = inf) and of the damping rule.
         near
-            A start that follows the steps before more closely, shape (n + m,). If it was good at
-            the stage before, Newton begins there without sweeps, moved by what it is expected to
-            miss.
+            A start that follows the steps before more closely, shape (n + m,); zero where all
+            Dirichlet values are. If it was good at the stage before, Newton begins there without
+            sweeps, moved by what it is expected to miss.
         warm
             What the stage before has left.
         """
@@ -348,7 +349,10 @@ class CoupledStage:
         def begin() -> Array:
             return self._imposed(start() if callable(start) else start, moment)
 
-        near = begin() if near is None else self._imposed(near, moment)
+        if near is None:
+            near = begin()
+        elif not self.model.homogeneous:
+            near = self._imposed(near, moment)
         equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
         good, follows = warm.missed <= self.newton.basin, warm.h == h
@@ -366,6 +370,7 @@ class CoupledStage:
             kept=factor,
             expected=warm.kept.ageing * age,
             trusted=GROWN * warm.kept.seen,
+            shares=self._shares(warm.trend) if follows else None,
         )
         y = solved.y
         miss = y - near
@@ -373,6 +378,12 @@ class CoupledStage:
         missed = self.parts.relative(miss, y) if math.isnan(solved.missed) else solved.missed
         kept = self._keep(warm.kept, equation, solved, age) if self.keeps else warm.kept
         return y, Warm(missed, miss, trend, h, kept)
+
+    @staticmethod
+    def _shares(trend: Array) -> tuple[float, float, float]:
+        """Return in which of `parts` misses are errors of the time step, and not noise."""
+        unobserved, observed, q = trend.tolist()
+        return max(unobserved, observed, 0.0), max(observed, 0.0), max(q, 0.0)
 
     def _imposed(self, y: Array, moment: Moment) -> Array:
         y[: self.n] = self.model.impose(y[: self.n], moment)
@@ -431,7 +442,7 @@ class CoupledStage:
     @cached_property
     def patience(self) -> int:
         """Updates beyond one for each stage that a factor may cost before it is made again."""
-        return 3 if isinstance(self.solver, BandedSolver) else 12
+        return 2 if isinstance(self.solver, BandedSolver) else 12
 
     def _factor(self, kept: Kept, moment: Moment) -> Factor:
         """Return the factor that is kept, made again if this stage has another."""
@@ -595,7 +606,7 @@ class _Bilinear:
         ]
         self.linear = sp.csr_array(sp.block_array(rows))
         self.linear.eliminate_zeros()
-        self.observed = sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass]))
+        self.observed = compact(sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass])))
 
 
 class _BilinearEquation(_Equation):

@@ -146,6 +146,7 @@ class Newton:
         kept: Factor | None = None,
         expected: float = math.inf,
         trusted: float = math.inf,
+        shares: tuple[float, ...] | None = None,
     ) -> Solution:
         """Return the solution, starting from y.
 
@@ -167,6 +168,8 @@ class Newton:
         expected, trusted
             With `near`: the ratio of the second update to the first that is expected, if the first
             is not larger than `trusted`, relative to y. It spares the second one where it is small.
+        shares
+            With `near`: how much of `share` counts in each part; by default all.
 
         Raises
         ------
@@ -192,7 +195,8 @@ class Newton:
             if not math.isfinite(sum(squares) + sum(scales)):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
             if count == 1 and near is not None:
-                miss = [self.share**2 * square for square in squares]
+                pairs = zip(squares, shares or (1.0,) * len(squares), strict=True)
+                miss = [square * (self.share * share) ** 2 for square, share in pairs]
             # Updates are relative to y, and compared with what may be left of the error.
             size = excess = 0.0
             for square, scale, floor, m in zip(squares, scales, parts.floors, miss, strict=True):
