@@ -256,9 +256,12 @@ def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
         equal(Path("pieces") / name, Path("rods") / name)
 
 
-@pytest.mark.parametrize("waiting", [500, 10**9])
-def test_goes_on_separately_after_an_interruption(alike, monkeypatch, waiting):
-    """Whether it was stopped, or killed between two writings."""
+@pytest.mark.parametrize(
+    ("waiting", "how"),
+    [(500, "3 separately: they had begun before (3)."), (10**9, "3 were stepped together.")],
+)
+def test_goes_on_after_a_kill(alike, monkeypatch, waiting, how):
+    """Separately from what was written, or together where nothing was."""
     call(*FIRST, "rods")
     monkeypatch.setattr(together, "WAITING", waiting)
     stepped = Fleet.step
@@ -275,7 +278,8 @@ def test_goes_on_separately_after_an_interruption(alike, monkeypatch, waiting):
     assert runs.open(Path("again/a")).status == "running"
     assert (Path("again/a") / JOURNAL).exists() == (waiting == 500)
     _, output = call(*FIRST, "again", "--resume", "--json")
-    assert "3 separately: they had begun before (3)" in json.loads(output)["notes"][0]
+    assert json.loads(output)["notes"][0] == f"Of 3 members {how}"
+    assert runs.open(Path("again/a")).status == "finished"
     for name in "abc":
         same(runs.open(Path("again") / name).dataset, runs.open(Path("rods") / name).dataset)
 
@@ -285,6 +289,10 @@ class Killed(BaseException):
 
 
 def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
+    """Others do not begin."""
+    others = "d,,,0.1 K\ne,rod/other.csv,,0.1 K\nf,,,0.2 K\n"
+    lines = [line + "," for line in ALIKE.splitlines()[1:]]
+    Path("rods.csv").write_text("\n".join(["name,data,initial,law.noise", *lines, others]))
     stepped = Fleet.step
 
     def step(self, t, z, inputs=None):
@@ -297,11 +305,26 @@ def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
         code, _ = call(*FIRST, "rods")
     assert code == INTERRUPTED
     table = pd.read_csv("rods/fleet.csv")
+    assert table["name"].tolist() == ["a", "b", "c"]
     assert (table["status"] == "interrupted").all()
     assert (table["samples"] == 21).all()
     assert "Interrupted after 21 samples." in runs.open(Path("rods/c")).notes
     call(*FIRST, "rods", "--resume")
-    assert (pd.read_csv("rods/fleet.csv")["samples"] == 39).all()
+    table = pd.read_csv("rods/fleet.csv")
+    assert (len(table), table["samples"].unique().tolist()) == (6, [39])
+
+
+def test_what_is_another_run_is_refused_alone(alike):
+    """It does not keep the others from going on."""
+    call(*FIRST, "rods")
+    for name in "abc":
+        for file in (JOURNAL, "estimates.nc"):
+            (Path("rods") / name / file).unlink()
+    Path("rods.csv").write_text(ALIKE.replace("b,rod/other.csv", "b,rod/third.csv"))
+    code, output = call(*FIRST, "rods", "--resume")
+    assert code == 1
+    assert "b: rods/b was run with --data" in " ".join(output.split())
+    assert pd.read_csv("rods/fleet.csv")["status"].tolist() == ["finished", "failed", "finished"]
 
 
 def test_what_is_finished_is_not_run_again(alike, monkeypatch):

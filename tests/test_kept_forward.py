@@ -1,5 +1,7 @@
 """A factor of the forward model that is kept while the parameter moves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -126,6 +128,54 @@ def test_a_factor_is_made_again_once_it_has_cost_a_new_one(model):
     assert 0.7 * forward.solver.price < spent[renewed - 1] <= forward.solver.price
     assert forward.made == 2
     assert spent[renewed:] == [0.0] * (21 - renewed)
+
+
+def test_a_factor_is_kept_while_the_process_rests():
+    """What corrections leave there is rounding, whose rate tells nothing."""
+    steady = square_at_rest()
+    forward, kept = Counted(steady), Kept.none()
+    c, directions = np.zeros((steady.X.dim, 3)), np.zeros((steady.Q.dim, 2))
+    c[:, 0] = 1.0
+    for k in range(6):
+        q = bump(steady, 1.0 + 0.1 * k)
+        c, kept = forward.advance(c, q, directions, H, lp.Moment(H * (k + 1)), kept)
+        assert kept.spent == 0.0
+    assert forward.made == 1
+    np.testing.assert_allclose(c[:, 0], 1.0, atol=1e-12)
+
+
+def test_errors_are_small_beside_slow_changes():
+    """A state that changes by 1e-8 of itself in a step is not left where it was."""
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh)),
+        lp.Field(mesh, lp.linear(mesh)),
+        A=lambda q, u, v, x: q * (u - 1.0) * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    h, moment, directions = 1e-4, lp.Moment(1e-4), np.zeros((model.Q.dim, 1))
+    q = 1e3 * np.ones(model.Q.dim)
+    forward = Counted(model)
+    c = np.column_stack([1.0 + 1e-7 * bump(model, 1.0), np.zeros(model.X.dim)])
+    _, kept = forward.advance(c, 0 * q, directions, h, moment, Kept.none())
+    kept = replace(kept, trend=0.0 * kept.trend)
+    found, _ = forward.advance(c, q, directions, h, moment, kept)
+    exact, _ = ForwardStage(model).advance(c, q, directions, h, moment, Kept.none())
+    change = np.linalg.norm(exact[:, 0] - c[:, 0])
+    assert forward.made == 1
+    assert change < 1e-7 * np.linalg.norm(c[:, 0])
+    assert np.linalg.norm(found[:, 0] - exact[:, 0]) < 2e-2 * change
+
+
+def square_at_rest():
+    """A constant state that no unknown moves."""
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
+    return lp.Model(
+        lp.Field(mesh, lp.linear(mesh)),
+        lp.Field(mesh, lp.linear(mesh)),
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
 
 
 def test_banded_factors_are_not_kept():

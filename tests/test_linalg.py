@@ -74,6 +74,31 @@ def test_assembler_is_the_dense_block_matrix(data, n, m):
     np.testing.assert_allclose(found, expected, atol=1e-10 * (1 + abs(expected).max()))
 
 
+def test_assembler_with_diagonal_factors():
+    """Entries that are multiplied by zero drop out, and blocks that are alike share their map."""
+    rng = np.random.default_rng(0)
+    dense = rng.standard_normal((6, 6)) * (rng.random((6, 6)) < 0.5)
+    K = Pattern.of(sp.csr_array(dense))
+    left, right = (
+        np.array([1.0, 0.0, 2.0, 1.0, 0.0, -1.0]),
+        np.array([1.0, 1.0, 0.0, 1.0, 3.0, 1.0]),
+    )
+    a, b = sp.diags_array(left), sp.diags_array(right)
+    whole = Assembler(12)
+    whole.add("K", K, a, b)
+    whole.add("same", K, a, b)
+    whole.add("T", K, a, b, at=(6, 0), transposed=True)
+    whole.add("sparse", K, sp.csr_array(a), sp.csr_array(b), at=(6, 6))
+    pattern, maps = whole.build()
+    assert maps["same"] is maps["K"]
+    values = dense[np.nonzero(dense)]
+    corner, turned = left[:, None] * dense * right, left[:, None] * dense.T * right
+    expected = np.block([[corner, np.zeros((6, 6))], [turned, corner]])
+    found = pattern.matrix(sum(maps[name] @ values for name in ("K", "T", "sparse")))
+    np.testing.assert_array_equal(found.toarray(), expected)
+    assert pattern.nnz == np.count_nonzero(expected + np.eye(12))
+
+
 @given(st.data(), SIZES, SIZES)
 @settings(max_examples=40, deadline=None)
 def test_pattern_keeps_structure_and_positions(data, n, m):
@@ -128,6 +153,11 @@ ENGINES = [
     for name in BUILD
 ]
 DEFINITE = ("symmetric", "cholmod", "pardiso symmetric", "multigrid")
+
+
+def test_whether_a_matrix_is_symmetric_may_be_told_by_numpy():
+    solver = SuperLUSolver(Pattern.of(sp.eye_array(3, format="csr")), symmetric=np.False_)
+    np.testing.assert_array_equal(solver.factorise(np.full(3, 2.0)).solve(np.ones(3)), 0.5)
 
 
 @pytest.mark.parametrize("engine", ENGINES)

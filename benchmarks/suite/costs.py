@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 from livepde import GradientLaw, Identifier, ResidualDamping, SensitivityLaw
@@ -13,7 +13,6 @@ from livepde.bench.step import problem, step
 
 LAWS = ("gradient", "sensitivity")
 MODES = 10
-KIB = 1024  # bytes; what the system counts memory in
 
 
 class Step:
@@ -68,8 +67,9 @@ class Fleet:
 
 
 def _peak() -> float:
-    """Return the most memory that this process has had, in bytes."""
-    return KIB * float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+    """Return the most memory that this process has had, in bytes (Linux)."""
+    rows = Path("/proc/self/status").read_text().splitlines()
+    return next(1024.0 * int(row.split()[1]) for row in rows if row.startswith("VmHWM"))
 
 
 def _spent(nodes: int, law: str) -> float:

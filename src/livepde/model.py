@@ -332,6 +332,13 @@ class Model:
     def _constant_source(self) -> Array:
         return self.form_F.vector("v")
 
+    @cached_property
+    def homogeneous(self) -> bool:
+        """True if every Dirichlet value is the number 0: what is zero there stays so."""
+        fields = [block.field for block in self.state_space.fields.values()]
+        values = [value for field in fields for value in field.dirichlet.values()]
+        return all(isinstance(value, int | float) and value == 0.0 for value in values)
+
     def impose(self, u: Array, moment: Moment) -> Array:
         """Return u with the Dirichlet values of a moment."""
         return self.state_space.impose(u, moment)

@@ -34,6 +34,7 @@ ENTRIES = 2_500_000  # and at most so many numbers of them
 ITERATED = 1e-12  # residual of the Riesz map of a large space, where iterations do:
 FEW = 50  # at most so many
 PROBES = 16  # random vectors of a trace
+ROUNDING = 1e-9  # share of a variance that is none
 PRECISE = 1e-8  # relative error of the modes of a large space
 
 
@@ -181,20 +182,56 @@ class HilbertSpace:
     def variance(self) -> Array:
         """Prior variance of each coefficient: the diagonal of G^{-1}, shape (n,); 0 where fixed.
 
-        Solved for at most 1000 coefficients, evenly chosen; beyond 20 000 coefficients for fewer,
-        in inverse proportion to their number, and at least 64. In between v_i G_ii, or v_i where G
-        is not written out, is harmonic on the graph of G: the mean of its neighbours.
+        Solved for at most 1000 coefficients, evenly chosen; of more than 40 000 for fewer, in
+        inverse proportion to their number and at least 64, chosen at random. In between v_i G_ii,
+        or v_i where G is not written out, is harmonic on the graph of G: the mean of its
+        neighbours.
         """
-        variance, free = np.zeros(self.dim), np.flatnonzero(self.free)
-        count = max(min(SOLVED, SOLVED * LARGE // len(free)), FEWEST_SOLVED) if len(free) else 0
-        solved = free[np.unique(np.linspace(0, len(free) - 1, count).astype(int))]
-        block = max(1, min(BLOCK, ENTRIES // self.dim))
+        return self._between(*self._solved)
+
+    def beyond(self, modes: Array) -> Array:
+        """Return the prior variance of each coefficient that modes leave out, shape (n,).
+
+        As `variance`, but of more than 20 000 coefficients what the modes leave out is harmonic in
+        between, not the whole. Zero where it is rounding.
+
+        Parameters
+        ----------
+        modes
+            G-orthonormal columns, shape (n, k).
+        """
+        held = (modes**2).sum(axis=1)
+        if self.dim <= LARGE:
+            left = self.variance - held
+            return np.where(left > ROUNDING * self.variance, left, 0.0)
+        solved, variance = self._solved
+        left = variance - held[solved]
+        return self._between(solved, np.where(left > 10 * PRECISE * variance, left, 0.0))
+
+    @cached_property
+    def _solved(self) -> tuple[IntArray, Array]:
+        """Some coefficients and their prior variances."""
+        free = np.flatnonzero(self.free)
+        if len(free) > LARGE:
+            count = max(min(SOLVED, 2 * SOLVED * LARGE // len(free)), FEWEST_SOLVED)
+            solved = np.sort(np.random.default_rng(0).choice(free, count, replace=False))
+        else:
+            solved = free[np.unique(np.linspace(0, len(free) - 1, SOLVED).astype(int))]
+        variance = np.zeros(len(solved))
+        block = max(1, min(BLOCK, ENTRIES // max(self.dim, 1)))
         for start in range(0, len(solved), block):
             at = solved[start : start + block]
             unit = np.zeros((self.dim, len(at)))
             unit[at, np.arange(len(at))] = 1.0
-            variance[at] = self.factor.solve(unit)[at, np.arange(len(at))]
-        rest = np.setdiff1d(free, solved)
+            found = self.factor.solve(unit)[at, np.arange(len(at))]
+            variance[start : start + block] = found
+        return solved, variance
+
+    def _between(self, solved: IntArray, values: Array) -> Array:
+        """Return values of all free coefficients, known at some, harmonic in between."""
+        found = np.zeros(self.dim)
+        found[solved] = values
+        rest = np.setdiff1d(np.flatnonzero(self.free), solved)
         if len(rest):
             whole, links = self.augmented, self._links
             scale = whole.diagonal() if whole.shape[0] == self.dim else np.ones(self.dim)
@@ -202,9 +239,9 @@ class HilbertSpace:
             inner = sp.csr_array(graph[rest][:, rest])
             pattern = Pattern.of(inner)
             factor = analyse(pattern, symmetric=True).factorise(_data(inner))
-            known = graph[rest][:, solved] @ (variance * scale)[solved]
-            variance[rest] = -factor.solve(known) / scale[rest]
-        return variance
+            known = graph[rest][:, solved] @ (found * scale)[solved]
+            found[rest] = -factor.solve(known) / scale[rest]
+        return found
 
     @property
     def _links(self) -> sp.csr_array:

@@ -227,7 +227,7 @@ class Runs:
     def __call__(self, rows: Sequence[Member]) -> list[Ended]:
         """Run members as `livepde run` would, as blocks where they can."""
         from livepde.cases.together import blocks
-        from livepde.runs import RECORD
+        from livepde.runs import JOURNAL
 
         members = {row.name: row for row in rows}
         ended: dict[str, Ended] = {}
@@ -237,19 +237,20 @@ class Runs:
             try:
                 if row.settings not in loaded:
                     loaded[row.settings] = load_case(self.case, self.allow_code, self._own(row))
-                ready[row.name] = loaded[row.settings].read(row.data or None)
+                case = loaded[row.settings]
+                self._refuse_other(row, case)
+                ready[row.name] = case.read(row.data or None)
             except LivepdeError as error:
                 ended[row.name] = Ended(row.name, "failed", error=str(error))
-        begun = {name for name in ready if self.resume and (self.folder / name / RECORD).exists()}
+        begun = {name for name in ready if (self.folder / name / JOURNAL).exists()}
         new = {name: one for name, one in ready.items() if name not in begun}
         found, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
         apart |= dict.fromkeys(begun, GOES_ON)
         for block in found:
-            ended |= self._together(block, members)
+            ended |= self._together(block, members) if not _interrupted(ended) else {}
         for name, why in apart.items():
-            if any(item.status == "interrupted" for item in ended.values()):  # Ctrl-C ends all
-                break
-            ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
+            if not _interrupted(ended):
+                ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
         return [ended[row.name] for row in rows if row.name in ended]
 
     def _own(self, member: Member) -> list[str]:
@@ -260,6 +261,15 @@ class Runs:
         command = ["livepde", "run", str(self.case), "--out", str(target)]
         command += ["--data", member.data] if member.data else []
         return command + [word for text in self._own(member) for word in ("--set", text)]
+
+    def _refuse_other(self, member: Member, case: Case) -> None:
+        """Raise `RunError` if there is a run to go on with that is none of this member."""
+        from livepde import runs
+
+        target = self.folder / member.name
+        if self.resume and (target / runs.RECORD).exists():
+            run = runs.open(target)
+            run.refuse_other(self._command(member), case.text, self._own(member))
 
     def _writer(self, member: Member, case: Case) -> RunWriter:
         target, command = self.folder / member.name, self._command(member)
@@ -313,8 +323,12 @@ class Runs:
         run = runs.open(target)
         if run.status != "finished" or run.record.get("samples") != len(table):
             return None
-        run.refuse_other(self._command(member), prepared.case.text, self._own(member))
         return _ended(member.name, run, run.dataset, run.checks)
+
+
+def _interrupted(ended: Mapping[str, Ended]) -> bool:
+    """Return whether Ctrl-C has ended a run, and with it all."""
+    return any(item.status == "interrupted" for item in ended.values())
 
 
 def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]) -> Ended:

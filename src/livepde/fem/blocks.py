@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -117,55 +117,55 @@ class Measure:
     @cached_property
     def mapping(self) -> Any:
         """scikit-fem's mapping; one of its own for a part, which keeps nothing for other cells."""
-        mesh, where = self.mesh, self._where
+        where = self._where
         if where is None and self.kept and not self.thin:
-            return mesh._mapping()
-        if mesh.affine and where is not None and not self.on_boundary:
-            return MappingAffine(mesh, where)
-        mapping = copy(mesh._mapping())
-        for name in [name for name in vars(mapping) if name.startswith("_")]:
-            delattr(mapping, name)  # what it has cached
-        return mapping
+            return self.mesh._mapping()
+        if self.mesh.affine and where is not None:
+            return MappingAffine(self.mesh, where)
+        return self._empty_mapping()
 
-    @cached_property
-    def _facets(self) -> FacetBasis:
-        """scikit-fem's basis of the mesh's own element on a boundary."""
-        return self.facets(own(self.mesh.elem()), self.mesh.dofs)
+    def _empty_mapping(self) -> Any:
+        """Return scikit-fem's mapping for all cells without what that of the mesh has cached."""
+        mapping = copy(self.mesh._mapping())
+        for name in [name for name in vars(mapping) if name.startswith("_")]:
+            delattr(mapping, name)
+        return mapping
 
     def facets(self, element: Any, dofs: Any) -> FacetBasis:
         """Return scikit-fem's basis of an element on a boundary."""
-        where, rule = self._where, self._rule
-        options = {"mapping": self.mapping, "dofs": dofs, "disable_doflocs": True}
-        return FacetBasis(self.mesh, element, facets=where, quadrature=rule, **options)
+        options = {"mapping": self._empty_mapping(), "dofs": dofs, "disable_doflocs": True}
+        return FacetBasis(self.mesh, element, facets=self._where, quadrature=self._rule, **options)
+
+    @cached_property
+    def _sides(self) -> _Sides:
+        """What a boundary knows of its facets."""
+        basis = self.facets(own(self.mesh.elem()), self.mesh.dofs)
+        x, normals = basis.global_coordinates(), basis.normals
+        return _Sides(basis.tind, np.asarray(x), np.asarray(basis.dx), np.asarray(normals))
 
     @property
     def cells(self) -> IntArray | None:
         """The cells, on a boundary those behind its facets; None: all of the mesh."""
-        if not self.on_boundary:
-            return self._where
-        cells: IntArray = self._facets.tind
-        return cells
+        return self._sides.cells if self.on_boundary else self._where
 
     @cached_property
     def points(self) -> Array:
         """Coordinates of the quadrature points, shape (d, elements, points)."""
-        if self.on_boundary:
-            return np.asarray(self._facets.global_coordinates())
-        return self.mapped(self._rule[0])
+        return self._sides.points if self.on_boundary else self.mapped(self._rule[0])
 
     @cached_property
     def weights(self) -> Array:
         """Quadrature weights, shape (elements, points)."""
         if self.on_boundary:
-            return np.asarray(self._facets.dx)
+            return self._sides.weights
         X, W = self._rule
         dx: Array = np.abs(self.mapping.detDF(X, tind=self._where)) * W
         return dx
 
-    @cached_property
+    @property
     def normal(self) -> Array | None:
         """Outward normals on a boundary."""
-        return np.asarray(self._facets.normals) if self.on_boundary else None
+        return self._sides.normals if self.on_boundary else None
 
     @cached_property
     def diameter(self) -> Array:
@@ -197,6 +197,15 @@ class Measure:
     def place(self, moment: Moment) -> Place:
         """Return what an integrand sees as x at a moment."""
         return Place(self.points, self.normal, moment, lambda: self.diameter)
+
+
+class _Sides(NamedTuple):
+    """The facets of a boundary: cells behind them, quadrature points and weights, normals."""
+
+    cells: IntArray
+    points: Array
+    weights: Array
+    normals: Array
 
 
 def _chosen(members: IntArray, at: Any) -> IntArray:

@@ -23,6 +23,7 @@ from livepde.linalg import (
     Pattern,
     Solver,
     analyse,
+    compact,
 )
 from livepde.model import Model
 from livepde.observation import Split
@@ -339,9 +340,9 @@ class CoupledStage:
         metric
             In the place of G_Q/gain (with gain = inf) and of the damping rule.
         near
-            A start that follows the steps before more closely, shape (n + m,). If it was good at
-            the stage before, Newton begins there without sweeps, moved by what it is expected to
-            miss.
+            A start that follows the steps before more closely, shape (n + m,); zero where all
+            Dirichlet values are. If it was good at the stage before, Newton begins there without
+            sweeps, moved by what it is expected to miss.
         warm
             What the stage before has left.
         """
@@ -350,7 +351,10 @@ class CoupledStage:
         def begin() -> Array:
             return self._imposed(start() if callable(start) else start, moment)
 
-        near = begin() if near is None else self._imposed(near, moment)
+        if near is None:
+            near = begin()
+        elif not self.model.homogeneous:
+            near = self._imposed(near, moment)
         equation = self._equation(c, h, moment, u_alpha)
         equation.metric = metric
         good, follows = warm.missed <= self.newton.basin, warm.h == h
@@ -372,6 +376,7 @@ class CoupledStage:
             kept=factor,
             expected=warm.kept.ageing * self._wear(age),
             trusted=GROWN * warm.kept.seen,
+            shares=self._shares(warm.trend) if follows and blocks is None else None,
         )
         y = solved.y
         miss = y - near
@@ -379,6 +384,12 @@ class CoupledStage:
         missed = self.parts.relative(miss, y) if math.isnan(solved.missed) else solved.missed
         kept = self._keep(warm.kept, equation, solved, age) if self.keeps else warm.kept
         return y, Warm(missed, miss, trend, h, kept)
+
+    @staticmethod
+    def _shares(trend: Array) -> tuple[float, float, float]:
+        """Return in which of `parts` misses are errors of the time step, and not noise."""
+        unobserved, observed, q = trend.tolist()
+        return max(unobserved, observed, 0.0), max(observed, 0.0), max(q, 0.0)
 
     def _imposed(self, y: Array, moment: Moment) -> Array:
         y[: self.n] = self.model.impose(y[: self.n], moment)
@@ -459,7 +470,7 @@ class CoupledStage:
         """Updates beyond one for each stage that a factor may cost before it is made again."""
         if self.by_blocks is not None:
             return self.by_blocks.patience
-        return 3 if isinstance(self.solver, BandedSolver) else 12
+        return 2 if isinstance(self.solver, BandedSolver) else 12
 
     def _factor(self, kept: Kept, moment: Moment) -> Factor:
         """Return the factor that is kept, made again if this stage has another."""
@@ -497,10 +508,10 @@ class _Lean(Parts):
         state, observed = ((x[:n] * y[:n]) @ self.weights).tolist()
         return [state, observed, float(x[n:] @ y[n:])]
 
-    def allowed(self, share: float, missed: list[float], scales: list[float]) -> list[float]:
+    def allowed(self, shares: list[float], missed: list[float], scales: list[float]) -> list[float]:
         floored = [max(scale, floor) for scale, floor in zip(scales, self.floors, strict=True)]
         worst = max(square / scale for square, scale in zip(missed, floored, strict=True))
-        return [share**2 * worst * scale for scale in floored]
+        return [share**2 * worst * scale for share, scale in zip(shares, floored, strict=True)]
 
 
 class _Equation:
@@ -651,7 +662,7 @@ class _Bilinear:
         ]
         self.linear = sp.csr_array(sp.block_array(rows))
         self.linear.eliminate_zeros()
-        self.observed = sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass]))
+        self.observed = compact(sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass])))
 
 
 class _BilinearEquation(_Equation):

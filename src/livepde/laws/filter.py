@@ -18,7 +18,6 @@ from livepde.stepping import ForwardStage, Interval, Kept, StepFailed, advance
 
 __all__ = ["Filter", "Motion", "Point", "reduction"]
 
-ROUNDING = 1e-9  # share of a variance that is none
 LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
 MOST_MODES = 60  # of a field with modes="auto"
 GAIN = 1e-4  # relative error of a square root of the covariance: it steers the gain only
@@ -189,14 +188,13 @@ class Filter:
     def _left_out(self) -> Array:
         """Prior variance of each latent coefficient in the modes that are left out, shape (m,)."""
         model = self.problem.model
-        variance = np.zeros(len(self.Phi))
+        left = np.zeros(len(self.Phi))
         for item in model.latent.parts.values():
             if isinstance(item.block, FieldBlock):
                 first = slice(item.part.start, item.part.start + item.size)
-                whole = model.Q.restricted(first, item.block.fixed).variance
-                variance[item.part] = np.tile(whole, item.evolution.copies)
-        left = variance - (self.Phi**2).sum(axis=1)
-        return np.where(left > ROUNDING * variance, left, 0.0)
+                space = model.Q.restricted(first, item.block.fixed)
+                left[item.part] = np.tile(space.beyond(self.Phi[first]), item.evolution.copies)
+        return left
 
     @cached_property
     def _still(self) -> Array:

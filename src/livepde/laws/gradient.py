@@ -243,12 +243,13 @@ class GradientLaw(Law[GradientWork, GradientState]):
             alpha, waits = smoother.alpha(balance), smoother.waits(balance)
 
         def reconstruct(t: float) -> Reconstructed:
-            boundary = model.impose(zero, interval.at(t))
+            boundary = None if model.homogeneous else model.impose(zero, interval.at(t))
             present = interval.present
             if regularises:
                 return observed.reconstruct(interval.z(t), boundary=boundary, present=present)
             if smoother is not None and alpha > 0.0:
-                return Reconstructed(smoother(alpha, interval.z(t), boundary), alpha, 0.0, None)
+                known = zero if boundary is None else boundary
+                return Reconstructed(smoother(alpha, interval.z(t), known), alpha, 0.0, None)
             return Reconstructed(coupled.split.reconstruct(interval.z(t), boundary), 0.0, 0.0, None)
 
         found = Reconstructed(zero, 0.0, 0.0, None)

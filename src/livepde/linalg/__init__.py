@@ -12,7 +12,7 @@ from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
 from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
 from livepde.linalg.pardiso import PardisoSolver
-from livepde.linalg.pattern import Pattern, PatternOperator, sandwich
+from livepde.linalg.pattern import Pattern, PatternOperator, compact, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
 from livepde.linalg.types import Array, IntArray, Mask, Sparse
@@ -40,6 +40,7 @@ __all__ = [
     "analyse",
     "approximate_inverse",
     "choose",
+    "compact",
     "conjugate_gradients",
     "gmres",
     "positive_definite",

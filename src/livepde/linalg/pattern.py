@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 from livepde.linalg.types import Array, IntArray, Sparse
 
-__all__ = ["Pattern", "PatternOperator", "sandwich"]
+__all__ = ["Pattern", "PatternOperator", "compact", "sandwich"]
 
 DENSE = 10_000  # entries up to which a dense product is faster than a sparse one
 
@@ -120,6 +120,11 @@ class PatternOperator:
         """Return the product of the transpose with x."""
         product: Array = self._transposed @ x if self._places is None else x @ self._dense
         return product
+
+
+def compact(matrix: sp.csr_array) -> sp.csr_array | Array:
+    """Return what multiplies fastest by a vector: a small matrix as a dense one."""
+    return matrix.toarray() if np.prod(matrix.shape) <= DENSE else matrix
 
 
 def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:

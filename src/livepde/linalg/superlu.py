@@ -66,7 +66,7 @@ class SuperLUSolver:
             raise LinearAlgebraError("The matrix holds values that are not finite.")
         transpose = sp.csc_array(self.pattern.transposed(data))
         options = SYMMETRIC if self.symmetric else {}
-        n, or_so = transpose.shape[0], " or not positive definite" * self.symmetric
+        n, or_so = transpose.shape[0], " or not positive definite" if self.symmetric else ""
         message = (
             f"The {n} by {n} matrix is singular{or_so}: check the model's forms, or take a smaller "
             "time step."

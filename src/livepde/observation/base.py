@@ -163,7 +163,7 @@ class Split:
         projected: Array = self.R @ u if self._diagonal is None else self._diagonal * u
         return projected
 
-    def reconstruct(self, z: Array, boundary: Array) -> Array:
+    def reconstruct(self, z: Array, boundary: Array | None) -> Array:
         """Return the observed part R u* = G^+ z of the state in X, shape (n,).
 
         Parameters
@@ -171,15 +171,16 @@ class Split:
         z
             Measurements, shape (sensors,); missing ones (NaN) take no part.
         boundary
-            A coefficient vector that holds the Dirichlet values and is zero elsewhere.
+            A coefficient vector that holds the Dirichlet values and is zero elsewhere. None: all of
+            it is zero.
         """
         known = z[self.present]
-        if boundary.any():
+        if boundary is not None and boundary.any():
             known = known - self.G @ boundary
         if self._selected is None:
             part: Array = self.inverse @ known
             return part
-        part = np.zeros(len(boundary))
+        part = np.zeros(self.R.shape[0])
         part[self._selected] = known
         return part
 

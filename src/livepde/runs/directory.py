@@ -153,9 +153,6 @@ class RunWriter:
             There is no such run, or it was of another case.
         """
         run = open_run(path)
-        begun = (path / JOURNAL).is_file() or not (path / ESTIMATES).exists()
-        if not (path / CASE).is_file() or not begun:
-            raise RunError(f"{path} has no case and journal: it cannot be resumed.")
         run.refuse_other(command, case, settings)
         resumed = [*run.record.get("resumed", []), {"at": _now(), "livepde": version}]
         record = run.record | {"status": "running", "resumed": resumed}
@@ -302,7 +299,10 @@ class Run:
         return _data_of(self.record.get("command", []))
 
     def refuse_other(self, command: Sequence[str], case: str, settings: Sequence[str]) -> None:
-        """Raise `RunError` unless the run was made of this case, with these settings and data."""
+        """Raise `RunError` unless the run can go on with this case, these settings and data."""
+        begun = (self.path / JOURNAL).is_file() or not (self.path / ESTIMATES).exists()
+        if not (self.path / CASE).is_file() or not begun:
+            raise RunError(f"{self.path} has no case and journal: it cannot be resumed.")
         same = (self.path / CASE).read_text(encoding="utf-8") == case
         if not same or self.settings != list(settings):
             raise RunError(

@@ -79,9 +79,12 @@ class Parts:
         products: list[float] = ((x * y) @ self.weights).tolist()
         return products
 
-    def allowed(self, share: float, missed: list[float], scales: list[float]) -> list[float]:
-        """Return how much of each part may be left, from what was missed of it, all squared."""
-        return [share**2 * square for square in missed]
+    def allowed(self, shares: list[float], missed: list[float], scales: list[float]) -> list[float]:
+        """Return how much of each part may be left, from what was missed of it.
+
+        All but the shares are squares; `scales` are those of y.
+        """
+        return [share**2 * square for share, square in zip(shares, missed, strict=True)]
 
     def relative(self, change: Array, y: Array) -> float:
         """Return the size of a change of y, relative to it, in its worst part."""
@@ -154,6 +157,7 @@ class Newton:
         kept: Factor | None = None,
         expected: float = math.inf,
         trusted: float = math.inf,
+        shares: tuple[float, ...] | None = None,
     ) -> Solution:
         """Return the solution, starting from y.
 
@@ -175,6 +179,8 @@ class Newton:
         expected, trusted
             With `near`: the ratio of the second update to the first that is expected, if the first
             is not larger than `trusted`, relative to y. It spares the second one where it is small.
+        shares
+            With `near`: how much of `share` counts in each part; by default all.
 
         Raises
         ------
@@ -200,7 +206,8 @@ class Newton:
             if not math.isfinite(sum(squares) + sum(scales)):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
             if count == 1 and near is not None:
-                miss = parts.allowed(self.share, squares, scales)
+                each = [self.share * share for share in shares or (1.0,) * len(squares)]
+                miss = parts.allowed(each, squares, scales)
             # Updates are relative to y, and compared with what may be left of the error.
             size = excess = 0.0
             for square, scale, floor, m in zip(squares, scales, parts.floors, miss, strict=True):

@@ -23,6 +23,8 @@ __all__ = ["ForwardStage", "Kept", "simulate"]
 
 STATE = 1e-8  # relative error of the state that corrections with a kept factor leave
 PASSES = 2  # corrections of the state by the factor of a q nearby; those of tangents are one less
+SHARE = 1e-2  # of what a stage changes: the error is at most this, however slow the process
+ROUNDING = 1e-11  # relative corrections below this are the end of what arithmetic can do
 SLOW = 0.3  # a factor whose corrections leave more than this share of the error is made again
 LINEAR = 1e-12  # relative asymmetry that is rounding
 
@@ -248,8 +250,9 @@ class ForwardStage:
         """Return state and tangents at the end of a stage, and what it leaves to the next.
 
         Where the matrix depends on q and h only, the factor of an earlier q corrects the solution
-        until the error of the state is 1e-8 of its norm. It is made again where that would cost
-        more solves than a factorisation (`Solver.price`), counted from when it was made.
+        until the error of the state is 1e-8 of its norm, and a hundredth of its change. It is made
+        again where that would cost more solves than a factorisation (`Solver.price`), counted from
+        when it was made.
 
         Parameters
         ----------
@@ -260,7 +263,8 @@ class ForwardStage:
         kept
             What the stage before has left.
         tolerance
-            Bound on the error of the tangents, relative to the norm of all of them.
+            Bound on the error of the tangents, relative to the norm of all of them; it is a
+            hundredth of their change, too.
 
         Raises
         ------
@@ -279,9 +283,9 @@ class ForwardStage:
         system = self._system(q, h, moment)
         known = self._known(begin, system, q, h, moment)
         corrected = _Corrections(self, system.matrix, at, moment, factor_at, kept.spent)
-        u = corrected.solve(model.impose(guess, moment), known, STATE, PASSES)
+        u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
         known = self._driven(u, start, q, directions, h, moment)
-        tangents = corrected.solve(start, known, tolerance, PASSES - 1)
+        tangents = corrected.solve(start, start, known, tolerance, PASSES - 1)
         left = Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
         return np.column_stack([u, tangents]), left
 
@@ -322,11 +326,13 @@ class _Corrections:
         self.factor_at = factor_at
         self.spent = spent
 
-    def solve(self, start: Array, b: Array, tolerance: float, passes: int) -> Array:
+    def solve(self, before: Array, start: Array, b: Array, tolerance: float, passes: int) -> Array:
         """Return x with matrix x = b on the free coefficients.
 
         Parameters
         ----------
+        before
+            What x was where the stage begins.
         start
             What x is on the fixed ones, and about elsewhere, shape (n,) or (n, r).
         tolerance
@@ -338,30 +344,31 @@ class _Corrections:
         free = self.stage.model.X.free.reshape(-1, *[1] * (b.ndim - 1))
         width = b[0].size
         exact = self.at.same(*self.factor_at)
-        residual = (b - self.matrix @ start) * free
-        x, r, count = start, residual, 0
+        first = (b - self.matrix @ start) * free
+        x, r, count = start, first, 0
         while True:
-            factor = self.stage.factor(*self.factor_at, self.moment)
-            update = _solved(factor, r)
+            update = _solved(self.stage.factor(*self.factor_at, self.moment), r)
             x, count = x + update, count + 1
-            if exact:
+            moved, size = float(np.linalg.norm(update)), float(np.linalg.norm(x))
+            if exact or moved <= ROUNDING * size:
                 return x
-            before, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
-            if before == 0.0:
-                return x
-            rate = float(np.linalg.norm(r)) / before
+            last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
+            rate = float(np.linalg.norm(r)) / last
             if rate <= SLOW:
-                left = float(np.linalg.norm(update) / np.linalg.norm(x)) * rate / (1.0 - rate)
-                more = 0.0 if left <= tolerance else math.log(tolerance / left) / math.log(rate)
+                left = moved * rate / (1.0 - rate)
+                change = float(np.linalg.norm(x - before))
+                allowed = max(min(tolerance * size, SHARE * change), ROUNDING * size)
+                done = left <= allowed
+                more = 0.0 if done else math.log(allowed / left) / math.log(rate)
                 spent = self.spent + width * max(count + more - passes, 0)
-                if left <= tolerance:
+                if done:
                     self.spent = spent
                     return x
                 if spent <= self.stage.solver.price:
                     continue
             # Keeping the factor has cost as much as a new one, or would.
             self.factor_at, self.spent, exact = self.at, 0.0, True
-            x, r = start, residual
+            x, r = start, first
 
 
 def _solved(factor: Factor, b: Array) -> Array:
