@@ -109,11 +109,10 @@ class BlockSolver:
         """Begin a stage with the factors of an earlier one."""
         self.last, self.made, self.iterations = kept, None, []
 
-    def current(self, K: Jacobian, renew: bool = False) -> Approximate:
-        """Return the factors of this stage, by default those at hand; else those of K."""
-        if self.last is None or renew:
-            self.last = None  # its memory, first
-            self.made = self.last = K.approximate()
+    def renew(self, K: Jacobian) -> Approximate:
+        """Make the factors of K those of the stage."""
+        self.last = None  # its memory, first
+        self.made = self.last = K.approximate()
         return self.last
 
     @cached_property
@@ -247,7 +246,7 @@ class BlockSolver:
             or not np.array_equal(solver.pattern.indptr, matrix.indptr)
             or not np.array_equal(solver.pattern.indices, matrix.indices)
         ):
-            pattern = Pattern(matrix.shape, matrix.indptr.copy(), matrix.indices.copy())
+            pattern = Pattern(matrix.shape, matrix.indptr, matrix.indices)
             solver = analyse(pattern, symmetric=symmetric, approximate=approximate)
             self._solvers[name] = solver, symmetric
         return solver
@@ -316,11 +315,12 @@ class Jacobian:
         new ones.
         """
         solver = self.solver
-        try:
-            return self._solve(b, solver.current(self), ITERATIONS if solver.made else PATIENCE)
-        except LinearAlgebraError:
-            pass  # and let go of the factors that did not serve, before others are made
-        return self._solve(b, solver.current(self, renew=True), ITERATIONS)
+        if solver.last is not None:
+            try:
+                return self._solve(b, solver.last, PATIENCE)
+            except LinearAlgebraError:
+                pass  # and let go of the factors that did not serve, before others are made
+        return self._solve(b, solver.renew(self), ITERATIONS)
 
     def approximate(self) -> Approximate:
         """Return K by factors of its blocks."""
