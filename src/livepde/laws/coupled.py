@@ -31,7 +31,7 @@ from livepde.stepping import TINY, Newton, Parts, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
-SHARE = 0.5  # at least this of what its start missed may be left of a stage by blocks
+SHARE = 1.0  # of what its start missed may be left of a stage by blocks: the next step goes on
 
 AGES = 8.0  # stages in which what factors of blocks leave of an error doubles, as long as unseen
 
