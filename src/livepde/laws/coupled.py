@@ -377,6 +377,7 @@ class CoupledStage:
             expected=warm.kept.ageing * self._wear(age),
             trusted=GROWN * warm.kept.seen,
             shares=self._shares(warm.trend) if follows and blocks is None else None,
+            rough=blocks is not None,
         )
         y = solved.y
         miss = y - near

@@ -158,6 +158,7 @@ class Newton:
         expected: float = math.inf,
         trusted: float = math.inf,
         shares: tuple[float, ...] | None = None,
+        rough: bool = False,
     ) -> Solution:
         """Return the solution, starting from y.
 
@@ -181,6 +182,10 @@ class Newton:
             is not larger than `trusted`, relative to y. It spares the second one where it is small.
         shares
             With `near`: how much of `share` counts in each part; by default all.
+
+        rough
+            The kept factor is that of an approximate Jacobian: an update by it that is larger than
+            the one before does not mean that the neighbourhood was left.
 
         Raises
         ------
@@ -234,7 +239,10 @@ class Newton:
             if (
                 lagged
                 and not sweeps
-                and (size >= limit or (slow and near is not None and kept is None))
+                and (
+                    (size >= limit and not (rough and kept is not None))
+                    or (slow and near is not None and kept is None)
+                )
             ):
                 # Newton left the neighbourhood: sweep on from where it began, and come closer.
                 if near is None:
