@@ -58,7 +58,7 @@ EXPONENT = 1.15  # of the cost of a step from the smallest to the largest square
 MEMORY = 3.0  # kB for each coefficient of the state
 HUGE = 1_000_000  # nodes of the large run
 WIDTH = 0.0625  # time step, a binary number
-FINDING, TIMED = 12, 12  # steps before those that are timed, and these
+FINDING, TIMED = 16, 24  # steps before those that are timed, and these
 MILLION = 100  # its steps
 ACCURACY = 0.1  # relative error of its q, at most
 

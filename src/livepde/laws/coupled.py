@@ -31,8 +31,8 @@ from livepde.stepping import TINY, Newton, Parts, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
-# Of what its start missed so much may be left of a stage by blocks. The next step goes on from there;
-# but its start extrapolates what is left about threefold: with more it grows from step to step.
+# Of what its start missed so much may be left of a stage by blocks. The next step goes on with it,
+# but its start extrapolates it about threefold: more would grow from step to step.
 SHARE = 0.3
 
 AGES = 8.0  # stages in which what factors of blocks leave of an error doubles, as long as unseen
