@@ -14,6 +14,7 @@ import livepde as lp
 from livepde.laws.operators import observed_operator, unobserved_operator
 from livepde.reproduce import EXPERIMENTS, degenerate
 from livepde.runs.outcome import Outcome
+from livepde.stepping import Advance, ImplicitEuler
 
 
 def left(x):
@@ -54,7 +55,9 @@ def test_the_law_takes_them():
     """PNP sees the unobserved part of N only, and RMR the observed one of M."""
     model = reaction(line(), ElementLineP1())
     law = lp.GradientLaw(M_op=observed_operator(left, -1.0), N_op=unobserved_operator(left, -1.0))
-    work = law.prepare(lp.Problem(model, observe(model, lp.Subdomain(left)), None))
+    work = law.prepare(
+        lp.Problem(model, observe(model, lp.Subdomain(left)), Advance(ImplicitEuler()))
+    )
     stage = work.stage(np.ones(work.problem.observed.size, dtype=bool))
     hidden = np.flatnonzero(stage.split.P.diagonal())
     assert set(np.unique(stage.PNP.nonzero()[0])) <= set(hidden)
