@@ -17,7 +17,7 @@ PYTHON ?= python3
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check format docs bench lock clean
+.PHONY: help demo test mpi check format docs bench lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
@@ -29,6 +29,11 @@ demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) 
 
 test: $(READY)  ## Run all tests and doctests, with coverage
 	@$(BIN)/pytest --cov --numprocesses auto --maxprocesses 8 --dist loadfile
+
+mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment of its own
+	@.venv-petsc/bin/python -c 'import petsc4py, livepde, pytest' 2>/dev/null || deploy/petsc.sh .venv-petsc
+	@.venv-petsc/bin/python -m pip --disable-pip-version-check --quiet install pytest
+	@.venv-petsc/bin/python -m pytest --quiet tests/test_parallel.py
 
 check: $(READY)  ## Check style, format, types and import layers
 	@$(BIN)/ruff check --quiet

@@ -116,6 +116,29 @@ def scale(
 
 
 @bench.command()
+def mpi(
+    size: Annotated[int, typer.Option(min=2500, help="Number of nodes.")] = 1_000_000,
+    ranks: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="Number of ranks, default 1 and 2. Repeat for more."),
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, help="Steps that are timed.")] = 5,
+    rounds: Annotated[int, typer.Option(min=1, help="Runs with each number of ranks.")] = 2,
+    as_json: JsonOption = False,
+) -> None:
+    """Time the gradient law on several ranks of MPI, and count what crosses between them.
+
+    Example:  livepde bench mpi --size 100000
+    """
+    from livepde.bench.mpi import mpi as benchmark
+
+    command = ["livepde", "bench", "mpi", "--size", str(size)]
+    command += [word for count in ranks or () for word in ("--ranks", str(count))]
+    command += ["--samples", str(samples), "--rounds", str(rounds)]
+    report_outcome(benchmark(size, ranks or (1, 2), samples, rounds), command, as_json)
+
+
+@bench.command()
 def cases(
     only: Annotated[
         list[str] | None, typer.Option(help="Only this case. Repeat it for more.")

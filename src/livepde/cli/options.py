@@ -2,16 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from enum import StrEnum
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
     from livepde.cases import Case
+    from livepde.model import Model
 
-__all__ = ["CaseArgument", "CodeOption", "JsonOption", "OutOption", "SetOption", "load_case"]
+__all__ = [
+    "CaseArgument",
+    "CodeOption",
+    "EngineName",
+    "EngineOption",
+    "JsonOption",
+    "OutOption",
+    "SetOption",
+    "load_case",
+    "with_engine",
+]
+
+
+class EngineName(StrEnum):
+    """What solves large systems."""
+
+    own = "own"
+    petsc = "petsc"
+
 
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object, with 'checks'; exit 1 if one fails.")
@@ -35,12 +56,51 @@ SetOption = Annotated[
         show_default=False,
     ),
 ]
+EngineOption = Annotated[
+    EngineName,
+    typer.Option(
+        help="What solves large systems: one process by itself, or PETSc on all processes that "
+        "mpirun has started."
+    ),
+]
 CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show_default=False)]
 
 
 def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
-    """Read a case with the settings of the command line."""
+    """Read a case with the settings of the command line; other ranks may build its model, too."""
+    from livepde.linalg import in_use
+
+    loaded, engine = _load(case, allow_code, settings), in_use()
+    if engine is not None:
+        engine.build(_model, case, allow_code, settings, known=loaded.model)
+    return loaded
+
+
+def _load(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
     from livepde import cases
     from livepde.cases.settings import parse
 
     return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
+
+
+def _model(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Model:
+    return _load(case, allow_code, settings).model
+
+
+def with_engine(command: Callable[..., None]) -> Callable[..., None]:
+    """Let a command have the engine that its option `engine` names.
+
+    A process that only lends a hand does so until the first one has ended its command.
+    """
+
+    @wraps(command)
+    def wrapped(**options: Any) -> None:
+        if options["engine"] is EngineName.own:
+            return command(**options)
+        from livepde.parallel import petsc
+
+        with petsc() as engine:
+            if engine is not None:
+                command(**options)
+
+    return wrapped

@@ -19,10 +19,13 @@ from livepde.cli.live import Beside, beside
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
+    EngineName,
+    EngineOption,
     JsonOption,
     OutOption,
     SetOption,
     load_case,
+    with_engine,
 )
 from livepde.cli.printing import (
     CHECK_FAILED,
@@ -52,6 +55,7 @@ class LogKind(StrEnum):
     json = "json"
 
 
+@with_engine
 def run(
     case: CaseArgument,
     data: Annotated[
@@ -118,6 +122,7 @@ def run(
         ),
     ] = False,
     log: Annotated[LogKind, typer.Option(help="How a live run writes its log.")] = LogKind.text,
+    engine: EngineOption = EngineName.own,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
@@ -129,6 +134,7 @@ def run(
     Example:  livepde run mycase/case.toml
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
+    Parallel: mpirun -n 4 livepde run mycase/case.toml --engine petsc
     """
     from livepde.runs import free_path
     from livepde.runs.logs import configure
@@ -260,12 +266,15 @@ def concluded(
     draw
         With figures.
     """
+    from livepde.linalg import in_use
     from livepde.runs import arrivals, checks_of, doubts, tables
 
     dataset = driven.result.to_xarray()
     shown = [*tables(dataset), *arrivals(driven.journal)]
     checks = checks_of(loaded.expected, dataset)
     notes = [*loaded.notes, *doubts(dataset)]
+    if (engine := in_use()) is not None:
+        notes.append(f"Large systems were solved by {engine.reason}.")
     if len(driven.result):
         notes += _traded(loaded, identifier)
     if driven.status == "interrupted":

@@ -196,7 +196,10 @@ class Form(FormMatrices):
             Numbers of the cells.
         """
         part = copy(self)
-        part.terms = [replace(term, measure=term.measure.on(cells)) for term in self.terms]
+        here = [replace(term, measure=term.measure.on(cells)) for term in self.terms]
+        kept = [k for k, term in enumerate(here) if term.measure.shape[0]] or [0]
+        part.terms = [here[k] for k in kept]
+        part.derivatives = [self.derivatives[k] for k in kept]
         part._operators = {}
         part._forget()
         return part

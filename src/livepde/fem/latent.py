@@ -224,6 +224,10 @@ class Composed(FormMatrices):
         self.latent = latent
         self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array | None]] = {}
 
+    def on(self, cells: IntArray) -> Composed:
+        """Return the same integrals over some cells of the mesh only."""
+        return Composed(self.form.on(cells), self.latent)
+
     @property
     def affine(self) -> bool:
         """True if the form is affine in u."""

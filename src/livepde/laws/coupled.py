@@ -13,6 +13,7 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.damping import Damping, Residual
+from livepde.laws.distributed import Distributed, distributed
 from livepde.laws.schur import LARGE, Approximate, BlockSolver, Jacobian, narrow
 from livepde.linalg import (
     Array,
@@ -242,9 +243,16 @@ class CoupledStage:
         return self._assembled[0]
 
     @cached_property
+    def distributed(self) -> Distributed | None:
+        """The stage on several ranks; None: this process solves it."""
+        return distributed(self)
+
+    @cached_property
     def by_blocks(self) -> BlockSolver | None:
         """What solves a large system by blocks; None: the coupled matrix is factorised."""
-        if self.size < LARGE or narrow(sp.csr_array(self.model.mass + self.RMR)):
+        if self.size < LARGE or self.distributed is not None:
+            return None
+        if narrow(sp.csr_array(self.model.mass + self.RMR)):
             return None
         return BlockSolver(self)
 
@@ -290,7 +298,7 @@ class CoupledStage:
     @cached_property
     def _bilinear(self) -> _Bilinear | None:
         form = self.model.form_A
-        if self.model.latent.generator.nnz:
+        if self.model.latent.generator.nnz or self.distributed is not None:
             return None
         if self.by_blocks is not None:
             return None
@@ -457,6 +465,8 @@ class CoupledStage:
         return Parts(weights, (TINY, TINY, floor))
 
     def _equation(self, c: Array, h: float, moment: Moment, u_alpha: Array) -> _Equation:
+        if self.distributed is not None:
+            return _DistributedEquation(self, self.distributed, c, h, moment, u_alpha)
         if self.by_blocks is not None:
             return BlockEquation(self.by_blocks, c, h, moment, u_alpha)
         if self._bilinear is not None:
@@ -466,11 +476,15 @@ class CoupledStage:
     @cached_property
     def keeps(self) -> bool:
         """True if a factor is kept from stage to stage."""
+        if self.distributed is not None:
+            return self.model.constant
         return self._bilinear is not None if self.by_blocks is None else self.model.constant
 
     @cached_property
     def patience(self) -> int:
         """Updates beyond one for each stage that a factor may cost before it is made again."""
+        if self.distributed is not None:
+            return 3
         if self.by_blocks is not None:
             return self.by_blocks.patience
         return 2 if isinstance(self.solver, BandedSolver) else 12
@@ -742,6 +756,38 @@ class BlockEquation(_Equation):
             return K
         row = self.stage.slope(self.norms, self.Mr, self.mass_r)
         return K.bordered(self.Mr, row) if row.any() else K
+
+
+class _DistributedEquation(_Equation):
+    """The same equation, its residual and Jacobian on several ranks."""
+
+    def __init__(
+        self,
+        stage: CoupledStage,
+        shared: Distributed,
+        c: Array,
+        h: float,
+        moment: Moment,
+        u_alpha: Array,
+    ) -> None:
+        super().__init__(stage, c, h, moment, u_alpha)
+        self.shared = shared.equation(c, h, moment, u_alpha, self.source)
+
+    def residual(self, y: Array) -> Array:
+        n, u = self.stage.n, y[: self.stage.n]
+        self.count += 1
+        self.r = self.stage.split.R @ u - self.u_alpha
+        first, self.Mr, self.mass_r, second = self.shared.residual(u, y[n:])
+        return np.concatenate([first + self.pull(), second])
+
+    def factor(self, y: Array, sweep: bool) -> Factor:
+        row = np.zeros(self.stage.n)
+        if not sweep:
+            row = self.stage.slope(self.norms, self.Mr, self.mass_r)
+        factor: Factor = self.shared.jacobian(self.theta, sweep, self.Mr, row)
+        if not sweep:
+            self.made = (y, factor)
+        return factor
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from livepde.linalg.banded import BandedSolver
 from livepde.linalg.blocks import BandedBlocks, BlockFactor
 from livepde.linalg.choice import Choice, analyse, choose
 from livepde.linalg.cholmod import CholmodSolver
+from livepde.linalg.engine import Engine, in_use, using
 from livepde.linalg.kept import Costs
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
@@ -26,6 +27,7 @@ __all__ = [
     "Choice",
     "CholmodSolver",
     "Costs",
+    "Engine",
     "Factor",
     "IntArray",
     "Leading",
@@ -43,6 +45,8 @@ __all__ = [
     "compact",
     "conjugate_gradients",
     "gmres",
+    "in_use",
     "positive_definite",
     "sandwich",
+    "using",
 ]

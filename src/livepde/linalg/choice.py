@@ -12,7 +12,7 @@ factor are about as large, whatever the dimension:
     beyond                                multigrid
 
 Multigrid serves symmetric positive definite matrices; others are factorised, by Pardiso if it is
-installed, at any size.
+installed, at any size. An engine in use (`livepde.linalg.using`) comes before all but banded LU.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from importlib.util import find_spec
 
 from livepde.linalg.banded import BandedSolver
 from livepde.linalg.cholmod import CholmodSolver
+from livepde.linalg.engine import in_use
 from livepde.linalg.multigrid import MultigridSolver
 from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern
@@ -66,6 +67,10 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
     wide = f"a band of {band}"
     if band <= WIDEST_BAND:
         return Choice(banded, f"{wide}, at most {WIDEST_BAND}")
+    engine = in_use()
+    solver = engine.solver(pattern, symmetric=symmetric) if engine else None
+    if engine is not None and solver is not None:
+        return Choice(solver, f"{wide}; {engine.reason}")
     superlu = SuperLUSolver(pattern, symmetric)
     if band <= SMALL:
         return Choice(superlu, f"{wide}, at most {SMALL}")

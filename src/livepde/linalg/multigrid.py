@@ -73,4 +73,5 @@ class MultigridSolver:
 
 def approximate_inverse(factor: Factor) -> Callable[[Array], Array]:
     """Return what a factor offers a Krylov method: one V-cycle instead of an iteration within."""
-    return factor.precondition if isinstance(factor, MultigridFactor) else factor.solve
+    cycle: Callable[[Array], Array] = getattr(factor, "precondition", factor.solve)
+    return cycle
