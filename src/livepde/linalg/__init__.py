@@ -8,7 +8,6 @@ from livepde.linalg.blocks import BandedBlocks, BlockFactor
 from livepde.linalg.choice import Choice, analyse, choose
 from livepde.linalg.cholmod import CholmodSolver
 from livepde.linalg.engine import Engine, in_use, using
-from livepde.linalg.kept import Costs
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
 from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
@@ -26,7 +25,6 @@ __all__ = [
     "BlockFactor",
     "Choice",
     "CholmodSolver",
-    "Costs",
     "Engine",
     "Factor",
     "IntArray",
