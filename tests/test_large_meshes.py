@@ -165,6 +165,17 @@ def test_trilinear_forms_element_by_element(mesh, state, parameter, monkeypatch)
         close(T.applied_transposed(w, y), matrix.T @ y)
 
 
+def test_an_unknown_that_the_equation_does_not_read(monkeypatch):
+    """Only sensors do, as those with offsets: its tensors are all zero."""
+    monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
+    field = lp.Field(triangles(), ElementTriP1())
+    form = lp.Model(field, lp.Scalar(0.0), A=lambda q, u, v, x: 0.0 * q * u * v).form_A
+    u, q = np.ones(form.spaces["u"].dim), np.ones(1)
+    assert not form.vector("v", q=q, u=u).any()
+    assert not form.matrix("v", "u", q=q).count_nonzero()
+    assert not form.product("v", "u", u, q=q).any()
+
+
 def test_straight_triangles_share_one_tensor(monkeypatch):
     monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
     mesh = MeshTri().refined(3)
