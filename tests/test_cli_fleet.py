@@ -126,6 +126,7 @@ def test_in_several_processes(here):
     [
         ("data\nrod.csv\n", "one called 'name'"),
         ("name\n", "no rows"),
+        ("name,data\na,rod/warm.csv,\n", "more cells than its header"),
         ("name\na\na\n", "'a' is taken"),
         ("name\n../a\n", "does not do for a folder"),
         ("name,data\n,rod.csv\n", "does not do for a folder"),

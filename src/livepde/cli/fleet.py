@@ -175,6 +175,11 @@ def _read(path: Path) -> list[Member]:
         table = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise DataError(f"Cannot read the members in {path}: {error}.") from error
+    if not isinstance(table.index, pd.RangeIndex):  # pandas takes the first cells for labels
+        raise DataError(
+            f"{path}: its rows have more cells than its header: name each column, and end no row "
+            "with a separator."
+        )
     if NAME not in table.columns:
         raise DataError(
             f"{path} has the columns {list(table.columns)}: one called '{NAME}' is needed, which "
