@@ -216,6 +216,21 @@ def test_forms_on_some_cells_add_up():
     assert matrices[0].nnz < whole.pattern("v", "u").nnz
 
 
+def test_forms_on_cells_that_some_terms_do_not_have():
+    """Of a form that is nonlinear in both arguments, with terms on parts of the mesh."""
+    mesh = triangles()
+    form = nonlinear(mesh, ElementTriP1())().form_A
+    far = np.flatnonzero(mesh.p[0, mesh.t].min(axis=0) >= 0.5)
+    parts = [form.on(cells) for cells in (far, np.setdiff1d(np.arange(mesh.nelements), far))]
+    rng, at = np.random.default_rng(4), Moment(0.3)
+    values = {key: rng.standard_normal(space.dim) for key, space in form.spaces.items()}
+    assert [len(part.terms) for part in parts] == [1, 3]
+    for slots in [("v", "u"), ("q", "u"), ("q", "v")]:
+        found = sum(part.matrix(*slots, at, **values) for part in parts)
+        close(found.toarray(), form.matrix(*slots, at, **values).toarray())
+    assert not form.on(far[:0]).matrix("q", "u", at, **values).nnz
+
+
 def test_vector_fields_and_points_on_large_meshes(pieces):
     mesh, element = triangles(), ElementVector(ElementTriP1())
     points = np.array([[0.31, 0.62, 0.9], [0.11, 0.43, 0.95]])
