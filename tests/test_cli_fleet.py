@@ -83,6 +83,22 @@ def test_each_row_is_a_run_of_its_own(here):
         assert table.loc[name, "alpha"] == float(mine.dataset["alpha"][-1])
 
 
+def test_steps_that_failed_are_told(here):
+    """Also of members that are stepped together: nothing else would show it."""
+    table = pd.read_csv("rod/rod.csv")
+    table.loc[20:, "T_left"] = 1e300
+    table.to_csv("rod/hot.csv", index=False)
+    Path("rods.csv").write_text("name,data\nplain,\nhot,rod/hot.csv\n")
+    code, output = call(
+        "fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--json"
+    )
+    assert code == 1
+    notes = json.loads(output)["notes"]
+    assert "Of 2 members 2 were stepped together." in notes
+    assert "hot: 19 of 39 steps failed: not_finite" in notes
+    assert not any("plain: " in note and "steps failed" in note for note in notes)
+
+
 def test_goes_on_with_what_is_there(here):
     Path("rods.csv").write_text("name,data\nplain,\n")
     arguments = ["fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--json"]
@@ -110,6 +126,7 @@ def test_in_several_processes(here):
     [
         ("data\nrod.csv\n", "one called 'name'"),
         ("name\n", "no rows"),
+        ("name,data\na,rod/warm.csv,\n", "more cells than its header"),
         ("name\na\na\n", "'a' is taken"),
         ("name\n../a\n", "does not do for a folder"),
         ("name,data\n,rod.csv\n", "does not do for a folder"),

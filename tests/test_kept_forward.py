@@ -235,6 +235,73 @@ def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
         np.testing.assert_array_equal(one.belief.q_factor, other.belief.q_factor)
 
 
+def transport(share):
+    """Conduction in slow units with wind; `share(q)` of it."""
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
+    return lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"left": 0.0}),
+        lp.Scalar(0.0),
+        A=lambda q, u, v, x: share(q) * lp.grad(u)[0] * v,
+        B=lambda u, v, x: 1e-16 * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
+@pytest.mark.parametrize("engine", list(ENGINES))
+@pytest.mark.parametrize(
+    ("share", "claimed"),
+    [
+        (lambda q: 1e-15 * (1.0 + q), False),  # beside M/h it is rounding, unless h is large
+        (lambda q: 1e-15 * (q - 8.0) * (np.real(q) > 8.0), True),  # begins eight deviations off
+    ],
+)
+def test_only_symmetric_matrices_are_factorised_as_such(engine, share, claimed, monkeypatch):
+    module, make = ENGINES[engine]
+    if module:
+        pytest.importorskip(module)
+
+    def chosen(pattern, symmetric=False):
+        return Choice(make(pattern) if symmetric else SuperLUSolver(pattern), "a test")
+
+    monkeypatch.setattr(state_module, "choose", chosen)
+    moving, h, q = transport(share), 1e15, np.array([20.0])
+    forward = ForwardStage(moving)
+    assert forward.symmetric is claimed
+    c = moving.initial(lambda x: np.sin(3.0 * x[0]) + x[1])
+    u = forward.solve(c, q, h, lp.Moment(h))
+    rate, wind = moving.mass @ (u - c) / h, moving.form_A.vector("v", q=q, u=u)
+    residual = (rate + wind + moving.B(u)) * moving.X.free
+    np.testing.assert_allclose(residual, 0.0, atol=1e-10 * np.abs(wind).max())
+
+
+def test_units_of_components_do_not_hide_what_is_not_symmetric():
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (20, 20)).to_meshtri()
+    field = lp.Field(mesh, lp.linear(mesh))
+    two = lp.Model(
+        {"a": field, "b": field},
+        lp.Scalar(0.0),
+        A=lambda q, u, v, x: q * u.b * v.b,
+        M=lambda u, v, x: 1e15 * u.a * v.a + u.b * v.b,
+        B=lambda u, v, x: 1e15 * u.a * v.a + lp.grad(u.b)[0] * v.b,
+    )
+    assert not ForwardStage(two).symmetric
+
+
+@pytest.mark.parametrize("size", [1e-157, 1e-158, 1e-159, 1e-160])
+def test_a_state_may_fade_until_its_squares_underflow(model, size):
+    kept, directions = Kept.none(), np.ones((model.Q.dim, 1))
+    calm = lp.Model(
+        model.state_space.blocks["u"].field,
+        model.parameter_space.blocks["q"].field,
+        A=lambda q, u, v, x: q * u * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    forward, c = ForwardStage(calm), size * np.column_stack([model.X.free] * 2)
+    for k in range(3):
+        q = bump(calm, 1.0 + 0.1 * k)
+        c, kept = forward.advance(c, q, directions, H, lp.Moment(H * (k + 1)), kept)
+    assert 0.0 < np.abs(c[:, 0]).max() < size
+
+
 def test_a_matrix_that_is_not_positive_definite_is_still_solved(model):
     """A reaction that grows faster than the step resolves."""
     q = bump(model, -400.0)

@@ -165,6 +165,17 @@ def test_trilinear_forms_element_by_element(mesh, state, parameter, monkeypatch)
         close(T.applied_transposed(w, y), matrix.T @ y)
 
 
+def test_an_unknown_that_the_equation_does_not_read(monkeypatch):
+    """Only sensors do, as those with offsets: its tensors are all zero."""
+    monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
+    field = lp.Field(triangles(), ElementTriP1())
+    form = lp.Model(field, lp.Scalar(0.0), A=lambda q, u, v, x: 0.0 * q * u * v).form_A
+    u, q = np.ones(form.spaces["u"].dim), np.ones(1)
+    assert not form.vector("v", q=q, u=u).any()
+    assert not form.matrix("v", "u", q=q).count_nonzero()
+    assert not form.product("v", "u", u, q=q).any()
+
+
 def test_straight_triangles_share_one_tensor(monkeypatch):
     monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
     mesh = MeshTri().refined(3)
@@ -203,6 +214,21 @@ def test_forms_on_some_cells_add_up():
     matrices = [part.matrix("v", "u", u=u) for part in parts]
     close(sum(matrices).toarray(), whole.matrix("v", "u", u=u).toarray())
     assert matrices[0].nnz < whole.pattern("v", "u").nnz
+
+
+def test_forms_on_cells_that_some_terms_do_not_have():
+    """Of a form that is nonlinear in both arguments, with terms on parts of the mesh."""
+    mesh = triangles()
+    form = nonlinear(mesh, ElementTriP1())().form_A
+    far = np.flatnonzero(mesh.p[0, mesh.t].min(axis=0) >= 0.5)
+    parts = [form.on(cells) for cells in (far, np.setdiff1d(np.arange(mesh.nelements), far))]
+    rng, at = np.random.default_rng(4), Moment(0.3)
+    values = {key: rng.standard_normal(space.dim) for key, space in form.spaces.items()}
+    assert [len(part.terms) for part in parts] == [1, 3]
+    for slots in [("v", "u"), ("q", "u"), ("q", "v")]:
+        found = sum(part.matrix(*slots, at, **values) for part in parts)
+        close(found.toarray(), form.matrix(*slots, at, **values).toarray())
+    assert not form.on(far[:0]).matrix("q", "u", at, **values).nnz
 
 
 def test_vector_fields_and_points_on_large_meshes(pieces):

@@ -67,6 +67,8 @@ class Ended:
         Label of each number -> last value and standard deviation.
     failed
         Names of checks that failed.
+    lost
+        Why steps failed -> how many.
     error
         Why it failed.
     apart
@@ -78,6 +80,7 @@ class Ended:
     samples: int = 0
     unknowns: dict[str, tuple[float, float]] = field(default_factory=dict)
     failed: tuple[str, ...] = ()
+    lost: dict[str, int] = field(default_factory=dict)
     error: str = ""
     apart: str = ""
 
@@ -146,6 +149,11 @@ def fleet(
     wrong = [item for item in ended if item.status == "failed" or item.failed]
     notes = [how] if (how := _how(ended)) else []
     notes += [f"{item.name}: {item.error}" for item in ended if item.error]
+    notes += [
+        f"{item.name}: {count} of {item.samples} steps failed: {why}"
+        for item in ended
+        for why, count in item.lost.items()
+    ]
     notes += [f"{item.name}: check failed: {check}" for item in ended for check in item.failed]
     if as_json:
         print_json([_table(summary)], [], notes, run=str(folder), failed=len(wrong))
@@ -167,6 +175,11 @@ def _read(path: Path) -> list[Member]:
         table = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
     except (OSError, UnicodeDecodeError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise DataError(f"Cannot read the members in {path}: {error}.") from error
+    if not isinstance(table.index, pd.RangeIndex):  # pandas takes the first cells for labels
+        raise DataError(
+            f"{path}: its rows have more cells than its header: name each column, and end no row "
+            "with a separator."
+        )
     if NAME not in table.columns:
         raise DataError(
             f"{path} has the columns {list(table.columns)}: one called '{NAME}' is needed, which "
@@ -332,6 +345,8 @@ def _interrupted(ended: Mapping[str, Ended]) -> bool:
 
 
 def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]) -> Ended:
+    from livepde.records import STATUS_CODES
+
     unknowns = {
         label: (float(dataset[label][-1]), float(dataset[f"{label}_std"][-1]))
         for label in filter(None, dataset.attrs["scalars"].split("\n"))
@@ -340,7 +355,8 @@ def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[C
     failed = tuple(check.name for check in checks if not check.ok)
     error = getattr(run, "error", None)
     samples = dataset.sizes["time"]
-    return Ended(name, run.status, samples, unknowns, failed, str(error) if error else "")
+    lost = dict(Counter(STATUS_CODES[code] for code in dataset["status"].values.tolist() if code))
+    return Ended(name, run.status, samples, unknowns, failed, lost, str(error) if error else "")
 
 
 def _how(ended: Sequence[Ended]) -> str:

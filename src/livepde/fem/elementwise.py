@@ -121,7 +121,7 @@ class ElementTensor:
         data = np.zeros(self.places.pattern.nnz)
         for number, at, tensors, (_, _, third), shares in self._blocks(*self.slots):
             i, j, n, r = tensors.shape
-            mixed = (w[third][:, None] * shares).reshape(n * r, -1)
+            mixed = (w[third][:, None] * shares).reshape(n * r, shares.shape[1])
             local = tensors.reshape(i * j, n * r) @ mixed
             self.places.add(data, number, at, local.reshape(i, j, -1))
         return data
@@ -141,6 +141,6 @@ class ElementTensor:
         for _, _, tensors, (into, from_, of), shares in self._blocks(rows, cols, third):
             i, j, n, r = tensors.shape
             mixed = x[from_][:, None, None] * w[of][:, None] * shares
-            local = tensors.reshape(i, j * n * r) @ mixed.reshape(j * n * r, -1)
+            local = tensors.reshape(i, j * n * r) @ mixed.reshape(j * n * r, shares.shape[1])
             np.add.at(result, into.ravel(), local.ravel())
         return result

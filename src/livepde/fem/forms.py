@@ -188,7 +188,8 @@ class Form(FormMatrices):
     def on(self, cells: IntArray) -> Form:
         """Return the form integrated over some cells of the mesh, and over the facets they have.
 
-        Its functions are those of the whole mesh; its patterns hold what these cells couple.
+        Terms that live elsewhere are left out. Its functions are those of the whole mesh; its
+        patterns hold what these cells couple.
 
         Parameters
         ----------
@@ -196,10 +197,10 @@ class Form(FormMatrices):
             Numbers of the cells.
         """
         part = copy(self)
-        here = [replace(term, measure=term.measure.on(cells)) for term in self.terms]
-        kept = [k for k, term in enumerate(here) if term.measure.shape[0]] or [0]
-        part.terms = [here[k] for k in kept]
-        part.derivatives = [self.derivatives[k] for k in kept]
+        measures = [term.measure.on(cells) for term in self.terms]
+        here = [k for k, measure in enumerate(measures) if measure.shape[0]]
+        part.terms = [replace(self.terms[k], measure=measures[k]) for k in here]
+        part.derivatives = [self.derivatives[k] for k in here]
         part._operators = {}
         part._forget()
         return part

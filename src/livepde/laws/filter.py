@@ -305,6 +305,7 @@ class Filter:
             U, C = _compressed(U, C, self.scale, self.rank)
         return replace(end, u=y[:, 0], U=U, C=C, du=du, kept=kept), steps, None
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def updated(self, point: Point, interval: Interval, predicted: Array) -> tuple[Point, int]:
         """Return the filter after the sample, and how many values the gate refused."""
         d = interval.z1 - predicted

@@ -14,7 +14,17 @@ import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array, Assembler, Choice, Factor, Pattern, Solver, analyse, choose
+from livepde.linalg import (
+    Array,
+    Assembler,
+    Choice,
+    Factor,
+    IntArray,
+    Pattern,
+    Solver,
+    analyse,
+    choose,
+)
 from livepde.model import Model
 from livepde.stepping.interval import Advance, Interval, advance
 from livepde.stepping.newton import Newton, StepFailed
@@ -105,16 +115,36 @@ class ForwardStage:
 
     @cached_property
     def symmetric(self) -> bool:
-        """True if the matrix of a stage is symmetric whatever q: seen at one that is random."""
+        """True if the matrix of a stage should be symmetric for all q and h.
+
+        M is, and the rest is at one q that is random: `_factorise` looks at each matrix again.
+        """
         if not self.keeps:
             return False
-        model, (pattern, rows, _) = self.model, self._free
+        model, rows = self.model, self._free[1]
         some = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
         inputs = Inputs(dict.fromkeys(model.channels, 1.0))
         with np.errstate(all="ignore"):
-            data = rows @ self._data_at(model.latent.prior + some, 1.0, Moment(0.0, inputs))
-        matrix = pattern.matrix(data)
-        return bool(abs(matrix - matrix.T).max() <= LINEAR * abs(data).max())
+            rest = self._data_at(model.latent.prior + some, math.inf, Moment(0.0, inputs))
+        parts = (self._rows[1]["M"] @ model.mass.data, rest)
+        return all(self._mirrored(rows @ part) for part in parts)
+
+    @cached_property
+    def _mirror(self) -> IntArray:
+        """Where in the data of the free part the entries of its transpose stand."""
+        pattern = self._free[0]
+        return pattern.positions(pattern.indices, pattern.rows)
+
+    def _mirrored(self, data: Array) -> bool:
+        """Return whether data of the free part are symmetric, each beside its own diagonal.
+
+        A positive definite matrix has no entry beyond the root of the product of its two diagonal
+        entries: that measure does not depend on the units of the state's components.
+        """
+        pattern = self._free[0]
+        scale = np.sqrt(np.abs(pattern.matrix(data).diagonal()))
+        allowed = LINEAR * scale[pattern.rows] * scale[pattern.indices]
+        return bool(np.all(np.abs(data - data[self._mirror]) <= allowed))
 
     @cached_property
     def engine(self) -> Choice:
@@ -167,11 +197,13 @@ class ForwardStage:
     def _factorise(self, data: Array) -> Factor:
         _, rows, fixed = self._free
         complete = rows @ data + fixed
-        try:
-            return self.solver.factorise(complete)
-        except LinearAlgebraError as error:
-            if not self.symmetric:
-                raise StepFailed("singular", str(error)) from error
+        # An engine for definite matrices reads half of each, and would not see the other half.
+        if not self.solver.definite or self._mirrored(complete):
+            try:
+                return self.solver.factorise(complete)
+            except LinearAlgebraError as error:
+                if not self.symmetric:
+                    raise StepFailed("singular", str(error)) from error
         try:  # not positive definite: q is far off, and the step may still be good
             return self._general.factorise(complete)
         except LinearAlgebraError as error:
@@ -353,7 +385,7 @@ class _Corrections:
             if exact or moved <= ROUNDING * size:
                 return x
             last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
-            rate = float(np.linalg.norm(r)) / last
+            rate = float(np.linalg.norm(r)) / last if last else math.inf  # squares may underflow
             if rate <= SLOW:
                 left = moved * rate / (1.0 - rate)
                 change = float(np.linalg.norm(x - before))
