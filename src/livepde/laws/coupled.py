@@ -28,7 +28,7 @@ from livepde.linalg import (
 )
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import TINY, Newton, Parts, Solution
+from livepde.stepping import TINY, Newton, Parts, Secants, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
@@ -115,6 +115,8 @@ class Kept:
         By how much more each stage of age makes the second update, relative to the first, and how
         large the first was when that was seen, relative to y. Of the factor before, until it is
         seen again.
+    secants
+        What stages since then have taught about it.
     """
 
     y: Array
@@ -124,11 +126,12 @@ class Kept:
     spent: int
     ageing: float
     seen: float
+    secants: Secants
 
     @classmethod
     def none(cls, ageing: float = math.inf, seen: float = 0.0) -> Kept:
         """Return the value without a factor."""
-        return cls(np.zeros(0), np.zeros(0), 0.0, 0, 0, ageing, seen)
+        return cls(np.zeros(0), np.zeros(0), 0.0, 0, 0, ageing, seen, Secants.none())
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,11 +375,14 @@ class CoupledStage:
         if blocks is not None:
             blocks.begin(self._block(blocks, warm.kept, moment) if len(warm.kept.y) else None)
             newton = replace(newton, share=max(newton.share, SHARE) if newton.share else 0.0)
-        used, factor, age = None, None, 1
+        used, factor, age, secants, trusted = None, None, 1, Secants.none(), warm.kept.seen
         if good:
             used = near + self._spread(warm.trend) * warm.miss if follows else near
             if warm.kept.h == h:
                 factor, age = self._factor(warm.kept, moment), warm.kept.age + 1
+                secants = warm.kept.secants
+        if blocks is None:
+            trusted = min(trusted, warm.missed)
         solved = newton.solve(
             equation,
             begin,
@@ -385,8 +391,9 @@ class CoupledStage:
             near=used,
             kept=factor,
             expected=warm.kept.ageing * self._wear(age),
-            trusted=GROWN * warm.kept.seen,
+            trusted=GROWN * trusted,
             shares=self._shares(warm.trend) if follows and blocks is None else None,
+            secants=secants if self.keeps and blocks is None else None,
             rough=blocks is not None,
         )
         y = solved.y
@@ -417,16 +424,18 @@ class CoupledStage:
         """Return what becomes of the factor after a stage."""
         ageing, seen, blocks = kept.ageing, kept.seen, self.by_blocks
         if blocks is not None and blocks.made is not None:
-            return Kept(blocks.made.at, equation.u_alpha, equation.h, 0, 0, ageing, seen)
+            made = blocks.made.at
+            return Kept(made, equation.u_alpha, equation.h, 0, 0, ageing, seen, solved.secants)
         if equation.made is not None:
             self._made = equation.made
-            return Kept(equation.made[0], equation.u_alpha, equation.h, 0, 0, ageing, seen)
+            made = equation.made[0]
+            return Kept(made, equation.u_alpha, equation.h, 0, 0, ageing, seen, solved.secants)
         if not math.isnan(solved.rate):
             ageing, seen = solved.rate / self._wear(age), solved.missed
         spent = kept.spent + solved.updates - 1 + (sum(blocks.iterations) if blocks else 0)
         if spent > self.patience:
             return Kept.none(ageing, seen)
-        return Kept(kept.y, kept.u_alpha, kept.h, age, spent, ageing, seen)
+        return Kept(kept.y, kept.u_alpha, kept.h, age, spent, ageing, seen, solved.secants)
 
     def _trend(self, miss: Array, before: Array) -> Array:
         """Return by how much two misses that follow each other agree, shape (3,)."""

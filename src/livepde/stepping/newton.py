@@ -12,15 +12,17 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["TINY", "Newton", "Parts", "Solution", "StepFailed"]
+__all__ = ["TINY", "Newton", "Parts", "Secants", "Solution", "StepFailed"]
 
 
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
 
 
-SLOWEST = 0.1  # rate at which a kept factor of a stage with sweeps is expected to go on
+SLOWEST = 0.1  # rate at which a factor of a stage with sweeps is expected to go on
 
 TINY = 1e-300  # what is zero counts as this large
+
+LEAST = 0.1  # a pair whose second update goes this far beyond teaches nothing
 
 STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
 
@@ -86,10 +88,52 @@ class Parts:
         """
         return [share**2 * square for share, square in zip(shares, missed, strict=True)]
 
+    def dual(self, scales: list[float]) -> Array:
+        """Return weights of a sum of squares relative to those of all parts, shape (n,)."""
+        sizes = [max(scale, floor) for scale, floor in zip(scales, self.floors, strict=True)]
+        weights: Array = self.weights @ (1.0 / np.array(sizes))
+        return weights
+
     def relative(self, change: Array, y: Array) -> float:
         """Return the size of a change of y, relative to it, in its worst part."""
         pairs = zip(self.squares(change), self.squares(y), self.floors, strict=True)
         return math.sqrt(max(square / max(scale, floor) for square, scale, floor in pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class Secants:
+    """What updates by one factor have taught about the Jacobian since: Broyden's method.
+
+    A first update p and a second one p' say what the next one should be along p: each such pair
+    corrects an update x by p' (g, x), with (g, x) = (p, x)/(p, p - p').
+
+    Attributes
+    ----------
+    pairs
+        p' and g of each pair, the oldest first, one behind the other; empty if there are none.
+    """
+
+    pairs: Array
+
+    @classmethod
+    def none(cls) -> Secants:
+        """Return the value before any pair."""
+        return cls(np.zeros(0))
+
+    def corrected(self, update: Array) -> Array:
+        """Return an update by the factor as the pairs correct it."""
+        for change, row in self.pairs.reshape(-1, 2, len(update)):
+            update = update + float(row @ update) * change
+        return update
+
+    def taught(self, first: Array, second: Array, weights: Array) -> Secants:
+        """Return these with a pair more, in the inner product with weights, shape (n,)."""
+        row = weights * first
+        left = float(row @ (first - second))
+        if not left > LEAST * float(row @ first):
+            return self
+        row /= left
+        return Secants(np.concatenate([self.pairs, second, row]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +151,15 @@ class Solution:
         not where the iteration began in the end.
     rate
         From there, the second update over the first, with the same factor; NaN if there are none.
+    secants
+        What updates have taught about the factor that was used last.
     """
 
     y: Array
     updates: int
     missed: float
     rate: float
+    secants: Secants
 
 
 @dataclass(frozen=True)
@@ -140,7 +187,7 @@ class Newton:
     """
 
     tolerance: float = 1e-7
-    share: float = 0.05
+    share: float = 0.1
     iterations: int = 60
     refresh: float = 0.2
     basin: float = 3e-2
@@ -158,6 +205,7 @@ class Newton:
         expected: float = math.inf,
         trusted: float = math.inf,
         shares: tuple[float, ...] | None = None,
+        secants: Secants | None = None,
         rough: bool = False,
     ) -> Solution:
         """Return the solution, starting from y.
@@ -182,7 +230,8 @@ class Newton:
             is not larger than `trusted`, relative to y. It spares the second one where it is small.
         shares
             With `near`: how much of `share` counts in each part; by default all.
-
+        secants
+            What is known of `kept`; updates teach more, about any factor. None: they do not.
         rough
             The kept factor is that of an approximate Jacobian: an update by it that is larger than
             the one before does not mean that the neighbourhood was left.
@@ -199,11 +248,15 @@ class Newton:
         limit, stalled = math.inf if near is None else self.basin, 0
         strict, miss = max(self.tolerance, 1e-150) ** 2, [0.0] * len(parts.floors)
         missed = seen = math.nan
+        expected = math.inf if near is None else expected
+        learns, secants, before = secants is not None, secants or Secants.none(), np.zeros(0)
         for count in range(1, self.iterations + 1):
             residual = equation.residual(y)
             try:
-                factor = factor or equation.factor(y, sweeps)
-                update = factor.solve(residual)
+                if factor is None:
+                    factor = equation.factor(y, sweeps)
+                    secants, before = Secants.none(), np.zeros(0)
+                update = secants.corrected(factor.solve(residual))
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
@@ -221,6 +274,9 @@ class Newton:
                     size = max(size, square / scale)
                     excess = max(excess, square / max(strict * scale, m))
             size, excess = math.sqrt(size), math.sqrt(excess)
+            if len(before):
+                secants = secants.taught(before, update, parts.dual(scales))
+            before = update if learns and not sweeps else np.zeros(0)
             if count == 1 and near is not None:
                 missed = size
             ratio = excess / last
@@ -231,7 +287,7 @@ class Newton:
             # What converges slowly may only show later.
             rate = max(ratio, SLOWEST) if lagged else ratio
             if math.isinf(last):
-                rate = min(expected, 1.0) if count == 1 and missed <= trusted else 1.0
+                rate = min(expected, 1.0) if size <= trusted else 1.0
             done = excess * rate <= 1.0 - rate  # the error is rate/(1 - rate) times the update
             # A kept factor that needs one or two more is not replaced now.
             ends = kept is not None and count <= 2 and excess * rate**3 <= 1.0 - rate
@@ -252,7 +308,7 @@ class Newton:
                 y, factor, sweeps, near, last = begin, None, True, None, math.inf
                 limit, stalled = math.inf, 0
                 miss, missed = [0.0] * len(miss), math.nan
-                seen = math.nan
+                seen, expected = math.nan, math.inf
                 continue
             if not sweeps and math.isinf(last):
                 limit = size
@@ -266,8 +322,10 @@ class Newton:
             if sweeps and (size <= basin or stalled == STALLED):
                 # Newton's first update may be larger: sweeps creep, Newton goes all the way.
                 begin, factor, sweeps, last = y, None, False, math.inf
+                expected = math.inf
             elif kept is not None and slow:
                 factor, kept, last = None, None, math.inf  # a factor of its own begins anew
+                expected, trusted = math.inf if rough else SLOWEST, math.inf
             elif sweeps or slow:
                 factor = None
         else:
@@ -275,7 +333,7 @@ class Newton:
                 "not_converged",
                 f"{self.iterations} iterations left a relative update of {size:.1e}",
             )
-        return Solution(new, count, missed, seen)
+        return Solution(new, count, missed, seen, secants)
 
 
 def _evaluated(start: Array | Callable[[], Array]) -> Array:
