@@ -656,7 +656,7 @@ class _Bilinear:
     lagged, jacobian
         w, and (w, q, r) -> data of the part of the stage's Jacobian that changes.
     linear
-        (y, u_alpha, (y - c)/h) -> the linear part of the residual, stacked above r.
+        (w, (y - c)/h, y) -> the linear part of the residual.
     observed
         r -> R^T M_op r above R^T M r.
     offset
@@ -678,16 +678,14 @@ class _Bilinear:
         B = model.form_B.matrix("v", "u", u=zero)
         self.offset = model.B(zero) * model.X.free
         gram = sp.csr_array(free_q @ stage.gram / g.gain)
-        state = sp.csr_array(free @ (B @ stage.W + g.nu * stage.PNP))
-        fed = sp.csr_array((n, n)) if g.at_estimate else free @ B  # what u_alpha adds to B(w)
-        none, wide = sp.csr_array((m, n)), sp.csr_array((n, m))
+        wide = sp.csr_array((n, m))
         rows = [
-            [state, wide, fed, free @ model.mass, wide],
-            [none, g.sigma * gram, none, none, gram],
-            [stage.split.R, wide, -sp.eye_array(n), sp.csr_array((n, n)), wide],
+            [free @ B, free @ model.mass, wide, g.nu * free @ stage.PNP, wide],
+            [wide.T, wide.T, gram, wide.T, g.sigma * gram],
         ]
-        self.linear = sp.csr_array(sp.block_array(rows))
-        self.linear.eliminate_zeros()
+        linear = sp.csr_array(sp.block_array(rows))
+        linear.eliminate_zeros()
+        self.linear = Pattern.of(linear).matrix(linear.data)  # with short indices
         self.observed = compact(sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass])))
 
 
@@ -708,17 +706,16 @@ class _BilinearEquation(_Equation):
         self.known = self.source * stage.model.X.free - products.offset
 
     def residual(self, y: Array) -> Array:
-        n, size, products = self.stage.n, len(y), self.products
+        n, products = self.stage.n, self.products
         self.count += 1
         u, q = y[:n], y[n:]
-        stack = products.linear @ np.concatenate((y, self.u_alpha, (y - self.c) / self.h))
-        self.r = r = stack[size:]
+        self.r = r = self.stage.split.project(u) - self.u_alpha
         self.w = w = u if self.stage.gains.at_estimate else u - r
+        out: Array = products.linear @ np.concatenate((w, (y - self.c) / self.h, y))
         observed = products.observed @ r
         self.Mr, self.mass_r = observed[:n], observed[n:]
         A = products.operator
         A.set(products.coupling @ w)
-        out: Array = stack[:size]
         out[:n] += A.apply(q) + self.pull() - self.known
         out[n:] -= A.apply_transposed(r)
         if self.metric is not None:
