@@ -32,6 +32,7 @@ from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
 __all__ = ["Identifier", "Sample"]
 
 FORMAT = 2  # of the checkpoint
+NOTHING = np.zeros(0)  # withheld sensors without a value
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -344,7 +345,7 @@ class Identifier:
             named = {name: values[name] for name in self.inputs if name in values}
         else:
             measured = _array(z, self.observed)
-            withheld, named = np.full(len(hidden), np.nan), {}
+            withheld, named = np.full(len(hidden), np.nan) if hidden else NOTHING, {}
         for name, value in inputs.items():
             if name not in self.inputs:
                 raise SampleError(

@@ -180,6 +180,16 @@ class Latent:
         return self._filled(lower), self._filled(upper)
 
     @cached_property
+    def bounded(self) -> bool:
+        """True if a latent coefficient has a bound."""
+        return any(bool(np.isfinite(bound).any()) for bound in self.bounds)
+
+    def clipped(self, a: Array) -> Array:
+        """Return latent coefficients as the bounds allow them."""
+        lower, upper = self.bounds
+        return np.minimum(np.maximum(a, lower), upper) if self.bounded else a
+
+    @cached_property
     def limits(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the coefficients of q, each of shape (m,)."""
         parts = self.parts.values()

@@ -28,7 +28,7 @@ from livepde.linalg import (
 )
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import TINY, Newton, Parts, Secants, Solution
+from livepde.stepping import TINY, Newton, Parts, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
@@ -115,8 +115,6 @@ class Kept:
         By how much more each stage of age makes the second update, relative to the first, and how
         large the first was when that was seen, relative to y. Of the factor before, until it is
         seen again.
-    secants
-        What stages since then have taught about it.
     """
 
     y: Array
@@ -126,12 +124,11 @@ class Kept:
     spent: int
     ageing: float
     seen: float
-    secants: Secants
 
     @classmethod
     def none(cls, ageing: float = math.inf, seen: float = 0.0) -> Kept:
         """Return the value without a factor."""
-        return cls(np.zeros(0), np.zeros(0), 0.0, 0, 0, ageing, seen, Secants.none())
+        return cls(np.zeros(0), np.zeros(0), 0.0, 0, 0, ageing, seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,12 +372,11 @@ class CoupledStage:
         if blocks is not None:
             blocks.begin(self._block(blocks, warm.kept, moment) if len(warm.kept.y) else None)
             newton = replace(newton, share=max(newton.share, SHARE) if newton.share else 0.0)
-        used, factor, age, secants, trusted = None, None, 1, Secants.none(), warm.kept.seen
+        used, factor, age, trusted = None, None, 1, warm.kept.seen
         if good:
             used = near + self._spread(warm.trend) * warm.miss if follows else near
             if warm.kept.h == h:
                 factor, age = self._factor(warm.kept, moment), warm.kept.age + 1
-                secants = warm.kept.secants
         if blocks is None:
             trusted = min(trusted, warm.missed)
         solved = newton.solve(
@@ -393,7 +389,6 @@ class CoupledStage:
             expected=warm.kept.ageing * self._wear(age),
             trusted=GROWN * trusted,
             shares=self._shares(warm.trend) if follows and blocks is None else None,
-            secants=secants if self.keeps and blocks is None else None,
             rough=blocks is not None,
         )
         y = solved.y
@@ -424,18 +419,16 @@ class CoupledStage:
         """Return what becomes of the factor after a stage."""
         ageing, seen, blocks = kept.ageing, kept.seen, self.by_blocks
         if blocks is not None and blocks.made is not None:
-            made = blocks.made.at
-            return Kept(made, equation.u_alpha, equation.h, 0, 0, ageing, seen, solved.secants)
+            return Kept(blocks.made.at, equation.u_alpha, equation.h, 0, 0, ageing, seen)
         if equation.made is not None:
             self._made = equation.made
-            made = equation.made[0]
-            return Kept(made, equation.u_alpha, equation.h, 0, 0, ageing, seen, solved.secants)
+            return Kept(equation.made[0], equation.u_alpha, equation.h, 0, 0, ageing, seen)
         if not math.isnan(solved.rate):
             ageing, seen = solved.rate / self._wear(age), solved.missed
         spent = kept.spent + solved.updates - 1 + (sum(blocks.iterations) if blocks else 0)
         if spent > self.patience:
             return Kept.none(ageing, seen)
-        return Kept(kept.y, kept.u_alpha, kept.h, age, spent, ageing, seen, solved.secants)
+        return Kept(kept.y, kept.u_alpha, kept.h, age, spent, ageing, seen)
 
     def _trend(self, miss: Array, before: Array) -> Array:
         """Return by how much two misses that follow each other agree, shape (3,)."""
@@ -685,6 +678,7 @@ class _Bilinear:
         ]
         linear = sp.csr_array(sp.block_array(rows))
         linear.eliminate_zeros()
+        linear.sum_duplicates()
         self.linear = Pattern.of(linear).matrix(linear.data)  # with short indices
         self.observed = compact(sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass])))
 

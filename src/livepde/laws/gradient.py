@@ -301,8 +301,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             return state, Report(
                 Status.of(failure), work.problem.predict(state.u, state.q, interval.end)
             )
-        lower, upper = model.latent.bounds
-        u, q = end[:n], np.minimum(np.maximum(end[n:], lower), upper)
+        u, q = end[:n], model.latent.clipped(end[n:])
         r = coupled.split.project(u) - found.u
         rate = end - y
         rate[:n] -= found.u - state.u_alpha if known else coupled.split.project(rate[:n])

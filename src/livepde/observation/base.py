@@ -153,6 +153,11 @@ class Split:
         return self.R.diagonal() if alone else None
 
     @cached_property
+    def _complete(self) -> bool:
+        """True if all sensors are present."""
+        return bool(self.present.all())
+
+    @cached_property
     def _selected(self) -> IntArray | None:
         """Which coefficient each present sensor shows, if every one shows one as it is."""
         selects = self.vectors is None and _is_selection(sp.csr_array(self.inverse.T))
@@ -174,7 +179,7 @@ class Split:
             A coefficient vector that holds the Dirichlet values and is zero elsewhere. None: all of
             it is zero.
         """
-        known = z[self.present]
+        known = z if self._complete else z[self.present]
         if boundary is not None and boundary.any():
             known = known - self.G @ boundary
         if self._selected is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.newton import TINY, Newton, Parts, Secants, Solution, StepFailed
+from livepde.stepping.newton import TINY, Newton, Parts, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.state import ForwardStage, Kept, simulate
 
@@ -18,7 +18,6 @@ __all__ = [
     "Newton",
     "Parts",
     "Scheme",
-    "Secants",
     "Solution",
     "Stage",
     "StepFailed",

@@ -12,7 +12,7 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["TINY", "Newton", "Parts", "Secants", "Solution", "StepFailed"]
+__all__ = ["TINY", "Newton", "Parts", "Solution", "StepFailed"]
 
 
 ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
@@ -21,8 +21,6 @@ ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic c
 SLOWEST = 0.1  # rate at which a factor of a stage with sweeps is expected to go on
 
 TINY = 1e-300  # what is zero counts as this large
-
-LEAST = 0.1  # a pair whose second update goes this far beyond teaches nothing
 
 STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
 
@@ -88,52 +86,10 @@ class Parts:
         """
         return [share**2 * square for share, square in zip(shares, missed, strict=True)]
 
-    def dual(self, scales: list[float]) -> Array:
-        """Return weights of a sum of squares relative to those of all parts, shape (n,)."""
-        sizes = [max(scale, floor) for scale, floor in zip(scales, self.floors, strict=True)]
-        weights: Array = self.weights @ (1.0 / np.array(sizes))
-        return weights
-
     def relative(self, change: Array, y: Array) -> float:
         """Return the size of a change of y, relative to it, in its worst part."""
         pairs = zip(self.squares(change), self.squares(y), self.floors, strict=True)
         return math.sqrt(max(square / max(scale, floor) for square, scale, floor in pairs))
-
-
-@dataclass(frozen=True, eq=False)
-class Secants:
-    """What updates by one factor have taught about the Jacobian since: Broyden's method.
-
-    A first update p and a second one p' say what the next one should be along p: each such pair
-    corrects an update x by p' (g, x), with (g, x) = (p, x)/(p, p - p').
-
-    Attributes
-    ----------
-    pairs
-        p' and g of each pair, the oldest first, one behind the other; empty if there are none.
-    """
-
-    pairs: Array
-
-    @classmethod
-    def none(cls) -> Secants:
-        """Return the value before any pair."""
-        return cls(np.zeros(0))
-
-    def corrected(self, update: Array) -> Array:
-        """Return an update by the factor as the pairs correct it."""
-        for change, row in self.pairs.reshape(-1, 2, len(update)):
-            update = update + float(row @ update) * change
-        return update
-
-    def taught(self, first: Array, second: Array, weights: Array) -> Secants:
-        """Return these with a pair more, in the inner product with weights, shape (n,)."""
-        row = weights * first
-        left = float(row @ (first - second))
-        if not left > LEAST * float(row @ first):
-            return self
-        row /= left
-        return Secants(np.concatenate([self.pairs, second, row]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,15 +107,12 @@ class Solution:
         not where the iteration began in the end.
     rate
         From there, the second update over the first, with the same factor; NaN if there are none.
-    secants
-        What updates have taught about the factor that was used last.
     """
 
     y: Array
     updates: int
     missed: float
     rate: float
-    secants: Secants
 
 
 @dataclass(frozen=True)
@@ -205,7 +158,6 @@ class Newton:
         expected: float = math.inf,
         trusted: float = math.inf,
         shares: tuple[float, ...] | None = None,
-        secants: Secants | None = None,
         rough: bool = False,
     ) -> Solution:
         """Return the solution, starting from y.
@@ -230,8 +182,6 @@ class Newton:
             is not larger than `trusted`, relative to y. It spares the second one where it is small.
         shares
             With `near`: how much of `share` counts in each part; by default all.
-        secants
-            What is known of `kept`; updates teach more, about any factor. None: they do not.
         rough
             The kept factor is that of an approximate Jacobian: an update by it that is larger than
             the one before does not mean that the neighbourhood was left.
@@ -249,14 +199,11 @@ class Newton:
         strict, miss = max(self.tolerance, 1e-150) ** 2, [0.0] * len(parts.floors)
         missed = seen = math.nan
         expected = math.inf if near is None else expected
-        learns, secants, before = secants is not None, secants or Secants.none(), np.zeros(0)
         for count in range(1, self.iterations + 1):
             residual = equation.residual(y)
             try:
-                if factor is None:
-                    factor = equation.factor(y, sweeps)
-                    secants, before = Secants.none(), np.zeros(0)
-                update = secants.corrected(factor.solve(residual))
+                factor = factor or equation.factor(y, sweeps)
+                update = factor.solve(residual)
             except LinearAlgebraError as error:
                 raise StepFailed("singular", str(error)) from error
             new = y - update
@@ -274,9 +221,6 @@ class Newton:
                     size = max(size, square / scale)
                     excess = max(excess, square / max(strict * scale, m))
             size, excess = math.sqrt(size), math.sqrt(excess)
-            if len(before):
-                secants = secants.taught(before, update, parts.dual(scales))
-            before = update if learns and not sweeps else np.zeros(0)
             if count == 1 and near is not None:
                 missed = size
             ratio = excess / last
@@ -333,7 +277,7 @@ class Newton:
                 "not_converged",
                 f"{self.iterations} iterations left a relative update of {size:.1e}",
             )
-        return Solution(new, count, missed, seen, secants)
+        return Solution(new, count, missed, seen)
 
 
 def _evaluated(start: Array | Callable[[], Array]) -> Array:
