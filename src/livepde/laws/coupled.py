@@ -235,7 +235,22 @@ class CoupledStage:
         fixed = np.concatenate([1.0 - model.X.free, 1.0 - self.free_q, rest])
         whole.add("fixed", Pattern.of(sp.eye_array(len(fixed))), sp.diags_array(fixed))
         pattern, maps = whole.build()
-        return analyse(pattern), maps
+        solver = analyse(pattern)
+        if isinstance(solver, BandedSolver):
+            solver = replace(solver, units=self._units)
+        return solver, maps
+
+    @property
+    def _units(self) -> Array:
+        """Powers of two in which the diagonal of the coupled matrix is about one, times 1/h."""
+        gram = self.gram.diagonal()
+        if np.isfinite(self.gains.gain):
+            gram = gram / self.gains.gain
+        diagonal = np.abs(np.concatenate([self.model.mass.diagonal(), gram]))
+        fixed = np.concatenate([self.model.X.free, self.free_q, np.ones(self.auxiliary)]) == 0.0
+        diagonal[fixed | (diagonal == 0.0)] = 1.0
+        units: Array = np.exp2(np.round(-0.5 * np.log2(diagonal)))
+        return units
 
     @property
     def solver(self) -> Solver:
