@@ -306,3 +306,22 @@ def test_positive_definite_is_the_sign_of_the_smallest_eigenvalue(n, seed, shift
 
 def test_a_zero_matrix_is_not_positive_definite():
     assert not positive_definite(sp.csr_array((3, 3)))
+
+
+def test_units_spare_the_banded_engine_its_exchanges_of_rows():
+    """Rows of different size are exchanged without need; in units of the diagonal they are not."""
+    n = 40
+    sizes = np.exp2(np.arange(n) % 7)
+    even = sp.diags_array([-np.ones(n - 1), 3.0 * np.ones(n), np.ones(n - 1)], offsets=[-1, 0, 1])
+    matrix = sp.csr_array(sp.diags_array(sizes) @ even @ sp.diags_array(sizes))
+    matrix.sort_indices()
+    pattern = Pattern.of(matrix)
+    plain = BandedSolver(pattern).factorise(matrix.data)
+    scaled = BandedSolver(pattern, units=1.0 / sizes).factorise(matrix.data)
+    assert plain._triangles is None
+    assert scaled._triangles is not None
+    x = np.random.default_rng(0).standard_normal((n, 2))
+    for b in (matrix @ x[:, 0], matrix @ x):
+        expected = x[:, 0] if b.ndim == 1 else x
+        np.testing.assert_allclose(scaled.solve(b), expected, rtol=1e-10)
+        np.testing.assert_allclose(plain.solve(b), expected, rtol=1e-10)
