@@ -369,6 +369,9 @@ class CoupledStage:
             used = near + self._spread(warm.trend) * warm.miss if follows else near
             if warm.kept.h == h:
                 factor, age = self._factor(warm.kept, moment), warm.kept.age + 1
+            elif isinstance(equation, BlockEquation) and self.keeps:
+                equation.residual(used)
+                factor, age = equation.blocks.renew(equation.jacobian(used, False)), 0
         solved = newton.solve(
             equation,
             begin,
