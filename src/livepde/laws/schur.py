@@ -381,9 +381,9 @@ class Approximate:
         x = np.empty_like(b)
         u = approximate_inverse(self.state)(b[:n])
         right = b[n:].copy()
-        right[: size - n] += free_q * (A.T @ split.project(u))
+        right[: size - n] += free_q * np.asarray(A.T @ split.project(u))
         x[n:] = approximate_inverse(self.schur)(right)
-        flux = A @ (free_q * x[n:size])
+        flux: Array = A @ (free_q * x[n:size])
         u -= split.project(split.project_transposed(flux) / self.rates)
         x[:n] = self.state.again(b[:n] - flux, u) if isinstance(self.state, _Triangle) else u
         if self.seam is not None:
@@ -437,7 +437,17 @@ class _Triangle:
 
 @dataclass(frozen=True, eq=False)
 class _Series:
-    """Chebyshev's iteration for a matrix that is near its diagonal, as a mass matrix is."""
+    """Chebyshev's iteration for a matrix K near its diagonal D, as a mass matrix is.
+
+    Attributes
+    ----------
+    matrix, inverse
+        D^{-1} K and the diagonal of D^{-1}.
+    low, high
+        About its eigenvalues.
+    degree
+        Products with it, and one.
+    """
 
     matrix: sp.csr_array
     inverse: Array
@@ -463,19 +473,23 @@ class _Series:
             return None
         root = np.sqrt(high / low)
         degree = math.ceil(math.log(2.0 / SERIES) / math.log((root + 1.0) / (root - 1.0)))
-        return cls(matrix, 1.0 / diagonal, low, high, degree)
+        scaled = masked(matrix, 1.0 / diagonal, np.ones(len(diagonal)))
+        return cls(scaled, 1.0 / diagonal, low, high, degree)
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b, but for `SERIES`."""
         middle, half = 0.5 * (self.high + self.low), 0.5 * (self.high - self.low)
-        ratio = half / middle
-        x = step = self.inverse * b / middle
+        ratio, scaled = half / middle, self.inverse * b
+        step = scaled / middle
+        x = step.copy()
         for _ in range(self.degree - 1):
             after = 1.0 / (2.0 * middle / half - ratio)
-            step = (after * ratio) * step + (2.0 * after / half) * (
-                self.inverse * (b - self.matrix @ x)
-            )
-            x = x + step
+            left: Array = self.matrix @ x
+            np.subtract(scaled, left, out=left)
+            left *= 2.0 * after / half
+            step *= after * ratio
+            step += left
+            x += step
             ratio = after
         return x
 
