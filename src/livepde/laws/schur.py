@@ -383,7 +383,7 @@ class Approximate:
         right = b[n:].copy()
         right[: size - n] += free_q * np.asarray(A.T @ split.project(u))
         x[n:] = approximate_inverse(self.schur)(right)
-        flux: Array = A @ (free_q * x[n:size])
+        flux = np.asarray(A @ (free_q * x[n:size]))
         u -= split.project(split.project_transposed(flux) / self.rates)
         x[:n] = self.state.again(b[:n] - flux, u) if isinstance(self.state, _Triangle) else u
         if self.seam is not None:
