@@ -20,7 +20,7 @@ from livepde.linalg import Array, IntArray
 __all__ = ["ElementProducts", "ElementTensor"]
 
 EXACT = 1e-13  # what combinations may leave of an element's tensor, relative to it
-BLOCK = 20_000  # elements that are multiplied at once
+BLOCK = 8_000  # elements that are multiplied at once
 
 
 @dataclass(frozen=True, eq=False)

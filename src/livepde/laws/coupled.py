@@ -392,6 +392,9 @@ class CoupledStage:
             used = near + self._spread(warm.trend) * warm.miss if follows else near
             if warm.kept.h == h:
                 factor, age = self._factor(warm.kept, moment), warm.kept.age + 1
+            elif isinstance(equation, BlockEquation) and self.keeps:
+                equation.residual(used)
+                factor, age = equation.blocks.renew(equation.jacobian(used, False)), 0
         if blocks is None:
             trusted = min(trusted, warm.missed)
         solved = newton.solve(
@@ -573,9 +576,9 @@ class _Equation:
         stage, model, n, g = self.stage, self.stage.model, self.stage.n, self.stage.gains
         u, q = y[:n], y[n:]
         self.count += 1
-        self.r = r = stage.split.R @ u - self.u_alpha
+        self.r = r = stage.split.project(u) - self.u_alpha
         self.w = w = u if g.at_estimate else u - r  # u_alpha + P u, since P = I - R
-        self.Mr, self.mass_r = stage.RM @ r, stage.RT @ (model.mass @ r)
+        self.Mr, self.mass_r = stage.RM @ r, stage.split.project_transposed(model.mass @ r)
         self.A = A = model.form_A.matrix("v", "q", self.moment, u=w, q=q)
         C = A @ q if stage.linear else model.form_A.vector("v", self.moment, u=w, q=q)
         flux = model.B(w, self.moment) + C + (g.nu and g.nu * (stage.PNP @ u)) - self.source

@@ -34,6 +34,7 @@ error. Where it takes off too little, GMRES solves with K itself (`Jacobian`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -68,6 +69,10 @@ SPENT = 24  # updates and iterations: about what new factors cost
 ROUNDING = 1e-12  # asymmetry of a symmetric matrix, relative to its largest entry
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
 LAYERS = 4  # neighbours on either side of where observed coefficients meet others
+POWERS = 20  # of a matrix, to estimate an eigenvalue
+MARGIN = 0.8  # of that estimate
+SPREAD = 16.0  # eigenvalues of a matrix near its diagonal, largest over smallest
+SERIES = 3e-2  # bound on the error that Chebyshev's iteration leaves
 REMEDY = "take a smaller gain or a smaller time step."
 
 
@@ -111,7 +116,7 @@ class BlockSolver:
 
     def renew(self, K: Jacobian) -> Approximate:
         """Make the factors of K those of the stage."""
-        self.last = None  # its memory, first
+        self.made = self.last = None  # its memory, first
         self.made = self.last = K.approximate()
         return self.last
 
@@ -200,12 +205,14 @@ class BlockSolver:
         if self.parts is None:
             return self._factorise("S", S)
         unseen, seen = self.parts
-        bottom = sp.csr_array(S[seen])
+        top, bottom = sp.csr_array(S[unseen]), sp.csr_array(S[seen])
+        local = sp.csr_array(bottom[:, seen])
         return _Triangle(
             self.parts,
-            self._factorise("S, not observed", sp.csr_array(S[unseen][:, unseen])),
-            self._factorise("S, observed", sp.csr_array(bottom[:, seen])),
+            self._factorise("S, not observed", sp.csr_array(top[:, unseen])),
+            _Series.of(local) or self._factorise("S, observed", local),
             sp.csr_array(bottom[:, unseen]),
+            sp.csr_array(top[:, seen]),
         )
 
     @cached_property
@@ -370,14 +377,15 @@ class Approximate:
     def whole(self, b: Array) -> Array:
         """Return the same with auxiliary unknowns behind, of b and of the solution."""
         stage, A = self.blocks.stage, self.blocks.A
-        n, size, R, free_q = stage.n, stage.size, stage.split.R, stage.free_q
+        n, size, split, free_q = stage.n, stage.size, stage.split, stage.free_q
         x = np.empty_like(b)
         u = approximate_inverse(self.state)(b[:n])
         right = b[n:].copy()
-        right[: size - n] += free_q * (A.T @ (R @ u))
+        right[: size - n] += free_q * np.asarray(A.T @ split.project(u))
         x[n:] = approximate_inverse(self.schur)(right)
-        seen = np.asarray(R.T @ (A @ (free_q * x[n:size])))
-        x[:n] = u - R @ (seen / self.rates)
+        flux = np.asarray(A @ (free_q * x[n:size]))
+        u -= split.project(split.project_transposed(flux) / self.rates)
+        x[:n] = self.state.again(b[:n] - flux, u) if isinstance(self.state, _Triangle) else u
         if self.seam is not None:
             self.seam.mend(b[:n], x[:n], x[n:size])
         for fixed in (stage.model.X.fixed, n + stage.model.Q.fixed):
@@ -407,14 +415,82 @@ class _Triangle:
     unseen: Factor
     seen: Factor
     link: sp.csr_array
+    back: sp.csr_array
 
     def solve(self, b: Array) -> Array:
         """Return x with S x = b."""
+        return self._solve(b, b[self.parts[0]])
+
+    def again(self, b: Array, x: Array) -> Array:
+        """Return the same with M_uo/h, from an x that approximates the solution."""
+        unseen, seen = self.parts
+        return self._solve(b, b[unseen] - self.back @ x[seen])
+
+    def _solve(self, b: Array, above: Array) -> Array:
         unseen, seen = self.parts
         x = np.empty_like(b)
-        first = approximate_inverse(self.unseen)(b[unseen])
+        first = approximate_inverse(self.unseen)(above)
         x[unseen] = first
         x[seen] = approximate_inverse(self.seen)(b[seen] - self.link @ first)
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    """Chebyshev's iteration for a matrix K near its diagonal D, as a mass matrix is.
+
+    Attributes
+    ----------
+    matrix, inverse
+        D^{-1} K and the diagonal of D^{-1}.
+    low, high
+        About its eigenvalues.
+    degree
+        Products with it, and one.
+    """
+
+    matrix: sp.csr_array
+    inverse: Array
+    low: float
+    high: float
+    degree: int
+
+    @classmethod
+    def of(cls, matrix: sp.csr_array) -> _Series | None:
+        """Return it for a symmetric matrix K; None where it would take long."""
+        diagonal = matrix.diagonal()
+        if not (diagonal > 0.0).all() or not _is_symmetric(matrix):
+            return None
+        high = float((abs(matrix).sum(axis=1) / diagonal).max())  # Gershgorin's bound
+        # The smallest eigenvalue of D^{-1} K, by the largest of high - D^{-1} K.
+        x, size = np.random.default_rng(0).standard_normal(len(diagonal)), 1.0
+        for _ in range(POWERS):
+            x = high * x - (matrix @ x) / diagonal
+            size = float(np.linalg.norm(x))
+            x /= size
+        low = (high - size) * MARGIN
+        if not low * SPREAD >= high:
+            return None
+        root = np.sqrt(high / low)
+        degree = math.ceil(math.log(2.0 / SERIES) / math.log((root + 1.0) / (root - 1.0)))
+        scaled = masked(matrix, 1.0 / diagonal, np.ones(len(diagonal)))
+        return cls(scaled, 1.0 / diagonal, low, high, degree)
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b, but for `SERIES`."""
+        middle, half = 0.5 * (self.high + self.low), 0.5 * (self.high - self.low)
+        ratio, scaled = half / middle, self.inverse * b
+        step = scaled / middle
+        x = step.copy()
+        for _ in range(self.degree - 1):
+            after = 1.0 / (2.0 * middle / half - ratio)
+            left: Array = self.matrix @ x
+            np.subtract(scaled, left, out=left)
+            left *= 2.0 * after / half
+            step *= after * ratio
+            step += left
+            x += step
+            ratio = after
         return x
 
 
