@@ -272,6 +272,16 @@ def test_newton_begins_where_the_start_is_good(near, kept, made):
     assert equation.sweeps == made
 
 
+def test_a_factor_in_the_place_of_a_kept_one_is_believed():
+    """Two updates by the kept one, and one by its own: that is enough for a share of the miss."""
+    equation = Cubic()
+    near = np.array([6.01])
+    found = lp.Newton().solve(equation, np.array([5.6]), lagged=True, near=near, kept=Slope(5.0))
+    assert found.updates == 3
+    assert equation.sweeps == [False]
+    assert abs(found.y[0] - 6.0) < 0.01 * 0.01
+
+
 @pytest.mark.parametrize(("expected", "trusted", "updates"), [(0.02, 0.01, 1), (0.02, 1e-4, 2)])
 def test_newton_stops_at_a_share_of_what_the_start_missed(expected, trusted, updates):
     """A factor that goes on at a hundredth: one update serves, if it is believed."""
