@@ -158,6 +158,30 @@ def test_one_update_takes_off_nearly_all_of_the_error(sensors, monkeypatch):
         assert np.linalg.norm(left[part]) < 0.05 * np.linalg.norm(exact[part])
 
 
+def test_the_observed_part_follows_from_the_rest(monkeypatch):
+    """What A q moves next to the observed part reaches it in the same update."""
+    stage, equation, c = first_stage(plane(32), 1.0, monkeypatch, lp.Subdomain(inside), c1=0.0)
+    equation.residual(c)
+    K = equation.jacobian(c, sweep=False)
+    approximate = K.approximate()
+    assert "S, observed" not in stage.by_blocks.engines  # a few products serve
+    n, model = stage.n, stage.model
+    free, seen = model.X.free > 0, stage.split.R.diagonal() > 0
+    x = np.concatenate([model.initial(lambda x: x[0] * (1 - x[0]) * x[1] * (1 - x[1])), c[n:]])
+    x[:n][~free] = 0.0
+    left = approximate.solve(K.apply(x)) - x
+    assert np.linalg.norm(left[:n][seen]) < 0.02 * np.linalg.norm(x[:n][seen])
+
+
+def test_stiff_observed_parts_are_factorised(monkeypatch):
+    sensors = lp.Subdomain(inside)
+    stage, equation, c = first_stage(plane(32), 1.0, monkeypatch, sensors, c1=10.0)
+    c[: stage.n] *= 1.1  # r, and theta with it
+    equation.residual(c)
+    equation.jacobian(c, sweep=False).approximate()
+    assert "S, observed" in stage.by_blocks.engines
+
+
 def test_factors_are_kept_and_renewed_where_they_fail(monkeypatch):
     stage, equation, c = first_stage(plane(), 1e3, monkeypatch)
     blocks = stage.by_blocks
@@ -233,6 +257,16 @@ def test_a_jump_of_the_process_renews_the_factors(stream):
     estimates, after = settled(model, sensors, jumped, identifier)
     assert sum(after) > 0
     assert all(estimate.status.ok for estimate in estimates)
+
+
+def test_another_time_step_makes_factors_without_sweeps(stream, monkeypatch):
+    model, sensors, samples, fresh = stream
+    identifier = fresh()
+    settled(model, sensors, samples[:20], identifier)
+    monkeypatch.setattr(schur.Jacobian, "solve", None)
+    estimates, made = settled(model, sensors, samples[21::2], identifier)
+    assert all(estimate.status.ok for estimate in estimates)
+    assert made[0] == 1
 
 
 def test_nothing_of_the_size_of_the_square_is_made(monkeypatch):

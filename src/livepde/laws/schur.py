@@ -24,9 +24,12 @@ A(w) q:
 
     S = [[S_uu, M_uo/h], [S_ou, S_oo]]        u: not observed, o: observed
 
-is not symmetric, but S_uu and S_oo are, if B and A(.) q are. Without M_uo/h, S is solved by a
-factor of each of the two, as cheaply as the matrix of the forward model. What is left then is large
-only where the two meet: in a strip of a few nodes S u + A q = b_u is solved once more (`_Seam`).
+is not symmetric, but S_uu and S_oo are, if B and A(.) q are. Without M_uo/h, S is solved by the two.
+With small theta S_oo is little more than a mass matrix, and a few products replace its factor
+(`_Series`). S_ou is that of a differential operator, of the size of h/x^2 times S_oo with cells of
+size x: a small error of u where it is not observed is a large one next to it. So, with q known,
+S u = b_u - A q is solved again, with M_uo/h times the u at hand (`_Triangle.again`). What is left
+then is large only where the two meet: a strip of a few nodes is solved as a whole (`_Seam`).
 
 That serves Newton as a kept factor (`Approximate`): an update takes off all but 1e-2 to 1e-3 of the
 error. Where it takes off too little, GMRES solves with K itself (`Jacobian`).
