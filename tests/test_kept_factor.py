@@ -97,7 +97,7 @@ def rod(newton, scheme=None, gain=1e4, given=ROD):
 def test_one_update_is_enough_in_most_steps():
     few, updates = rod(lp.Newton())
     exact, more = rod(lp.Newton(share=0.0, tolerance=1e-10))
-    assert updates[10:].mean() < 1.3 < 2.0 < more[10:].mean()
+    assert updates[10:].mean() < 1.3 < 2.5 < more[10:].mean()
     assert np.mean(updates[10:] == 1) > 0.7
     for one, other in zip(few[10:], exact[10:], strict=True):
         assert np.linalg.norm(one.q - other.q) < 2e-4 * np.linalg.norm(other.q)
