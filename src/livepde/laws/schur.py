@@ -24,7 +24,7 @@ A(w) q:
 
     S = [[S_uu, M_uo/h], [S_ou, S_oo]]        u: not observed, o: observed
 
-is not symmetric, but S_uu and S_oo are, if B and A(.) q are. Without M_uo/h, S is solved by the two.
+is not symmetric, but S_uu and S_oo are, if B and A(.) q are. Without M_uo/h the two solve S.
 With small theta S_oo is little more than a mass matrix, and a few products replace its factor
 (`_Series`). S_ou is that of a differential operator, of the size of h/x^2 times S_oo with cells of
 size x: a small error of u where it is not observed is a large one next to it. So, with q known,
