@@ -20,6 +20,7 @@ import livepde
 from livepde import cli, runs
 from livepde.cases.template import write_template
 from livepde.errors import LivepdeError
+from livepde.linalg import using
 from livepde.runs import Check, Outcome, Table
 
 COMMANDS = (
@@ -335,6 +336,24 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     )
     assert call("run", rod, "--out", "begun", "--resume")[0] == 0  # there is none: it begins
     xr.testing.assert_identical(runs.open("begun").dataset, whole)
+
+
+def test_a_run_resumed_with_an_engine_says_how_well_it_agrees(rod, here):
+    class Serves:
+        reason = "another program"
+
+        def build(self, function, *args, known):
+            return known
+
+        def solver(self, pattern, *, symmetric):
+            return None
+
+    with using(Serves()):
+        for resumed in (False, True):
+            assert call("run", rod, "--out", "run", "--resume")[0] == 0
+            notes = " ".join(runs.open("run").record["notes"])
+            assert "solved by another program" in notes
+            assert ("not to the last digit" in notes) == resumed
 
 
 def test_a_full_disk_is_one_sentence_where_a_run_goes_on_or_is_shown(rod, here, monkeypatch):

@@ -198,6 +198,15 @@ def test_saved_before_the_first_sample(tmp_path):
     np.testing.assert_array_equal(one.step(*sample()).q, two.step(*sample()).q)
 
 
+def test_a_checkpoint_of_an_earlier_format_is_refused(monkeypatch):
+    ident = identifier()
+    ident.step(*sample())
+    content = ident.dump()
+    monkeypatch.setattr("livepde.identifier.FORMAT", 99)
+    with pytest.raises(lp.RunError, match="another version of livepde, in another format"):
+        identifier().restore(content)
+
+
 def test_checkpoints_that_cannot_be_used(tmp_path):
     ident = identifier()
     ident.step(*sample())

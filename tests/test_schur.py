@@ -95,6 +95,23 @@ def test_blocks_do_not_change_the_result(name, monkeypatch):
     np.testing.assert_allclose(blocks, direct, rtol=0, atol=1e-8 * abs(direct).max())
 
 
+def test_a_law_that_tunes_itself_trusts_no_rate_of_another_metric(monkeypatch):
+    model, law = plane(), lp.GradientLaw("auto", newton=EXACT)
+    direct, _ = run(model, lp.Full(), law, monkeypatch, large=False, samples=16)
+    blocks, _ = run(model, lp.Full(), law, monkeypatch, large=True, samples=16)
+    np.testing.assert_allclose(blocks, direct, rtol=0, atol=1e-6 * abs(direct).max())
+
+
+def test_a_law_that_tunes_itself_learns_little_from_what_blocks_leave(monkeypatch):
+    model, law = plane(), lp.GradientLaw("auto")
+    q = model.initial_parameter(lambda x: 1 + np.sin(np.pi * x[0]) ** 2 * x[1])
+    errors = []
+    for large in (False, True):
+        found, _ = run(model, lp.Full(), law, monkeypatch, large=large, samples=26)
+        errors.append(np.linalg.norm(found[-1, model.X.dim :] - q))
+    assert errors[1] < 1.03 * errors[0]
+
+
 def test_blocks_serve_the_second_order_scheme_and_averages(monkeypatch):
     model = plane()
     sensors = lp.Averages({f"z{k}": lambda x, k=k: abs(x[0] - 0.2 * k) < 0.1 for k in range(1, 5)})
@@ -226,18 +243,19 @@ def stream(monkeypatch):
     times = 0.05 * np.arange(30)
     samples = list(zip(times, data(model, sensors, times), strict=True))
 
-    def fresh():
-        return lp.Identifier(model, sensors, lp.GradientLaw(gain=10.0), q0=0.5, u0=2.0)
+    def fresh(gain=10.0):
+        return lp.Identifier(model, sensors, lp.GradientLaw(gain=gain), q0=0.5, u0=2.0)
 
     return model, sensors, samples, fresh
 
 
-def test_a_run_resumed_gives_the_same_numbers(stream, tmp_path):
+@pytest.mark.parametrize("gain", [10.0, "auto"])
+def test_a_run_resumed_gives_the_same_numbers(gain, stream, tmp_path):
     model, sensors, samples, fresh = stream
-    whole = fresh()
+    whole = fresh(gain)
     settled(model, sensors, samples[:20], whole)
     whole.save(tmp_path / "half.npz")
-    again = fresh()
+    again = fresh(gain)
     again.load(tmp_path / "half.npz")
     one, kept = settled(model, sensors, samples[20:], whole)
     other, made = settled(model, sensors, samples[20:], again)

@@ -416,6 +416,11 @@ class Identifier:
         mine = self._fingerprint()
         for key, value in mine.items():
             if header.get(key) != value:
+                if key == "format":
+                    raise RunError(
+                        f"{where} was saved by another version of livepde, in another format: go "
+                        "on with that version, or begin anew."
+                    )
                 raise RunError(
                     f"{where} was saved with {key} = {header.get(key)!r}; this identifier has "
                     f"{value!r}. Build it as it was when it was saved."

@@ -275,6 +275,11 @@ def concluded(
     notes = [*loaded.notes, *doubts(dataset)]
     if (engine := in_use()) is not None:
         notes.append(f"Large systems were solved by {engine.reason}.")
+        if "resumed" in writer.record:
+            notes.append(
+                "Resumed: the numbers are those of a run that never stopped to the tolerance of "
+                "these solvers, not to the last digit."
+            )
     if len(driven.result):
         notes += _traded(loaded, identifier)
     if driven.status == "interrupted":

@@ -115,6 +115,8 @@ class Kept:
         By how much more each stage of age makes the second update, relative to the first, and how
         large the first was when that was seen, relative to y. Of the factor before, until it is
         seen again.
+    spread, information
+        Of its metric: S, and data of J; 0 and empty without one.
     """
 
     y: Array
@@ -124,11 +126,20 @@ class Kept:
     spent: int
     ageing: float
     seen: float
+    spread: float
+    information: Array
 
     @classmethod
     def none(cls, ageing: float = math.inf, seen: float = 0.0) -> Kept:
         """Return the value without a factor."""
-        return cls(np.zeros(0), np.zeros(0), 0.0, 0, 0, ageing, seen)
+        return cls(np.zeros(0), np.zeros(0), 0.0, 0, 0, ageing, seen, 0.0, np.zeros(0))
+
+    @classmethod
+    def made(cls, y: Array, equation: _Equation, ageing: float, seen: float) -> Kept:
+        """Return the value for a factor made at y in a stage."""
+        metric = equation.metric
+        learned = (0.0, np.zeros(0)) if metric is None else (metric.spread, metric.data)
+        return cls(y, equation.u_alpha, equation.h, 0, 0, ageing, seen, *learned)
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,7 +397,8 @@ class CoupledStage:
         newton, blocks = self.newton, self.by_blocks
         if blocks is not None:
             blocks.begin(self._block(blocks, warm.kept, moment) if len(warm.kept.y) else None)
-            newton = replace(newton, share=max(newton.share, SHARE) if newton.share else 0.0)
+            if metric is None and newton.share:  # a law that tunes itself learns from what is left
+                newton = replace(newton, share=max(newton.share, SHARE))
         used, factor, age, trusted = None, None, 1, warm.kept.seen
         if good:
             used = near + self._spread(warm.trend) * warm.miss if follows else near
@@ -404,7 +416,8 @@ class CoupledStage:
             lagged=True,
             near=used,
             kept=factor,
-            expected=warm.kept.ageing * self._wear(age),
+            # A metric changes from stage to stage, and with it how factors serve.
+            expected=warm.kept.ageing * self._wear(age) if metric is None else math.inf,
             trusted=GROWN * trusted,
             shares=self._shares(warm.trend) if follows and blocks is None else None,
             rough=blocks is not None,
@@ -437,16 +450,16 @@ class CoupledStage:
         """Return what becomes of the factor after a stage."""
         ageing, seen, blocks = kept.ageing, kept.seen, self.by_blocks
         if blocks is not None and blocks.made is not None:
-            return Kept(blocks.made.at, equation.u_alpha, equation.h, 0, 0, ageing, seen)
+            return Kept.made(blocks.made.at, equation, ageing, seen)
         if equation.made is not None:
             self._made = equation.made
-            return Kept(equation.made[0], equation.u_alpha, equation.h, 0, 0, ageing, seen)
+            return Kept.made(equation.made[0], equation, ageing, seen)
         if not math.isnan(solved.rate):
             ageing, seen = solved.rate / self._wear(age), solved.missed
         spent = kept.spent + solved.updates - 1 + (sum(blocks.iterations) if blocks else 0)
         if spent > self.patience:
             return Kept.none(ageing, seen)
-        return Kept(kept.y, kept.u_alpha, kept.h, age, spent, ageing, seen)
+        return replace(kept, age=age, spent=spent, ageing=ageing, seen=seen)
 
     def _trend(self, miss: Array, before: Array) -> Array:
         """Return by how much two misses that follow each other agree, shape (3,)."""
@@ -523,6 +536,9 @@ class CoupledStage:
         """Return the same of a stage by blocks."""
         if blocks.last is None or blocks.last.at is not kept.y:
             equation = BlockEquation(blocks, np.zeros_like(kept.y), kept.h, moment, kept.u_alpha)
+            if self.memory is not None:
+                J, data = self.memory.matrix(kept.information), kept.information
+                equation.metric = Metric(kept.spread, J, data, np.zeros(self.model.Q.dim))
             equation.residual(kept.y)
             blocks.last = equation.jacobian(kept.y, False).approximate()
         return blocks.last

@@ -26,9 +26,8 @@ from livepde.linalg import Array, IntArray
 __all__ = ["MISSING", "Handle", "Team", "world"]
 
 MISSING = (
-    "The engine 'petsc' needs petsc4py and mpi4py (the extra 'petsc'); on Debian: apt-get install "
-    "python3-petsc4py python3-petsc4py-real python3-mpi4py, and PETSC_DIR set as docs/parallel.md "
-    "says."
+    "The engine 'petsc' needs petsc4py and mpi4py (the extra 'petsc'); deploy/petsc.sh sets up an "
+    "environment with Debian's, as docs/parallel.md says."
 )
 
 
