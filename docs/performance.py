@@ -30,6 +30,7 @@ BENCHES = ("step", "memory", "scale", "mpi", "fleet")
 SIZED = ("step", "scale")  # take --size
 MEMORY_SIZES = (10_000, 40_000)
 LAWS = ("gradient", "sensitivity")
+KEYS = ("nodes", "dimension", "law", "c1", "gain")  # first columns of a table: what a row is of
 PER_UNKNOWN = "kB per unknown"  # columns whose name has this are drawn as memory
 MARKERS = "osD^vP*X"
 
@@ -108,7 +109,7 @@ def merged(contents: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
         notes |= dict.fromkeys(content["notes"])
         for table in content["tables"]:
             into = tables.setdefault(table["title"], {**table, "rows": {}})
-            keys = max(1, sum(name in ("nodes", "law", "c1", "gain") for name in table["columns"]))
+            keys = max(1, sum(name in KEYS for name in table["columns"]))
             into["rows"] |= {tuple(row[:keys]): row for row in table["rows"]}
     for table in tables.values():
         table["rows"] = list(table["rows"].values())
