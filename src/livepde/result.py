@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from livepde import plots
 from livepde.errors import ConfigurationError
@@ -17,6 +16,9 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import STATUS_CODES, Layout, Record, Records, Snapshot
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = [
     "Estimate",

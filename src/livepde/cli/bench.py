@@ -60,6 +60,21 @@ def step(
     report_outcome(benchmark(size or SIZES, modes or MODES), command, as_json)
 
 
+@bench.command("import")
+def startup(
+    rounds: Annotated[int, typer.Option(min=1, help="Fresh processes of each.")] = 15,
+    as_json: JsonOption = False,
+) -> None:
+    """Time the import of livepde, in fresh processes, against that of SciPy and scikit-fem.
+
+    Example:  livepde bench import --json
+    """
+    from livepde.bench.startup import startup as benchmark
+
+    command = ["livepde", "bench", "import", "--rounds", str(rounds)]
+    report_outcome(benchmark(rounds), command, as_json)
+
+
 @bench.command()
 def fleet(
     members: Annotated[int, typer.Option(min=1, help="How many rods step.")] = 1000,

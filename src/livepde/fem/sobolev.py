@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, eigsh
-from scipy.special import gamma
 from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
 
 from livepde.errors import SpaceError
@@ -99,6 +99,7 @@ class Sobolev:
                 f"Sobolev({self.s:g}).pointwise({dimension}): values at points have a finite "
                 f"deviation for s > {half:g} only; take a larger s."
             )
+        gamma = scipy.special.gamma
         volume = (4.0 * np.pi) ** half * self.length**dimension
         return replace(self, factor=float(gamma(self.s - half) / gamma(self.s) / volume))
 
