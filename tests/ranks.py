@@ -47,6 +47,8 @@ def gradient() -> dict[str, np.ndarray]:
             estimate = identifier.step(t, u[seen])
             assert estimate.status.ok
         found |= {f"{name}.q": estimate.q, f"{name}.u": estimate.u}
+        stage = identifier._work.stage(np.ones(identifier.observed.size, dtype=bool))
+        assert (stage.distributed is None) == (engine is None)  # all ranks evaluate it together
     return found
 
 
@@ -121,4 +123,4 @@ if __name__ == "__main__":
     with petsc() as engine:
         if engine is not None:
             found = everything()
-            np.savez(sys.argv[1], ranks=engine.team.size, shared=engine.stages, **found)
+            np.savez(sys.argv[1], ranks=engine.team.size, **found)

@@ -845,8 +845,8 @@ class _Bordered:
         return x - self.column * (self._scaled @ x[: len(self.row)])
 
 
-def stored(matrix: sp.csr_array, pattern: Pattern | None = None) -> Array:
-    """Return the data of a matrix in the order of a pattern, by default its own."""
+def stored(matrix: sp.csr_array) -> Array:
+    """Return the data of a matrix in the order of its pattern."""
     coo = sp.coo_array(matrix)
-    data: Array = (pattern or Pattern.of(matrix)).gather(coo.row, coo.col) @ coo.data
+    data: Array = Pattern.of(matrix).gather(coo.row, coo.col) @ coo.data
     return data

@@ -130,7 +130,6 @@ def distributed(stage: CoupledStage) -> Distributed | None:
     ]
     weights = Weights(g.gain, g.nu, g.sigma, g.at_estimate)
     sent = (shared.key, weights, R.diagonal(), model.X.free, stage.free_q)
-    engine.stages += 1
     return Distributed(engine.team.share(SharedStage, *sent, here=(rows,)), known)
 
 
