@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from markdown.extensions.toc import slugify
 from pydantic import BaseModel
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -250,6 +251,27 @@ def test_what_a_page_names_is_there(page):
                 assert words[2] in program.commands["bench"].commands, name
             if words[1] == "reproduce" and words[2:] and words[2].islower():
                 assert words[2] in EXPERIMENTS, name
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "experiments/README.md"])
+def test_links_of_pages_outside_of_the_site_lead_somewhere(name):
+    """`make docs` follows those of the site."""
+    page = ROOT / name
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if "://" in target:
+            continue
+        file, _, anchor = target.partition("#")
+        assert (page.parent / file).exists(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.+)$", (page.parent / file).read_text(), re.MULTILINE)
+            assert anchor in [slugify(title.replace("`", ""), "-") for title in titles], target
+
+
+def test_warnings_of_the_site_are_errors():
+    """--quiet hides them from --strict, too: then nothing would be one."""
+    (command,) = re.findall(r"mkdocs build.*", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    assert "--strict" in command
+    assert "--quiet" not in command
 
 
 def test_the_house_is_drawn_as_it_is_built():
