@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import indent
 
 from matplotlib.figure import Figure
 from PIL import Image
@@ -56,11 +57,16 @@ class Sketch:
         group `NAME_std` is the deviation of NAME.
     heading
         Pattern of a line whose group comes before the labels of the lines after it.
+    scale
+        Of the axis.
+    last
+        Only the last paragraph is shown, and drawn; what comes before it is single runs.
     """
 
     row: str
     heading: str = "$^"
     scale: str = "log"
+    last: bool = False
 
 
 NUMBER = r"[-+]?[\d.]+(?:e[-+]?\d+)?"
@@ -87,7 +93,29 @@ SKETCHES = {
         rf"(?P<k_after_10_h>{NUMBER}) ± (?P<k_after_10_h_std>{NUMBER})  ",
         scale="linear",
     ),
+    "auto_bank": Sketch(
+        rf"^(?P<label>\S+ +\d+%) +(?P<auto>{NUMBER}) +\S+ +{NUMBER} +{NUMBER} "
+        rf"+(?P<best_of_grid>{NUMBER})"
+    ),
+    "auto_gain": Sketch(
+        rf"^(?P<label>\S+ +\d+%) +(?P<auto>{NUMBER}) +(?P<best_of_grid>{NUMBER}) ", last=True
+    ),
+    "outside": Sketch(
+        r"^(?P<label>\S.+?) +(?P<error_in_omega>\d+\.\d{3}) *(?P<error_outside>\d+\.\d{3}) ",
+        heading=r"^(reaction|rod), ",
+    ),
 }
+
+
+def shown(name: str, text: str) -> str:
+    """Return the part of a script's output that the page shows."""
+    text = text.strip("\n")
+    if name in SKETCHES and SKETCHES[name].last:
+        text = text.rsplit("\n\n", 1)[-1]
+    rows = text.splitlines()
+    if len(rows) > LONGEST:
+        rows = [*rows[:LONGEST], f"... ({len(rows) - LONGEST} lines more)"]
+    return "\n".join(rows)
 
 
 def drawn(name: str, text: str) -> Figure | None:
@@ -150,7 +178,8 @@ def keep(name: str, out: Path) -> None:
 
 def small(path: Path, target: Path) -> None:
     """Write a picture with fewer pixels and a palette of few colours."""
-    picture = Image.open(path).convert("RGB")
+    with Image.open(path) as large:
+        picture = large.convert("RGB")
     picture.thumbnail((WIDEST, 10 * WIDEST))
     picture.quantize(COLOURS).save(target, optimize=True)
 
@@ -186,8 +215,9 @@ def _report(name: str) -> str:
     text = _kept(name).read_text(encoding="utf-8").replace("| None |", "| – |")
     title, rest = text.removeprefix("# ").split("\n", 1)
     pictures = re.findall(r"^!\[.*\]\((.*)\)$\n?", rest, flags=re.MULTILINE)
-    rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE).replace("\n## ", "\n#### ")
+    rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE)
     shown = [f"![{Path(one).stem}](experiments/{one})" for one in pictures]
+    rest = re.sub(r"^## (.*)$", r"**\1**", rest, flags=re.MULTILINE)
     lines = [f"### {name}", title, f"`livepde reproduce {name}`", *shown, rest.strip()]
     return "\n\n".join(lines) + "\n"
 
@@ -204,10 +234,7 @@ def _script(path: Path) -> str:
         picture.savefig(target, dpi=120)
         small(target, target)
         lines.append(f"![{path.stem}](experiments/{target.name})")
-    rows = printed.strip("\n").splitlines()
-    if len(rows) > LONGEST:
-        rows = [*rows[:LONGEST], f"... ({len(rows) - LONGEST} lines more)"]
-    lines.append("\n".join(f"    {row}".rstrip() for row in rows))
+    lines.append(indent(shown(path.stem, printed), "    "))
     return "\n\n".join(lines) + "\n"
 
 
