@@ -33,7 +33,12 @@ def command_line() -> str:
     """Return the help of all commands, as Typer writes it."""
     command = [sys.executable, "-m", "typer", "livepde.cli", "utils", "docs", "--name", "livepde"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    text = done.stdout.split("\n\n", 1)[1]  # the page has a title of its own
+    text = done.stdout
+    # What every command has, and lists of commands with their words cut off, are of no use here.
+    text = re.sub(r"^\*\*Commands\*\*:\n\n(\*.*\n)+\n?", "", text, flags=re.MULTILINE)
+    text = text.replace("* `--help`: Show this message and exit.\n", "")
+    text = text.replace("**Options**:\n\n\n", "").split("\n\n", 1)[1]
+    # Examples are words to Typer: a line for each, and as code.
     example = r"^(.*?)(Example|Replay|Service|Parallel): +(\S.*)$"
     return re.sub(example, r"\1\n\n\2: `\3`", text, flags=re.MULTILINE)
 
