@@ -296,8 +296,9 @@ def test_pages_that_the_program_writes(monkeypatch):
         section = commands[commands.index(f"## `livepde {name}`\n") :]
         for inner in getattr(command, "commands", ()):
             assert f"### `livepde {name} {inner}`\n" in section
-        for option in (one for one in command.params if not getattr(one, "hidden", False)):
-            assert max(option.opts, key=len) in section
+        for option in command.params:
+            name = max(option.opts, key=len)
+            assert name in section or not name.startswith("--") or option.hidden, name
     assert "Example: `livepde run mycase/case.toml`\n" in commands
     keys = hooks.on_page_markdown("<!-- keys of a case -->")
     assert "| `prior` | a quantity | required |" in keys
