@@ -15,6 +15,7 @@ from livepde.laws.coupled import CoupledStage
 from livepde.laws.gains import Gains
 from livepde.laws.warm import Misses
 from livepde.linalg import SuperLUSolver
+from livepde.stepping import Near
 
 
 @pytest.fixture(scope="module")
@@ -128,9 +129,9 @@ def test_noise_is_no_error_of_the_time_step():
     assert misses.shares(np.array([0.9, -0.4, 0.3])) == (0.9, 0.0, 0.3)
     near, start = np.array([6.01]), np.array([5.6])
     cubic = Cubic()
-    found = lp.Newton().solve(cubic, start, lagged=True, near=near, shares=(0.0,))
+    found = lp.Newton().solve(cubic, start, lagged=True, near=Near(near, shares=(0.0,)))
     assert abs(found.y[0] - 6.0) < 1e-6
-    rough = lp.Newton().solve(cubic, start, lagged=True, near=near)
+    rough = lp.Newton().solve(cubic, start, lagged=True, near=Near(near))
     assert rough.updates < found.updates
 
 

@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.fem import Moment
-from livepde.laws.equation import Equation
-from livepde.laws.gains import Metric
 from livepde.laws.whole import Whole, WholeEquation
 from livepde.linalg import Array, Pattern, compact
 
@@ -18,6 +15,43 @@ if TYPE_CHECKING:
     from livepde.laws.coupled import CoupledStage
 
 __all__ = ["Bilinear", "BilinearEquation"]
+
+
+class BilinearEquation(WholeEquation):
+    """The equation of a stage by products made ahead."""
+
+    way: Bilinear
+
+    @cached_property
+    def _known(self) -> Array:
+        """F - B(0), shape (n,)."""
+        known: Array = self.source * self.stage.model.X.free - self.way.offset
+        return known
+
+    def residual(self, y: Array) -> Array:
+        n, way = self.stage.n, self.way
+        u, q = y[:n], y[n:]
+        self.r = r = self.stage.split.project(u) - self.u_alpha
+        self.w = w = u if self.stage.gains.at_estimate else u - r
+        out: Array = way.linear @ np.concatenate((w, (y - self.c) / self.h, y))
+        observed = way.observed @ r
+        self.Mr, self.mass_r = observed[:n], observed[n:]
+        A = way.operator
+        A.set(way.coupling @ w)
+        out[:n] += A.apply(q) + self.pull() - self._known
+        out[n:] -= A.apply_transposed(r)
+        if self.metric is not None:
+            out[n:] += self.learned(y) * self.stage.free_q
+        return out
+
+    def changing(self, y: Array, sweep: bool) -> Array:
+        known = [self.w, y[self.stage.n :]]
+        data: Array
+        if sweep:
+            data = self.way.lagged @ np.concatenate(known)
+        else:
+            data = self.way.jacobian @ np.concatenate([*known, self.r])
+        return data
 
 
 class Bilinear(Whole):
@@ -36,6 +70,8 @@ class Bilinear(Whole):
     offset
         B(0) on the free coefficients.
     """
+
+    equations = BilinearEquation
 
     def __init__(
         self, stage: CoupledStage, vq: sp.csr_array, vu: sp.csr_array, qu: sp.csr_array
@@ -79,45 +115,3 @@ class Bilinear(Whole):
     @property
     def keeps(self) -> bool:
         return True
-
-    def equation(
-        self, c: Array, h: float, moment: Moment, u_alpha: Array, metric: Metric | None = None
-    ) -> Equation:
-        return BilinearEquation(self, c, h, moment, u_alpha, metric)
-
-
-class BilinearEquation(WholeEquation):
-    """The same equation by the products of a `Bilinear`."""
-
-    way: Bilinear
-
-    @cached_property
-    def _known(self) -> Array:
-        """F - B(0), shape (n,)."""
-        known: Array = self.source * self.stage.model.X.free - self.way.offset
-        return known
-
-    def residual(self, y: Array) -> Array:
-        n, way = self.stage.n, self.way
-        u, q = y[:n], y[n:]
-        self.r = r = self.stage.split.project(u) - self.u_alpha
-        self.w = w = u if self.stage.gains.at_estimate else u - r
-        out: Array = way.linear @ np.concatenate((w, (y - self.c) / self.h, y))
-        observed = way.observed @ r
-        self.Mr, self.mass_r = observed[:n], observed[n:]
-        A = way.operator
-        A.set(way.coupling @ w)
-        out[:n] += A.apply(q) + self.pull() - self._known
-        out[n:] -= A.apply_transposed(r)
-        if self.metric is not None:
-            out[n:] += self.learned(y) * self.stage.free_q
-        return out
-
-    def changing(self, y: Array, sweep: bool) -> Array:
-        known = [self.w, y[self.stage.n :]]
-        data: Array
-        if sweep:
-            data = self.way.lagged @ np.concatenate(known)
-        else:
-            data = self.way.jacobian @ np.concatenate([*known, self.r])
-        return data

@@ -20,10 +20,10 @@ from livepde.laws.schur import BlockSolver
 from livepde.laws.warm import Kept, Misses, Warm
 from livepde.laws.way import Way
 from livepde.laws.whole import Whole
-from livepde.linalg import Array, Pattern
+from livepde.linalg import Array, Factor, Pattern
 from livepde.model import Model
 from livepde.observation import Split
-from livepde.stepping import Newton, Solution
+from livepde.stepping import Near, Newton, Solution
 
 RESOLVED = 1e-6  # share of the prior deviation of q below which q counts as this large
 
@@ -141,7 +141,7 @@ class CoupledStage:
             What the stage before has left.
         """
         warm = warm or Warm.none()
-        kept, way, misses = warm.kept, self.way, self.misses
+        way, misses = self.way, self.misses
 
         def begin() -> Array:
             return self._imposed(start() if callable(start) else start, moment)
@@ -151,34 +151,38 @@ class CoupledStage:
         elif not self.model.homogeneous:
             near = self._imposed(near, moment)
         equation = way.equation(c, h, moment, u_alpha, metric)
-        way.begin(kept, moment)
-        newton, follows = way.newton(tunes=metric is not None), warm.h == h
-        used, factor, age = None, None, 1
+        way.begin(warm.kept, moment)
+        newton = way.newton(tunes=metric is not None)
+        good, age = None, 1
         if warm.missed <= newton.basin:
-            used = near + misses.spread(warm.trend) * warm.miss if follows else near
-            if kept.h == h:
-                factor, age = way.factor(kept, moment), kept.age + 1
-            else:
-                factor = way.fresh(equation, used)
-                age = 1 if factor is None else 0
-        solved = newton.solve(
-            equation,
-            begin,
-            misses.parts,
-            lagged=True,
-            near=used,
-            kept=factor,
-            # A metric changes from stage to stage, and with it how factors serve.
-            expected=kept.ageing * way.wear(age) if metric is None else math.inf,
-            trusted=GROWN * way.trusted(kept.seen, warm.missed),
-            shares=misses.shares(warm.trend) if follows else None,
-            rough=way.rough,
-        )
+            good, age = self._good(near, equation, warm)
+        solved = newton.solve(equation, begin, misses.parts, lagged=True, near=good)
         y = solved.y
         miss = y - near
-        trend = misses.trend(miss, warm.miss) if follows else np.zeros(3)
+        trend = misses.trend(miss, warm.miss) if warm.h == h else np.zeros(3)
         missed = misses.parts.relative(miss, y) if math.isnan(solved.missed) else solved.missed
-        return y, Warm(missed, miss, trend, h, self._kept(kept, equation, solved, age))
+        return y, Warm(missed, miss, trend, h, self._kept(warm.kept, equation, solved, age))
+
+    def _good(self, near: Array, equation: Equation, warm: Warm) -> tuple[Near, int]:
+        """Return where Newton may begin, and how old the factor for it is."""
+        way, kept, follows = self.way, warm.kept, warm.h == equation.h
+        y = near + self.misses.spread(warm.trend) * warm.miss if follows else near
+        if kept.h == equation.h:
+            factor: Factor | None = way.factor(kept, equation.moment)
+            age = kept.age + 1
+        else:
+            factor = way.fresh(equation, y)
+            age = 1 if factor is None else 0
+        found = Near(
+            y,
+            factor,
+            # A metric changes from stage to stage, and with it how factors serve.
+            expected=kept.ageing * way.wear(age) if equation.metric is None else math.inf,
+            trusted=GROWN * way.trusted(kept.seen, warm.missed),
+            shares=self.misses.shares(warm.trend) if follows else None,
+            rough=way.rough,
+        )
+        return found, age
 
     def _imposed(self, y: Array, moment: Moment) -> Array:
         y[: self.n] = self.model.impose(y[: self.n], moment)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.fem import FieldBlock, Moment
+from livepde.fem import FieldBlock
 from livepde.laws.equation import Equation
-from livepde.laws.gains import Metric
 from livepde.laws.schur import LARGE
 from livepde.laws.way import Way
 from livepde.linalg import Array, BandedSolver, Factor, Pattern, analyse, in_use
@@ -25,6 +25,60 @@ if TYPE_CHECKING:
 __all__ = ["Distributed", "DistributedEquation"]
 
 
+@dataclass(frozen=True, eq=False)
+class _DistributedFactor:
+    """The Jacobian, as a `Factor`: GMRES on all ranks."""
+
+    way: Distributed
+    handle: Handle
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
+        way, u, q = self.way, self.way.model.u, self.way.model.q
+        pieces = way.rows((b[: u.dim], u), (b[u.dim :], q))
+        return np.concatenate(way.joined(self.handle("solve", here=(pieces,)), u, q))
+
+
+class DistributedEquation(Equation):
+    """The equation of a stage, its residual and Jacobian on all ranks."""
+
+    way: Distributed
+
+    @cached_property
+    def handle(self) -> Handle:
+        """The equation of all ranks."""
+        way, c, u_alpha = self.way, self.c, self.u_alpha
+        u, q = way.model.u, way.model.q
+        c_u, c_q = c[: u.dim], c[u.dim :]
+        own = way.rows((self.source, u))
+        known = [
+            np.concatenate([c_u[a], u_alpha[a], c_q[b], f])
+            for a, b, f in zip(u.reaches, q.reaches, own, strict=True)
+        ]
+        sent = (way.shared.key, self.h, self.moment.t, dict(self.moment.inputs))
+        return way.shared.team.share(SharedEquation, *sent, here=(known,))
+
+    def residual(self, y: Array) -> Array:
+        way, n = self.way, self.stage.n
+        u, q = y[:n], y[n:]
+        self.r = self.stage.split.R @ u - self.u_alpha
+        pieces = self.handle("residual", here=(way.reached(u, q),))
+        shares = (way.model.u, way.model.u, way.model.u, way.model.q)
+        first, self.Mr, self.mass_r, second = way.joined(pieces, *shares)
+        return np.concatenate([first + self.pull(), second])
+
+    def factor(self, y: Array, sweep: bool) -> Factor:
+        way, u, row = self.way, self.way.model.u, self.slope(sweep)
+        border = way.rows((self.Mr, u), (np.zeros(u.dim) if row is None else row, u))
+        sent = (self.handle.key, self.theta, sweep)
+        factor = _DistributedFactor(
+            way, way.shared.team.share(SharedJacobian, *sent, here=(border,))
+        )
+        if not sweep:
+            self.made = (y, factor)
+        return factor
+
+
 class Distributed(Way):
     """Solves a stage that all ranks share.
 
@@ -33,6 +87,8 @@ class Distributed(Way):
     shared, model
         The stage and the model of all ranks.
     """
+
+    equations = DistributedEquation
 
     def __init__(self, stage: CoupledStage, shared: Handle, model: SharedModel) -> None:
         super().__init__(stage)
@@ -80,11 +136,6 @@ class Distributed(Way):
     def patience(self) -> int:
         return 3
 
-    def equation(
-        self, c: Array, h: float, moment: Moment, u_alpha: Array, metric: Metric | None = None
-    ) -> Equation:
-        return DistributedEquation(self, c, h, moment, u_alpha, metric)
-
     def reached(self, u: Array, q: Array) -> list[Array]:
         """Return what each rank needs of vectors of the state and of the parameter."""
         pairs = zip(self.model.u.reaches, self.model.q.reaches, strict=True)
@@ -105,65 +156,6 @@ class Distributed(Way):
                 start = int(share.sizes[:rank].sum())
                 values[share.order[start : start + len(part)]] = part
         return found
-
-
-class DistributedEquation(Equation):
-    """The equation of a stage, its residual and Jacobian on all ranks."""
-
-    def __init__(
-        self,
-        way: Distributed,
-        c: Array,
-        h: float,
-        moment: Moment,
-        u_alpha: Array,
-        metric: Metric | None = None,
-    ) -> None:
-        super().__init__(way.stage, c, h, moment, u_alpha, metric)
-        self.way = way
-        u, q = way.model.u, way.model.q
-        c_u, c_q = c[: u.dim], c[u.dim :]
-        own = way.rows((self.source, u))
-        known = [
-            np.concatenate([c_u[a], u_alpha[a], c_q[b], f])
-            for a, b, f in zip(u.reaches, q.reaches, own, strict=True)
-        ]
-        sent = (way.shared.key, h, moment.t, dict(moment.inputs))
-        self.handle = way.shared.team.share(SharedEquation, *sent, here=(known,))
-
-    def residual(self, y: Array) -> Array:
-        way, n = self.way, self.stage.n
-        u, q = y[:n], y[n:]
-        self.r = self.stage.split.R @ u - self.u_alpha
-        pieces = self.handle("residual", here=(way.reached(u, q),))
-        shares = (way.model.u, way.model.u, way.model.u, way.model.q)
-        first, self.Mr, self.mass_r, second = way.joined(pieces, *shares)
-        return np.concatenate([first + self.pull(), second])
-
-    def factor(self, y: Array, sweep: bool) -> Factor:
-        way, u, row = self.way, self.way.model.u, self.slope(sweep)
-        border = way.rows((self.Mr, u), (np.zeros(u.dim) if row is None else row, u))
-        sent = (self.handle.key, self.theta, sweep)
-        factor = _DistributedFactor(
-            way, way.shared.team.share(SharedJacobian, *sent, here=(border,))
-        )
-        if not sweep:
-            self.made = (y, factor)
-        return factor
-
-
-@dataclass(frozen=True, eq=False)
-class _DistributedFactor:
-    """The Jacobian, as a `Factor`: GMRES on all ranks."""
-
-    way: Distributed
-    handle: Handle
-
-    def solve(self, b: Array) -> Array:
-        """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
-        way, u, q = self.way, self.way.model.u, self.way.model.q
-        pieces = way.rows((b[: u.dim], u), (b[u.dim :], q))
-        return np.concatenate(way.joined(self.handle("solve", here=(pieces,)), u, q))
 
 
 def _ends(sizes: Any) -> Any:

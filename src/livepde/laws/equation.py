@@ -12,7 +12,7 @@ from livepde.laws.gains import PULL, Metric
 from livepde.linalg import Array, Factor
 
 if TYPE_CHECKING:
-    from livepde.laws.coupled import CoupledStage
+    from livepde.laws.way import Way
 
 __all__ = ["Equation"]
 
@@ -25,6 +25,8 @@ class Equation(ABC):
 
     Parameters
     ----------
+    way
+        How the stage is solved.
     c, h, moment, u_alpha, metric
         As for `CoupledStage.solve`.
 
@@ -36,20 +38,21 @@ class Equation(ABC):
 
     def __init__(
         self,
-        stage: CoupledStage,
+        way: Way,
         c: Array,
         h: float,
         moment: Moment,
         u_alpha: Array,
         metric: Metric | None = None,
     ) -> None:
-        self.stage = stage
+        self.way = way
+        self.stage = way.stage
         self.c = c
         self.h = h
         self.moment = moment
         self.u_alpha = u_alpha
         self.metric = metric
-        self.source = stage.model.F(moment)
+        self.source = way.stage.model.F(moment)
         self.made: tuple[Array, Factor] | None = None
 
     def residual(self, y: Array) -> Array:

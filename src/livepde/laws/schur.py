@@ -71,6 +71,20 @@ ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign 
 LAYERS = 4  # neighbours on either side of where observed coefficients meet others
 
 
+class BlockEquation(Equation):
+    """The equation of a stage, its Jacobian by blocks."""
+
+    way: BlockSolver
+
+    def residual(self, y: Array) -> Array:
+        out = super().residual(y)
+        self.way.A = self.A
+        return out
+
+    def factor(self, y: Array, sweep: bool) -> Jacobian:
+        return self.way.jacobian(self, y, sweep)
+
+
 class BlockSolver(Way):
     """Solves the coupled systems of a stage by blocks.
 
@@ -85,6 +99,7 @@ class BlockSolver(Way):
     """
 
     rough = True
+    equations = BlockEquation
     kind = LeanMisses
 
     def __init__(self, stage: CoupledStage) -> None:
@@ -123,11 +138,6 @@ class BlockSolver(Way):
             return newton
         return replace(newton, share=max(newton.share, SHARE))
 
-    def equation(
-        self, c: Array, h: float, moment: Moment, u_alpha: Array, metric: Metric | None = None
-    ) -> BlockEquation:
-        return BlockEquation(self, c, h, moment, u_alpha, metric)
-
     def begin(self, kept: Kept, moment: Moment) -> None:
         self.resume(self.factor(kept, moment) if len(kept.y) else None)
 
@@ -144,7 +154,7 @@ class BlockSolver(Way):
             zero = np.zeros_like(kept.y)
             equation = self.equation(zero, kept.h, moment, kept.u_alpha, metric)
             equation.residual(kept.y)
-            self.last = self.approximate(equation.factor(kept.y, False))
+            self.last = self.approximate(self.jacobian(equation, kept.y, False))
         return self.last
 
     def fresh(self, equation: Equation, y: Array) -> Factor | None:
@@ -314,30 +324,6 @@ class BlockSolver(Way):
     def engines(self) -> dict[str, str]:
         """Names of the engines of the blocks that were factorised."""
         return {name: solver.name for name, (solver, _) in self._solvers.items()}
-
-
-class BlockEquation(Equation):
-    """The equation of a stage, its Jacobian by blocks."""
-
-    def __init__(
-        self,
-        blocks: BlockSolver,
-        c: Array,
-        h: float,
-        moment: Moment,
-        u_alpha: Array,
-        metric: Metric | None = None,
-    ) -> None:
-        super().__init__(blocks.stage, c, h, moment, u_alpha, metric)
-        self.blocks = blocks
-
-    def residual(self, y: Array) -> Array:
-        out = super().residual(y)
-        self.blocks.A = self.A
-        return out
-
-    def factor(self, y: Array, sweep: bool) -> Jacobian:
-        return self.blocks.jacobian(self, y, sweep)
 
 
 def _product(matrix: sp.csr_array, W: sp.csr_array) -> sp.csr_array:

@@ -29,11 +29,12 @@ class Way(ABC):
         How many each linear system of this stage took; empty where none is iterated.
     rough
         True if a kept factor is that of an approximate Jacobian.
-    kind
-        How misses are compared.
+    equations, kind
+        What evaluates the equation of a stage, and what compares misses.
     """
 
     rough = False
+    equations: type[Equation]
     kind: type[Misses] = Misses
 
     def __init__(self, stage: CoupledStage) -> None:
@@ -51,11 +52,11 @@ class Way(ABC):
     def patience(self) -> int:
         """Updates and iterations, beyond one update for each stage, that renew a factor."""
 
-    @abstractmethod
     def equation(
         self, c: Array, h: float, moment: Moment, u_alpha: Array, metric: Metric | None = None
     ) -> Equation:
         """Return the equation of a stage; arguments as for `CoupledStage.solve`."""
+        return self.equations(self, c, h, moment, u_alpha, metric)
 
     def newton(self, tunes: bool) -> Newton:
         """Return the nonlinear iteration, of a law that tunes itself or not."""

@@ -10,9 +10,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
-from livepde.fem import Moment
 from livepde.laws.equation import Equation
-from livepde.laws.gains import PULL, Metric
+from livepde.laws.gains import PULL
 from livepde.laws.way import Way
 from livepde.linalg import Array, Assembler, BandedSolver, Factor, Leading, Pattern, Solver, analyse
 
@@ -22,8 +21,50 @@ if TYPE_CHECKING:
 __all__ = ["Whole", "WholeEquation"]
 
 
+class WholeEquation(Equation):
+    """The equation of a stage, its Jacobian as one matrix."""
+
+    way: Whole
+
+    def changing(self, y: Array, sweep: bool) -> Array:
+        """Return the data of the Jacobian that depend on y."""
+        stage, form, maps = self.stage, self.stage.model.form_A, self.way.maps
+        q, r, w = y[stage.n :], self.r, self.w
+        data: Array = maps["A"] @ self.A.data
+        data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
+        if not sweep:
+            data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r, q=q)
+            if not stage.linear:
+                data += maps["Aqq"] @ form.data("q", "q", self.moment, u=w, v=r, q=q)
+        if not stage.constant_B:
+            data += maps["B"] @ stage.model.form_B.data("v", "u", self.moment, u=w)
+        return data
+
+    def factor(self, y: Array, sweep: bool) -> Factor:
+        stage, way, metric = self.stage, self.way, self.metric
+        data = self.changing(y, sweep)
+        data += way.constant(self.h)
+        data += self.theta * way.constant_data["pull"]
+        if metric is not None:
+            data += way.maps["G"] @ ((metric.spread / PULL) * way.gram_data)
+            data += way.maps["J"] @ (metric.data / PULL)
+        factor: Factor = way.solver.factorise(data)
+        if stage.auxiliary:
+            factor = Leading(factor, stage.size, stage.size + stage.auxiliary)
+        row = self.slope(sweep)
+        if row is not None:
+            column = np.zeros_like(y)
+            column[: stage.n] = self.Mr
+            factor = _Bordered(factor, factor.solve(column), row)
+        if metric is None and not sweep:
+            self.made = (y, factor)
+        return factor
+
+
 class Whole(Way):
     """Factorises the matrix of u and q, with auxiliary unknowns behind."""
+
+    equations = WholeEquation
 
     def __init__(self, stage: CoupledStage) -> None:
         super().__init__(stage)
@@ -123,61 +164,6 @@ class Whole(Way):
     @property
     def patience(self) -> int:
         return 2 if isinstance(self.solver, BandedSolver) else 12
-
-    def equation(
-        self, c: Array, h: float, moment: Moment, u_alpha: Array, metric: Metric | None = None
-    ) -> Equation:
-        return WholeEquation(self, c, h, moment, u_alpha, metric)
-
-
-class WholeEquation(Equation):
-    """The equation of a stage, its Jacobian as one matrix."""
-
-    def __init__(
-        self,
-        way: Whole,
-        c: Array,
-        h: float,
-        moment: Moment,
-        u_alpha: Array,
-        metric: Metric | None = None,
-    ) -> None:
-        super().__init__(way.stage, c, h, moment, u_alpha, metric)
-        self.way = way
-
-    def changing(self, y: Array, sweep: bool) -> Array:
-        """Return the data of the Jacobian that depend on y."""
-        stage, form, maps = self.stage, self.stage.model.form_A, self.way.maps
-        q, r, w = y[stage.n :], self.r, self.w
-        data: Array = maps["A"] @ self.A.data
-        data += maps["Au"] @ form.data("v", "u", self.moment, u=w, q=q)
-        if not sweep:
-            data += maps["Aq"] @ form.data("q", "u", self.moment, u=w, v=r, q=q)
-            if not stage.linear:
-                data += maps["Aqq"] @ form.data("q", "q", self.moment, u=w, v=r, q=q)
-        if not stage.constant_B:
-            data += maps["B"] @ stage.model.form_B.data("v", "u", self.moment, u=w)
-        return data
-
-    def factor(self, y: Array, sweep: bool) -> Factor:
-        stage, way, metric = self.stage, self.way, self.metric
-        data = self.changing(y, sweep)
-        data += way.constant(self.h)
-        data += self.theta * way.constant_data["pull"]
-        if metric is not None:
-            data += way.maps["G"] @ ((metric.spread / PULL) * way.gram_data)
-            data += way.maps["J"] @ (metric.data / PULL)
-        factor: Factor = way.solver.factorise(data)
-        if stage.auxiliary:
-            factor = Leading(factor, stage.size, stage.size + stage.auxiliary)
-        row = self.slope(sweep)
-        if row is not None:
-            column = np.zeros_like(y)
-            column[: stage.n] = self.Mr
-            factor = _Bordered(factor, factor.solve(column), row)
-        if metric is None and not sweep:
-            self.made = (y, factor)
-        return factor
 
 
 @dataclass(frozen=True, eq=False)
