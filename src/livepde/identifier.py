@@ -270,8 +270,6 @@ class Identifier:
             error = withheld - self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
         return Estimate(
             t=t,
-            q=belief.q,
-            u=belief.u,
             belief=belief,
             innovation=measured - report.predicted,
             withheld_error=error,
