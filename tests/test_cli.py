@@ -35,6 +35,7 @@ COMMANDS = (
     "watch",
     "export",
     "bench",
+    "citation",
 )
 
 

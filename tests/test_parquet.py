@@ -86,7 +86,7 @@ def test_dates(written, times):
     [
         pa.array([1, None, 3], pa.int8()),
         pa.array([1, None, 3], pa.uint64()),
-        pa.array([1, None, 3], pa.float16()),
+        pa.array([np.float16(1), None, np.float16(3)], pa.float16()),
         pa.array([Decimal(1), None, Decimal(3)]),
     ],
     ids=lambda column: str(column.type),

@@ -13,6 +13,7 @@ from livepde import __version__
 from livepde.cli.bench import bench
 from livepde.cli.cases import equations, init
 from livepde.cli.check import check
+from livepde.cli.citation import citation
 from livepde.cli.experiments import demo, reproduce
 from livepde.cli.export import export
 from livepde.cli.fleet import fleet
@@ -30,12 +31,12 @@ app = typer.Typer(
 
     Start with:  livepde demo,  then  livepde init mycase,  livepde run mycase/case.toml""",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, init, check, run, fleet, watch, report, export, equations, reproduce):
+commands = (demo, init, check, run, fleet, watch, report, export, equations, reproduce, citation)
+for command in commands:
     app.command()(command)
 app.add_typer(bench)
 
