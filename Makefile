@@ -76,7 +76,8 @@ format: $(READY)  ## Format the code and mend what can be mended automatically
 	@$(BIN)/ruff format
 
 docs: $(READY)  ## Build the documentation into site/
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@$(BIN)/python docs/links.py
 	@echo "Built: site/index.html"
 
 bench: $(READY)  ## Measure what one step costs

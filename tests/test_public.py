@@ -16,6 +16,25 @@ import livepde
 from livepde import errors
 from livepde.bench.startup import BASE, SCRIPT, startup
 
+DOCUMENTED = (
+    ".models",
+    ".diagnostics",
+    ".cases",
+    ".runs",
+    ".dashboard",
+    ".reproduce",
+    ".plots",
+    ".streams",
+    ".streams.mqtt",
+    ".streams.opcua",
+    ".laws",
+    ".observation",
+    ".stepping",
+    ".fem",
+    ".linalg",
+    ".spaces",
+    ".parallel",
+)
 
 def test_exports_are_complete_and_sorted():
     """What runs and what type checkers see is the same list."""
@@ -39,14 +58,20 @@ def test_what_is_not_there_is_said():
 
 def test_the_reference_holds_what_is_exported():
     """Pages are made of docstrings; helpers of scikit-fem have none there and stand in a table."""
-    reference = (Path(__file__).parents[1] / "docs" / "reference.md").read_text()
+    docs = Path(__file__).parents[1] / "docs"
+    reference = (docs / "reference.md").read_text()
     helpers = re.findall(r"`(\w+)\(", reference)
     for name in livepde.__all__:
         owner = getattr(getattr(livepde, name), "__module__", "livepde")
         assert owner.startswith("livepde") != (name in helpers), name
-    for package in ("", ".models", ".diagnostics", ".cases", ".runs", ".streams", ".streams.mqtt"):
-        assert f"::: livepde{package}\n" in reference
+    pages = "\n".join(path.read_text() for path in [docs / "reference.md", *docs.glob("api/*.md")])
+    for package in ("", *DOCUMENTED):
+        found = re.search(rf"^::: livepde{package}\n((?: .*\n)*)", pages, re.MULTILINE)
+        assert found, package
         module = importlib.import_module(f"livepde{package}")
+        if found[1]:
+            listed = re.findall(r"^        - (\w+)$", found[1], re.MULTILINE)
+            assert set(listed) == set(module.__all__) - set(livepde.__all__), package
         for name in module.__all__:
             value = getattr(module, name)
             if inspect.isclass(value) or inspect.isfunction(value):

@@ -58,6 +58,8 @@ class Sobolev:
     factor
         Of the inner product; `pointwise` chooses it.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> from skfem import ElementLineP1
     >>> q = lp.Field(lp.interval(0, 1, 20), ElementLineP1(), inner=Sobolev(0.75, length=0.2))
@@ -90,6 +92,8 @@ class Sobolev:
         SpaceError
             Unless s > dimension/2: values at points have no finite deviation.
 
+        Examples
+        --------
         >>> round(Sobolev(1, length=0.25).pointwise(1).factor, 12)  # 1/(2 length)
         2.0
         """
