@@ -851,7 +851,7 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
         ("return ", "raise ValueError('bad') #", "failed with ValueError: bad"),
         ("rod.csv", "none.csv", "there is no file"),
         ('frame["time_s"]', "[]", "holds no samples"),
-        ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is not later"),
+        ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is earlier"),
         ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (181,); there are 180 times"),
         ("{key:", "{key + '_': ", "there is no column 'T_left'; did you mean 'T_left_'?"),
         ("+ noise", "+ np.inf + noise", "is infinite in sample 0"),

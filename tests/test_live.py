@@ -28,9 +28,10 @@ from livepde.runs.live import Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 from livepde.stepping import Advance, ImplicitEuler
+from livepde.streams.clock import Clock
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Follow, Rows, json_row
-from livepde.streams.table import Clock, Column
+from livepde.streams.table import Column
 
 COLUMNS = {name: Column((name,)) for name in ("a", "b", "left")}
 CLOCK = Clock("t")

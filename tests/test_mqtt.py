@@ -20,10 +20,10 @@ from test_live import COLUMNS, live, rows
 
 import livepde as lp
 from livepde.runs.feeds import Gathered
+from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
 from livepde.streams.sources import Rows
-from livepde.streams.table import Clock
 
 pytest.importorskip("paho.mqtt")
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
