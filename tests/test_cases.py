@@ -483,7 +483,7 @@ def test_missing_case(tmp_path):
     with pytest.raises(lp.CaseError, match="livepde init"):
         cases.load(tmp_path / "case.toml")
     (tmp_path / "case.toml").write_text("")
-    with pytest.raises(lp.CaseError, match=r"Did you mean '.*case\.toml'"):
+    with pytest.raises(lp.CaseError, match=r"did you mean '.*case\.toml'"):
         cases.load(tmp_path / "cas.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(lp.CaseError, match="cannot be read"):

@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from livepde.laws import Jumps, Replay
+from livepde.laws import Guards, Jumps, Replay
 from livepde.runs.outcome import Bound, Sense
 from livepde.streams.csvfile import UTF_8
 
@@ -359,6 +359,16 @@ class JumpsSpec(Spec):
     settle: NonNegativeInt = Jumps.settle
 
 
+class GuardsSpec(Spec):
+    """When the law is out of its depth: how far a sample moves an unknown, and when to restart."""
+
+    reach: PositiveFloat = Guards.reach
+    iterations: PositiveInt = Guards.iterations
+    temperings: NonNegativeInt = Guards.temperings
+    runaway: PositiveFloat = Guards.runaway
+    past: PositiveInt = Guards.past
+
+
 class SensitivitySpec(Spec):
     """The law for sparse, noisy sensors."""
 
@@ -370,6 +380,7 @@ class SensitivitySpec(Spec):
     replay: StrictBool | ReplaySpec = False
     gate: PositiveFloat | None = None
     jumps: StrictBool | JumpsSpec = False
+    guards: StrictBool | GuardsSpec = True
 
 
 class AutoSpec(Spec):
