@@ -132,7 +132,9 @@ def test_time_has_to_increase(csv, times):
 
 def test_missing_file(tmp_path):
     (tmp_path / "nine.csv").touch()
-    with pytest.raises(DataError, match="there is no file .*none.csv'; did you mean 'nine.csv'?"):
+    with pytest.raises(
+        DataError, match=r"there is no file .*none\.csv'; did you mean 'nine\.csv'\?"
+    ):
         read_csv(tmp_path / "none.csv", COLUMNS, Clock("t"))
 
 

@@ -107,16 +107,16 @@ def read_toml(text: str, where: str) -> dict[str, Any]:
     except RecursionError as error:
         raise CaseError(f"{where}: is not valid TOML: {error}.") from None
     except tomllib.TOMLDecodeError as error:
-        raise CaseError(f"{where}: is not valid TOML: {error}.{_line(text, str(error))}") from None
+        raise CaseError(f"{where}: is not valid TOML: {error}{_line(text, str(error))}.") from None
 
 
 def _line(text: str, reason: str) -> str:
     """Return the line of a TOML file about which a reason speaks, with what is mostly wrong."""
     number = re.search(r"at line (\d+)", reason)
-    line = text.splitlines()[int(number[1]) - 1].strip() if number else ""
+    line = re.split(r"\s+#", text.splitlines()[int(number[1]) - 1])[0].strip() if number else ""
     if not line:
         return ""
-    return f" There stands: {line[:SHOWN]}. Text needs quotes at both ends, decimals a point."
+    return f": {line[:SHOWN]}; text needs quotes at both ends, decimals a point"
 
 
 def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:

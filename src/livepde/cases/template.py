@@ -21,7 +21,6 @@ CASE = """\
 #   livepde run {case}       identify; writes a run directory
 # Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
 # With data of your own: [data], the columns and places in [channels], the prior; drop [expect].
-# When something goes wrong, one sentence says what and where: docs/mistakes.md has more on it.
 title = "A metal rod, heated and cooled at its left end"
 equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
                                # or your own as "file.py:function" (run it with --allow-code)

@@ -34,5 +34,8 @@ def no_file(path: Path) -> DataError:
     """Return an error about a file that is not there, with those of its kind that are."""
     if not path.parent.is_dir():
         return DataError(f"there is no file '{path}': there is no folder '{path.parent}'.")
+    below = sorted(path.parent.glob(f"*/{path.name}"))
+    if below:
+        return DataError(f"there is no file '{path}'; did you mean '{below[0]}'?")
     known = sorted(item.name for item in path.parent.glob(f"*{path.suffix}") if item.is_file())
     return DataError(f"there is no file '{path}'{hint(path.name, known)}")
