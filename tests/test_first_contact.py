@@ -99,7 +99,7 @@ def edit(case: Path, edits: Mapping[str, str]) -> None:
     case.write_text("\n".join(lines) + "\n")
 
 
-def test_from_nothing_to_a_result_of_ones_own(shell):
+def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     home = shell.folder
 
     # He looks around, and lets a case be written.

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_live import identifier, live, rows
+from live_rod import identifier, live, rows
 from typer.testing import CliRunner
 
 import livepde as lp

@@ -89,7 +89,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
             item.name,
             f"{item.prior:.3g}",
             f"{item.posterior:.3g}",
-            f"{100 * item.left:.3g} %",
+            _percent(item.left),
             item.unit,
             "hardly identified" if item.hardly else "",
         )
@@ -107,6 +107,10 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     return [*hardly, *found.sentences]
 
 
+def _percent(share: float) -> str:
+    return f"{100 * share:.{2 if share < 0.995 else 3}g} %"
+
+
 def _show_advice(console: Console, prepared: Prepared) -> None:
     """Print where one more sensor would help most."""
     from livepde.cases.placement import advise
@@ -115,10 +119,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
     found = advise(prepared, prepared.stream)
     unit = prepared.case.frame.equation.length_unit
     at = ", ".join(f"{x:.3g}" for x in found.position)
-    rows = [
-        (name, f"{100 * left:.3g} %", f"{100 * found.then[name]:.3g} %")
-        for name, left in found.now.items()
-    ]
+    rows = [(name, _percent(left), _percent(found.then[name])) for name, left in found.now.items()]
     title = f"One more sensor helps most at {at} {unit}".rstrip()
     columns = ("unknown", "deviation left", "with the sensor")
     print_table(console, Table(title, columns, rows))
