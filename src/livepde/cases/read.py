@@ -137,8 +137,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
-    # A misspelt key makes two errors, one extra and one missing: the extra one says it better.
-    found = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")[0]
+    # A misspelt key makes two errors, one extra and one missing: the extra one says it better. And
+    # where true, false or a table may stand, a table is not wrong for being no boolean.
+    def rank(item: Any) -> tuple[bool, bool]:
+        table = item["type"] == "bool_type" and isinstance(item["input"], dict)
+        return item["type"] != "extra_forbidden", table
+
+    found = min(error.errors(), key=rank)
     path = _path(found["loc"], raw)
     key = ".".join(path)
     kind, got = found["type"], found["input"]

@@ -20,7 +20,7 @@ CASE = """\
 #   livepde check {case}     what is in here, and what its sensors can tell
 #   livepde run {case}       identify; writes a run directory
 # Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
-# With data of your own: [data], the columns and places in [channels], the prior; drop [expect].
+# With data of your own: say so in "data", "channels" and the prior, and drop "expect" at the end.
 title = "A metal rod, heated and cooled at its left end"
 equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
                                # or your own as "file.py:function" (run it with --allow-code)
