@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import call
+from commands import call
 
 import livepde as lp
 from livepde import cases

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_stepping import Cubic
+from problems import Cubic
 
 import livepde as lp
 from livepde.bench.step import problem

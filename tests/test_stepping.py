@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from problems import laplace, line, product, rates, reaction, truth
+from problems import Cubic, Slope, laplace, line, product, rates, reaction, truth
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -228,31 +228,6 @@ def test_newton_keeps_its_factor_while_it_is_good():
     equation = Equation([8.0])
     lp.Newton().solve(equation, np.array([2.001]))
     assert equation.factors == 1
-
-
-class Slope:
-    """The factor of a single number."""
-
-    def __init__(self, slope):
-        self.slope = slope
-
-    def solve(self, b):
-        return b / self.slope
-
-
-class Cubic:
-    """x^3 = x for x = y - 5: sweeps go to 1 from x > 0, Newton anywhere."""
-
-    def __init__(self):
-        self.sweeps = []
-
-    def residual(self, y):
-        x = y - 5.0
-        return x**3 - x
-
-    def factor(self, y, sweep):
-        self.sweeps.append(sweep)
-        return Slope(2.0 if sweep else 3.0 * (y[0] - 5.0) ** 2 - 1.0)
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,8 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Another value than the case has, as law.noise='2 K'. Repeat it for more.",
+        help="Another value than the case has, as law.noise='2 K'; nothing after the = takes the "
+        "key away. Repeat it for more.",
         show_default=False,
     ),
 ]
