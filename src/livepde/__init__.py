@@ -63,7 +63,8 @@ from livepde.fem import (
     upwind,
 )
 from livepde.fleet import Fleet, FleetEstimate, FleetResult
-from livepde.identifier import Identifier, Sample
+from livepde.forecast import Forecast
+from livepde.identifier import Identifier
 from livepde.laws import (
     AutoLaw,
     BaumeisterLaw,
@@ -107,6 +108,7 @@ from livepde.observation import (
 )
 from livepde.operators import DualOperator
 from livepde.result import Estimate, Result
+from livepde.samples import Sample
 from livepde.spaces import HilbertSpace
 from livepde.stepping import Advance, Alexander2, ImplicitEuler, Interval, Newton, Scheme, simulate
 
@@ -137,6 +139,7 @@ __all__ = [
     "Fleet",
     "FleetEstimate",
     "FleetResult",
+    "Forecast",
     "Full",
     "Functionals",
     "GradientLaw",
