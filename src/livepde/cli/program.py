@@ -16,6 +16,7 @@ from livepde.cli.check import check
 from livepde.cli.experiments import demo, reproduce
 from livepde.cli.export import export
 from livepde.cli.fleet import fleet
+from livepde.cli.fmu import fmu
 from livepde.cli.printing import BAD_INPUT, terminal
 from livepde.cli.report import report
 from livepde.cli.run import run
@@ -35,7 +36,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, init, check, run, fleet, watch, report, export, equations, reproduce):
+COMMANDS = (demo, init, check, run, fleet, watch, report, export, fmu, equations, reproduce)
+for command in COMMANDS:
     app.command()(command)
 app.add_typer(bench)
 
