@@ -133,6 +133,7 @@ __all__ = [
     "Fleet",
     "FleetEstimate",
     "FleetResult",
+    "Forecast",
     "Full",
     "Functionals",
     "GradientLaw",

@@ -10,12 +10,32 @@ from typing import Any
 
 from livepde.errors import CaseError
 
-__all__ = ["Affine", "conversion", "convert"]
+__all__ = ["SI", "Affine", "conversion", "convert", "in_si"]
 
 KINDS = (("s", "min", "h", "d"), ("mm", "cm", "m", "ft"), ("degC", "K", "degF"))  # for hints
 # What pint's parser lets through for text that is no unit at all.
 NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
+
+
+BASE = {
+    "[mass]": "kg",
+    "[length]": "m",
+    "[time]": "s",
+    "[current]": "A",
+    "[temperature]": "K",
+    "[substance]": "mol",
+    "[luminosity]": "cd",
+}
+
+
+@dataclass(frozen=True)
+class SI:
+    """value in SI units = factor * value + offset; `exponents` of the base units."""
+
+    factor: float
+    offset: float
+    exponents: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -84,6 +104,26 @@ def conversion(given: str, unit: str, where: str) -> Affine:
     except (pint.PintError, *NOT_A_UNIT):
         raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit, given)}.") from None
     return Affine(float(one - zero), float(zero))
+
+
+def in_si(unit: str) -> SI | None:
+    """Return how values in a unit become values in units of the SI; None if it has none.
+
+    >>> in_si("km/h").exponents, round(in_si("degC").offset, 2)
+    ({'m': 1, 's': -1}, 273.15)
+    """
+    registry = _registry()
+    try:
+        zero = registry.Quantity(0.0, registry.parse_units(unit)).to_base_units()
+        one = registry.Quantity(1.0, registry.parse_units(unit)).to_base_units()
+    except (_pint().PintError, *NOT_A_UNIT):
+        return None
+    exponents = {BASE[name]: power for name, power in one.dimensionality.items() if name in BASE}
+    if len(exponents) < len(one.dimensionality) or any(p != int(p) for p in exponents.values()):
+        return None
+    whole = {name: int(power) for name, power in exponents.items()}
+    offset = float(zero.magnitude)
+    return SI(float(one.magnitude) - offset, offset, whole)
 
 
 def _expected(unit: str, given: str) -> str:

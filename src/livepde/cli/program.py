@@ -17,6 +17,7 @@ from livepde.cli.citation import citation
 from livepde.cli.experiments import demo, reproduce
 from livepde.cli.export import export
 from livepde.cli.fleet import fleet
+from livepde.cli.fmu import fmu
 from livepde.cli.printing import BAD_INPUT, terminal
 from livepde.cli.report import report
 from livepde.cli.run import run
@@ -35,8 +36,21 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-commands = (demo, init, check, run, fleet, watch, report, export, equations, reproduce, citation)
-for command in commands:
+COMMANDS = (
+    demo,
+    init,
+    check,
+    run,
+    fleet,
+    watch,
+    report,
+    export,
+    fmu,
+    equations,
+    reproduce,
+    citation,
+)
+for command in COMMANDS:
     app.command()(command)
 app.add_typer(bench)
 
