@@ -36,6 +36,7 @@ DOCUMENTED = (
     ".parallel",
 )
 
+
 def test_exports_are_complete_and_sorted():
     """What runs and what type checkers see is the same list."""
     stub = ast.parse(Path(livepde.__file__).with_suffix(".pyi").read_text())
