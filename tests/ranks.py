@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 import livepde as lp
+from livepde.laws.distributed import Distributed
 from livepde.linalg import Pattern, choose, in_use
 from livepde.parallel import petsc
 from livepde.stepping import Advance, ImplicitEuler, Newton, simulate
@@ -48,7 +49,7 @@ def gradient() -> dict[str, np.ndarray]:
             assert estimate.status.ok
         found |= {f"{name}.q": estimate.q, f"{name}.u": estimate.u}
         stage = identifier._work.stage(np.ones(identifier.observed.size, dtype=bool))
-        assert (stage.distributed is None) == (engine is None)  # all ranks evaluate it together
+        assert isinstance(stage.way, Distributed) == (engine is not None)
     return found
 
 

@@ -431,6 +431,21 @@ def test_a_report_says_what_there_is_to_say(tmp_path):
         call("export", run.path, tmp_path / "run.html")
 
 
+def test_all_formats_are_looked_at_before_one_is_written(tmp_path, monkeypatch):
+    run = watched_run(tmp_path / "run")
+    monkeypatch.setitem(sys.modules, "meshio", None)  # as if it were not there
+    with pytest.raises(ConfigurationError, match=r"rod\.xdmf: this format needs meshio: pip"):
+        call("export", run.path, tmp_path / "rod.csv", tmp_path / "rod.xdmf")
+    assert not (tmp_path / "rod.csv").exists()
+
+
+def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
+    run = watched_run(tmp_path / "run")
+    (run.path / "case.toml").write_bytes('title = "Fühler"'.encode("cp1252"))
+    write_report(run, tmp_path / "run.html")
+    assert 'title = "F\N{REPLACEMENT CHARACTER}hler"' in Page(tmp_path / "run.html").text
+
+
 @pytest.mark.parametrize(
     ("value", "doubts", "said"),
     [

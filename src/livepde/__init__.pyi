@@ -59,7 +59,8 @@ from .fem import (
     upwind,
 )
 from .fleet import Fleet, FleetEstimate, FleetResult
-from .identifier import Identifier, Sample
+from .forecast import Forecast
+from .identifier import Identifier
 from .laws import (
     AutoLaw,
     BaumeisterLaw,
@@ -103,6 +104,7 @@ from .observation import (
 )
 from .operators import DualOperator
 from .result import Estimate, Result
+from .samples import Sample
 from .spaces import HilbertSpace
 from .stepping import Advance, Alexander2, ImplicitEuler, Interval, Newton, Scheme, simulate
 
@@ -133,6 +135,7 @@ __all__ = [
     "Fleet",
     "FleetEstimate",
     "FleetResult",
+    "Forecast",
     "Full",
     "Functionals",
     "GradientLaw",

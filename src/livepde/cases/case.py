@@ -31,6 +31,7 @@ from livepde.laws import (
     ConstantDamping,
     Damping,
     GradientLaw,
+    Guards,
     Jumps,
     Replay,
     ResidualDamping,
@@ -303,8 +304,12 @@ class Case:
 
     def _sensitivity(self, spec: SensitivitySpec) -> SensitivityLaw:
         frame, time = self.frame, self.frame.equation.time_unit
-        noise, memory = self._noise(spec), float(np.inf)
-        if noise is None and noise_of(frame, "sensor") is None:
+        auto, memory = spec.noise == "auto", float(np.inf)
+        noise = "auto" if auto else self._noise(spec)
+        if noise in (None, "auto") and noise_of(frame, "sensor") is None:
+            if auto:
+                text = "got 'auto', which begins with a guess: give every sensor its noise."
+                raise frame.error("law.noise", text)
             raise frame.missing(
                 "law.noise",
                 "the sensitivity law weighs the sensors by their noise (a standard deviation); "
@@ -319,8 +324,11 @@ class Case:
         jumps = Jumps() if spec.jumps is True else None
         if not isinstance(spec.jumps, bool):
             jumps = Jumps(**spec.jumps.model_dump())
-        gate = spec.gate or np.inf
-        return SensitivityLaw(spec.modes, noise, drift, memory, replay, gate=gate, jumps=jumps)
+        guards = Guards() if spec.guards is True else None
+        if not isinstance(spec.guards, bool):
+            guards = Guards(**spec.guards.model_dump())
+        more: dict[str, Any] = {"gate": spec.gate or np.inf, "jumps": jumps, "guards": guards}
+        return SensitivityLaw(spec.modes, noise, drift, memory, replay, **more)
 
     def _auto(self, spec: AutoSpec) -> AutoLaw:
         return AutoLaw(spec.modes, self._noise(spec), gate=spec.gate or np.inf)

@@ -8,13 +8,18 @@ from typing import Annotated
 
 import typer
 
-from livepde.cli.options import JsonOption
+from livepde.cli.options import JsonOption, names_in
 from livepde.cli.printing import can_draw, named, report_outcome, terminal
 
 __all__ = ["bench"]
 
 ProblemsOption = Annotated[
-    list[str] | None, typer.Option("--only", help="Only this problem. Repeat it for more.")
+    list[str] | None,
+    typer.Option(
+        "--only",
+        help="Only this problem. Repeat it for more.",
+        autocompletion=names_in("livepde.bench.problems:PROBLEMS"),
+    ),
 ]
 
 LevelsOption = Annotated[
@@ -257,7 +262,10 @@ def faults(
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="One of file, mqtt, restart, malformed, messages. Repeat it."),
+        typer.Option(
+            help="One of file, mqtt, restart, malformed, messages. Repeat it.",
+            autocompletion=names_in("livepde.bench.faults:PARTS"),
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

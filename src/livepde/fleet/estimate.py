@@ -91,12 +91,9 @@ class FleetEstimate:
         """Return the estimate of one member, by name or number, as `Identifier.step` does."""
         k = name if isinstance(name, int) else self.members.index(name)
         notes = {key: float(values[k]) for key, values in self.notes.items()}
-        belief = self.belief(k)
         return Estimate(
             t=self.t,
-            q=belief.q,
-            u=belief.u,
-            belief=belief,
+            belief=self.belief(k),
             innovation=self.innovation[k],
             withheld_error=self.withheld_error[k],
             status=self.statuses[k],

@@ -36,7 +36,7 @@ REMEDY = "take a smaller gain or a smaller time step."
 
 @dataclass(frozen=True)
 class Weights:
-    """Numbers of the law; see `livepde.laws.coupled.Gains`."""
+    """Numbers of the law; see `livepde.laws.gains.Gains`."""
 
     gain: float
     nu: float

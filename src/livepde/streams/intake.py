@@ -14,7 +14,8 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 from livepde.errors import DataError, SampleError
-from livepde.streams.table import Clock, Column, channel_value, row_time
+from livepde.streams.clock import Clock
+from livepde.streams.table import Column, channel_value, row_time
 
 __all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark", "gather"]
 
