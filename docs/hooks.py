@@ -49,7 +49,8 @@ def command_line() -> str:
 def members(room: str) -> str:
     """Return a directive for mkdocstrings that shows what only this room exports."""
     names = [name for name in import_module(room).__all__ if name not in livepde.__all__]
-    options = {"show_root_heading": False, "show_root_toc_entry": False, "members": names}
+    hidden = {"show_root_heading": False, "show_root_toc_entry": False}
+    options = {"heading_level": 3, "members": names, **hidden}
     return f"::: {room}\n    options: {json.dumps(options)}\n"
 
 

@@ -275,6 +275,16 @@ def test_warnings_of_the_site_are_errors():
     assert "--quiet" not in command
 
 
+def test_a_site_that_loads_something_from_elsewhere_is_refused(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    links = importlib.import_module("links")
+    (tmp_path / "index.html").write_text('<script async src="https://a.b/c.js"></script>')
+    with pytest.raises(SystemExit, match=r"elsewhere:\n<script async src=.https://a\.b/c\.js"):
+        links.main(tmp_path)
+    text = '<a href="https://a.b">there</a> <script src="../c.js"></script> <img src="d.png">'
+    assert not links.LOADED.findall(text)
+
+
 def test_the_house_is_drawn_as_it_is_built():
     """The rows of the developers' page are the layers that `make check` holds, from the top."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
