@@ -1,7 +1,8 @@
-"""Pages that the program writes while the site is built: its command line, and the keys of a case.
+"""What the program writes into pages while the site is built, in the place of comments.
 
-Such a page holds a comment, `<!-- command line -->` or `<!-- keys of a case -->`, which is
-replaced.
+<!-- command line -->             the help of all commands
+<!-- keys of a case -->           tables of all keys of a case file
+<!-- members of livepde.ROOM -->  what a room exports beside what livepde itself does
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from importlib import import_module
 from typing import Any
 
+import livepde
 from livepde.cases.schema import CaseSpec
 
 Schema = Mapping[str, Any]
@@ -26,16 +29,28 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     for comment, write in WRITERS.items():
         if comment in markdown:
             markdown = markdown.replace(comment, write())
-    return markdown
+    return re.sub(r"<!-- members of (\S+) -->", lambda found: members(found[1]), markdown)
 
 
 def command_line() -> str:
     """Return the help of all commands, as Typer writes it."""
     command = [sys.executable, "-m", "typer", "livepde.cli", "utils", "docs", "--name", "livepde"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    text = done.stdout.split("\n\n", 1)[1]  # the page has a title of its own
+    text = done.stdout
+    # What every command has, and lists of commands with their words cut off, are of no use here.
+    text = re.sub(r"^\*\*Commands\*\*:\n\n(\*.*\n)+\n?", "", text, flags=re.MULTILINE)
+    text = text.replace("* `--help`: Show this message and exit.\n", "")
+    text = text.replace("**Options**:\n\n\n", "").split("\n\n", 1)[1]
+    # Examples are words to Typer: a line for each, and as code.
     example = r"^(.*?)(Example|Replay|Service|Parallel): +(\S.*)$"
     return re.sub(example, r"\1\n\n\2: `\3`", text, flags=re.MULTILINE)
+
+
+def members(room: str) -> str:
+    """Return a directive for mkdocstrings that shows what only this room exports."""
+    names = [name for name in import_module(room).__all__ if name not in livepde.__all__]
+    options = {"show_root_heading": False, "show_root_toc_entry": False, "members": names}
+    return f"::: {room}\n    options: {json.dumps(options)}\n"
 
 
 def keys_of_a_case() -> str:

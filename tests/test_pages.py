@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import doctest
+import importlib
 import io
 import json
 import os
@@ -282,6 +283,32 @@ def test_the_house_is_drawn_as_it_is_built():
     table = page[page.index("| room of") : page.index("What holds the rooms")]
     drawn = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.splitlines()[2:] if line]
     assert drawn == [re.findall(r"\w+", layer) for layer in layers]
+
+
+def test_pages_that_the_program_writes(monkeypatch):
+    """Every command with its options, and every key with what it may be."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    hooks = importlib.import_module("hooks")
+    assert hooks.on_page_markdown("as it is") == "as it is"
+    commands = hooks.on_page_markdown("<!-- command line -->")
+    program = get_command(app)
+    for name, command in program.commands.items():
+        section = commands[commands.index(f"## `livepde {name}`\n") :]
+        for inner in getattr(command, "commands", ()):
+            assert f"### `livepde {name} {inner}`\n" in section
+        for option in command.params:
+            name = max(option.opts, key=len)
+            assert name in section or not name.startswith("--") or option.hidden, name
+    assert "Example: `livepde run mycase/case.toml`\n" in commands
+    keys = hooks.on_page_markdown("<!-- keys of a case -->")
+    assert "| `prior` | a quantity | required |" in keys
+    assert '| `spacing` | `"uniform"` or `"geometric"` | `"uniform"` |' in keys
+    assert "| `start` | a date or a time |  |" in keys
+    assert "| `cells` | a whole number or [a whole number, a whole number] |  |" in keys
+    assert "## `[unknowns.NAME.evolution]`" in keys
+    assert '## `[law]`, `kind = "gradient"`' in keys
+    assert "| `replay` | true or false or a table | `false` |" in keys
+    assert "## `[[variants]]`" in keys
 
 
 def test_every_key_of_a_case_has_a_meaning():
