@@ -11,11 +11,12 @@ import subprocess
 import sys
 import sysconfig
 import zipfile
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1
+from skfem import ElementLineP1, MeshTri
 from typer.testing import CliRunner
 
 import livepde as lp
@@ -133,6 +134,7 @@ def test_the_description_says_names_units_and_times(unit):
     assert (getattr(able, "canGetAndSetFMUstate", 0) or able.canGetAndSetFMUState) is True
     assert able.canSerializeFMUstate if hasattr(able, "canSerializeFMUstate") else True
     assert "heated" in description.description
+    assert description.generationTool.startswith(f"livepde {lp.__version__} by PythonFMU")
 
 
 def test_a_simulation_runs_the_unit_as_users_do(rod, unit):
@@ -353,6 +355,79 @@ def test_a_case_with_code_asks_for_leave_and_takes_its_files_along(rod, tmp_path
     with running(unit, 0.0) as instance:
         for t, z in history(3):
             assert taken(instance, t, z)[4] == 0.0
+
+
+def test_a_case_takes_its_mesh_along(rod, tmp_path):
+    pytest.importorskip("meshio")
+    (tmp_path / "meshes").mkdir()
+    MeshTri().refined(2).scaled(0.4).save(tmp_path / "meshes" / "plate.msh")
+    shutil.copy(rod.with_name("rod.csv"), tmp_path)
+    text = re.sub(
+        r"\[mesh\].*?\[data\]",
+        '[mesh]\nfile = "meshes/plate.msh"\n\n[data]',
+        rod.read_text(),
+        flags=re.DOTALL,
+    )
+    text = re.sub(r"^T_(left|right|20) = .*\n", "", text, flags=re.MULTILINE)
+    text = text.replace('at = "10 cm"', 'at = ["10 cm", "10 cm"]')
+    text = text.replace('at = "30 cm"', 'at = ["30 cm", "10 cm"]')
+    case = tmp_path / "case.toml"
+    case.write_text(text.replace('initial = "interpolate"', 'initial = "20 degC"'))
+    unit = export_fmu(case, tmp_path / "plate.fmu")
+    assert "resources/process/plate.msh" in zipfile.ZipFile(unit).namelist()
+    (tmp_path / "meshes" / "plate.msh").rename(tmp_path / "gone.msh")
+    with running(unit, 0.0) as instance:
+        instance.set(["T_10", "T_30"], [20.0, 20.0])
+        instance.step(0.0, 20.0)
+        assert instance.get(["status", "T_10_model"]) == pytest.approx([0.0, 20.0])
+
+
+def test_files_of_one_name_do_not_fit_into_a_unit(rod, tmp_path):
+    shutil.copy(rod.with_name("rod.csv"), tmp_path)
+    for folder, code in (("a", "mine = EQUATIONS['heat']"), ("b", "def read(folder): ...")):
+        (tmp_path / folder).mkdir()
+        text = f"from livepde.models import EQUATIONS\n{code}\n"
+        (tmp_path / folder / "own.py").write_text(text)
+    text = rod.read_text().replace('equation = "heat"', 'equation = "a/own.py:mine"')
+    text = re.sub(r"^file = .*$", 'reader = "b/own.py:read"', text, flags=re.MULTILINE)
+    case = tmp_path / "case.toml"
+    case.write_text(text)
+    with pytest.raises(lp.ConfigurationError, match="holds another file of that name"):
+        recipe_of(load(case, allow_code=True))
+
+
+def test_a_case_without_data_becomes_a_unit(rod, tmp_path):
+    case = tmp_path / "case.toml"
+    case.write_text(re.sub(r"^file = .*\n", "", rod.read_text(), flags=re.MULTILINE))
+    unit = export_fmu(case, tmp_path / "rod.fmu")
+    assert fmpy.read_model_description(str(unit)).defaultExperiment is None
+    with running(unit, 400.0) as instance:  # it begins when the other program does
+        found = [taken(instance, 400.0 + t, z) for t, z in history(3)]
+    assert [row[-1] for row in found] == [0.0, 0.0, 0.0]
+    with pytest.raises(lp.CaseError, match=r"data\.file is missing"):
+        compare_fmu(unit, load(case))
+
+
+def test_dates_of_the_case_hold_in_the_unit(rod, tmp_path):
+    header, *rows = rod.with_name("rod.csv").read_text().splitlines()
+    begin = datetime(2025, 4, 1)
+    dated = [header]
+    for row in rows[:80]:
+        seconds, _, rest = row.partition(",")
+        dated.append(f"{begin + timedelta(seconds=float(seconds))},{rest}")
+    (tmp_path / "rod.csv").write_text("\n".join(dated))
+    text = rod.read_text().replace('time_unit = "s"', "assimilate_from = 2025-04-01T00:10:00")
+    case = tmp_path / "case.toml"
+    case.write_text(text)
+    unit = export_fmu(case, tmp_path / "rod.fmu")
+    found = compare_fmu(unit, load(case))
+    assert found.samples == 80
+    assert found.largest <= 1e-10
+    component = Component(recipe_of(load(case)).process)
+    for t, z in history(32):
+        component.inputs = z
+        component.take(t)
+        assert (component.outputs[1] == 5e-5) == (t < 600.0)
 
 
 def test_bad_input_is_one_sentence(rod, tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
+from livepde import __version__
 from livepde.cases.units import in_si
 from livepde.exchange.component import Component
 from livepde.exchange.process import STATUS, Output, Process
@@ -95,6 +96,7 @@ class IdentifierSlave:
         """Return the description of the unit, with what the exporter leaves out."""
         root: Element = super().to_xml(*options)  # type: ignore[misc]
         root.set("variableNamingConvention", "flat")
+        root.set("generationTool", f"livepde {__version__} by {root.get('generationTool')}")
         if any(self._units.values()):
             root.insert(1, _definitions(set(self._units.values()) - {""}))
         for variable in root.findall("ModelVariables/*"):
