@@ -94,7 +94,13 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
     path.write_bytes(EXCEL.replace("Zeit", "Uhr ü").encode(encoding))
     clock, how = replace(GERMAN, name="Uhr ü"), {"separator": ";"}
     if encoding in ("cp1252", "utf-16"):
-        with pytest.raises(DataError, match=f"row 1.: say encoding = '{encoding}'"):
+        with pytest.raises(DataError) as error:
+            read_csv(path, COLUMNS, Clock("Uhr ü"))
+        assert str(error.value).endswith(
+            f"in row 1): say encoding = '{encoding}', separator = ';', decimal = ',' and "
+            "time_format = '%d.%m.%Y %H:%M'; or save it as 'CSV UTF-8'."
+        )
+        with pytest.raises(DataError, match=f": say encoding = '{encoding}'; or save it"):
             read_csv(path, COMMAS, clock, **how)
         how["encoding"] = encoding
     table = read_csv(path, COMMAS, clock, **how)
@@ -206,6 +212,7 @@ def test_json_lines_with_dates_and_bounds(tmp_path):
     ("line", "named"),
     [
         ("not json", "is not JSON"),
+        ('{"t": "later", "a": 1}', "got 'later'; expected a number, as in the other rows"),
         ("[1, 2]", "expected an object"),
         ('{"time": 1}', "there is no 't'"),
         ('{"t": 1, "a": "warm"}', "line 2, 'a': got 'warm'"),

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
 import copy
+import gc
 import importlib
+import sys
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
+from livepde import __version__
 from livepde.cases.units import in_si
 from livepde.exchange.component import Component
 from livepde.exchange.process import STATUS, Output, Process
@@ -18,6 +22,11 @@ from livepde.exchange.recipe import opened
 __all__ = ["FOLDER", "IdentifierSlave"]
 
 FOLDER = "process"  # of the resources
+
+if not sys.orig_argv:
+    # In a program that is no Python the exporters end the interpreter from a thread of their own,
+    # and its last collection of cycles crashes. The program ends or goes on: nothing is lost.
+    atexit.register(gc.freeze)
 
 
 class IdentifierSlave:
@@ -47,7 +56,8 @@ class IdentifierSlave:
     def _kit(self, name: str) -> Any:
         """Return something of the exporter: DefaultExperiment, or {}Status as Fmi2Status."""
         exporter = "pythonfmu" if self.fmi == 2 else "pythonfmu3"
-        return getattr(importlib.import_module(exporter), name.format(f"Fmi{self.fmi}"))
+        module = f"{exporter}.enums" if name == "{}Status" else exporter
+        return getattr(importlib.import_module(module), name.format(f"Fmi{self.fmi}"))
 
     def _register(self, process: Process) -> None:
         causality, variability = self._kit("{}Causality"), self._kit("{}Variability")
@@ -86,6 +96,7 @@ class IdentifierSlave:
         """Return the description of the unit, with what the exporter leaves out."""
         root: Element = super().to_xml(*options)  # type: ignore[misc]
         root.set("variableNamingConvention", "flat")
+        root.set("generationTool", f"livepde {__version__} by {root.get('generationTool')}")
         if any(self._units.values()):
             root.insert(1, _definitions(set(self._units.values()) - {""}))
         for variable in root.findall("ModelVariables/*"):

@@ -145,6 +145,7 @@ def running(unit: str | Path, start: float) -> Iterator[Instance]:
     """
     try:
         import fmpy
+        from fmpy.fmi1 import FMICallException
     except ImportError:
         raise ConfigurationError("Running a unit needs FMPy: pip install fmpy.") from None
     messages: list[str] = []
@@ -156,7 +157,9 @@ def running(unit: str | Path, start: float) -> Iterator[Instance]:
     try:
         try:
             description = fmpy.read_model_description(folder)
-            fmu = fmpy.instantiate_fmu(folder, description, "CoSimulation", logger=heard)
+            fmu = fmpy.instantiate_fmu(
+                folder, description, "CoSimulation", debug_logging=True, logger=heard
+            )
         except Exception as error:
             raise RunError(f"{unit} does not run: {' '.join([*messages, str(error)])}.") from error
         try:
@@ -170,7 +173,7 @@ def running(unit: str | Path, start: float) -> Iterator[Instance]:
             fmu.terminate()
         finally:
             fmu.freeInstance()
-    except fmpy.FMICallException as error:
+    except FMICallException as error:
         raise RunError(f"{unit} does not run: {' '.join([*messages, str(error)])}.") from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)

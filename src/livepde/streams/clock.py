@@ -97,9 +97,24 @@ class Clock:
         return float(value)
 
 
-def read_times(cells: list[Any], clock: Clock, where: Callable[[int], str]) -> tuple[Array, bool]:
-    """Return times in the model's unit, and whether they are dates; `where` names a cell."""
-    dates = _are_dates(cells, clock)
+def read_times(
+    cells: list[Any], clock: Clock, where: Callable[[int], str], before: bool | None = None
+) -> tuple[Array, bool]:
+    """Return times in the model's unit, and whether they are dates.
+
+    Parameters
+    ----------
+    where
+        Names a cell.
+    before
+        Whether earlier ones were dates, if there were any.
+
+    Raises
+    ------
+    SampleError
+        A time that cannot be read, with the likely remedy.
+    """
+    dates = _are_dates(cells, clock, before)
     times = np.empty(len(cells))
     for k, cell in enumerate(cells):
         value = clock.stamp(cell, clock.format) if dates else number_of(cell, clock.decimal)
@@ -139,8 +154,8 @@ def guessed_format(text: str) -> str:
         return guess_datetime_format(text.strip(), dayfirst="." in text[:5]) or ""
 
 
-def _are_dates(cells: list[Any], clock: Clock) -> bool:
-    """Return whether times are dates: the first one tells, or if it is nothing at all the most."""
+def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
+    """Return whether times are dates: the first tells; if it is neither, those before, or most."""
 
     def number(cell: Any) -> bool:
         return number_of(cell, clock.decimal) is not None
@@ -152,6 +167,8 @@ def _are_dates(cells: list[Any], clock: Clock) -> bool:
         return True
     if number(first) or clock.stamp(first) is not None:
         return not number(first)
+    if before is not None:
+        return before
     return 2 * sum(map(number, cells)) < len(cells)
 
 

@@ -12,7 +12,14 @@ import numpy as np
 
 from livepde.errors import DataError, SampleError
 from livepde.linalg import Array
-from livepde.streams.clock import POINT, Clock, has_decimal_comma, read_times
+from livepde.streams.clock import (
+    POINT,
+    Clock,
+    guessed_format,
+    has_decimal_comma,
+    number_of,
+    read_times,
+)
 from livepde.streams.names import check_columns, no_file
 from livepde.streams.table import Column, Table, cell_number, to_table
 
@@ -61,7 +68,7 @@ def read_csv(
     how: dict[str, Any] = {"skipinitialspace": True, "sep": separator, "encoding": encoding}
     try:
         header = list(pd.read_csv(path, nrows=0, **how).columns)
-        _check_separator(path, header, separator, encoding)
+        _check_separator(path, header, separator, encoding, clock)
         check_columns(str(path), needed, header)
         _check_widths(path, len(header), separator, encoding)
         frame = pd.read_csv(
@@ -75,7 +82,7 @@ def read_csv(
     except FileNotFoundError:
         raise no_file(path) from None
     except UnicodeError as error:
-        raise _not_text(path, encoding) from error
+        raise _not_text(path, separator, encoding, clock) from error
     except (OSError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
     blank = (frame == "").all(axis=1)
@@ -98,20 +105,36 @@ def read_csv(
     return to_table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
 
 
-def _check_separator(path: Path, header: list[str], separator: str, encoding: str) -> None:
+def _check_separator(
+    path: Path, header: list[str], separator: str, encoding: str, clock: Clock
+) -> None:
     """Refuse a header that another separator would divide."""
-    if len(header) > 1:
-        return
-    for other in SEPARATORS:
-        if other != separator and header and other in header[0]:
-            with path.open(encoding=encoding) as file:
-                cells = file.read(LOOK).partition("\n")[2].partition("\n")[0].split(other)
-            commas = other != "," and any(map(has_decimal_comma, cells))
-            raise SampleError(
-                f"{path}: the header is one field with {separator!r} between fields, and "
-                f"{header[0].count(other) + 1} with {other!r}: say separator = {other!r}"
-                + (" and decimal = ','." if commas else ".")
-            )
+    others = [other for other in SEPARATORS if other != separator and other in header[0]]
+    if len(header) == 1 and others:
+        raise SampleError(
+            f"{path}: the header is one field with {separator!r} between fields, and "
+            f"{header[0].count(others[0]) + 1} with {others[0]!r}: "
+            f"say {_as_written(path, others[0], encoding, clock, f'separator = {others[0]!r}')}."
+        )
+
+
+def _as_written(path: Path, separator: str, encoding: str, clock: Clock, known: str) -> str:
+    """Return what to say of how a file is written: what is known, and how two lines of it look."""
+    with path.open(encoding=encoding, errors="replace") as file:
+        header, row, *_ = [*file.read(LOOK).splitlines(), "", ""]
+    said = [known]
+    other = max(SEPARATORS, key=header.count)
+    if separator not in header and other in header:
+        separator = other
+        said.append(f"separator = {separator!r}")
+    cells = row.split(separator)
+    if clock.decimal == "." and any(map(has_decimal_comma, cells)):
+        said.append("decimal = ','")
+    texts = (c for c in cells if number_of(c, ",") is None and clock.stamp(c) is None)
+    formats = list(filter(None, map(guessed_format, texts)))
+    if formats and not clock.format:
+        said.append(f"time_format = {formats[0]!r}")
+    return " and ".join(filter(None, (", ".join(said[:-1]), said[-1])))
 
 
 def _check_widths(path: Path, width: int, separator: str, encoding: str) -> None:
@@ -125,7 +148,7 @@ def _check_widths(path: Path, width: int, separator: str, encoding: str) -> None
                 )
 
 
-def _not_text(path: Path, encoding: str) -> DataError:
+def _not_text(path: Path, separator: str, encoding: str, clock: Clock) -> DataError:
     """Return an error about a file that is no text in this encoding."""
     content, row, byte = path.read_bytes(), 1, ""
     try:
@@ -134,9 +157,10 @@ def _not_text(path: Path, encoding: str) -> DataError:
         row, byte = content.count(b"\n", 0, error.start) + 1, f"byte 0x{content[error.start]:02x} "
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     likely = "utf-16" if wide else "cp1252" if encoding == UTF_8 else "utf-8"
+    said = _as_written(path, separator, likely, clock, f"encoding = {likely!r}")
     return DataError(
         f"{path} is not text in {encoding.removesuffix('-sig').upper()} ({byte}in row {row}): say "
-        f"encoding = '{likely}', or save it as 'CSV UTF-8'."
+        f"{said}; or save it as 'CSV UTF-8'."
     )
 
 

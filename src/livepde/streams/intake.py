@@ -283,7 +283,7 @@ class Intake:
 
     def _time(self, row: Mapping[str, Any]) -> float | None:
         """Return the time of a row, None if it is outside of what is used."""
-        t, dates = row_time(row, self.clock)
+        t, dates = row_time(row, self.clock, before=self._dates)
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
             return None

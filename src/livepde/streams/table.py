@@ -271,14 +271,14 @@ class JsonLines:
         self.origin: datetime | None = None
 
     def __iter__(self) -> Iterator[Sample]:
-        clock, kept, last = self._clock, 0, -math.inf
+        clock, kept, last, dates = self._clock, 0, -math.inf, None
         zero: float | None = None
         for number, line in enumerate(self._lines, start=1):
             if not line.strip():
                 continue
             where = f"{self._where}, line {number}"
             row = _object(line, where)
-            t, dates = row_time(row, clock, where)
+            t, dates = row_time(row, clock, where, dates)
             low, high = clock.bounds(dates, self._where)
             if t > high:
                 return
@@ -309,11 +309,16 @@ class JsonLines:
                 yield Sample(t - zero, values)
 
 
-def row_time(row: Mapping[str, Any], clock: Clock, where: str = "row") -> tuple[float, bool]:
-    """Return the time of a row in the model's unit, and whether it is a date (then since 1970)."""
+def row_time(
+    row: Mapping[str, Any], clock: Clock, where: str = "row", before: bool | None = None
+) -> tuple[float, bool]:
+    """Return the time of a row in the model's unit, and whether it is a date (then since 1970).
+
+    `before`: whether the times of earlier rows were dates.
+    """
     if clock.name not in row:
         raise SampleError(f"{where}: there is no '{clock.name}'{hint(clock.name, list(row))}")
-    times, dates = read_times([row[clock.name]], clock, lambda _: f"{where},")
+    times, dates = read_times([row[clock.name]], clock, lambda _: f"{where},", before)
     return float(times[0]), dates
 
 
