@@ -22,6 +22,7 @@ DOCUMENTED = (
     ".cases",
     ".runs",
     ".dashboard",
+    ".exchange",
     ".reproduce",
     ".plots",
     ".streams",
