@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -21,9 +21,6 @@ from livepde.cli.printing import (
     show,
     terminal,
 )
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["demo", "reproduce"]
 
