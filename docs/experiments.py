@@ -64,7 +64,7 @@ class Sketch:
     """
 
     row: str
-    heading: str = "$^"
+    heading: str = "(?!)"  # never
     scale: str = "log"
     last: bool = False
 
