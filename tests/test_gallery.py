@@ -69,7 +69,7 @@ def test_every_script_has_a_figure_what_it_prints_and_its_command(name, maker):
     assert f"`python experiments/{name}.py" in text
     kept = (FOLDER / "experiments" / f"{name}.txt").read_text(encoding="utf-8")
     assert maker.drawn(name, kept) is not None
-    assert f"    {kept.strip(chr(10)).splitlines()[0]}" in text
+    assert f"    {maker.shown(name, kept).splitlines()[0]}" in text
 
 
 @pytest.mark.parametrize("name", PROGRAMS)
@@ -88,6 +88,9 @@ def test_a_table_becomes_dots(maker):
     drawn = [line.get_xdata().tolist() for line in axes.lines if len(line.get_xdata())]
     assert drawn[0] == [2.93]
     assert maker.drawn("ten_lines", text) is None
+    text = "single run: 1.0\n\nexample  auto\nseed   0%  0.5  0.4  1.25"
+    assert maker.shown("auto_gain", text).splitlines()[0] == "example  auto"
+    assert maker.shown("jumps", "row\n" * 100).endswith("... (55 lines more)")
 
 
 def test_a_picture_becomes_small(maker, tmp_path):
