@@ -39,7 +39,7 @@ test: $(READY)  ## Run all tests and doctests, with coverage
 	@$(BIN)/pytest --cov --numprocesses auto --maxprocesses 8 --dist loadfile
 
 mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment of its own
-	@.venv-petsc/bin/python -c 'import petsc4py, livepde, pytest' 2>/dev/null || deploy/petsc.sh .venv-petsc
+	@.venv-petsc/bin/python -c 'import petsc4py, pytest, livepde; livepde.Model' 2>/dev/null || deploy/petsc.sh .venv-petsc
 	@.venv-petsc/bin/python -m pip --disable-pip-version-check --quiet install pytest
 	@.venv-petsc/bin/python -m pytest --quiet tests/test_parallel.py
 

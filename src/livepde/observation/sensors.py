@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Predicate
-from livepde.fem.blocks import Measure
+from livepde.fem.measure import Measure
 from livepde.linalg import Array
 from livepde.observation.base import Direct, Observation
 
