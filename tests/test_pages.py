@@ -43,6 +43,7 @@ from livepde.reproduce import EXPERIMENTS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
 FENCE = re.compile(
     r'^```(?P<kind>\w*)(?: title="(?P<title>[^"]+)")?\n(?P<text>.*?)^```$',
     re.MULTILINE | re.DOTALL,
@@ -212,6 +213,8 @@ def test_every_block_is_of_a_kind_that_runs(page):
         assert hasattr(Session, f"_{block.kind}"), f"line {block.above}: '{block.kind}'"
         for command in block.commands if block.kind == "sh" else ():
             known = command.startswith(("livepde ", "python ")) or _stands_elsewhere(command)
+            if command.startswith("make "):
+                known = re.search(rf"^{command.split()[1]}:", MAKEFILE, re.MULTILINE)
             assert known, f"line {block.above}: what tests '{command}'? Say it in ELSEWHERE."
 
 
@@ -245,6 +248,8 @@ def test_what_a_page_names_is_there(page):
             assert is_a_test(name), name
         elif re.fullmatch(r"(python )?(experiments|examples|cases)/[a-z_0-9]+\.(py|toml)", name):
             assert (ROOT / words[-1]).exists(), name
+        elif words[0] == "make" and words[1:] and words[1].islower():
+            assert re.search(rf"^{words[1]}:", MAKEFILE, re.MULTILINE), name
         elif words[0] == "livepde" and words[1:] and words[1].islower():
             assert words[1] in program.commands, name
             if words[1] == "bench" and words[2:]:
@@ -270,7 +275,7 @@ def test_links_of_pages_outside_of_the_site_lead_somewhere(name):
 
 def test_warnings_of_the_site_are_errors():
     """--quiet hides them from --strict, too: then nothing would be one."""
-    (command,) = re.findall(r"mkdocs build.*", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    (command,) = re.findall(r"mkdocs build.*", MAKEFILE)
     assert "--strict" in command
     assert "--quiet" not in command
 

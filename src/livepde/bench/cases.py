@@ -36,7 +36,7 @@ from livepde.stepping import ForwardStage, Interval, advance
 __all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run_job"]
 
 GALLERY = """\
-# Gallery
+# Gallery: cases
 
 Every case on measurements or fields that others published, with its variants: what was estimated,
 the deviation that the law states, what others found, and the checks of the case. Written by
