@@ -1,15 +1,16 @@
 """Make docs/gallery/experiments.md, with: python docs/experiments.py [NAME ...].
 
-Runs what `livepde reproduce` knows, the scripts of experiments/ and the programs of examples/, each
-by the name of its experiment or file; without names all of them, which takes an hour. What they
-print and draw is kept in docs/gallery/experiments/, and the page is made of all that is there.
-`--draw` runs nothing. The data of the cases are read from $LIVEPDE_DATA.
+Runs what `livepde reproduce` knows, `livepde bench control`, the scripts of experiments/ and the
+programs of examples/, each by the name of its experiment or file; without names all of them, which
+takes hours. What they print and draw is kept in docs/gallery/experiments/, and the page is made of
+all that is there. `--draw` runs nothing. The data of the cases are read from $LIVEPDE_DATA.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import json
 import re
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from pathlib import Path
 from textwrap import indent
 
 from matplotlib.figure import Figure
+from performance import report
 from PIL import Image
 
 from livepde.plots import PALETTE, figure
@@ -39,8 +41,10 @@ What the paper shows, what follows from it, and what needs the truth or hindsigh
 must never see. Each with its figure, its table and its command. Written by `python
 docs/experiments.py`. The cases on data of others have [a page of their own](gallery.md).
 """
+BENCHES = ("control",)  # benchmarks that draw
 PARTS = {
     "reproduce": "Published and stated experiments; commands and tests check their bounds.",
+    "benchmarks": "What is held against others; the page of the benchmark has more.",
     "experiments": "Scripts that use the truth or hindsight. A dot is a number of the table below.",
     "examples": "Programs to start from.",
 }
@@ -159,7 +163,14 @@ def run(name: str) -> None:
             out = Path(folder) / "run"
             command = [sys.executable, "-m", "livepde", "reproduce", name, "--out", str(out)]
             subprocess.run(command, check=False)  # a bound that is missed is said in the report
-            keep(name, out)
+            keep(name, out, (out / "report.md").read_text(encoding="utf-8"))
+        return
+    if name in BENCHES:
+        with tempfile.TemporaryDirectory() as folder:
+            command = [sys.executable, "-m", "livepde", "bench", name, "--draw", folder, "--json"]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+            content = json.loads(done.stdout)
+            keep(name, Path(folder), report(content["command"], content))
         return
     script = scripts()[name]
     command = [sys.executable, str(script), *OPTIONS.get(name, ())]
@@ -167,12 +178,12 @@ def run(name: str) -> None:
     (KEPT / f"{name}.txt").write_text(done.stdout, encoding="utf-8")
 
 
-def keep(name: str, out: Path) -> None:
-    """Keep the report of a run directory, and its figures, smaller."""
-    text = (out / "report.md").read_text(encoding="utf-8")
+def keep(name: str, out: Path, text: str) -> None:
+    """Keep a report, and the figures of a folder, smaller."""
+    text = re.sub(r"^!\[.*\]\(.*\)$\n?", "", text, flags=re.MULTILINE)
     for path in sorted(out.glob("*.png")):
         small(path, KEPT / f"{name}-{path.name}")
-        text = text.replace(f"({path.name})", f"({name}-{path.name})")
+        text += f"\n![{path.stem}]({name}-{path.name})\n"
     (KEPT / f"{name}.txt").write_text(text, encoding="utf-8")
 
 
@@ -195,14 +206,14 @@ def scripts() -> dict[str, Path]:
 
 def page() -> str:
     """Return the page of all that is kept."""
+    files = scripts()
     parts = [HEAD]
     for title, words in PARTS.items():
-        parts.append(f"## {title.capitalize()}\n\n{words}\n")
-        if title == "reproduce":
-            parts += [_report(name) for name in EXPERIMENTS if _kept(name).exists()]
-        else:
-            mine = [path for path in scripts().values() if path.parent.name == title]
-            parts += [_script(path) for path in mine if _kept(path.stem).exists()]
+        names = [name for name, path in files.items() if path.parent.name == title]
+        names = {"reproduce": [*EXPERIMENTS], "benchmarks": [*BENCHES]}.get(title, names)
+        kept = [name for name in names if _kept(name).exists()]
+        parts += [f"## {title.capitalize()}\n\n{words}\n"] if kept else []
+        parts += [_script(files[name]) if name in files else _report(name) for name in kept]
     return "\n".join(parts)
 
 
@@ -218,7 +229,10 @@ def _report(name: str) -> str:
     rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE)
     shown = [f"![{Path(one).stem}](experiments/{one})" for one in pictures]
     rest = re.sub(r"^## (.*)$", r"**\1**", rest, flags=re.MULTILINE)
-    lines = [f"### {name}", title, f"`livepde reproduce {name}`", *shown, rest.strip()]
+    command = f"livepde {'bench' if name in BENCHES else 'reproduce'} {name}"
+    lines = [f"### {name}", f"`{command}`", *shown, rest.strip()]
+    if title != command:
+        lines.insert(1, title)
     return "\n\n".join(lines) + "\n"
 
 
@@ -241,11 +255,13 @@ def _script(path: Path) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run what is named, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", choices=[[], *EXPERIMENTS, *scripts()], metavar="NAME")
+    parser.add_argument(
+        "names", nargs="*", choices=[[], *EXPERIMENTS, *BENCHES, *scripts()], metavar="NAME"
+    )
     parser.add_argument("--draw", action="store_true", help="run nothing")
     chosen = parser.parse_args(arguments)
     KEPT.mkdir(exist_ok=True)
-    for name in () if chosen.draw else chosen.names or (*EXPERIMENTS, *scripts()):
+    for name in () if chosen.draw else chosen.names or known:
         run(name)
     PAGE.write_text(page(), encoding="utf-8")
 

@@ -26,7 +26,7 @@ from livepde.runs.directory import markdown
 DOCS = Path(__file__).resolve().parent
 MEASURED = DOCS / "performance"
 SUITE = DOCS.parent / "benchmarks" / "suite" / "costs.py"
-BENCHES = ("step", "memory", "scale", "mpi", "fleet")
+BENCHES = ("step", "memory", "scale", "mpi", "fleet", "import")
 SIZED = ("step", "scale")  # take --size
 MEMORY_SIZES = (10_000, 40_000)
 LAWS = ("gradient", "sensitivity")
@@ -180,8 +180,8 @@ def _finished(ax: Axes, title: str, what: str) -> None:
         ax.legend(fontsize="small", frameon=False)
 
 
-def section(name: str, content: Mapping[str, Any]) -> str:
-    """Return what a benchmark has printed as a part of the page."""
+def report(title: str, content: Mapping[str, Any]) -> str:
+    """Return what a command has printed as JSON as a report in Markdown."""
     shown = [Table(item["title"], item["columns"], item["rows"]) for item in content["tables"]]
     checks = [
         Check(
@@ -192,8 +192,13 @@ def section(name: str, content: Mapping[str, Any]) -> str:
         )
         for item in content["checks"]
     ]
+    return markdown(title, shown, checks, content["notes"]).replace("| None |", "| – |")
+
+
+def section(name: str, content: Mapping[str, Any]) -> str:
+    """Return what a benchmark has printed as a part of the page."""
     title = f"livepde bench {name}" if name != "memory" else "Memory"
-    text = markdown(title, shown, checks, content["notes"]).replace("| None |", "| – |")
+    text = report(title, content)
     lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
     commands = "\n".join(content["commands"])
     return "\n".join([lines[0], "", f"```sh\n{commands}\n```", *lines[1:]]) + "\n"

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -22,11 +21,9 @@ LARGEST = 150_000  # bytes of a picture
 @pytest.fixture(scope="module")
 def maker():
     """The program that makes the page of experiments."""
-    spec = importlib.util.spec_from_file_location("maker", ROOT / "docs" / "experiments.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # its dataclass looks there
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "docs"))
+        return importlib.import_module("experiments")
 
 
 def part(page, heading):

@@ -58,6 +58,7 @@ ELSEWHERE = {
     "test_pages.py": ["make", "python3 -m venv .venv", ". .venv/bin/activate", "pip install"],
     "test_cli.py": ["livepde bench step"],
     "test_schur.py": ["livepde bench scale"],
+    "test_public.py::test_the_benchmark_of_the_import": ["livepde bench import"],
     "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["livepde bench fleet"],
     "test_benchmarks.py::test_steps_are_ratios": ["python benchmarks/suite/costs.py"],
     "test_cli_fleet.py::test_each_row_is_a_run_of_its_own": ["livepde fleet mycase"],
@@ -250,7 +251,7 @@ def test_what_a_page_names_is_there(page):
             assert (ROOT / words[-1]).exists(), name
         elif words[0] == "make" and words[1:] and words[1].islower():
             assert re.search(rf"^{words[1]}:", MAKEFILE, re.MULTILINE), name
-        elif words[0] == "livepde" and words[1:] and words[1].islower():
+        elif words[0] == "livepde" and words[1:] and re.fullmatch(r"[a-z]+", words[1]):
             assert words[1] in program.commands, name
             if words[1] == "bench" and words[2:]:
                 assert words[2] in program.commands["bench"].commands, name
