@@ -255,9 +255,8 @@ def _script(path: Path) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run what is named, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "names", nargs="*", choices=[[], *EXPERIMENTS, *BENCHES, *scripts()], metavar="NAME"
-    )
+    known = [*EXPERIMENTS, *BENCHES, *scripts()]
+    parser.add_argument("names", nargs="*", choices=[[], *known], metavar="NAME")
     parser.add_argument("--draw", action="store_true", help="run nothing")
     chosen = parser.parse_args(arguments)
     KEPT.mkdir(exist_ok=True)
