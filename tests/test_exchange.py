@@ -527,8 +527,9 @@ def test_the_unit_runs_in_a_program_that_is_no_python(rod, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     found = [[float(word) for word in line.split()] for line in done.stdout.splitlines()]
+    assert found[:10] == found[10:]  # the second run
     component = Component(recipe_of(load(rod)).process)
-    for (t, z), shown in zip(history(10), found, strict=True):
+    for (t, z), shown in zip(history(10), found[:10], strict=True):
         component.inputs = z
         component.take(t)
         assert component.outputs[1:3] == pytest.approx(shown, rel=1e-10)
