@@ -656,13 +656,13 @@ def test_rivers_checks_that_fit():
 
 
 def test_the_page_shows_a_controller_in_three_lines():
-    """It runs with all blocks of the pages, in test_examples.py; here it must act, too."""
+    """All blocks run in test_pages.py; here it must act, too."""
     page = (Path(__file__).parents[1] / "docs" / "exchange.md").read_text()
     blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     (loop,) = (block for block in blocks if "on_estimate" in block)
     assert len([line for line in loop.splitlines() if line]) == 3
     namespace = {}
-    for block in blocks[1 : blocks.index(loop) + 1]:
+    for block in blocks[: blocks.index(loop) + 1]:
         exec(block, namespace)
     result = namespace["result"]
     data = result.to_xarray()
