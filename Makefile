@@ -85,12 +85,10 @@ docs: $(READY)  ## Build the documentation into site/
 bench: $(READY)  ## Measure what one step costs
 	@$(BIN)/livepde bench step
 
-lock:  ## Renew constraints.txt from pyproject.toml with the newest versions
-	@$(PYTHON) -m venv --clear .venv-lock
-	@.venv-lock/bin/python -m pip --disable-pip-version-check --quiet install -e ".[dev]"
-	@.venv-lock/bin/python -m pip --disable-pip-version-check freeze --exclude-editable > constraints.txt
-	@rm -rf .venv-lock
-	@echo "Renewed constraints.txt: read the difference, then run 'make check test'."
+lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest versions
+	@$(UV) pip compile --quiet --upgrade --python $(BIN)/python --extra dev --no-header --no-annotate \
+	  --output-file constraints.txt pyproject.toml
+	@echo "Renewed constraints.txt: read the difference, then run 'make check test versions'."
 
 clean:  ## Remove caches and build products (not .venv)
 	@rm -rf build dist site htmlcov .coverage .coverage.* .hypothesis

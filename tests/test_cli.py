@@ -10,6 +10,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -300,7 +301,7 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     assert call("run", rod, "--out", "whole")[0] == 0
     whole = runs.open("whole").dataset
     shutil.copytree("whole", "cut")
-    with sqlite3.connect("cut/journal.sqlite") as journal:
+    with closing(sqlite3.connect("cut/journal.sqlite")) as journal, journal:
         journal.execute("DELETE FROM checkpoints")
         journal.execute("DELETE FROM samples WHERE id > 60")
         journal.execute("DELETE FROM estimates WHERE id > 59")

@@ -10,7 +10,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -465,7 +465,7 @@ def rewrite_layout(path: Path, **changes) -> None:
     """Change the layout of a journal as somebody might who means harm."""
     import sqlite3
 
-    with sqlite3.connect(path) as db:
+    with closing(sqlite3.connect(path)) as db, db:
         (content,) = db.execute("SELECT value FROM meta WHERE key = 'layout'").fetchone()
         layout = {**json.loads(content), **changes}
         db.execute("UPDATE meta SET value = ? WHERE key = 'layout'", (json.dumps(layout),))

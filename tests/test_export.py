@@ -269,7 +269,9 @@ def volume(points, kind, corners) -> float:
 
 def test_pandas_opens_what_is_over_time(rod, tmp_path):
     export(rod, tmp_path / "rod.csv")
-    found = pd.read_csv(tmp_path / "rod.csv", parse_dates=["date"], float_precision="round_trip")
+    found = pd.read_csv(tmp_path / "rod.csv", parse_dates=["date"], dtype=str)
+    numbers = [name for name in found if name.endswith("]")]
+    found[numbers] = found[numbers].astype(float)  # exactly, as no parser of pandas 2 does
     data = rod.dataset
     assert found["date"].iloc[1] == pd.Timestamp("2025-04-01 06:01")
     assert np.array_equal(found["time [s]"], data["time"])

@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +49,7 @@ def finished(folder: Path, count: int = 30) -> Path:
 
 def content(path: Path) -> dict[str, dict[int, tuple]]:
     """Return all that a journal holds, row by row."""
-    with sqlite3.connect(f"file:{path}?mode=ro", uri=True) as raw:
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as raw:
         tables = ("samples", "estimates", "fields", "events")
         return {name: {r[0]: r for r in raw.execute(f"SELECT * FROM {name}")} for name in tables}
 
@@ -178,7 +178,7 @@ def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path)
     kept = len(run.journal)
     run.journal.close()
     assert 0 < kept < 600
-    with sqlite3.connect(full / NAME) as raw:
+    with closing(sqlite3.connect(full / NAME)) as raw:
         assert raw.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     again = started(full, 600)
     again.resume()

@@ -19,7 +19,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import STATUS_CODES
 from livepde.result import Estimate, Result, unknown_of, vertex_order
-from livepde.samples import Sample
+from livepde.samples import Sample, number
 from livepde.streams import Column
 from livepde.streams.table import channel_value
 
@@ -59,7 +59,8 @@ class Port:
 
     def taken(self, value: float, missing: frozenset[float]) -> float:
         """Return a value in the unit of the model, NaN if it is missing or not valid."""
-        found = channel_value(self.column, {self.name: value}, missing, "input")
+        given = number(value, f"input '{self.name}'")
+        found = channel_value(self.column, {self.name: given}, missing)
         low, high = self.column.valid
         return found if low <= found <= high else math.nan
 

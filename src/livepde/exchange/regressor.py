@@ -92,12 +92,6 @@ def river_regressor(identifier: Identifier, time: str = "t") -> Any:
     ------
     ConfigurationError
         River is missing.
-
-    Examples
-    --------
-    >>> from river import evaluate, metrics  # doctest: +SKIP
-    >>> model = river_regressor(identifier)  # doctest: +SKIP
-    >>> evaluate.progressive_val_score(samples, model, metrics.MAE())  # doctest: +SKIP
     """
     try:
         from river import base

@@ -24,8 +24,9 @@ __all__ = ["FOLDER", "IdentifierSlave"]
 FOLDER = "process"  # of the resources
 
 if not sys.orig_argv:
-    # In a program that is no Python the exporters end the interpreter from a thread of their own,
-    # and its last collection of cycles crashes. The program ends or goes on: nothing is lost.
+    # In a program that is no Python the exporters end the interpreter from a thread of their own;
+    # its last collection of cycles has crashed there, which depends on what lies where in memory.
+    # The program ends or goes on: nothing is lost.
     atexit.register(gc.freeze)
 
 

@@ -150,7 +150,7 @@ class Journal:
             "layout": json.dumps(layout.to_dict()),
         }
         if path is None:
-            connection = sqlite3.connect(MEMORY)
+            connection = sqlite3.connect(MEMORY, factory=_Connection)
             _fill(connection, meta)
             return cls(MEMORY, connection, None)
         lock = _locked(path)
@@ -569,8 +569,18 @@ def _reader(path: Path) -> sqlite3.Connection:
     return connection
 
 
+class _Connection(sqlite3.Connection):
+    """Closed when nobody holds it any more; Python 3.13 warns of others."""
+
+    def __del__(self) -> None:
+        with suppress(sqlite3.Error):  # of another thread
+            self.close()
+
+
 def _connect(path: Path, options: str) -> sqlite3.Connection:
-    connection = sqlite3.connect(f"{path.absolute().as_uri()}?{options}", uri=True)
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?{options}", uri=True, factory=_Connection
+    )
     connection.execute("PRAGMA trusted_schema = OFF")
     connection.execute("PRAGMA cell_size_check = ON")
     return connection
