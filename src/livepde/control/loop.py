@@ -1,0 +1,234 @@
+"""A control loop: one call for every sample."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from livepde import checkpoint
+from livepde.control.estimators import Estimator, Learned
+from livepde.control.goal import Controller, Plan
+from livepde.control.kalman import Kalman
+from livepde.control.known import Known
+from livepde.control.trust import Trust
+from livepde.errors import ConfigurationError, RunError, SampleError
+from livepde.identifier import Identifier
+from livepde.linalg import Array
+from livepde.result import Estimate
+
+__all__ = ["Action", "Loop"]
+
+Future: TypeAlias = Mapping[str, ArrayLike]
+"""Name -> a number that holds, or one for each coming period."""
+
+
+@dataclass(frozen=True, eq=False)
+class Action:
+    """What to set from now on, and on what grounds.
+
+    Attributes
+    ----------
+    t
+        Time of the sample.
+    inputs
+        Control -> value to apply until the next sample.
+    known
+        State and unknown numbers on which it was decided.
+    outputs
+        Output -> its estimated value now.
+    status
+        "ok", or what went wrong in the controller and what was done instead.
+    estimate
+        Of the identifier; None with another estimator.
+    """
+
+    t: float
+    inputs: Mapping[str, float]
+    known: Known
+    outputs: Mapping[str, float]
+    status: str
+    estimate: Estimate | None
+
+    @property
+    def source(self) -> str:
+        """Whether the estimate or the fallback was used: "estimate", "fallback"."""
+        return self.known.source
+
+    @property
+    def why(self) -> str:
+        """Why the estimate is not trusted; empty if it is."""
+        return self.known.why
+
+
+class Loop:
+    """An estimator and a controller, one call per sample.
+
+    Parameters
+    ----------
+    estimator
+        An `Identifier`, beside which a nominal model is run for the fallback; or any `Estimator`.
+    controller
+        `LQ`, `MPC`, or one of your own.
+    trust
+        When the estimate of an identifier is used.
+    drive
+        Channel -> standard deviation of its noise, for the filter of the nominal model; default a
+        tenth of the range of each control.
+    before
+        Control -> what was applied before the first sample; default the lower end of its range.
+
+    Raises
+    ------
+    ConfigurationError
+        Parts that do not fit together.
+    """
+
+    def __init__(
+        self,
+        estimator: Identifier | Estimator,
+        controller: Controller,
+        trust: Trust | None = None,
+        *,
+        drive: Mapping[str, float] | None = None,
+        before: Mapping[str, float] | None = None,
+    ) -> None:
+        model = controller.model
+        low, high = controller.goal.range(model)
+        if isinstance(estimator, Identifier):
+            given = dict(drive or {})
+            if not given:
+                width = np.where(np.isfinite(high - low), 0.1 * (high - low), 1.0)
+                given = dict(zip(model.controls, width.tolist(), strict=True))
+            nominal = Kalman(model, controller.period, drive=given, steps=controller.steps)
+            estimator = Learned(estimator, nominal, trust, controller.steps)
+        elif trust is not None:
+            raise ConfigurationError("Loop: trust is for an Identifier; give it to `Learned`.")
+        self.estimator: Estimator = estimator
+        self.controller = controller
+        start = np.where(np.isfinite(low), low, 0.0)
+        for name, value in (before or {}).items():
+            start[model.controls.index(name)] = float(value)
+        self._before: Array = start
+        self._memory: Array = controller.start()
+        self._disturbances: Array = np.full(len(model.disturbances), np.nan)
+
+    def step(
+        self,
+        t: float,
+        z: Any,
+        inputs: Mapping[str, float] | None = None,
+        *,
+        reference: Future,
+        forecast: Future | None = None,
+    ) -> Action:
+        """Take a sample and return what to set until the next one.
+
+        Parameters
+        ----------
+        t, z
+            As for `Identifier.step`: measurements of the sensors.
+        inputs
+            Measured disturbances; and what a control really applied since the sample before, where
+            that is not what was asked for.
+        reference
+            Tracked output -> a number, or its values at the end of each coming period.
+        forecast
+            Disturbance -> a number, or its values over each coming period; default what it is now.
+
+        Raises
+        ------
+        SampleError
+            A reference is missing, or something is named that does not exist.
+        """
+        controller, model = self.controller, self.controller.model
+        given = dict(inputs or {})
+        unknown = [name for name in given if name not in model.channels]
+        if unknown:
+            raise SampleError(f"unknown input '{unknown[0]}'; there are {list(model.channels)}.")
+        applied = np.array(
+            [given.get(n, v) for n, v in zip(model.controls, self._before, strict=True)]
+        )
+        held = zip(model.disturbances, self._disturbances, strict=True)
+        now = np.array([float(given.get(name, value)) for name, value in held])
+        if np.isnan(now).any():
+            name = model.disturbances[int(np.flatnonzero(np.isnan(now))[0])]
+            raise SampleError(f"input '{name}' has no value yet; send it with the first sample.")
+        channels = dict(zip(model.controls, applied.tolist(), strict=True))
+        channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
+        known = self.estimator.step(t, z, channels)
+        plan = Plan(
+            _ahead(reference, tuple(controller.goal.track), None, controller.horizon, "reference"),
+            _ahead(forecast or {}, model.disturbances, now, controller.horizon, "forecast"),
+        )
+        decision = controller.decide(known, plan, applied, self._memory)
+        self._before, self._memory = decision.inputs, decision.memory
+        self._disturbances = now
+        y = model.outputs(known.x, model.values(channels))
+        return Action(
+            t,
+            dict(zip(model.controls, decision.inputs.tolist(), strict=True)),
+            known,
+            dict(zip(model.outputs.names, y.tolist(), strict=True)),
+            decision.status,
+            getattr(self.estimator, "estimate", None),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the state to a file, from which `load` continues with bit-identical numbers."""
+        leaves = {
+            "estimator": np.frombuffer(self.estimator.dump(), dtype=np.uint8),
+            "before": self._before,
+            "memory": self._memory,
+            "disturbances": self._disturbances,
+        }
+        checkpoint.write(path, checkpoint.packed({"kind": "loop"}, leaves))
+
+    def load(self, path: str | os.PathLike[str]) -> None:
+        """Continue from a saved state; the loop must be built as the one that was saved.
+
+        Raises
+        ------
+        RunError
+            The file is damaged, or of another loop.
+        """
+        where = str(path)
+        header, leaves = checkpoint.unpacked(checkpoint.read(path), where)
+        shapes = {"before": self._before, "disturbances": self._disturbances}
+        wrong = [
+            k for k, mine in shapes.items() if k not in leaves or leaves[k].shape != mine.shape
+        ]
+        if header.get("kind") != "loop" or wrong or leaves["memory"].shape != self._memory.shape:
+            raise RunError(f"{where} is of another loop: build it as it was when it was saved.")
+        self.estimator.restore(leaves["estimator"].tobytes(), where)
+        self._before, self._memory = leaves["before"], leaves["memory"]
+        self._disturbances = leaves["disturbances"]
+
+
+def _ahead(
+    given: Future, names: tuple[str, ...], default: Array | None, horizon: int, what: str
+) -> Array:
+    """Return values over the horizon, shape (horizon, names)."""
+    for name in given:
+        if name not in names:
+            raise SampleError(f"{what} names '{name}'; there are {list(names)}.")
+    columns = []
+    for k, name in enumerate(names):
+        if name not in given and default is None:
+            raise SampleError(f"{what}: '{name}' has none; give a number, or one for each period.")
+        values = np.asarray(
+            given.get(name, default[k] if default is not None else 0.0), dtype=float
+        )
+        if (
+            values.ndim > 1
+            or (values.ndim == 1 and len(values) < 1)
+            or not np.isfinite(values).all()
+        ):
+            raise SampleError(f"{what}['{name}'] must be a number, or one for each period.")
+        flat = np.atleast_1d(values)[:horizon]
+        columns.append(np.concatenate([flat, np.full(horizon - len(flat), flat[-1])]))
+    return np.column_stack(columns) if columns else np.zeros((horizon, 0))
