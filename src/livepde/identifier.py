@@ -164,6 +164,11 @@ class Identifier:
         self._inputs = inputs
 
     @property
+    def u0(self) -> Array:
+        """Coefficients of the given initial state, without boundary values, shape (n,)."""
+        return self._u0
+
+    @property
     def t(self) -> float:
         """Time of the last accepted sample."""
         return self._t

@@ -74,8 +74,10 @@ class Learned:
         self._good = 0
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
-        nominal = self.nominal.step(t, z, inputs)
         identifier, model = self.identifier, self.nominal.model
+        if isinstance(z, Mapping):
+            z = np.array([float(z.get(name, np.nan)) for name in identifier.observed.names])
+        nominal = self.nominal.step(t, z, inputs)
         begin, nothing = identifier.t, np.full(identifier.observed.size, np.nan)
         for k in range(1, self.steps if t > begin else 1):
             identifier.step(begin + k * (t - begin) / self.steps, nothing, inputs)

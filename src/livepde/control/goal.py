@@ -22,8 +22,8 @@ FREE = (-np.inf, np.inf)
 class Goal:
     """What is paid for, and what must not happen.
 
-    The cost of a sample is the sum of track (y - reference)^2 over outputs and of move (v - v
-    before)^2 over controls.
+    The cost of a sample is the sum of track (y - reference)^2 + penalty (units beyond a limit) over
+    outputs, and of move (v - v before)^2 + price v over controls.
 
     Parameters
     ----------
@@ -34,13 +34,21 @@ class Goal:
     inputs
         Control -> (least, largest) value that the actuator takes; never left.
     limits
-        Output -> (least, largest) value; `MPC` keeps them, `LQ` does not know them.
+        Output -> (least, largest) value; `MPC` keeps them, `LQ` does not know them. They may change
+        with time: `Loop.step`.
+    price
+        Control -> what a unit of it costs in a sample; `LQ` does not know it.
+    penalty
+        Cost of one unit beyond a limit in one sample, in `MPC`; default a hundred times the sum of
+        the weights of errors, or 100 without.
     """
 
     track: Mapping[str, float]
     move: Mapping[str, float]
     inputs: Mapping[str, tuple[float, float]]
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    price: Mapping[str, float] = field(default_factory=dict)
+    penalty: float | None = None
 
     def __post_init__(self) -> None:
         for what, weights, least in (("track", self.track, 0.0), ("move", self.move, 1e-300)):
@@ -57,6 +65,11 @@ class Goal:
                         f"got {(low, high)}."
                     )
 
+    @property
+    def beyond(self) -> float:
+        """Cost of one unit beyond a limit in one sample."""
+        return 100.0 * (sum(self.track.values()) or 1.0) if self.penalty is None else self.penalty
+
     def check(self, model: ReducedModel) -> None:
         """Raise `ConfigurationError` where it names what the model does not have."""
         for what, names, known in (
@@ -64,6 +77,7 @@ class Goal:
             ("limits", self.limits, model.outputs.names),
             ("move", self.move, model.controls),
             ("inputs", self.inputs, model.controls),
+            ("price", self.price, model.controls),
         ):
             for name in names:
                 if name not in known:
@@ -71,11 +85,11 @@ class Goal:
                         f"Goal: {what} names '{name}'; the reduced model has {list(known)}."
                     )
         missing = [name for name in model.controls if name not in self.move]
-        if missing or not self.track:
+        if missing or not (self.track or self.price):
             raise ConfigurationError(
                 f"Goal: give a weight for the changes of {missing}."
                 if missing
-                else "Goal: track names no output; give at least one and its weight."
+                else "Goal: track names no output; give at least one and its weight, or a price."
             )
 
     def range(self, model: ReducedModel) -> tuple[Array, Array]:
@@ -96,10 +110,15 @@ class Plan:
     disturbances
         In the order of `ReducedModel.disturbances`, over each coming period, shape
         (horizon, disturbances).
+    low, high
+        Limits of the outputs in the order of `Goal.limits` at the end of each coming period, shapes
+        (horizon, limited).
     """
 
     reference: Array
     disturbances: Array
+    low: Array
+    high: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""A fixed model with its steady Kalman filter."""
+"""A model with given unknown numbers, and its Kalman filter."""
 
 from __future__ import annotations
 
@@ -6,24 +6,23 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from livepde.checkpoint import packed, unpacked
 from livepde.control.known import Known
-from livepde.control.reduced import Discrete, ReducedModel
+from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError, RunError
 from livepde.linalg import Array
 
 __all__ = ["Kalman"]
 
-FLOOR = 1e-6  # process noise of each coordinate, relative to the largest: the equation has a root
+FLOOR = 1e-6  # process noise of each coordinate, relative to the largest
 
 
 class Kalman:
     """The state of a reduced model with given unknown numbers, from the sensors.
 
-    The filter is the steady one. Its process noise enters as noise of the channels: what the
-    surroundings and the actuator do that nobody measures.
+    Process noise enters as noise of the channels: what the surroundings and the actuator do that
+    nobody measures. Of sensors that are not linear it takes the derivative at the estimate.
 
     Parameters
     ----------
@@ -32,7 +31,7 @@ class Kalman:
     period, steps
         Time between two samples, and implicit Euler steps that it is divided into.
     drive
-        Channel -> standard deviation of its noise over a period, in its unit.
+        Channel -> standard deviation of its noise, held over a period, in its unit.
     q
         Unknown numbers by label; default the prior.
     x
@@ -62,47 +61,53 @@ class Kalman:
         self.period = period
         self.steps = steps
         self.drive = np.array([float(drive.get(name, 0.0)) for name in model.channels])
-        self._x = model.start if x is None else np.asarray(x, dtype=float)
+        self._noise = np.asarray(model.sensors.noise)
         self._begun = False
         self.set(q or {})
+        self._x = model.start if x is None else np.asarray(x, dtype=float)
+        self._P = self._gained
+
+    @property
+    def q(self) -> Array:
+        """The unknown numbers, shape (m,)."""
+        return self._q
 
     def set(self, q: Mapping[str, float]) -> None:
         """Take other unknown numbers; those that are not named are the prior's."""
         values = zip(self.model.unknowns, self.model.prior, strict=True)
-        self.q = np.array([float(q.get(label, prior)) for label, prior in values])
-        self.step_of = self.model.matrices(self.q, self.period, self.steps)
-        self.gain = gain(self.model, self.step_of, self.drive)
+        self._q = np.array([float(q.get(label, prior)) for label, prior in values])
+        self._move = self.model.matrices(self._q, self.period, self.steps)
+        driven = self._move.B * self.drive
+        gained = driven @ driven.T
+        floor = FLOOR**2 * float(np.trace(gained))
+        self._gained: Array = gained + floor * np.eye(len(gained))
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         """Take a sample, as an `Estimator` does; the first one describes the start."""
-        c, seen = self.model.values(inputs), np.asarray(z, dtype=float)
+        seen, A = np.asarray(z, dtype=float), self._move.A
         if self._begun:
-            self._x = self.step_of(self._x, c)
+            self._x = self._move(self._x, self.model.values(inputs))
+            self._P = A @ self._P @ A.T + self._gained
         self._begun = True
-        missed = seen - self.model.sensors(self._x, c)
-        self._x = self._x + self.gain @ np.where(np.isfinite(missed), missed, 0.0)
-        return Known(self._x, self.q, np.zeros((len(self.q), 0)))
+        expected, H = self.model.seen(self._x, self._q, inputs)
+        used = np.isfinite(seen) & np.isfinite(expected)
+        H, missed = H[used], (seen - expected)[used]
+        S = H @ self._P @ H.T + np.diag(self._noise[used] ** 2)
+        gain = np.linalg.solve(S, H @ self._P).T
+        self._x = self._x + gain @ missed
+        left = np.eye(len(self._x)) - gain @ H  # Joseph's form stays symmetric and positive
+        self._P = left @ self._P @ left.T + (gain * self._noise[used] ** 2) @ gain.T
+        return Known(self._x, self._q, np.zeros((len(self._q), 0)))
 
     def dump(self) -> bytes:
         """Return the state."""
-        return packed({"kind": "kalman"}, {"x": self._x, "q": self.q, "begun": self._begun})
+        leaves = {"x": self._x, "P": self._P, "q": self._q, "begun": self._begun}
+        return packed({"kind": "kalman"}, leaves)
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
         """Continue from what `dump` returned."""
-        _, leaves = unpacked(content, where)
-        if leaves["x"].shape != self._x.shape or leaves["q"].shape != self.q.shape:
-            raise RunError(
-                f"{where} was saved with another reduced model: build it as it was then."
-            )
+        header, leaves = unpacked(content, where)
+        if header.get("kind") != "kalman" or leaves["x"].shape != self._x.shape:
+            raise RunError(f"{where} is of another reduced model: build it as it was then.")
         self.set(dict(zip(self.model.unknowns, leaves["q"].tolist(), strict=True)))
-        self._x, self._begun = leaves["x"], bool(leaves["begun"])
-
-
-def gain(model: ReducedModel, step: Discrete, drive: Array) -> Array:
-    """Return the gain of the steady filter, shape (r, sensors)."""
-    noise = np.asarray(model.sensors.noise)
-    C, driven = model.sensors.C, step.B * drive
-    Q = driven @ driven.T
-    Q += FLOOR**2 * max(float(np.trace(Q)), 1e-300) * np.eye(len(Q))
-    P = solve_discrete_are(step.A.T, C.T, Q, np.diag(noise**2))
-    return np.asarray(np.linalg.solve(C @ P @ C.T + np.diag(noise**2), C @ P).T)
+        self._x, self._P, self._begun = leaves["x"], leaves["P"], bool(leaves["begun"])

@@ -104,7 +104,13 @@ class Loop:
             if not given:
                 width = np.where(np.isfinite(high - low), 0.1 * (high - low), 1.0)
                 given = dict(zip(model.controls, width.tolist(), strict=True))
-            nominal = Kalman(model, controller.period, drive=given, steps=controller.steps)
+            nominal = Kalman(
+                model,
+                controller.period,
+                drive=given,
+                steps=controller.steps,
+                x=model.project(estimator.u0),
+            )
             estimator = Learned(estimator, nominal, trust, controller.steps)
         elif trust is not None:
             raise ConfigurationError("Loop: trust is for an Identifier; give it to `Learned`.")
@@ -123,8 +129,9 @@ class Loop:
         z: Any,
         inputs: Mapping[str, float] | None = None,
         *,
-        reference: Future,
+        reference: Future | None = None,
         forecast: Future | None = None,
+        limits: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
     ) -> Action:
         """Take a sample and return what to set until the next one.
 
@@ -139,6 +146,9 @@ class Loop:
             Tracked output -> a number, or its values at the end of each coming period.
         forecast
             Disturbance -> a number, or its values over each coming period; default what it is now.
+        limits
+            Output -> (least, largest), each a number or its values at the end of each coming
+            period; default those of the goal.
 
         Raises
         ------
@@ -161,10 +171,7 @@ class Loop:
         channels = dict(zip(model.controls, applied.tolist(), strict=True))
         channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
         known = self.estimator.step(t, z, channels)
-        plan = Plan(
-            _ahead(reference, tuple(controller.goal.track), None, controller.horizon, "reference"),
-            _ahead(forecast or {}, model.disturbances, now, controller.horizon, "forecast"),
-        )
+        plan = self._plan(reference or {}, forecast or {}, now, limits or {})
         decision = controller.decide(known, plan, applied, self._memory)
         self._before, self._memory = decision.inputs, decision.memory
         self._disturbances = now
@@ -176,6 +183,24 @@ class Loop:
             dict(zip(model.outputs.names, y.tolist(), strict=True)),
             decision.status,
             getattr(self.estimator, "estimate", None),
+        )
+
+    def _plan(
+        self,
+        reference: Future,
+        forecast: Future,
+        now: Array,
+        limits: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    ) -> Plan:
+        """Return what is known of the future, checked."""
+        goal, model, count = self.controller.goal, self.controller.model, self.controller.horizon
+        held = [np.array([ends[k] for ends in goal.limits.values()]) for k in (0, 1)]
+        low, high = ({name: ends[k] for name, ends in limits.items()} for k in (0, 1))
+        return Plan(
+            _ahead(reference, tuple(goal.track), None, count, "reference"),
+            _ahead(forecast, model.disturbances, now, count, "forecast"),
+            _ahead(low, tuple(goal.limits), held[0], count, "limits"),
+            _ahead(high, tuple(goal.limits), held[1], count, "limits"),
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -218,17 +243,14 @@ def _ahead(
             raise SampleError(f"{what} names '{name}'; there are {list(names)}.")
     columns = []
     for k, name in enumerate(names):
-        if name not in given and default is None:
+        if name in given:
+            values = np.atleast_1d(np.asarray(given[name], dtype=float))
+            if values.ndim > 1 or not len(values) or np.isnan(values).any():
+                raise SampleError(f"{what}['{name}'] must be a number, or one for each period.")
+        elif default is None:
             raise SampleError(f"{what}: '{name}' has none; give a number, or one for each period.")
-        values = np.asarray(
-            given.get(name, default[k] if default is not None else 0.0), dtype=float
-        )
-        if (
-            values.ndim > 1
-            or (values.ndim == 1 and len(values) < 1)
-            or not np.isfinite(values).all()
-        ):
-            raise SampleError(f"{what}['{name}'] must be a number, or one for each period.")
-        flat = np.atleast_1d(values)[:horizon]
+        else:
+            values = default[k : k + 1]
+        flat = values[:horizon]
         columns.append(np.concatenate([flat, np.full(horizon - len(flat), flat[-1])]))
     return np.column_stack(columns) if columns else np.zeros((horizon, 0))

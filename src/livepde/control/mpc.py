@@ -18,6 +18,7 @@ from livepde.linalg import Array
 __all__ = ["MPC"]
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
+FAR = 1e12  # stands for a limit that is infinite for a while
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -29,7 +30,7 @@ class MPC:
     both sides along the leading directions of their covariance; one sequence of inputs begins in
     the same way for all of them. With a better estimate they come together, and it acts less
     cautiously. Ranges of actuators are never left; limits of outputs are kept where that is
-    possible, each unit of violation in a sample costs `penalty`.
+    possible, and what lies beyond costs the penalty of the goal.
 
     If Ipopt finds no solution the inputs are held, and the action says so.
 
@@ -45,9 +46,6 @@ class MPC:
         Standard deviations between the scenarios; 0 takes the estimate for the truth.
     directions
         Directions of the covariance that are looked at: two scenarios for each.
-    penalty
-        Cost of one unit of violation of a limit in one sample; default a hundred times the largest
-        weight of an error.
 
     Raises
     ------
@@ -62,7 +60,6 @@ class MPC:
     horizon: int = 20
     kappa: float = 2.0
     directions: int = 1
-    penalty: float | None = None
 
     def __post_init__(self) -> None:
         check(self)
@@ -89,7 +86,11 @@ class MPC:
         x = process.set_variable("_x", "x", (r, 1))
         v = process.set_variable("_u", "v", (len(model.controls), 1))
         d = process.set_variable("_tvp", "d", (len(model.disturbances) or 1, 1))
-        reference = process.set_variable("_tvp", "reference", (len(goal.track), 1))
+        reference = process.set_variable("_tvp", "reference", (len(goal.track) or 1, 1))
+        ends = {
+            side: process.set_variable("_tvp", side, (len(goal.limits) or 1, 1))
+            for side in ("low", "high")
+        }
         A = process.set_variable("_p", "A", (r, r))
         B = process.set_variable("_p", "B", (r, len(model.channels)))
         f = process.set_variable("_p", "f", (r, 1))
@@ -107,9 +108,13 @@ class MPC:
         cost = 0.0
         for k, (name, weight) in enumerate(goal.track.items()):
             cost += weight * (y[model.outputs.names.index(name)] - reference[k]) ** 2
+        for name, price in goal.price.items():
+            cost += price * v[model.controls.index(name)]
         process.set_expression("cost", cost)
-        for name in goal.limits:
-            process.set_expression(name, y[model.outputs.names.index(name)])
+        for k, name in enumerate(goal.limits):
+            value = y[model.outputs.names.index(name)]
+            process.set_expression(f"low_{name}", ends["low"][k] - value)
+            process.set_expression(f"high_{name}", value - ends["high"][k])
         process.setup()
         mpc = do_mpc.controller.MPC(process)
         mpc.settings.n_horizon = self.horizon
@@ -118,26 +123,30 @@ class MPC:
         mpc.settings.store_full_solution = False
         mpc.settings.nlpsol_opts = QUIET
         mpc.set_objective(mterm=casadi.SX(0.0), lterm=process.aux["cost"])
-        mpc.set_rterm(v=np.array([goal.move[name] for name in model.controls]))
         low, high = goal.range(model)
+        width = np.where(np.isfinite(high - low), high - low, 1.0)
+        mpc.scaling["_x", "x"] = 1.0 / np.abs(model.outputs.C).max()
+        mpc.scaling["_u", "v"] = width
+        # do-mpc weighs the changes of scaled inputs.
+        mpc.set_rterm(v=np.array([goal.move[name] for name in model.controls]) * width**2)
         mpc.bounds["lower", "_u", "v"] = low
         mpc.bounds["upper", "_u", "v"] = high
-        penalty = 100.0 * max(goal.track.values()) if self.penalty is None else self.penalty
-        for name, (least, largest) in goal.limits.items():
-            value = process.aux[name]
-            for side, excess in (("least", least - value), ("largest", value - largest)):
-                if np.isfinite(least if side == "least" else largest):
+        for name, limits in goal.limits.items():
+            for side, limit in zip(("low", "high"), limits, strict=True):
+                if np.isfinite(limit):
                     mpc.set_nl_cons(
                         f"{side}_{name}",
-                        excess,
+                        process.aux[f"{side}_{name}"],
                         ub=0.0,
                         soft_constraint=True,
-                        penalty_term_cons=penalty,
+                        penalty_term_cons=goal.beyond,
                     )
         future, uncertain = mpc.get_tvp_template(), mpc.get_p_template(self.scenarios)
         mpc.set_tvp_fun(lambda t: future)
         mpc.set_p_fun(lambda t: uncertain)
-        mpc.setup()
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "\\s*casadi", FutureWarning)  # do-mpc's affair
+            mpc.setup()
         mpc.future, mpc.uncertain = future, uncertain
         return mpc
 
@@ -155,7 +164,11 @@ class MPC:
             at = min(k, self.horizon - 1)
             if model.disturbances:
                 mpc.future["_tvp", k, "d"] = plan.disturbances[at]
-            mpc.future["_tvp", k, "reference"] = plan.reference[at]
+            if self.goal.track:
+                mpc.future["_tvp", k, "reference"] = plan.reference[at]
+            if self.goal.limits:
+                mpc.future["_tvp", k, "low"] = np.maximum(plan.low[at], -FAR)
+                mpc.future["_tvp", k, "high"] = np.minimum(plan.high[at], FAR)
         mpc.opt_p_num["_x0"] = known.x
         mpc.opt_p_num["_u_prev"] = before
         mpc.opt_p_num["_tvp"] = mpc.future["_tvp"]
@@ -166,7 +179,7 @@ class MPC:
             why = f"Ipopt: {mpc.solver_stats['return_status']}: the inputs were held"
             return Decision(before, why, memory)
         low, high = self.goal.range(model)
-        wanted = mpc.opt_x_num["_u", 0, 0].full().ravel()
+        wanted = (mpc.opt_x_num["_u", 0, 0] * mpc._u_scaling).full().ravel()
         solution = mpc.opt_x_num.master.full().ravel()
         return Decision(np.clip(wanted, low, high), "ok", solution)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from livepde.errors import ConfigurationError, ModelError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.observation import Observation
+from livepde.observation import Observation, Observed
 from livepde.result import unknown_of
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
@@ -161,6 +162,21 @@ class ReducedModel:
         """Return the unknown numbers among the coefficients of a parameter, shape (m,)."""
         return np.asarray(q[self.frame.rows])
 
+    def seen(self, x: Array, q: Array, inputs: Mapping[str, float]) -> tuple[Array, Array]:
+        """Return what the sensors show, (sensors,), and its derivative in x, (sensors, r).
+
+        Of sensors that are not linear in the state, or see unknown numbers, at x and q.
+        """
+        frame, c = self.frame, self.values(inputs)
+        observed = frame.observed_sensors
+        if observed.linear:
+            return self.sensors(x, c), self.sensors.C
+        full, moment = frame.q.copy(), Moment(0.0, Inputs(inputs))
+        full[frame.rows] = q
+        u = frame.lift(x, c)
+        H = observed.jacobian(u, full, moment)[0]
+        return observed.predict(u, full, moment), np.asarray(H @ frame.V)
+
     def about(
         self,
         u: Array | None = None,
@@ -257,19 +273,29 @@ class Frame:
         """Which coefficients of the parameter are unknown numbers."""
         return list(self.model.parameter_space.labels.values())
 
-    @property
+    @cached_property
+    def observed_sensors(self) -> Observed:
+        """The sensors, bound to the full model."""
+        return self.observed(self.sensors)
+
+    @cached_property
     def linearisation(self) -> Linearisation:
         """The linear systems of the full model."""
         return Linearisation(self.model, self.u, self.inputs)
 
-    def observed(self, observation: Observation) -> Any:
+    def observed(self, observation: Observation) -> Observed:
         """Return an observation bound to the full model."""
         model = self.model
         return observation.bind(model.state_space, model.X, model.parameter_space)
 
+    @cached_property
+    def boundary(self) -> tuple[Array, Array]:
+        """The lifting of boundary channels and values, as `Linearisation.boundary` has it."""
+        return self.linearisation.boundary()
+
     def lift(self, x: Array, c: Array) -> Array:
         """Return the state of the full model for coordinates and channels."""
-        W, known = self.linearisation.boundary()
+        W, known = self.boundary
         fixed = W @ c + known
         u: Array = fixed + self.V @ (x - self.test @ fixed)
         return u
@@ -327,7 +353,7 @@ class Frame:
 
     def _projected(self, system: Linear) -> Array:
         """Return K, E and f on the basis side by side, shape (r, r + channels + 1)."""
-        W, known = self.linearisation.boundary()
+        W, known = self.boundary
         fixed = np.column_stack([W, known])
         K: Array = self.V.T @ (system.K @ self.V)
         driven = self.V.T @ (np.column_stack([system.E, system.f]) - system.K @ fixed)
@@ -348,7 +374,7 @@ class Frame:
 
     def _output(self, observation: Observation) -> Output:
         observed, moment = self.observed(observation), self.linearisation.moment
-        W, known = self.linearisation.boundary()
+        W, known = self.boundary
         y = observed.predict(self.u, self.q, moment)
         H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
         C = H @ self.V
@@ -395,9 +421,8 @@ def reduce(
     modes
         Eigenmodes beside the static responses.
     u, q, inputs
-        Where to linearise, as for `Identifier` u0 and q0: default zero, the prior, and zero. Here
-        `Kalman` begins, so give the u0 of the identifier. Of an unknown field q is its value; see
-        `ReducedModel.about`.
+        Where to linearise, as for `Identifier` u0 and q0: default zero, the prior, and zero. Of an
+        unknown field q is its value; see `ReducedModel.about`.
 
     Raises
     ------
@@ -429,7 +454,7 @@ def reduce(
     )
     linearisation = frame.linearisation
     linearisation.check(physical)
-    W, known = linearisation.boundary()
+    W, known = frame.boundary
     values, space = [physical], model.parameter_space
     for label, row in space.labels.items():
         for end in likely(space, label, float(physical[row])):

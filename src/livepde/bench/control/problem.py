@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -64,6 +64,8 @@ class Problem:
         t -> measured disturbances; their forecast is what they are now.
     before
         Inputs before the first sample.
+    limits
+        t -> limits of outputs that change with time, output -> (least, largest); None: the goal's.
     jump
         Time of a sudden change; NaN if there is none.
     """
@@ -83,6 +85,7 @@ class Problem:
     reference: Values
     disturbances: Values
     before: Mapping[str, float]
+    limits: Callable[[float], Mapping[str, tuple[float, float]]] | None = None
     jump: float = np.nan
 
     @property
@@ -90,10 +93,22 @@ class Problem:
         """Times of the samples."""
         return [self.period * k for k in range(self.samples + 1)]
 
-    def ahead(self, t: float) -> dict[str, list[float]]:
-        """Return the references at the end of each coming period: they are known beforehand."""
-        coming = [self.reference(t + self.period * (k + 1)) for k in range(self.horizon)]
-        return {name: [values[name] for values in coming] for name in self.goal.track}
+    def limits_at(self, t: float) -> Mapping[str, tuple[float, float]]:
+        """Return the limits of outputs at a time."""
+        return self.goal.limits if self.limits is None else self.limits(t)
+
+    def ahead(self, t: float) -> dict[str, Any]:
+        """Return what `Loop.step` is told of the future: references and limits are known."""
+        coming = [t + self.period * (k + 1) for k in range(self.horizon)]
+        reference = [self.reference(now) for now in coming]
+        limits = [self.limits_at(now) for now in coming]
+        return {
+            "reference": {name: [at[name] for at in reference] for name in self.goal.track},
+            "limits": {
+                name: ([at[name][0] for at in limits], [at[name][1] for at in limits])
+                for name in self.goal.limits
+            },
+        }
 
 
 class Simulated:

@@ -57,16 +57,23 @@ class Run:
         before = np.array([[problem.before[name] for name in model.controls]])
         change = np.diff(self.inputs, axis=0, prepend=before) ** 2
         moved = change @ np.array([goal.move[name] for name in model.controls])
+        moved += self.inputs @ np.array([goal.price.get(name, 0.0) for name in model.controls])
+        beyond = goal.beyond * self.beyond(problem).sum(axis=1)
         counted = (self.t > since) & (self.t <= until)
-        return float((missed + moved)[counted].sum())
+        return float((missed + moved + beyond)[counted].sum())
+
+    def beyond(self, problem: Problem) -> Array:
+        """Return by how much each limited output was beyond its limits, (samples, limited)."""
+        found = np.zeros((len(self.t), len(problem.goal.limits)))
+        for k, name in enumerate(problem.goal.limits):
+            low, high = np.array([problem.limits_at(t)[name] for t in self.t.tolist()]).T
+            y = self.outputs[:, problem.reduced.outputs.names.index(name)]
+            found[:, k] = np.maximum(np.maximum(low - y, y - high), 0.0)
+        return found
 
     def violations(self, problem: Problem, tolerance: float = 0.0) -> Array:
         """Return at which samples an output was beyond its limits by more than a tolerance."""
-        found = np.zeros(len(self.t), dtype=bool)
-        for name, (low, high) in problem.goal.limits.items():
-            y = self.outputs[:, problem.reduced.outputs.names.index(name)]
-            found |= (y < low - tolerance) | (y > high + tolerance)
-        return found
+        return np.asarray((self.beyond(problem) > tolerance).any(axis=1))
 
 
 class Timed:
@@ -139,7 +146,7 @@ def closed_loop(problem: Problem, estimator: Estimator, controller: Controller, 
             plant.advance(now, {**inputs, **disturbances})
         z = plant.measure()
         begin = process_time()
-        action = loop.step(now, z, disturbances, reference=problem.ahead(now))
+        action = loop.step(now, z, disturbances, **problem.ahead(now))
         seconds = process_time() - begin
         inputs = dict(action.inputs)
         failed += action.status != "ok"
