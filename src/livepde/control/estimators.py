@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -86,7 +87,7 @@ class Learned:
         self._good = 0 if doubt else min(self._good + 1, self.trust.patience)
         if self._good < self.trust.patience:
             why = doubt or f"trusted only after {self.trust.patience} good samples in a row"
-            return Known(nominal.x, nominal.q, nominal.factor, "fallback", why)
+            return replace(nominal, source="fallback", why=why)
         belief = estimate.belief
         root = belief.q_factor if belief.q_factor is not None else np.zeros((len(belief.q), 0))
         factor = belief.inflation * model.numbers(root)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from livepde.checkpoint import packed, unpacked
 from livepde.control.known import Known
@@ -32,6 +33,10 @@ class Kalman:
         Time between two samples, and implicit Euler steps that it is divided into.
     drive
         Channel -> standard deviation of its noise, held over a period, in its unit.
+    offset
+        Channel -> standard deviation by which an unknown constant that is added to it may change
+        in a period. With it outputs that are measured have no lasting error, although the model is
+        wrong: the usual way to offset-free control.
     q
         Unknown numbers by label; default the prior.
     x
@@ -45,6 +50,7 @@ class Kalman:
         *,
         drive: Mapping[str, float],
         steps: int = 1,
+        offset: Mapping[str, float] | None = None,
         q: Mapping[str, float] | None = None,
         x: Array | None = None,
     ) -> None:
@@ -52,19 +58,22 @@ class Kalman:
             raise ConfigurationError(
                 "Kalman needs the noise of the sensors: give noise= to the observation."
             )
-        for name in drive:
+        for name in {**drive, **(offset or {})}:
             if name not in model.channels:
                 raise ConfigurationError(
-                    f"Kalman: drive names '{name}'; the channels are {list(model.channels)}."
+                    f"Kalman: there is no channel '{name}'; the model has {list(model.channels)}."
                 )
         self.model = model
         self.period = period
         self.steps = steps
         self.drive = np.array([float(drive.get(name, 0.0)) for name in model.channels])
+        self._moving = model.columns(list(offset or {}))
+        self._walk = np.array(list((offset or {}).values()))
         self._noise = np.asarray(model.sensors.noise)
         self._begun = False
         self.set(q or {})
-        self._x = model.start if x is None else np.asarray(x, dtype=float)
+        x = model.start if x is None else np.asarray(x, dtype=float)
+        self._x = np.concatenate([x, np.zeros(len(self._moving))])
         self._P = self._gained
 
     @property
@@ -80,16 +89,23 @@ class Kalman:
         driven = self._move.B * self.drive
         gained = driven @ driven.T
         floor = FLOOR**2 * float(np.trace(gained))
-        self._gained: Array = gained + floor * np.eye(len(gained))
+        gained = gained + floor * np.eye(len(gained))
+        self._gained: Array = block_diag(gained, np.diag(self._walk**2))
+        r, count = self.model.size, len(self._moving)
+        added = self._move.B[:, self._moving]
+        self._A = np.block([[self._move.A, added], [np.zeros((count, r)), np.eye(count)]])
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         """Take a sample, as an `Estimator` does; the first one describes the start."""
-        seen, A = np.asarray(z, dtype=float), self._move.A
+        seen, r = np.asarray(z, dtype=float), self.model.size
         if self._begun:
-            self._x = self._move(self._x, self.model.values(inputs))
-            self._P = A @ self._P @ A.T + self._gained
+            driven = self._move.B @ self.model.values(inputs) + self._move.f
+            self._x = self._A @ self._x
+            self._x[:r] += driven
+            self._P = self._A @ self._P @ self._A.T + self._gained
         self._begun = True
-        expected, H = self.model.seen(self._x, self._q, inputs)
+        expected, H = self.model.seen(self._x[:r], self._q, inputs)
+        H = np.hstack([H, np.zeros((len(H), len(self._moving)))])
         used = np.isfinite(seen) & np.isfinite(expected)
         H, missed = H[used], (seen - expected)[used]
         S = H @ self._P @ H.T + np.diag(self._noise[used] ** 2)
@@ -97,7 +113,14 @@ class Kalman:
         self._x = self._x + gain @ missed
         left = np.eye(len(self._x)) - gain @ H  # Joseph's form stays symmetric and positive
         self._P = left @ self._P @ left.T + (gain * self._noise[used] ** 2) @ gain.T
-        return Known(self._x, self._q, np.zeros((len(self._q), 0)))
+        offset = np.zeros(len(self.model.channels))
+        offset[self._moving] = self._x[r:]
+        return Known(
+            self._x[:r],
+            self._q,
+            np.zeros((len(self._q), 0)),
+            offset=offset if r < len(self._x) else None,
+        )
 
     def dump(self) -> bytes:
         """Return the state."""

@@ -24,6 +24,9 @@ class Known:
         Coordinates of the state, shape (r,), and unknown numbers, shape (m,).
     factor
         Square root of the covariance of q, shape (m, k); no columns: q counts as known.
+    offset
+        What is added to each channel by something that nobody measures, shape (channels,); None:
+        nothing. It acts on the state.
     source, why
         "estimate", or "fallback" and why the estimate is not trusted.
     """
@@ -33,6 +36,7 @@ class Known:
     factor: Array
     source: Source = "estimate"
     why: str = ""
+    offset: Array | None = None
 
     @property
     def std(self) -> Array:

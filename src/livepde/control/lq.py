@@ -50,7 +50,7 @@ class LQ:
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
         """Return what to set from now on; as for `Controller`."""
         model, low, high = self.model, *self.goal.range(self.model)
-        step = model.matrices(known.q, self.period, self.steps)
+        step = model.matrices(known.q, self.period, self.steps).with_offset(known.offset)
         try:
             x, v = self.target(step, plan.reference[0], plan.disturbances[0])
             gain = self.gain(step)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,7 +17,7 @@ from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
-__all__ = ["MPC"]
+__all__ = ["MPC", "packages", "quiet"]
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
 FAR = 1e12  # stands for a limit that is infinite for a while
@@ -80,7 +82,7 @@ class MPC:
     @cached_property
     def problem(self) -> Any:
         """do-mpc's object, without a state: all that changes is set at each sample."""
-        do_mpc, casadi = _packages()
+        do_mpc, casadi = packages()
         model, goal, r = self.model, self.goal, self.model.size
         process = do_mpc.model.Model("discrete")
         x = process.set_variable("_x", "x", (r, 1))
@@ -144,8 +146,7 @@ class MPC:
         future, uncertain = mpc.get_tvp_template(), mpc.get_p_template(self.scenarios)
         mpc.set_tvp_fun(lambda t: future)
         mpc.set_p_fun(lambda t: uncertain)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "\\s*casadi", FutureWarning)  # do-mpc's affair
+        with quiet():
             mpc.setup()
         mpc.future, mpc.uncertain = future, uncertain
         return mpc
@@ -158,7 +159,7 @@ class MPC:
         q = np.clip(q, model.lower, model.upper)
         q = np.where(np.isfinite(q), q, known.q)
         for k, values in enumerate(q):
-            step = model.matrices(values, self.period, self.steps)
+            step = model.matrices(values, self.period, self.steps).with_offset(known.offset)
             mpc.uncertain["_p", k] = np.concatenate([step.A.ravel("F"), step.B.ravel("F"), step.f])
         for k in range(self.horizon + 1):
             at = min(k, self.horizon - 1)
@@ -184,11 +185,25 @@ class MPC:
         return Decision(np.clip(wanted, low, high), "ok", solution)
 
 
-def _packages() -> tuple[Any, Any]:
-    """Return do_mpc and casadi."""
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Silence what do-mpc warns of itself: packages it can do without, and CasADi's changes."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The (ONNX|approximateMPC) feature", UserWarning)
+        warnings.filterwarnings("ignore", "\\s*casadi", FutureWarning)
+        yield
+
+
+def packages() -> tuple[Any, Any]:
+    """Return do_mpc and casadi.
+
+    Raises
+    ------
+    ConfigurationError
+        They are not installed.
+    """
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of packages that do-mpc can do without
+        with quiet():
             import casadi
             import do_mpc
     except ImportError:

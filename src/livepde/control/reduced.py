@@ -59,6 +59,10 @@ class Discrete:
     B: Array
     f: Array
 
+    def with_offset(self, offset: Array | None) -> Discrete:
+        """Return the step with something added to the channels, shape (channels,)."""
+        return self if offset is None else replace(self, f=self.f + self.B @ offset)
+
     def __call__(self, x: Array, c: Array) -> Array:
         """Return the state at the end of the step."""
         after: Array = self.A @ x + self.B @ c + self.f

@@ -66,6 +66,8 @@ class Problem:
         Inputs before the first sample.
     limits
         t -> limits of outputs that change with time, output -> (least, largest); None: the goal's.
+    tolerance
+        By how much a limit may be missed without counting as violated.
     jump
         Time of a sudden change; NaN if there is none.
     foreseen
@@ -90,6 +92,7 @@ class Problem:
     disturbances: Values
     before: Mapping[str, float]
     limits: Callable[[float], Mapping[str, tuple[float, float]]] | None = None
+    tolerance: float = 0.0
     jump: float = np.nan
     foreseen: bool = False
     trust: Trust = Trust()

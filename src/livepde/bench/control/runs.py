@@ -8,12 +8,13 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livepde.bench.control.problem import Problem
 from livepde.control import Controller, Estimator, Kalman, Known, Learned, Loop
 from livepde.linalg import Array
 
-__all__ = ["Run", "Told", "closed_loop", "learned", "nominal", "told"]
+__all__ = ["Run", "Told", "closed_loop", "learned", "nominal", "offset_free", "told"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +50,16 @@ class Run:
     estimating: Array
     whole: Array
 
-    def cost(self, problem: Problem, since: float = -np.inf, until: float = np.inf) -> float:
-        """Return the cost of the goal over samples with since < t <= until."""
+    def cost(
+        self, problem: Problem, since: float = -np.inf, until: float = np.inf, *, paid: bool = True
+    ) -> float:
+        """Return the cost of the goal over samples with since < t <= until.
+
+        Parameters
+        ----------
+        paid
+            With the penalties for what lies beyond limits.
+        """
         model, goal = problem.reduced, problem.goal
         rows = [model.outputs.names.index(name) for name in goal.track]
         missed = (self.outputs[:, rows] - self.reference) ** 2 @ np.array([*goal.track.values()])
@@ -58,7 +67,7 @@ class Run:
         change = np.diff(self.inputs, axis=0, prepend=before) ** 2
         moved = change @ np.array([goal.move[name] for name in model.controls])
         moved += self.inputs @ np.array([goal.price.get(name, 0.0) for name in model.controls])
-        beyond = goal.beyond * self.beyond(problem).sum(axis=1)
+        beyond = (goal.beyond if paid else 0.0) * self.beyond(problem).sum(axis=1)
         counted = (self.t > since) & (self.t <= until)
         return float((missed + moved + beyond)[counted].sum())
 
@@ -71,7 +80,7 @@ class Run:
             found[:, k] = np.maximum(np.maximum(low - y, y - high), 0.0)
         return found
 
-    def violations(self, problem: Problem, tolerance: float = 0.0) -> Array:
+    def violations(self, problem: Problem, tolerance: float = 0.0) -> NDArray[np.bool_]:
         """Return at which samples an output was beyond its limits by more than a tolerance."""
         return np.asarray((self.beyond(problem) > tolerance).any(axis=1))
 
@@ -121,6 +130,13 @@ class Told:
 def nominal(problem: Problem) -> Kalman:
     """Return the filter of the wrong fixed model: unknown numbers at the prior."""
     return Kalman(problem.reduced, problem.period, drive=problem.drive, steps=problem.steps)
+
+
+def offset_free(problem: Problem) -> Kalman:
+    """Return the same with an unknown offset of each control that its filter finds."""
+    model, walk = problem.reduced, problem.drive
+    offset = {name: walk[name] for name in model.controls if name in walk}
+    return Kalman(model, problem.period, drive=walk, steps=problem.steps, offset=offset)
 
 
 def told(problem: Problem) -> Told:
