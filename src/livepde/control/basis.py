@@ -19,7 +19,12 @@ SYMMETRIC = 1e-10  # relative asymmetry that is rounding
 
 
 def basis(
-    mass: sp.csr_array, free: IntArray, systems: Sequence[Linear], drives: Array, modes: int
+    mass: sp.csr_array,
+    free: IntArray,
+    systems: Sequence[Linear],
+    drives: Array,
+    modes: int,
+    rates: Sequence[float] = (),
 ) -> Array:
     """Return columns V with V^T M V = I, zero on fixed coefficients, shape (n, r).
 
@@ -36,6 +41,8 @@ def basis(
         Lifting of boundary channels and of known boundary values, shape (n, channels + 1).
     modes
         How many of the slowest eigenmodes of the first system are added.
+    rates
+        Responses to channels that grow with exp(rate t) are added.
     """
     M = sp.csc_array(mass[free][:, free])
     static, slowest = [], np.zeros((len(free), 0))
@@ -43,7 +50,8 @@ def basis(
         K = sp.csc_array(system.K[free][:, free])
         shift = SHIFT * float(abs(K).sum(axis=1).max() / M.sum(axis=1).max())
         loads = np.column_stack([system.E, system.f]) - system.K @ drives
-        static.append(splu(sp.csc_array(K + shift * M)).solve(np.ascontiguousarray(loads[free])))
+        for rate in (shift, *rates):
+            static.append(splu(sp.csc_array(K + rate * M)).solve(np.ascontiguousarray(loads[free])))
         if system is systems[0] and modes:
             slowest = _modes(K, M, modes, shift)
     responses = np.hstack(static)

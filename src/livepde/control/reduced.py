@@ -173,8 +173,6 @@ class ReducedModel:
         """
         frame, c = self.frame, self.values(inputs)
         observed = frame.observed_sensors
-        if observed.linear:
-            return self.sensors(x, c), self.sensors.C
         full, moment = frame.q.copy(), Moment(0.0, Inputs(inputs))
         full[frame.rows] = q
         u = frame.lift(x, c)
@@ -401,6 +399,7 @@ def reduce(
     *,
     sensors: Observation | None = None,
     modes: int = 6,
+    rates: Sequence[float] = (),
     u: Any = None,
     q: Any = None,
     inputs: Mapping[str, float] | None = None,
@@ -424,6 +423,9 @@ def reduce(
         What is measured; default `outputs`.
     modes
         Eigenmodes beside the static responses.
+    rates
+        Responses at these rates, one over a time, are exact, too: take 1/period where an output
+        lies where a control acts, so that it answers at once.
     u, q, inputs
         Where to linearise, as for `Identifier` u0 and q0: default zero, the prior, and zero. Of an
         unknown field q is its value; see `ReducedModel.about`.
@@ -467,5 +469,5 @@ def reduce(
             values.append(other)
     systems = [linearisation.at(value) for value in values]
     free = np.flatnonzero(model.X.free)
-    V = basis(model.mass, free, systems, np.column_stack([W, known]), modes)
+    V = basis(model.mass, free, systems, np.column_stack([W, known]), modes, rates)
     return replace(frame, V=V, test=V.T @ model.mass).build(tuple(controls))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from livepde.bench.control.problem import Problem, Simulated
-from livepde.control import Goal, reduce
+from livepde.control import Goal, Trust, reduce
 from livepde.fem import On, RandomWalk, Scalar, line
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
@@ -105,7 +105,7 @@ def battery(seed: int = 0) -> Problem:
     return Problem(
         name="battery",
         title="A battery particle whose diffusivity drifts",
-        reduced=reduce(model, fillings(), ["I"], sensors=voltage, modes=8, u=start),
+        reduced=reduce(model, fillings(), ["I"], sensors=voltage, modes=0, rates=(1.0 / PERIOD,), u=start),
         identifier=lambda: Identifier(model, voltage, SensitivityLaw(), u0=start),
         goal=Goal(
             track={"mean": 1.0},
@@ -123,4 +123,5 @@ def battery(seed: int = 0) -> Problem:
         reference=lambda t: {"mean": HIGH if t % CYCLE < CHARGING else LOW},
         disturbances=lambda t: {},
         before={"I": 0.0},
+        trust=Trust(spread=1.0),
     )

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from livepde.control import Goal, ReducedModel
+from livepde.control import Goal, ReducedModel, Trust
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
 from livepde.linalg import Array
@@ -61,7 +61,7 @@ class Problem:
     reference
         t -> what the tracked outputs should be.
     disturbances
-        t -> measured disturbances; their forecast is what they are now.
+        t -> measured disturbances, held over the period that ends at t.
     before
         Inputs before the first sample.
     limits
@@ -70,6 +70,10 @@ class Problem:
         By how much a limit may be missed without counting as violated.
     jump
         Time of a sudden change; NaN if there is none.
+    foreseen
+        Whether disturbances are known beforehand; else their forecast is what they are now.
+    trust
+        When livepde's estimate is used.
     """
 
     name: str
@@ -90,6 +94,8 @@ class Problem:
     limits: Callable[[float], Mapping[str, tuple[float, float]]] | None = None
     tolerance: float = 0.0
     jump: float = np.nan
+    foreseen: bool = False
+    trust: Trust = Trust()
 
     @property
     def times(self) -> list[float]:
@@ -101,11 +107,16 @@ class Problem:
         return self.goal.limits if self.limits is None else self.limits(t)
 
     def ahead(self, t: float) -> dict[str, Any]:
-        """Return what `Loop.step` is told of the future: references and limits are known."""
+        """Return what `Loop.step` is told of the future: references and limits are known.
+
+        So are disturbances, if they are foreseen.
+        """
         coming = [t + self.period * (k + 1) for k in range(self.horizon)]
         reference = [self.reference(now) for now in coming]
         limits = [self.limits_at(now) for now in coming]
+        others = [self.disturbances(now) for now in coming] if self.foreseen else [{}]
         return {
+            "forecast": {name: [at[name] for at in others] for name in others[0]},
             "reference": {name: [at[name] for at in reference] for name in self.goal.track},
             "limits": {
                 name: ([at[name][0] for at in limits], [at[name][1] for at in limits])

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from livepde.bench.control.problem import Problem
-from livepde.control import Controller, Estimator, Kalman, Known, Learned, Loop, Trust
+from livepde.control import Controller, Estimator, Kalman, Known, Learned, Loop
 from livepde.linalg import Array
 
 __all__ = ["Run", "Told", "closed_loop", "learned", "nominal", "offset_free", "told"]
@@ -167,9 +167,9 @@ def told(problem: Problem) -> Told:
     return Told(problem)
 
 
-def learned(problem: Problem, trust: Trust | None = None) -> Learned:
+def learned(problem: Problem) -> Learned:
     """Return livepde in the loop."""
-    return Learned(problem.identifier(), nominal(problem), trust, problem.steps)
+    return Learned(problem.identifier(), nominal(problem), problem.trust, problem.steps)
 
 
 def closed_loop(problem: Problem, estimator: Estimator, controller: Controller, seed: int) -> Run:

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from livepde.bench.control.problem import Problem, Simulated
-from livepde.control import Goal, reduce
+from livepde.control import Goal, Trust, reduce
 from livepde.errors import ConfigurationError
 from livepde.fem import Field, On, Piecewise, dot, grad, line, linear
 from livepde.identifier import Identifier
@@ -58,7 +58,8 @@ COLD = 8.0  # degC, at the start: nobody was there for a week
 WARM, NIGHT = 20.0, 15.0  # degC, least by day and by night
 MORNING, EVENING = 6.0, 18.0  # h
 HOTTEST = 24.0  # degC
-PRICE = 1.0 / POWER  # of an hour with full power: 2 samples
+PRICE = 1.0 / POWER  # of a sample with full power: 1
+PENALTY = 5.0  # of a kelvin too cold in a sample, in samples of full power
 PERIOD, STEPS, HORIZON, DAYS = 1800.0, 2, 24, 7
 FINE = 4, 300.0  # cells for each of the model's, s
 WEEKS = (0, 1, 2, 4, 5)  # of the record, those with frost
@@ -133,7 +134,7 @@ def wall(seed: int = 0) -> Problem:
     return Problem(
         name="wall",
         title="A room behind a wall whose layers are unknown",
-        reduced=reduce(model, outputs, ["heater"], sensors=sensors, modes=6, u=COLD),
+        reduced=reduce(model, outputs, ["heater"], sensors=sensors, modes=4, u=COLD),
         identifier=lambda: Identifier(model, sensors, SensitivityLaw(), u0=COLD),
         goal=Goal(
             track={},
@@ -141,6 +142,7 @@ def wall(seed: int = 0) -> Problem:
             inputs={"heater": (0.0, POWER)},
             limits={"air": (NIGHT, HOTTEST)},
             price={"heater": PRICE},
+            penalty=PENALTY,
         ),
         period=PERIOD,
         steps=STEPS,
@@ -153,6 +155,9 @@ def wall(seed: int = 0) -> Problem:
         disturbances=outside,
         before={"heater": 0.0},
         limits=comfort,
+        foreseen=True,
+        # What nobody can tell of the outer layer does not matter inside.
+        trust=Trust(spread=2.0),
     )
 
 
