@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -48,8 +48,11 @@ class Problem:
         plant, in this order.
     identifier
         Returns livepde's identifier, as it stands before the first sample.
-    goal, period, steps, horizon
+    goal, period, horizon
         As for `livepde.control.MPC`.
+    steps
+        Implicit Euler steps of a period in the moving horizon, for which the unknown numbers are
+        variables.
     samples
         Length of a run.
     plant
@@ -95,7 +98,7 @@ class Problem:
     tolerance: float = 0.0
     jump: float = np.nan
     foreseen: bool = False
-    trust: Trust = Trust()
+    trust: Trust = field(default_factory=Trust)
 
     @property
     def times(self) -> list[float]:

@@ -20,6 +20,7 @@ from livepde.identifier import Identifier
 from livepde.laws import Jumps, SensitivityLaw
 from livepde.model import Model
 from livepde.observation import Points
+from livepde.stepping import Alexander2
 
 __all__ = ["rod"]
 
@@ -90,7 +91,7 @@ def rod(seed: int = 0) -> Problem:
         name="rod",
         title="A heated rod whose conductivity is unknown and jumps",
         reduced=reduce(model, outputs, ["heater"], sensors=sensors, u=ROOM),
-        identifier=lambda: Identifier(model, sensors, law, u0=ROOM),
+        identifier=lambda: Identifier(model, sensors, law, u0=ROOM, scheme=Alexander2(), hold=True),
         goal=Goal(
             track={"tip": 1.0},
             move={"heater": 500.0},
