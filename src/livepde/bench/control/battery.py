@@ -42,7 +42,7 @@ FASTEST = (-3.0 * ONE, 1.0 * ONE)  # A: charge, discharge
 LIMITS = (0.05, 0.85)  # of the filling at the surface
 LOW, HIGH = 0.3, 0.8  # mean filling
 CYCLE, CHARGING = 5400.0, 2700.0  # s
-CYCLES = 3
+CYCLES = 2
 PERIOD, STEPS, HORIZON = 30.0, 4, 12
 CELLS, FINE = 24, (72, 3.0)  # of model and truth; s
 
@@ -51,7 +51,8 @@ def process(cells: int) -> Model:
     """Return the particle, on a mesh that is finer towards the surface."""
     inward = np.linspace(1.0, 0.0, cells + 1)
     mesh = line((RADIUS * (1.0 - inward**2)).tolist())
-    unknown = Scalar(D, SPREAD * D, transform="log", evolution=RandomWalk(DRIFT))
+    walk = RandomWalk(DRIFT)
+    unknown = Scalar(D, SPREAD * D, bounds=(0.0, np.inf), transform="log", evolution=walk)
     return battery_particle(mesh, unknown, area=AREA, c_max=FULL)
 
 

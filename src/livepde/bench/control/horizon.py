@@ -14,6 +14,7 @@ from livepde.bench.control.problem import Problem
 from livepde.bench.control.runs import nominal
 from livepde.checkpoint import packed, unpacked
 from livepde.control import Known, ReducedModel
+from livepde.control.mpc import packages, quiet
 from livepde.linalg import Array
 from livepde.observation import Transformed
 from livepde.result import unknown_of
@@ -150,9 +151,7 @@ class MovingHorizon:
     @cached_property
     def mhe(self) -> Any:
         """do-mpc's object."""
-        import casadi
-        import do_mpc
-
+        do_mpc, casadi = packages()
         problem, model, setting = self.problem, self.problem.reduced, self.setting
         r, m, steps = model.size, len(model.unknowns), problem.steps
         process = do_mpc.model.Model("discrete")
@@ -194,7 +193,8 @@ class MovingHorizon:
         mhe.set_p_fun(lambda t: none)
         mhe.bounds["lower", "_p_est", "p"] = -FARTHEST
         mhe.bounds["upper", "_p_est", "p"] = FARTHEST
-        mhe.setup()
+        with quiet():
+            mhe.setup()
         return mhe
 
 
@@ -213,8 +213,7 @@ def _scale(problem: Problem) -> Array:
 
 def _reading(model: ReducedModel, x: Any, c: Any) -> Any:
     """Return what the sensors show, as a CasADi expression."""
-    import casadi
-
+    casadi = packages()[1]
     seen, sensors = model.sensors, model.frame.sensors
     if not isinstance(sensors, Transformed):
         return casadi.DM(seen.C) @ x + casadi.DM(seen.D) @ c + casadi.DM(seen.d)

@@ -60,7 +60,7 @@ MORNING, EVENING = 6.0, 18.0  # h
 HOTTEST = 24.0  # degC
 PRICE = 1.0 / POWER  # of a sample with full power: 1
 PENALTY = 5.0  # of a kelvin too cold in a sample, in samples of full power
-PERIOD, STEPS, HORIZON, DAYS = 1800.0, 2, 24, 7
+PERIOD, STEPS, HORIZON, DAYS = 1800.0, 2, 20, 5
 FINE = 4, 300.0  # cells for each of the model's, s
 WEEKS = (0, 1, 2, 4, 5)  # of the record, those with frost
 RECORD = Path("soil_temperature") / "soil_2025_mar_jun.csv"
@@ -84,6 +84,7 @@ def process(fine: int = 1) -> Model:
         {name: (lambda x, name=name: inside(x, name)) for name in WALL},
         prior=1.0,
         std=SPREAD,
+        bounds=(0.0, np.inf),
         transform="log",
     )
     return Model(
