@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from livepde import plots
 from livepde.bench.control.horizon import MovingHorizon, Setting
 from livepde.bench.control.problem import Problem
 from livepde.bench.control.runs import Run, closed_loop, learned, nominal, offset_free, told
@@ -73,7 +74,7 @@ class Comparison:
         if math.isnan(problem.jump):
             found = run.t[run.trusted]
             return float(found[0]) if len(found) else math.inf
-        found = run.t[run.alarms & (run.t > problem.jump)]
+        found = run.t[np.logical_and(run.alarms, run.t > problem.jump)]
         return float(found[0]) + LEARNING * problem.period if len(found) else math.inf
 
     def learning(self, seed: int, controller: str = "MPC") -> BoolArray:
@@ -168,6 +169,12 @@ class Comparison:
         if self.setting is not None:
             title += f"; moving horizon of {self.setting}"
         return Table(title, columns, rows)
+
+    def figure(self, quantities: Sequence[str], seed: int = 0) -> Any:
+        """Draw the runs of one seed under model predictive control."""
+        shown = [row for controller, row in self.rows if controller == "MPC" and row != OFFSET]
+        runs = {row: self.runs["MPC", row][seed].to_xarray(self.problems[seed]) for row in shown}
+        return plots.loops(runs, quantities, title=self.problems[seed].title)
 
 
 def compare(

@@ -8,6 +8,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
 from livepde.bench.control.problem import Problem
@@ -49,6 +50,28 @@ class Run:
     failed: int
     estimating: Array
     whole: Array
+
+    def to_xarray(self, problem: Problem) -> xr.Dataset:
+        """Return it as `livepde.plots.loops` draws it."""
+        model, times = problem.reduced, self.t.tolist()
+        found: dict[str, Any] = dict(zip(model.outputs.names, self.outputs.T, strict=True))
+        found |= dict(zip(model.controls, self.inputs.T, strict=True))
+        for k, label in enumerate(model.unknowns):
+            found[label], found[f"{label}_std"] = self.q[:, k], self.std[:, k]
+            found[f"{label}_truth"] = [problem.truth(t)[label] for t in times]
+        for k, name in enumerate(problem.goal.track):
+            found[f"{name}_reference"] = self.reference[:, k]
+        for name, given in problem.goal.limits.items():
+            for k, end in enumerate(("low", "high")):
+                if np.isfinite(given[k]):
+                    found[f"{name}_{end}"] = [problem.limits_at(t)[name][k] for t in times]
+        for name, (low, high) in problem.goal.inputs.items():
+            found[f"{name}_low"], found[f"{name}_high"] = (
+                np.full(len(times), v) for v in (low, high)
+            )
+        data = {name: ("time", np.asarray(values)) for name, values in found.items()}
+        unit = model.frame.model.time_unit
+        return xr.Dataset(data, coords={"time": ("time", self.t, {"units": unit})})
 
     def cost(
         self, problem: Problem, since: float = -np.inf, until: float = np.inf, *, paid: bool = True
