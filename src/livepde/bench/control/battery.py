@@ -106,7 +106,9 @@ def battery(seed: int = 0) -> Problem:
     return Problem(
         name="battery",
         title="A battery particle whose diffusivity drifts",
-        reduced=reduce(model, fillings(), ["I"], sensors=voltage, modes=0, rates=(1.0 / PERIOD,), u=start),
+        reduced=reduce(
+            model, fillings(), ["I"], sensors=voltage, modes=0, rates=(1.0 / PERIOD,), u=start
+        ),
         identifier=lambda: Identifier(model, voltage, SensitivityLaw(), u0=start),
         goal=Goal(
             track={"mean": 1.0},
@@ -124,5 +126,6 @@ def battery(seed: int = 0) -> Problem:
         reference=lambda t: {"mean": HIGH if t % CYCLE < CHARGING else LOW},
         disturbances=lambda t: {},
         before={"I": 0.0},
+        tolerance=0.01,
         trust=Trust(spread=1.0),
     )

@@ -6,11 +6,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 
+from livepde.bench.control.battery import battery
 from livepde.bench.control.compare import FIXED, HORIZON, LEARNED, TRUE, Comparison, compare
 from livepde.bench.control.horizon import Setting
 from livepde.bench.control.problem import Problem
 from livepde.bench.control.rod import rod
+from livepde.bench.control.wall import wall
 from livepde.errors import ConfigurationError
+from livepde.linalg import Array
 from livepde.runs.outcome import Check, Outcome
 
 __all__ = ["PROBLEMS", "control"]
@@ -35,12 +38,19 @@ class Contest:
         What its figure shows.
     checks
         What is promised of it.
+    linear
+        Whether `LQ` is run besides: it knows no limits.
     """
 
     make: Callable[[int], Problem]
     settings: Sequence[Setting]
     quantities: Sequence[str]
     checks: Callable[[Comparison], list[Check]]
+    linear: bool = True
+
+    def compare(self, seeds: int, progress: bool) -> Comparison:
+        """Return its runs."""
+        return compare(self.make, seeds, self.settings, linear=self.linear, progress=progress)
 
 
 def control(
@@ -66,10 +76,7 @@ def control(
         raise ConfigurationError(
             "bench control needs do-mpc, which is not installed: pip install 'livepde[control]'."
         )
-    found = {
-        name: compare(PROBLEMS[name].make, seeds, PROBLEMS[name].settings, progress=progress)
-        for name in only or PROBLEMS
-    }
+    found = {name: PROBLEMS[name].compare(seeds, progress) for name in only or PROBLEMS}
     return Outcome(
         tables=[comparison.table() for comparison in found.values()],
         checks=[check for name in found for check in PROBLEMS[name].checks(found[name])],
@@ -136,11 +143,53 @@ def promises(comparison: Comparison) -> list[Check]:
     return found
 
 
+def bounded(comparison: Comparison) -> list[Check]:
+    """Return the checks of a process whose outputs have limits, which only `MPC` knows."""
+    what = f"{comparison.problems[0].name}, MPC"
+
+    def late(row: str) -> float:
+        return float(comparison.costs("MPC", row, late=True).mean())
+
+    def costs(row: str) -> Array:
+        return comparison.costs("MPC", row)
+
+    allowed = comparison.violations("MPC", TRUE)
+    allowed += comparison.violations("MPC", LEARNED, learning=True)
+    worst = float((costs(LEARNED) / costs(FIXED)).max())
+    found = [
+        Check(f"{what}: learned cost over true model's", late(LEARNED) / late(TRUE), OF_TRUE, "<="),
+        Check(f"{what}: total cost over wrong model's, worst seed", worst, WORST, "<="),
+        Check(f"{what}: violations", comparison.violations("MPC", LEARNED), allowed, "<="),
+    ]
+    if comparison.setting is not None:
+        ratio = comparison.seconds("MPC", HORIZON) / comparison.seconds("MPC", LEARNED)
+        cost = float(costs(LEARNED).mean() / costs(HORIZON).mean())
+        found += [
+            Check(f"{what}: times cheaper than the moving horizon", ratio, CHEAPER, ">="),
+            Check(f"{what}: cost over that with the moving horizon", cost, 1.0, "<="),
+        ]
+    return found
+
+
 PROBLEMS: Mapping[str, Contest] = {
     "rod": Contest(
         rod,
         [Setting(10, 1.0, 1.0), Setting(20, 1.0, 0.1), Setting(20, 1.0, 0.01)],
         ["tip", "face", "heater", "k"],
         promises,
+    ),
+    "wall": Contest(
+        wall,
+        [Setting(24, 1.0, 1.0), Setting(48, 1.0, 10.0), Setting(24, 1.0, 0.1)],
+        ["air", "heater", "k[masonry]", "k[insulation]"],
+        bounded,
+        linear=False,
+    ),
+    "battery": Contest(
+        battery,
+        [Setting(16, 1.0, 1.0), Setting(30, 1.0, 0.1), Setting(30, 0.1, 1.0)],
+        ["mean", "surface", "I", "D"],
+        bounded,
+        linear=False,
     ),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -74,6 +74,9 @@ class Problem:
         Whether disturbances are known beforehand; else their forecast is what they are now.
     trust
         When livepde's estimate is used.
+    settled
+        Time from which it should have learned, where nothing jumps; NaN: from the first sample at
+        which the estimate was trusted.
     """
 
     name: str
@@ -95,7 +98,8 @@ class Problem:
     tolerance: float = 0.0
     jump: float = np.nan
     foreseen: bool = False
-    trust: Trust = Trust()
+    trust: Trust = field(default_factory=Trust)
+    settled: float = np.nan
 
     @property
     def times(self) -> list[float]:
