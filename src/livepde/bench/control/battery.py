@@ -35,14 +35,14 @@ __all__ = ["battery", "graphite"]
 RADIUS, AREA, FULL = 5e-6, 1.0, 30555.0  # m, m^2, mol/m^3
 CAPACITY = FARADAY * FULL * AREA * RADIUS / 3  # C, of the particle from empty to full
 ONE = CAPACITY / 3600.0  # A, that fills it in an hour
-D, SPREAD = 6e-15, 0.5  # m^2/s, prior and deviation of its logarithm
+D, SPREAD = 3e-15, 0.5  # m^2/s, prior and deviation of its logarithm
 DRIFT = 0.3 / np.sqrt(3600.0)  # deviation that the logarithm gains, per square root of a second
 NOISE = 2e-3  # V
 FASTEST = (-3.0 * ONE, 1.0 * ONE)  # A: charge, discharge
 LIMITS = (0.05, 0.85)  # of the filling at the surface
 LOW, HIGH = 0.3, 0.8  # mean filling
 CYCLE, CHARGING = 5400.0, 2700.0  # s
-CYCLES = 3
+CYCLES = 2
 PERIOD, STEPS, HORIZON = 30.0, 4, 12
 CELLS, FINE = 24, (72, 3.0)  # of model and truth; s
 
@@ -51,7 +51,8 @@ def process(cells: int) -> Model:
     """Return the particle, on a mesh that is finer towards the surface."""
     inward = np.linspace(1.0, 0.0, cells + 1)
     mesh = line((RADIUS * (1.0 - inward**2)).tolist())
-    unknown = Scalar(D, SPREAD * D, transform="log", evolution=RandomWalk(DRIFT))
+    walk = RandomWalk(DRIFT)
+    unknown = Scalar(D, SPREAD * D, bounds=(0.0, np.inf), transform="log", evolution=walk)
     return battery_particle(mesh, unknown, area=AREA, c_max=FULL)
 
 
@@ -116,7 +117,6 @@ def battery(seed: int = 0) -> Problem:
             limits={"surface": LIMITS},
         ),
         period=PERIOD,
-        steps=STEPS,
         horizon=HORIZON,
         samples=round(CYCLES * CYCLE / PERIOD),
         plant=plant,
@@ -125,5 +125,6 @@ def battery(seed: int = 0) -> Problem:
         reference=lambda t: {"mean": HIGH if t % CYCLE < CHARGING else LOW},
         disturbances=lambda t: {},
         before={"I": 0.0},
+        tolerance=0.01,
         trust=Trust(spread=1.0),
     )

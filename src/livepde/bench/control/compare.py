@@ -67,10 +67,12 @@ class Comparison:
     def learned_at(self, seed: int, controller: str = "MPC") -> float:
         """Return until when livepde learns after the jump: `LEARNING` samples from its alarm on.
 
-        A rule that does not look at the result. Without a jump: the first sample at which the
-        estimate was trusted; infinite where there is none, or no alarm.
+        A rule that does not look at the result. Without a jump: what the problem says, or the first
+        sample at which the estimate was trusted; infinite where there is none, or no alarm.
         """
         problem, run = self.problems[seed], self.runs[controller, LEARNED][seed]
+        if not math.isnan(problem.settled):
+            return problem.settled
         if math.isnan(problem.jump):
             found = run.t[run.trusted]
             return float(found[0]) if len(found) else math.inf
@@ -80,6 +82,8 @@ class Comparison:
     def learning(self, seed: int, controller: str = "MPC") -> BoolArray:
         """Return which samples of a seed count as learning: at the start, and after the jump."""
         problem, run = self.problems[seed], self.runs[controller, LEARNED][seed]
+        if not math.isnan(problem.settled):
+            return np.asarray(run.t <= problem.settled)
         trusted = run.t[run.trusted]
         first = float(trusted[0]) if len(trusted) else math.inf
         found: BoolArray = np.asarray(run.t <= first)
@@ -202,18 +206,14 @@ def compare(
         Show a bar.
     """
     problems = [make(seed) for seed in range(seeds)]
-    controllers = {name: [of(problem) for problem in problems] for name, of in CONTROLLERS.items()}
+    used = CONTROLLERS if linear else {"MPC": CONTROLLERS["MPC"]}
+    controllers = {name: [of(problem) for problem in problems] for name, of in used.items()}
     runs: dict[tuple[str, str], list[Run]] = {}
 
     def run(controller: str, seed: int, estimator: Estimator) -> Run:
         return closed_loop(problems[seed], estimator, controllers[controller][seed], seed)
 
-    jobs = [
-        (controller, row, seed)
-        for controller in (CONTROLLERS if linear else ("MPC",))
-        for row in ROWS
-        for seed in range(seeds)
-    ]
+    jobs = [(controller, row, seed) for controller in used for row in ROWS for seed in range(seeds)]
     for controller, row, seed in watched(jobs, len(jobs), "loops") if progress else jobs:
         found = run(controller, seed, ROWS[row](problems[seed]))
         runs.setdefault((controller, row), []).append(found)

@@ -14,12 +14,14 @@ from livepde.bench.control.problem import Problem
 from livepde.bench.control.runs import nominal
 from livepde.checkpoint import packed, unpacked
 from livepde.control import Known, ReducedModel
+from livepde.control.mpc import packages, quiet
 from livepde.linalg import Array
 from livepde.observation import Transformed
 from livepde.result import unknown_of
 
 __all__ = ["MovingHorizon", "Setting"]
 
+RADAU = ((5 / 12, -1 / 12), (3 / 4, 1 / 4))  # of two stages, the second at the end
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 100}
 FLOOR = 1e-3  # process noise of each coordinate, relative to the largest
 FARTHEST = 6.0  # prior deviations that an unknown number moves at most: exp must not overflow
@@ -56,7 +58,7 @@ class MovingHorizon:
     Parameters
     ----------
     problem
-        With the reduced model; discretised as for everybody, by `steps` implicit Euler steps.
+        With the reduced model, whose periods are steps of Radau's method, do-mpc's default.
     setting
         Window and weights.
     """
@@ -131,7 +133,7 @@ class MovingHorizon:
         for k, x in enumerate(self._x / self.scale):
             mhe.opt_x_num["_x", k, -1] = x
         for k, x in enumerate(self._x[1:] / self.scale):
-            mhe.opt_x_num["_z", k, -1, "inner"] = np.tile(x, (self.problem.steps, 1)).T
+            mhe.opt_x_num["_z", k, -1, "inner"] = np.tile(x, (len(RADAU), 1)).T
         mhe.opt_x_num["_p_est"] = 0.0
         mhe.opt_p_num["_x_prev"] = mhe.opt_x_num["_x", 0, -1]
 
@@ -150,31 +152,31 @@ class MovingHorizon:
     @cached_property
     def mhe(self) -> Any:
         """do-mpc's object."""
-        import casadi
-        import do_mpc
-
+        do_mpc, casadi = packages()
         problem, model, setting = self.problem, self.problem.reduced, self.setting
-        r, m, steps = model.size, len(model.unknowns), problem.steps
+        r, m = model.size, len(model.unknowns)
         process = do_mpc.model.Model("discrete")
         x = process.set_variable("_x", "x", (r, 1))
-        inner = process.set_variable("_z", "inner", (r, steps))
+        inner = process.set_variable("_z", "inner", (r, len(RADAU)))
         c = process.set_variable("_tvp", "c", (len(model.channels), 1))
         p = process.set_variable("_p", "p", (m, 1))
         seen = _reading(model, self.scale[:, None] * inner[:, -1], c)
         process.set_meas("z", seen / casadi.DM(model.sensors.noise), meas_noise=True)
         process.set_rhs("x", inner[:, -1])
         q = [1.0, *self._numbers(p, casadi.exp)]
-        balance, before, h = [], x, problem.period / steps
-        for k in range(steps):
-            after = inner[:, k]
+        rates = []
+        for k in range(len(RADAU)):
             rate = 0.0
             for i, value in enumerate(q):
                 K = model.K[i] * self.scale / self.scale[:, None]
                 driven = casadi.DM(model.E[i] / self.scale[:, None]) @ c
                 driven += casadi.DM(model.f[i] / self.scale)
-                rate += value * (driven - casadi.DM(K) @ after)
-            balance.append(after - before - h * rate)
-            before = after
+                rate += value * (driven - casadi.DM(K) @ inner[:, k])
+            rates.append(rate)
+        balance = [
+            inner[:, k] - x - problem.period * sum(a * v for a, v in zip(row, rates, strict=True))
+            for k, row in enumerate(RADAU)
+        ]
         process.set_alg("balance", casadi.vertcat(*balance))
         process.setup()
         mhe = do_mpc.estimator.MHE(process, ["p"])
@@ -184,7 +186,7 @@ class MovingHorizon:
         mhe.settings.store_full_solution = False
         mhe.settings.nlpsol_opts = QUIET
         mhe.set_default_objective(
-            P_x=setting.state * np.eye(r),
+            P_x=np.diag(np.full(r, setting.state)),
             P_v=np.eye(len(model.sensors.names)),
             P_p=setting.unknowns * np.eye(m),
         )
@@ -194,7 +196,8 @@ class MovingHorizon:
         mhe.set_p_fun(lambda t: none)
         mhe.bounds["lower", "_p_est", "p"] = -FARTHEST
         mhe.bounds["upper", "_p_est", "p"] = FARTHEST
-        mhe.setup()
+        with quiet():
+            mhe.setup()
         return mhe
 
 
@@ -213,8 +216,7 @@ def _scale(problem: Problem) -> Array:
 
 def _reading(model: ReducedModel, x: Any, c: Any) -> Any:
     """Return what the sensors show, as a CasADi expression."""
-    import casadi
-
+    casadi = packages()[1]
     seen, sensors = model.sensors, model.frame.sensors
     if not isinstance(sensors, Transformed):
         return casadi.DM(seen.C) @ x + casadi.DM(seen.D) @ c + casadi.DM(seen.d)

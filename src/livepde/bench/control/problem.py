@@ -50,9 +50,6 @@ class Problem:
         Returns livepde's identifier, as it stands before the first sample.
     goal, period, horizon
         As for `livepde.control.MPC`.
-    steps
-        Implicit Euler steps of a period in the moving horizon, for which the unknown numbers are
-        variables.
     samples
         Length of a run.
     plant
@@ -77,6 +74,9 @@ class Problem:
         Whether disturbances are known beforehand; else their forecast is what they are now.
     trust
         When livepde's estimate is used.
+    settled
+        Time from which it should have learned, where nothing jumps; NaN: from the first sample at
+        which the estimate was trusted.
     """
 
     name: str
@@ -85,7 +85,6 @@ class Problem:
     identifier: Callable[[], Identifier]
     goal: Goal
     period: float
-    steps: int
     horizon: int
     samples: int
     plant: Callable[[int], Plant]
@@ -99,6 +98,7 @@ class Problem:
     jump: float = np.nan
     foreseen: bool = False
     trust: Trust = field(default_factory=Trust)
+    settled: float = np.nan
 
     @property
     def times(self) -> list[float]:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +59,9 @@ WARM, NIGHT = 20.0, 15.0  # degC, least by day and by night
 MORNING, EVENING = 6.0, 18.0  # h
 HOTTEST = 24.0  # degC
 PRICE = 1.0 / POWER  # of a sample with full power: 1
+LEARNT = 2.0 * DAY  # the first day warms the building up, for everybody
 PENALTY = 5.0  # of a kelvin too cold in a sample, in samples of full power
-PERIOD, STEPS, HORIZON, DAYS = 1800.0, 2, 24, 7
+PERIOD, STEPS, HORIZON, DAYS = 1800.0, 2, 20, 5
 FINE = 4, 300.0  # cells for each of the model's, s
 WEEKS = (0, 1, 2, 4, 5)  # of the record, those with frost
 RECORD = Path("soil_temperature") / "soil_2025_mar_jun.csv"
@@ -81,9 +82,10 @@ def process(fine: int = 1) -> Model:
 
     mesh = line(nodes).with_subdomains({"room": lambda x: x[0] < DEEP})
     share = Piecewise(
-        {name: (lambda x, name=name: inside(x, name)) for name in WALL},
+        {name: partial(inside, name=name) for name in WALL},
         prior=1.0,
         std=SPREAD,
+        bounds=(0.0, np.inf),
         transform="log",
     )
     return Model(
@@ -145,7 +147,6 @@ def wall(seed: int = 0) -> Problem:
             penalty=PENALTY,
         ),
         period=PERIOD,
-        steps=STEPS,
         horizon=HORIZON,
         samples=round(DAYS * DAY / PERIOD),
         plant=plant,
@@ -156,6 +157,8 @@ def wall(seed: int = 0) -> Problem:
         before={"heater": 0.0},
         limits=comfort,
         foreseen=True,
+        settled=LEARNT,
+        tolerance=0.2,
         # What nobody can tell of the outer layer does not matter inside.
         trust=Trust(spread=2.0),
     )
