@@ -47,13 +47,14 @@ def main() -> dict[str, tuple[float, float]]:
     """Let the tip follow 45 and 60 degrees in turn; neither tip nor hot face is measured."""
     model, plant = rod(30), Plant()
     sensors = lp.Points({"T_5": 0.05, "T_10": 0.10}, noise=0.2)
-    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(jumps=lp.Jumps()), u0=ROOM)
+    law = lp.SensitivityLaw(jumps=lp.Jumps())
+    identifier = lp.Identifier(model, sensors, law, u0=ROOM, hold=True, scheme=lp.Alexander2())
 
     seen = lp.Points({"face": 0.0, "tip": 0.15})
     reduced = ct.reduce(model, seen, controls=["heater"], sensors=sensors)
     print("missed by the reduced model:", reduced.error(h=PERIOD))
     goal = ct.Goal(track={"tip": 1.0}, move={"heater": 500.0}, inputs={"heater": (0.0, 1.0)})
-    controller = ct.LQ(reduced, goal, PERIOD, steps=4)  # or ct.MPC, with limits for the face
+    controller = ct.LQ(reduced, goal, PERIOD)  # or ct.MPC, with limits for the face
 
     loop = ct.Loop(identifier, controller)
     for k in range(150):

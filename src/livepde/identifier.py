@@ -79,6 +79,9 @@ class Identifier:
         Time scheme; a longer interval between samples is divided into substeps.
     assimilate_from
         Samples before this time drive inputs and are scored, but not assimilated.
+    hold
+        Whether inputs are held between samples at what the later one brings, as an actuator that
+        is set anew at each sample leaves them; else they change linearly.
 
     Raises
     ------
@@ -99,6 +102,7 @@ class Identifier:
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
         assimilate_from: float = -np.inf,
+        hold: bool = False,
     ) -> None:
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
@@ -109,7 +113,8 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
-        self.problem = Problem(model, self.observed, Advance(scheme or ImplicitEuler(), dt_max))
+        control = Advance(scheme or ImplicitEuler(), dt_max, hold=hold)
+        self.problem = Problem(model, self.observed, control)
         self.assimilate_from = assimilate_from
         self._check_names()
         self._work = law.prepare(self.problem)

@@ -42,13 +42,11 @@ class Learned:
     Parameters
     ----------
     identifier
-        What learns; its own model has any size.
+        What learns, built with `hold=True`; its own model has any size.
     nominal
         The fixed model with its filter, which runs beside at every sample.
     trust
         When the estimate is handed over.
-    steps
-        Steps that the identifier takes between two samples, with inputs held.
 
     Attributes
     ----------
@@ -56,11 +54,13 @@ class Learned:
         The identifier's last estimate.
     """
 
-    def __init__(
-        self, identifier: Identifier, nominal: Kalman, trust: Trust | None = None, steps: int = 1
-    ) -> None:
-        if steps < 1:
-            raise ConfigurationError(f"Learned: steps must be at least 1; got {steps}.")
+    def __init__(self, identifier: Identifier, nominal: Kalman, trust: Trust | None = None) -> None:
+        control = identifier.problem.control
+        if not control.hold:
+            raise ConfigurationError(
+                "Learned: inputs of a loop are held between samples: build the identifier with "
+                "hold=True."
+            )
         missing = [c for c in identifier.inputs if c not in nominal.model.channels]
         if missing:
             raise ConfigurationError(
@@ -70,7 +70,6 @@ class Learned:
         self.identifier = identifier
         self.nominal = nominal
         self.trust = trust or Trust()
-        self.steps = steps
         self.estimate: Estimate | None = None
         self._good = 0
 
@@ -79,9 +78,6 @@ class Learned:
         if isinstance(z, Mapping):
             z = np.array([float(z.get(name, np.nan)) for name in identifier.observed.names])
         nominal = self.nominal.step(t, z, inputs)
-        begin, nothing = identifier.t, np.full(identifier.observed.size, np.nan)
-        for k in range(1, self.steps if t > begin else 1):
-            identifier.step(begin + k * (t - begin) / self.steps, nothing, inputs)
         self.estimate = estimate = identifier.step(t, z, inputs)
         doubt = self.trust.doubt(estimate, model)
         self._good = 0 if doubt else min(self._good + 1, self.trust.patience)

@@ -156,10 +156,6 @@ class Controller(Protocol):
         """Time between two samples."""
 
     @property
-    def steps(self) -> int:
-        """Implicit Euler steps that a period is divided into."""
-
-    @property
     def horizon(self) -> int:
         """Number of periods that it looks ahead."""
 
@@ -190,5 +186,5 @@ def check(controller: Controller) -> None:
         raise ConfigurationError(
             f"{what}: period must be a positive number; got {controller.period}."
         )
-    if controller.steps < 1 or controller.horizon < 1:
-        raise ConfigurationError(f"{what}: steps and horizon must be at least 1.")
+    if controller.horizon < 1:
+        raise ConfigurationError(f"{what}: horizon must be at least 1; got {controller.horizon}.")

@@ -29,8 +29,8 @@ class Kalman:
     ----------
     model
         With the noise of its sensors.
-    period, steps
-        Time between two samples, and implicit Euler steps that it is divided into.
+    period
+        Time between two samples.
     drive
         Channel -> standard deviation of its noise, held over a period, in its unit.
     offset
@@ -49,7 +49,6 @@ class Kalman:
         period: float,
         *,
         drive: Mapping[str, float],
-        steps: int = 1,
         offset: Mapping[str, float] | None = None,
         q: Mapping[str, float] | None = None,
         x: Array | None = None,
@@ -65,7 +64,6 @@ class Kalman:
                 )
         self.model = model
         self.period = period
-        self.steps = steps
         self.drive = np.array([float(drive.get(name, 0.0)) for name in model.channels])
         self._moving = model.columns(list(offset or {}))
         self._walk = np.array(list((offset or {}).values()))
@@ -85,7 +83,7 @@ class Kalman:
         """Take other unknown numbers; those that are not named are the prior's."""
         values = zip(self.model.unknowns, self.model.prior, strict=True)
         self._q = np.array([float(q.get(label, prior)) for label, prior in values])
-        self._move = self.model.matrices(self._q, self.period, self.steps)
+        self._move = self.model.matrices(self._q, self.period)
         driven = self._move.B * self.drive
         gained = driven @ driven.T
         floor = FLOOR**2 * float(np.trace(gained))

@@ -108,10 +108,9 @@ class Loop:
                 model,
                 controller.period,
                 drive=given,
-                steps=controller.steps,
                 x=model.project(estimator.u0),
             )
-            estimator = Learned(estimator, nominal, trust, controller.steps)
+            estimator = Learned(estimator, nominal, trust)
         elif trust is not None:
             raise ConfigurationError("Loop: trust is for an Identifier; give it to `Learned`.")
         self.estimator: Estimator = estimator

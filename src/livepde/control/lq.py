@@ -30,14 +30,13 @@ class LQ:
     ----------
     model, goal
         Reduced model, and what is to be reached.
-    period, steps
-        Time between two samples, and implicit Euler steps that it is divided into.
+    period
+        Time between two samples.
     """
 
     model: ReducedModel
     goal: Goal
     period: float
-    steps: int = 1
     horizon: int = 1
 
     def __post_init__(self) -> None:
@@ -50,7 +49,7 @@ class LQ:
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
         """Return what to set from now on; as for `Controller`."""
         model, low, high = self.model, *self.goal.range(self.model)
-        step = model.matrices(known.q, self.period, self.steps).with_offset(known.offset)
+        step = model.matrices(known.q, self.period).with_offset(known.offset)
         try:
             x, v = self.target(step, plan.reference[0], plan.disturbances[0])
             gain = self.gain(step)

@@ -40,8 +40,8 @@ class MPC:
     ----------
     model, goal
         Reduced model, and what is to be reached.
-    period, steps
-        Time between two samples, and implicit Euler steps that it is divided into.
+    period
+        Time between two samples.
     horizon
         Number of periods that it looks ahead.
     kappa
@@ -58,7 +58,6 @@ class MPC:
     model: ReducedModel
     goal: Goal
     period: float
-    steps: int = 1
     horizon: int = 20
     kappa: float = 2.0
     directions: int = 1
@@ -159,7 +158,7 @@ class MPC:
         q = np.clip(q, model.lower, model.upper)
         q = np.where(np.isfinite(q), q, known.q)
         for k, values in enumerate(q):
-            step = model.matrices(values, self.period, self.steps).with_offset(known.offset)
+            step = model.matrices(values, self.period).with_offset(known.offset)
             mpc.uncertain["_p", k] = np.concatenate([step.A.ravel("F"), step.B.ravel("F"), step.f])
         for k in range(self.horizon + 1):
             at = min(k, self.horizon - 1)

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg import expm
 
 from livepde.control.basis import basis
 from livepde.control.linear import Linear, Linearisation
@@ -17,11 +18,12 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import unknown_of
-from livepde.stepping import Advance, ImplicitEuler, simulate
+from livepde.stepping import Advance, Alexander2, simulate
 
 __all__ = ["Discrete", "Output", "ReducedModel", "reduce"]
 
 LIKELY = 0.95  # probability of the range of an unknown number over which responses are taken
+FINER = 8  # steps of the full model between two samples, where it is compared
 LINEAR = 1e-8  # relative error of a system that should be linear in the unknown numbers
 
 
@@ -130,8 +132,8 @@ class ReducedModel:
         K, E, f = (np.tensordot(weights, part, axes=1) for part in (self.K, self.E, self.f))
         return K, E, f
 
-    def matrices(self, q: Array, h: float, steps: int = 1) -> Discrete:
-        """Return what `steps` steps of implicit Euler make of a time h in which channels are held.
+    def matrices(self, q: Array, h: float) -> Discrete:
+        """Return what becomes of the state in a time h in which channels are held: exact in time.
 
         Parameters
         ----------
@@ -139,14 +141,11 @@ class ReducedModel:
             Unknown numbers, shape (m,).
         """
         K, E, f = self.system(q)
-        dt, r = h / steps, self.size
-        one = np.linalg.solve(np.eye(r) + dt * K, np.column_stack([np.eye(r), dt * E, dt * f]))
-        A, driven = np.asarray(one[:, :r]), np.asarray(one[:, r:])
-        total = driven
-        for _ in range(steps - 1):
-            total = A @ total + driven
-        power = np.linalg.matrix_power(A, steps)
-        return Discrete(np.asarray(power), np.asarray(total[:, :-1]), np.asarray(total[:, -1]))
+        r, columns = self.size, np.column_stack([E, f])
+        whole = np.zeros((r + columns.shape[1], r + columns.shape[1]))
+        whole[:r, :r], whole[:r, r:] = -h * K, h * columns
+        moved = np.asarray(expm(whole))[:r]
+        return Discrete(moved[:, :r], moved[:, r:-1], moved[:, -1])
 
     def project(self, u: Array) -> Array:
         """Return the coordinates of a state of the full model, shape (r,)."""
@@ -211,7 +210,7 @@ class ReducedModel:
         q
             Unknown numbers by label; default the prior.
         h, samples
-            Length of an implicit Euler step, and how many are taken.
+            Time between samples, and how many are taken.
         """
         frame, numbers = self.frame, self.prior.copy()
         for label, value in (q or {}).items():
@@ -229,7 +228,7 @@ class ReducedModel:
                 model.latent.inverse(full),
                 u0,
                 times,
-                Advance(ImplicitEuler()),
+                Advance(Alexander2(), h / FINER),
                 lambda t, inputs=inputs: inputs,  # type: ignore[misc]
             )
             c, x, rows = self.values(inputs), self.project(u0), []

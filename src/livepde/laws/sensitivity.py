@@ -488,6 +488,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         def failed(status: Status) -> tuple[Point, Report]:
             return point, Report(status, work.predict(point, interval.end))
 
+        interval = work.problem.control.over(interval)
         # What unknowns gain in one substep is independent of what they gain in the next.
         count = work.problem.control.count(interval) if work.moves else 1
         moved, steps = point, 0

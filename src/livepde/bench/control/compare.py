@@ -33,8 +33,8 @@ ROWS: Mapping[str, Callable[[Problem], Estimator]] = {
     LEARNED: learned,
 }
 CONTROLLERS: Mapping[str, Callable[[Problem], Controller]] = {
-    "MPC": lambda p: MPC(p.reduced, p.goal, p.period, p.steps, p.horizon),
-    "LQ": lambda p: LQ(p.reduced, p.goal, p.period, p.steps),
+    "MPC": lambda p: MPC(p.reduced, p.goal, p.period, p.horizon),
+    "LQ": lambda p: LQ(p.reduced, p.goal, p.period),
 }
 BoolArray: TypeAlias = NDArray[np.bool_]
 

@@ -205,7 +205,7 @@ def _scale(problem: Problem) -> Array:
     """Return the deviation of each coordinate in the steady filter: units of the state."""
     model = problem.reduced
     drive = np.array([problem.drive.get(name, 0.0) for name in model.channels])
-    step = model.matrices(model.prior, problem.period, problem.steps)
+    step = model.matrices(model.prior, problem.period)
     driven = step.B * drive
     Q = driven @ driven.T
     Q += FLOOR**2 * float(np.trace(Q)) * np.eye(len(Q))

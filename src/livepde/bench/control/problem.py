@@ -48,7 +48,7 @@ class Problem:
         plant, in this order.
     identifier
         Returns livepde's identifier, as it stands before the first sample.
-    goal, period, steps, horizon
+    goal, period, horizon
         As for `livepde.control.MPC`.
     samples
         Length of a run.
@@ -85,7 +85,6 @@ class Problem:
     identifier: Callable[[], Identifier]
     goal: Goal
     period: float
-    steps: int
     horizon: int
     samples: int
     plant: Callable[[int], Plant]

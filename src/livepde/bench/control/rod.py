@@ -20,6 +20,7 @@ from livepde.identifier import Identifier
 from livepde.laws import Jumps, SensitivityLaw
 from livepde.model import Model
 from livepde.observation import Points
+from livepde.stepping import Alexander2
 
 __all__ = ["rod"]
 
@@ -37,7 +38,7 @@ TOLERANCE = 1.0  # K: about what a thermocouple there would tell
 LEVELS, HOLD = (45.0, 60.0), 3600.0  # degC, s
 PERIOD, SAMPLES, HORIZON = 60.0, 360, 30
 ROOM = 20.0  # degC
-CELLS, STEPS = 30, 4
+CELLS = 30
 FINE = 150, 5.0  # cells, s
 
 
@@ -90,7 +91,7 @@ def rod(seed: int = 0) -> Problem:
         name="rod",
         title="A heated rod whose conductivity is unknown and jumps",
         reduced=reduce(model, outputs, ["heater"], sensors=sensors, u=ROOM),
-        identifier=lambda: Identifier(model, sensors, law, u0=ROOM),
+        identifier=lambda: Identifier(model, sensors, law, u0=ROOM, scheme=Alexander2(), hold=True),
         goal=Goal(
             track={"tip": 1.0},
             move={"heater": 500.0},
@@ -98,7 +99,6 @@ def rod(seed: int = 0) -> Problem:
             limits={"face": (-np.inf, HOTTEST)},
         ),
         period=PERIOD,
-        steps=STEPS,
         horizon=HORIZON,
         samples=SAMPLES,
         plant=plant,

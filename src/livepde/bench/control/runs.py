@@ -152,14 +152,14 @@ class Told:
 
 def nominal(problem: Problem) -> Kalman:
     """Return the filter of the wrong fixed model: unknown numbers at the prior."""
-    return Kalman(problem.reduced, problem.period, drive=problem.drive, steps=problem.steps)
+    return Kalman(problem.reduced, problem.period, drive=problem.drive)
 
 
 def offset_free(problem: Problem) -> Kalman:
     """Return the same with an unknown offset of each control that its filter finds."""
     model, walk = problem.reduced, problem.drive
     offset = {name: walk[name] for name in model.controls if name in walk}
-    return Kalman(model, problem.period, drive=walk, steps=problem.steps, offset=offset)
+    return Kalman(model, problem.period, drive=walk, offset=offset)
 
 
 def told(problem: Problem) -> Told:
@@ -169,7 +169,7 @@ def told(problem: Problem) -> Told:
 
 def learned(problem: Problem) -> Learned:
     """Return livepde in the loop."""
-    return Learned(problem.identifier(), nominal(problem), problem.trust, problem.steps)
+    return Learned(problem.identifier(), nominal(problem), problem.trust)
 
 
 def closed_loop(problem: Problem, estimator: Estimator, controller: Controller, seed: int) -> Run:
