@@ -52,7 +52,9 @@ def main(D: float = 3e-15) -> dict[str, float]:
     """Charge a cell from 30 to 75 %; return what was reached, and the estimate over the truth."""
     model, cell = particle(24), Cell(D)
     sensor = lp.Transformed(lp.Points({"V": R}), voltage, noise=NOISE)
-    identifier = lp.Identifier(model, sensor, lp.SensitivityLaw(), u0=0.3 * FULL)
+    identifier = lp.Identifier(
+        model, sensor, lp.SensitivityLaw(), u0=0.3 * FULL, scheme=lp.Alexander2(), hold=True
+    )
 
     seen = lp.Functionals(
         {
@@ -69,7 +71,7 @@ def main(D: float = 3e-15) -> dict[str, float]:
         inputs={"I": (-3.0 * ONE, 0.0)},
         limits={"surface": (-np.inf, LIMIT)},
     )
-    controller = ct.MPC(reduced, goal, PERIOD, 4, horizon=12)
+    controller = ct.MPC(reduced, goal, PERIOD, horizon=12)
     loop = ct.Loop(identifier, controller, ct.Trust(spread=1.0), before={"I": 0.0})
     highest = 0.0
     for k in range(80):

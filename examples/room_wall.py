@@ -69,7 +69,7 @@ def main(days: int = 4) -> dict[str, tuple[float, float]]:
     """Heat a cold building; return the estimates, and how long it was too cold on the last day."""
     model, truth = room(4), room(10)
     sensors = lp.Points({"air": 0.0, "face": 0.03}, noise=0.1)
-    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=COLD)
+    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=COLD, hold=True)
     reduced = ct.reduce(model, lp.Points({"air": 0.0}), ["heater"], sensors=sensors, u=COLD)
     goal = ct.Goal(
         track={},
@@ -79,7 +79,7 @@ def main(days: int = 4) -> dict[str, tuple[float, float]]:
         price={"heater": 1.0 / POWER},
         penalty=5.0,  # of a kelvin too cold for half an hour, over that of full power
     )
-    controller = ct.MPC(reduced, goal, PERIOD, 2, horizon=18)
+    controller = ct.MPC(reduced, goal, PERIOD, horizon=18)
     loop = ct.Loop(identifier, controller, ct.Trust(spread=2.0))
 
     u, q = truth.initial(COLD), np.log([TRUE[name] for name in WALL])

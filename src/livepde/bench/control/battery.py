@@ -29,6 +29,7 @@ from livepde.model import Model
 from livepde.models import battery_particle
 from livepde.models.battery import FARADAY
 from livepde.observation import Functionals, Points, Transformed
+from livepde.stepping import Alexander2
 
 __all__ = ["battery", "graphite"]
 
@@ -43,7 +44,7 @@ LIMITS = (0.05, 0.85)  # of the filling at the surface
 LOW, HIGH = 0.3, 0.8  # mean filling
 CYCLE, CHARGING = 5400.0, 2700.0  # s
 CYCLES = 2
-PERIOD, STEPS, HORIZON = 30.0, 4, 12
+PERIOD, HORIZON = 30.0, 12
 CELLS, FINE = 24, (72, 3.0)  # of model and truth; s
 
 
@@ -109,7 +110,9 @@ def battery(seed: int = 0) -> Problem:
         reduced=reduce(
             model, fillings(), ["I"], sensors=voltage, modes=0, rates=(1.0 / PERIOD,), u=start
         ),
-        identifier=lambda: Identifier(model, voltage, SensitivityLaw(), u0=start),
+        identifier=lambda: Identifier(
+            model, voltage, SensitivityLaw(), u0=start, scheme=Alexander2(), hold=True
+        ),
         goal=Goal(
             track={"mean": 1.0},
             move={"I": 1e-5 / ONE**2},

@@ -34,6 +34,7 @@ from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
+from livepde.stepping import Alexander2
 
 __all__ = ["wall"]
 
@@ -61,7 +62,7 @@ HOTTEST = 24.0  # degC
 PRICE = 1.0 / POWER  # of a sample with full power: 1
 LEARNT = 2.0 * DAY  # the first day warms the building up, for everybody
 PENALTY = 5.0  # of a kelvin too cold in a sample, in samples of full power
-PERIOD, STEPS, HORIZON, DAYS = 1800.0, 2, 20, 5
+PERIOD, HORIZON, DAYS = 1800.0, 20, 5
 FINE = 4, 300.0  # cells for each of the model's, s
 WEEKS = (0, 1, 2, 4, 5)  # of the record, those with frost
 RECORD = Path("soil_temperature") / "soil_2025_mar_jun.csv"
@@ -137,7 +138,9 @@ def wall(seed: int = 0) -> Problem:
         name="wall",
         title="A room behind a wall whose layers are unknown",
         reduced=reduce(model, outputs, ["heater"], sensors=sensors, modes=4, u=COLD),
-        identifier=lambda: Identifier(model, sensors, SensitivityLaw(), u0=COLD),
+        identifier=lambda: Identifier(
+            model, sensors, SensitivityLaw(), u0=COLD, scheme=Alexander2(), hold=True
+        ),
         goal=Goal(
             track={},
             move={"heater": 1e-6},
