@@ -91,7 +91,9 @@ class Comparison:
             found = found | (run.t > problem.jump) & (run.t <= self.learned_at(seed, controller))
         return found
 
-    def costs(self, controller: str, row: str, *, late: bool = False, paid: bool = True) -> Array:
+    def costs(
+        self, controller: str, row: str, *, late: bool = False, paid: bool | None = None
+    ) -> Array:
         """Return the cost of each seed.
 
         Parameters
@@ -99,16 +101,14 @@ class Comparison:
         late
             Only after livepde has learned the jump.
         paid
-            With what violations cost.
+            With what violations cost; default for `MPC`, as `LQ` does not know limits.
         """
-        return np.array(
-            [
-                run.cost(problem, self.learned_at(k, controller) if late else -math.inf, paid=paid)
-                for k, (problem, run) in enumerate(
-                    zip(self.problems, self.runs[controller, row], strict=True)
-                )
-            ]
-        )
+        charged = controller == "MPC" if paid is None else paid
+        found = []
+        for k, run in enumerate(self.runs[controller, row]):
+            since = self.learned_at(k, controller) if late else -math.inf
+            found.append(run.cost(self.problems[k], since, paid=charged))
+        return np.array(found)
 
     def violations(self, controller: str, row: str, *, learning: bool | None = None) -> int:
         """Return at how many samples of all seeds a limit was violated.
