@@ -82,12 +82,12 @@ def control(
         checks=[check for name in found for check in promises(found[name])],
         notes=[
             "cost, least, largest: over the seeds; for MPC with what violations cost, LQ does not "
-            "know limits. learned: from 10 "
-            "samples after livepde's alarm on, or where nothing jumps from the first trusted "
-            "sample on; over true: that cost over the true model's. violations: samples of all "
-            "seeds; learning: those while livepde learned. estimator, sample: processor time of a "
-            "sample over livepde's, of the estimator and of all. The moving horizon has the "
-            "setting that did best, with the truth, on the first seed."
+            "know limits. learned: the cost from 10 samples after livepde's alarm on, or where "
+            "nothing jumps from the first trusted sample on; over true: that over the true "
+            "model's. violations: samples of all seeds; learning: those while livepde learned. "
+            "estimator, sample: processor time of a sample over livepde's, of the estimator and "
+            "of all, median of the seeds. The moving horizon has the setting that did best, with "
+            "the truth, on the first seed."
         ],
         figures={
             name: lambda name=name: found[name].figure(PROBLEMS[name].quantities)  # type: ignore[misc]
@@ -127,7 +127,7 @@ def promises(comparison: Comparison) -> list[Check]:
     found.append(Check(f"{problem.name}, MPC: violations", violations, allowed, "<="))
     if comparison.setting is not None:
         what = f"{problem.name}, moving horizon"
-        ratio = comparison.seconds("MPC", HORIZON) / comparison.seconds("MPC", LEARNED)
+        ratio = comparison.times("MPC", HORIZON)
         cost = comparison.costs("MPC", LEARNED).mean() / comparison.costs("MPC", HORIZON).mean()
         found += [
             Check(f"{what}: its processor time over livepde's", ratio, CHEAPER, ">="),
@@ -139,7 +139,7 @@ def promises(comparison: Comparison) -> list[Check]:
 PROBLEMS: Mapping[str, Contest] = {
     "rod": Contest(
         rod,
-        [Setting(count, 1.0, weight) for count in (10, 20) for weight in (1.0, 10.0)],
+        [Setting(10, 1.0, 1.0), Setting(10, 10.0, 1.0), Setting(20, 10.0, 1.0)],
         ["tip", "face", "heater", "k"],
     ),
     "wall": Contest(
