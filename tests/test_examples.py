@@ -38,6 +38,7 @@ def test_every_example_is_tested():
         "nonlinear_sensor",
         "smoothing_sensor",
         "beside",
+        "heated_rod",
     }
 
 
@@ -54,6 +55,7 @@ def test_experiments_find_what_they_import(path, monkeypatch):
         ("own_pde", {"k": 21.0, "eps": 0.8}),
         ("nonlinear_sensor", {"k": 0.8, "s": 1.5}),
         ("beside", {"alpha": 9.7e-5}),
+        ("heated_rod", {"k": 12.0}),
     ],
 )
 def test_examples_find_their_truth(name, truth):

@@ -61,6 +61,9 @@ class Identifier:
         Time scheme; a longer interval between samples is divided into substeps.
     assimilate_from
         Samples before this time drive inputs and are scored, but not assimilated.
+    hold
+        Whether inputs are held between samples at what the later one brings, as an actuator that
+        is set anew at each sample leaves them; else they change linearly.
 
     Raises
     ------
@@ -81,6 +84,7 @@ class Identifier:
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
         assimilate_from: float = -np.inf,
+        hold: bool = False,
     ) -> None:
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
@@ -91,7 +95,8 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
-        self.problem = Problem(model, self.observed, Advance(scheme or ImplicitEuler(), dt_max))
+        control = Advance(scheme or ImplicitEuler(), dt_max, hold=hold)
+        self.problem = Problem(model, self.observed, control)
         self.assimilate_from = assimilate_from
         self._check_names()
         self._work = law.prepare(self.problem)
@@ -154,6 +159,11 @@ class Identifier:
         else:
             u0 = self.model.impose(self._u0, moment)
         return self.law.start(self._work, self._q0, u0, moment)
+
+    @property
+    def u0(self) -> Array:
+        """Coefficients of the given initial state, without boundary values, shape (n,)."""
+        return self._u0
 
     @property
     def t(self) -> float:

@@ -30,6 +30,7 @@ __all__ = [
     "history",
     "interval_95",
     "labelled",
+    "loops",
     "overview",
     "profiles",
     "scored_from",
@@ -255,6 +256,59 @@ def history(
     ax.set_xlabel(xlabel)
     ax.set_ylabel(ylabel)
     return _finish(ax, outside=True)
+
+
+def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "") -> Figure:
+    """Draw closed loops: a column for each run, a row for each quantity, with common axes.
+
+    Parameters
+    ----------
+    runs
+        Name -> dataset with the quantities over `time`, and where there are such, what each should
+        be (`_reference`), its limits (`_low`, `_high`), what it is (`_truth`), its deviation
+        (`_std`). With the attribute `held` values are held from sample to sample.
+    rows
+        Names of the quantities.
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+    """
+    drawn = _empty(len(rows), len(runs), title)
+    drawn.set_size_inches(3.2 * len(runs), 2.2 * len(rows))
+    grid = drawn.subplots(len(rows), len(runs), squeeze=False, sharex=True, sharey="row")
+    for column, (label, data) in enumerate(runs.items()):
+        factor, clock = time_scale(data)
+        t = data["time"].values / factor
+        for row, name in enumerate(rows):
+            ax, values = grid[row][column], data[name].values
+            for end, style in (("reference", "--"), ("truth", "-"), ("low", ":"), ("high", ":")):
+                if f"{name}_{end}" in data:
+                    limit = end in ("low", "high")
+                    said = ax.get_legend_handles_labels()[1]
+                    meaning = "limit" if limit else end
+                    ax.plot(
+                        t,
+                        data[f"{name}_{end}"].values,
+                        style,
+                        color=PALETTE[1] if limit else PALETTE[-1],
+                        linewidth=1.0,
+                        label="" if meaning in said else meaning,
+                    )
+            if f"{name}_std" in data:
+                half = NORMAL_95 * data[f"{name}_std"].values
+                ax.fill_between(t, values - half, values + half, color=PALETTE[0], alpha=0.25)
+            drawstyle: Any = "steps-post" if "held" in data[name].attrs else "default"
+            ax.plot(t, values, color=PALETTE[0], linewidth=1.2, drawstyle=drawstyle)
+            if row == 0:
+                ax.set_title(label, fontsize="medium")
+            if column == 0:
+                ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+            if row == len(rows) - 1:
+                ax.set_xlabel(labelled("t", clock))
+            _finish(ax, legend=column == 0)
+    return drawn
 
 
 def ensemble(

@@ -99,6 +99,34 @@ def fleet(
 
 
 @bench.command()
+def control(
+    only: Annotated[
+        list[str] | None, typer.Option(help="Only this problem. Repeat it for more.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each kind.")] = 5,
+    draw: Annotated[Path | None, typer.Option(help="Folder for a figure of each problem.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Hold control with livepde against true and wrong models and a moving horizon.
+
+    Example:  livepde bench control --only rod --seeds 2
+    """
+    from livepde.bench.control import PROBLEMS
+    from livepde.bench.control import control as benchmark
+
+    for name in only or ():
+        named(name, PROBLEMS, "problem")
+    outcome = benchmark(only, seeds, progress=True)
+    if draw is not None and can_draw(terminal(err=True)):
+        draw.mkdir(parents=True, exist_ok=True)
+        for name, figure in outcome.figures.items():
+            figure().savefig(draw / f"{name}.png", dpi=110)
+    command = ["livepde", "bench", "control"]
+    command += [word for name in only or () for word in ("--only", name)]
+    report_outcome(outcome, [*command, "--seeds", str(seeds)], as_json)
+
+
+@bench.command()
 def scale(
     size: Annotated[
         list[int] | None,

@@ -225,6 +225,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
         self, work: GradientWork, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         model, observed = work.problem.model, work.problem.observed
+        interval = work.problem.control.over(interval)
         z0 = observed.linearised(interval.z0, state.u)
         z1 = observed.linearised(interval.z1, state.u)
         if z1 is not interval.z1:  # a nonlinear sensor

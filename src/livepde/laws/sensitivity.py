@@ -438,6 +438,8 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         After an alarm the samples since the jump are taken again, from before it: the state has
         gone astray with them, and what was measured before does not belong to the unknowns of now.
         """
+        if not interval.present.any():  # there is no innovation, and `newest` is that of before
+            return new, replace(report, notes={**report.notes, "jump": 0.0})
         usual, e = state.now.consistency, new.now.consistency.newest
         watch, alarm = jumps.add(state.watch, e, usual)
         new = replace(new, watch=watch)
@@ -486,6 +488,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         def failed(status: Status) -> tuple[Point, Report]:
             return point, Report(status, work.predict(point, interval.end))
 
+        interval = work.problem.control.over(interval)
         # What unknowns gain in one substep is independent of what they gain in the next.
         count = work.problem.control.count(interval) if work.moves else 1
         moved, steps = point, 0

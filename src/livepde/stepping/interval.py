@@ -105,11 +105,19 @@ class Advance:
         Longest substep; a longer interval is divided evenly.
     halvings
         A substep that fails is halved at most this often.
+    hold
+        Whether inputs are held between samples at what the later one brings, as an actuator that
+        is set anew at each sample leaves them; else they change linearly.
     """
 
     scheme: Scheme
     dt_max: float = np.inf
     halvings: int = 8
+    hold: bool = False
+
+    def over(self, interval: Interval) -> Interval:
+        """Return an interval with its inputs as they are taken."""
+        return replace(interval, inputs0=interval.inputs1) if self.hold else interval
 
     def count(self, interval: Interval) -> int:
         """Return the number of even substeps of an interval."""

@@ -1,0 +1,157 @@
+"""What `livepde bench control` prints: tables, and the promises with their bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+
+import numpy as np
+
+from livepde.bench.control.battery import battery
+from livepde.bench.control.compare import FIXED, HORIZON, LEARNED, TRUE, Comparison, compare
+from livepde.bench.control.horizon import Setting
+from livepde.bench.control.problem import Problem
+from livepde.bench.control.rod import rod
+from livepde.bench.control.wall import wall
+from livepde.errors import ConfigurationError
+from livepde.linalg import Array
+from livepde.runs.outcome import Check, Outcome
+
+__all__ = ["PROBLEMS", "control"]
+
+OF_TRUE = 1.10  # cost over that of the true model, after the jump has been learned
+OF_FIXED = 0.70  # cost over that of the wrong fixed model, then
+WORST = 1.05  # total cost over that of the wrong fixed model, in any seed
+CHEAPER = 20.0  # times less processor time than the moving horizon takes for a sample
+
+
+@dataclass(frozen=True)
+class Contest:
+    """A problem of the benchmark.
+
+    Attributes
+    ----------
+    make
+        Seed -> problem.
+    settings
+        Of the moving horizon.
+    quantities
+        What its figure shows.
+    linear
+        Whether `LQ` is run besides: it knows no limits.
+    """
+
+    make: Callable[[int], Problem]
+    settings: Sequence[Setting]
+    quantities: Sequence[str]
+    linear: bool = True
+
+    def compare(self, seeds: int, progress: bool) -> Comparison:
+        """Return its runs."""
+        return compare(self.make, seeds, self.settings, linear=self.linear, progress=progress)
+
+
+def control(
+    only: Sequence[str] | None = None, seeds: int = 5, *, progress: bool = False
+) -> Outcome:
+    """Compare true model, wrong fixed model, livepde and do-mpc's moving horizon in the loop.
+
+    Parameters
+    ----------
+    only
+        Names of problems; default all.
+    seeds
+        How many of each.
+    progress
+        Show a bar.
+
+    Raises
+    ------
+    ConfigurationError
+        do-mpc is not installed.
+    """
+    if find_spec("do_mpc") is None:
+        raise ConfigurationError(
+            "bench control needs do-mpc, which is not installed: pip install 'livepde[control]'."
+        )
+    found = {name: PROBLEMS[name].compare(seeds, progress) for name in only or PROBLEMS}
+    return Outcome(
+        tables=[comparison.table() for comparison in found.values()],
+        checks=[check for name in found for check in promises(found[name])],
+        notes=[
+            "cost, least, largest: over the seeds; for MPC with what violations cost, LQ does not "
+            "know limits. learned: from 10 "
+            "samples after livepde's alarm on, or where nothing jumps from the first trusted "
+            "sample on; over true: that cost over the true model's. violations: samples of all "
+            "seeds; learning: those while livepde learned. estimator, sample: processor time of a "
+            "sample over livepde's, of the estimator and of all. The moving horizon has the "
+            "setting that did best, with the truth, on the first seed."
+        ],
+        figures={
+            name: lambda name=name: found[name].figure(PROBLEMS[name].quantities)  # type: ignore[misc]
+            for name in found
+        },
+    )
+
+
+def promises(comparison: Comparison) -> list[Check]:
+    """Return the checks of a problem; `LQ` does not know limits and is not charged for them."""
+    found, problem = [], comparison.problems[0]
+    for controller in dict.fromkeys(controller for controller, _ in comparison.rows):
+        what = f"{problem.name}, {controller}"
+
+        def over(
+            row: str, late: bool, paid: bool | None = None, controller: str = controller
+        ) -> Array:
+            mine, others = (
+                comparison.costs(controller, name, late=late, paid=paid) for name in (LEARNED, row)
+            )
+            return np.array([mine.mean() / others.mean(), (mine / others).max()])
+
+        true, total = over(TRUE, True)[0], over(FIXED, False)[1]
+        found += [
+            Check(f"{what}: learned cost over true model's", true, OF_TRUE, "<="),
+            Check(f"{what}: total cost over wrong model's, worst seed", total, WORST, "<="),
+        ]
+        if not math.isnan(problem.jump):
+            name, fixed = f"{what}: learned cost over wrong model's", over(FIXED, True)[0]
+            found.append(Check(name, fixed, OF_FIXED, "<="))
+            if controller == "MPC":
+                plain = over(FIXED, True, False)[0]
+                found.append(Check(f"{name}, without penalties", plain, OF_FIXED, "<="))
+    allowed = comparison.violations("MPC", TRUE)
+    allowed += comparison.violations("MPC", LEARNED, learning=True)
+    violations = comparison.violations("MPC", LEARNED)
+    found.append(Check(f"{problem.name}, MPC: violations", violations, allowed, "<="))
+    if comparison.setting is not None:
+        what = f"{problem.name}, moving horizon"
+        ratio = comparison.seconds("MPC", HORIZON) / comparison.seconds("MPC", LEARNED)
+        cost = comparison.costs("MPC", LEARNED).mean() / comparison.costs("MPC", HORIZON).mean()
+        found += [
+            Check(f"{what}: its processor time over livepde's", ratio, CHEAPER, ">="),
+            Check(f"{what}: livepde's cost over that with it", float(cost), 1.0, "<="),
+        ]
+    return found
+
+
+PROBLEMS: Mapping[str, Contest] = {
+    "rod": Contest(
+        rod,
+        [Setting(count, 1.0, weight) for count in (10, 20) for weight in (1.0, 10.0)],
+        ["tip", "face", "heater", "k"],
+    ),
+    "wall": Contest(
+        wall,
+        [Setting(24, 1.0, 1.0), Setting(48, 1.0, 10.0), Setting(24, 1.0, 0.1)],
+        ["air", "heater", "k[masonry]", "k[insulation]"],
+        linear=False,
+    ),
+    "battery": Contest(
+        battery,
+        [Setting(16, 1.0, 1.0), Setting(30, 1.0, 0.1), Setting(30, 0.1, 1.0)],
+        ["mean", "surface", "I", "D"],
+        linear=False,
+    ),
+}

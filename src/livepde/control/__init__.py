@@ -1,0 +1,32 @@
+"""An identified model in a control loop: reduced model, trust, controllers, one call per sample."""
+
+from __future__ import annotations
+
+from livepde.control.estimators import Estimator, Known, Learned
+from livepde.control.goal import Controller, Decision, Goal, Plan
+from livepde.control.kalman import Kalman
+from livepde.control.loop import Action, Loop
+from livepde.control.lq import LQ
+from livepde.control.mpc import MPC
+from livepde.control.reduced import Discrete, Output, ReducedModel, reduce
+from livepde.control.trust import Trust
+
+__all__ = [
+    "LQ",
+    "MPC",
+    "Action",
+    "Controller",
+    "Decision",
+    "Discrete",
+    "Estimator",
+    "Goal",
+    "Kalman",
+    "Known",
+    "Learned",
+    "Loop",
+    "Output",
+    "Plan",
+    "ReducedModel",
+    "Trust",
+    "reduce",
+]

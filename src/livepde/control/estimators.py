@@ -1,0 +1,104 @@
+"""Where a controller gets state and unknown numbers from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from livepde.checkpoint import packed, unpacked
+from livepde.control.kalman import Kalman
+from livepde.control.known import Known
+from livepde.control.trust import Trust
+from livepde.errors import ConfigurationError
+from livepde.identifier import Identifier
+from livepde.result import Estimate
+
+__all__ = ["Estimator", "Known", "Learned"]
+
+
+class Estimator(Protocol):
+    """Anything that turns samples into state and unknown numbers of a reduced model.
+
+    Between two samples the inputs are held: a sample at t brings the inputs that were applied since
+    the one before.
+    """
+
+    def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
+        """Take a sample: measurements of the sensors, shape (sensors,), NaN where missing."""
+
+    def dump(self) -> bytes:
+        """Return its state."""
+
+    def restore(self, content: bytes, where: str = "the checkpoint") -> None:
+        """Continue from what `dump` returned; `where` names it in messages."""
+
+
+class Learned:
+    """An identifier with a fixed model beside it, to which control falls back.
+
+    Parameters
+    ----------
+    identifier
+        What learns, built with `hold=True`; its own model has any size.
+    nominal
+        The fixed model with its filter, which runs beside at every sample.
+    trust
+        When the estimate is handed over.
+
+    Attributes
+    ----------
+    estimate
+        The identifier's last estimate.
+    """
+
+    def __init__(self, identifier: Identifier, nominal: Kalman, trust: Trust | None = None) -> None:
+        control = identifier.problem.control
+        if not control.hold:
+            raise ConfigurationError(
+                "Learned: inputs of a loop are held between samples: build the identifier with "
+                "hold=True."
+            )
+        missing = [c for c in identifier.inputs if c not in nominal.model.channels]
+        if missing:
+            raise ConfigurationError(
+                f"Learned: the sensors of the identifier read {missing}, which the reduced model "
+                "does not have; give positions of sensors in another way."
+            )
+        self.identifier = identifier
+        self.nominal = nominal
+        self.trust = trust or Trust()
+        self.estimate: Estimate | None = None
+        self._good = 0
+
+    def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
+        identifier, model = self.identifier, self.nominal.model
+        if isinstance(z, Mapping):
+            z = np.array([float(z.get(name, np.nan)) for name in identifier.observed.names])
+        nominal = self.nominal.step(t, z, inputs)
+        self.estimate = estimate = identifier.step(t, z, inputs)
+        doubt = self.trust.doubt(estimate, model)
+        self._good = 0 if doubt else min(self._good + 1, self.trust.patience)
+        if self._good < self.trust.patience:
+            why = doubt or f"trusted only after {self.trust.patience} good samples in a row"
+            return replace(nominal, source="fallback", why=why)
+        belief = estimate.belief
+        root = belief.q_factor if belief.q_factor is not None else np.zeros((len(belief.q), 0))
+        factor = belief.inflation * model.numbers(root)
+        return Known(model.project(estimate.u), model.numbers(estimate.q), factor)
+
+    def dump(self) -> bytes:
+        leaves = {
+            "identifier": np.frombuffer(self.identifier.dump(), dtype=np.uint8),
+            "nominal": np.frombuffer(self.nominal.dump(), dtype=np.uint8),
+            "good": self._good,
+        }
+        return packed({"kind": "learned"}, leaves)
+
+    def restore(self, content: bytes, where: str = "the checkpoint") -> None:
+        _, leaves = unpacked(content, where)
+        self.identifier.restore(leaves["identifier"].tobytes(), where)
+        self.nominal.restore(leaves["nominal"].tobytes(), where)
+        self._good = int(leaves["good"])

@@ -1,0 +1,134 @@
+"""A model with given unknown numbers, and its Kalman filter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from livepde.checkpoint import packed, unpacked
+from livepde.control.known import Known
+from livepde.control.reduced import ReducedModel
+from livepde.errors import ConfigurationError, RunError
+from livepde.linalg import Array
+
+__all__ = ["Kalman"]
+
+FLOOR = 1e-6  # process noise of each coordinate, relative to the largest
+
+
+class Kalman:
+    """The state of a reduced model with given unknown numbers, from the sensors.
+
+    Process noise enters as noise of the channels: what the surroundings and the actuator do that
+    nobody measures. Of sensors that are not linear it takes the derivative at the estimate.
+
+    Parameters
+    ----------
+    model
+        With the noise of its sensors.
+    period
+        Time between two samples.
+    drive
+        Channel -> standard deviation of its noise, held over a period, in its unit.
+    offset
+        Channel -> standard deviation by which an unknown constant that is added to it may change
+        in a period. With it outputs that are measured have no lasting error, although the model is
+        wrong: the usual way to offset-free control.
+    q
+        Unknown numbers by label; default the prior.
+    x
+        State at the start, shape (r,); default that about which the model was reduced.
+    """
+
+    def __init__(
+        self,
+        model: ReducedModel,
+        period: float,
+        *,
+        drive: Mapping[str, float],
+        offset: Mapping[str, float] | None = None,
+        q: Mapping[str, float] | None = None,
+        x: Array | None = None,
+    ) -> None:
+        if model.sensors.noise is None:
+            raise ConfigurationError(
+                "Kalman needs the noise of the sensors: give noise= to the observation."
+            )
+        for name in {**drive, **(offset or {})}:
+            if name not in model.channels:
+                raise ConfigurationError(
+                    f"Kalman: there is no channel '{name}'; the model has {list(model.channels)}."
+                )
+        self.model = model
+        self.period = period
+        self.drive = np.array([float(drive.get(name, 0.0)) for name in model.channels])
+        self._moving = model.columns(list(offset or {}))
+        self._walk = np.array(list((offset or {}).values()))
+        self._noise = np.asarray(model.sensors.noise)
+        self._begun = False
+        self.set(q or {})
+        x = model.start if x is None else np.asarray(x, dtype=float)
+        self._x = np.concatenate([x, np.zeros(len(self._moving))])
+        self._P = self._gained
+
+    @property
+    def q(self) -> Array:
+        """The unknown numbers, shape (m,)."""
+        return self._q
+
+    def set(self, q: Mapping[str, float]) -> None:
+        """Take other unknown numbers; those that are not named are the prior's."""
+        values = zip(self.model.unknowns, self.model.prior, strict=True)
+        self._q = np.array([float(q.get(label, prior)) for label, prior in values])
+        self._move = self.model.matrices(self._q, self.period)
+        driven = self._move.B * self.drive
+        gained = driven @ driven.T
+        floor = FLOOR**2 * float(np.trace(gained))
+        gained = gained + floor * np.eye(len(gained))
+        self._gained: Array = block_diag(gained, np.diag(self._walk**2))
+        r, count = self.model.size, len(self._moving)
+        added = self._move.B[:, self._moving]
+        self._A = np.block([[self._move.A, added], [np.zeros((count, r)), np.eye(count)]])
+
+    def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
+        """Take a sample, as an `Estimator` does; the first one describes the start."""
+        seen, r = np.asarray(z, dtype=float), self.model.size
+        if self._begun:
+            driven = self._move.B @ self.model.values(inputs) + self._move.f
+            self._x = self._A @ self._x
+            self._x[:r] += driven
+            self._P = self._A @ self._P @ self._A.T + self._gained
+        self._begun = True
+        expected, H = self.model.seen(self._x[:r], self._q, inputs)
+        H = np.hstack([H, np.zeros((len(H), len(self._moving)))])
+        used = np.isfinite(seen) & np.isfinite(expected)
+        H, missed = H[used], (seen - expected)[used]
+        S = H @ self._P @ H.T + np.diag(self._noise[used] ** 2)
+        gain = np.linalg.solve(S, H @ self._P).T
+        self._x = self._x + gain @ missed
+        left = np.eye(len(self._x)) - gain @ H  # Joseph's form stays symmetric and positive
+        self._P = left @ self._P @ left.T + (gain * self._noise[used] ** 2) @ gain.T
+        offset = np.zeros(len(self.model.channels))
+        offset[self._moving] = self._x[r:]
+        return Known(
+            self._x[:r],
+            self._q,
+            np.zeros((len(self._q), 0)),
+            offset=offset if r < len(self._x) else None,
+        )
+
+    def dump(self) -> bytes:
+        """Return the state."""
+        leaves = {"x": self._x, "P": self._P, "q": self._q, "begun": self._begun}
+        return packed({"kind": "kalman"}, leaves)
+
+    def restore(self, content: bytes, where: str = "the checkpoint") -> None:
+        """Continue from what `dump` returned."""
+        header, leaves = unpacked(content, where)
+        if header.get("kind") != "kalman" or leaves["x"].shape != self._x.shape:
+            raise RunError(f"{where} is of another reduced model: build it as it was then.")
+        self.set(dict(zip(self.model.unknowns, leaves["q"].tolist(), strict=True)))
+        self._x, self._P, self._begun = leaves["x"], leaves["P"], bool(leaves["begun"])

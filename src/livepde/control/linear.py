@@ -1,0 +1,132 @@
+"""A model as a linear system in its free coefficients, for one value of the unknown numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.errors import ModelError
+from livepde.fem import Inputs, Moment
+from livepde.linalg import Array
+from livepde.model import Model
+
+__all__ = ["Linear", "Linearisation"]
+
+SAME = 1e-9  # relative difference that is rounding
+LATER = 12345.6789  # a time at which a model that reads the clock is another one
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """M u' = -K u + E c + f for the channels c.
+
+    Attributes
+    ----------
+    K, E, f
+        Shapes (n, n), (n, channels) and (n,); rows of fixed coefficients mean nothing.
+    """
+
+    K: sp.csr_array
+    E: Array
+    f: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """Linear systems of a model, about a state and inputs: exact where it is affine in both.
+
+    Attributes
+    ----------
+    model
+        The process.
+    u, inputs
+        Where it is linearised: coefficients, shape (n,), and a value for each channel.
+    """
+
+    model: Model
+    u: Array
+    inputs: Mapping[str, float]
+
+    @cached_property
+    def moment(self) -> Moment:
+        """The inputs at time zero."""
+        return self._moment(0.0, {})
+
+    def _moment(self, t: float, change: Mapping[str, float]) -> Moment:
+        values = {name: self.inputs[name] + change.get(name, 0.0) for name in self.model.channels}
+        return Moment(t, Inputs(values))
+
+    def residual(self, u: Array, q: Array, moment: Moment) -> Array:
+        """Return B(u) + A(u) q - F for physical coefficients q."""
+        model = self.model
+        a = model.latent.inverse(q)
+        change: Array = model.form_A.vector("v", moment, q=a, u=u) + model.B(u, moment)
+        return change - model.F(moment)
+
+    def slope(self, q: Array, moment: Moment) -> sp.csr_array:
+        """Return the derivative of the residual in u, shape (n, n)."""
+        model, a = self.model, self.model.latent.inverse(q)
+        slope = model.form_A.matrix("v", "u", moment, u=self.u, q=a)
+        return sp.csr_array(slope + model.form_B.matrix("v", "u", moment, u=self.u))
+
+    def at(self, q: Array) -> Linear:
+        """Return the system for physical coefficients q, shape (m,)."""
+        K, known = self.slope(q, self.moment), self.residual(self.u, q, self.moment)
+        columns = [
+            known - self.residual(self.u, q, self._moment(0.0, {name: 1.0}))
+            for name in self.model.channels
+        ]
+        E = np.column_stack(columns) if columns else np.zeros((len(known), 0))
+        values = np.array([self.inputs[name] for name in self.model.channels])
+        return Linear(K, E, K @ self.u - known - E @ values)
+
+    def boundary(self) -> tuple[Array, Array]:
+        """Return the lifting of boundary channels, (n, channels), and of known values, (n,).
+
+        Coefficients that are not fixed are zero.
+        """
+        model, zero = self.model, np.zeros(self.model.X.dim)
+        off = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
+        known = model.impose(zero, off)
+        columns = []
+        for name in model.channels:
+            values = dict.fromkeys(model.channels, 0.0) | {name: 1.0}
+            columns.append(model.impose(zero, Moment(0.0, Inputs(values))) - known)
+        return np.column_stack(columns) if columns else np.zeros((len(zero), 0)), known
+
+    def check(self, q: Array) -> None:
+        """Raise `ModelError` where no linear system with constant coefficients stands for it."""
+        model, free = self.model, self.model.X.free
+        steady = self.residual(self.u, q, self.moment)
+        later = self.residual(self.u, q, self._moment(LATER, {}))
+        moved = model.impose(self.u, self._moment(LATER, {})) - model.impose(self.u, self.moment)
+        if _differ(steady * free, later * free) or moved.any():
+            raise ModelError(
+                "reduce: the model reads the time. Make what changes with time an input channel, "
+                "so that a controller can be given its forecast."
+            )
+        rng = np.random.default_rng(0)
+        change = dict(zip(model.channels, rng.standard_normal(len(model.channels)), strict=True))
+        there = self._moment(0.0, change)
+        if _differ(self.slope(q, self.moment).data, self.slope(q, there).data):
+            raise ModelError(
+                "reduce: a channel multiplies the state, so that the model is not linear in its "
+                "inputs. Let it be a known number in the form, or a source or boundary value."
+            )
+        linear = self.at(q)
+        step = np.array([change[name] for name in model.channels])
+        expected = steady - linear.E @ step
+        if _differ(self.residual(self.u, q, there) * free, expected * free):
+            raise ModelError(
+                "reduce: the model is not linear in its input channels; let a channel be what "
+                "enters linearly, as the heat instead of the voltage."
+            )
+
+
+def _differ(one: Array, other: Array) -> bool:
+    size = max(float(np.abs(one).max(initial=0.0)), float(np.abs(other).max(initial=0.0)))
+    return bool(np.abs(one - other).max(initial=0.0) > SAME * size)

@@ -1,0 +1,255 @@
+"""A control loop: one call for every sample."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from livepde import checkpoint
+from livepde.control.estimators import Estimator, Learned
+from livepde.control.goal import Controller, Plan
+from livepde.control.kalman import Kalman
+from livepde.control.known import Known
+from livepde.control.trust import Trust
+from livepde.errors import ConfigurationError, RunError, SampleError
+from livepde.identifier import Identifier
+from livepde.linalg import Array
+from livepde.result import Estimate
+
+__all__ = ["Action", "Loop"]
+
+Future: TypeAlias = Mapping[str, ArrayLike]
+"""Name -> a number that holds, or one for each coming period."""
+
+
+@dataclass(frozen=True, eq=False)
+class Action:
+    """What to set from now on, and on what grounds.
+
+    Attributes
+    ----------
+    t
+        Time of the sample.
+    inputs
+        Control -> value to apply until the next sample.
+    known
+        State and unknown numbers on which it was decided.
+    outputs
+        Output -> its estimated value now.
+    status
+        "ok", or what went wrong in the controller and what was done instead.
+    estimate
+        Of the identifier; None with another estimator.
+    """
+
+    t: float
+    inputs: Mapping[str, float]
+    known: Known
+    outputs: Mapping[str, float]
+    status: str
+    estimate: Estimate | None
+
+    @property
+    def source(self) -> str:
+        """Whether the estimate or the fallback was used: "estimate", "fallback"."""
+        return self.known.source
+
+    @property
+    def why(self) -> str:
+        """Why the estimate is not trusted; empty if it is."""
+        return self.known.why
+
+
+class Loop:
+    """An estimator and a controller, one call per sample.
+
+    Parameters
+    ----------
+    estimator
+        An `Identifier`, beside which a nominal model is run for the fallback; or any `Estimator`.
+    controller
+        `LQ`, `MPC`, or one of your own.
+    trust
+        When the estimate of an identifier is used.
+    drive
+        Channel -> standard deviation of its noise, for the filter of the nominal model; default a
+        tenth of the range of each control.
+    before
+        Control -> what was applied before the first sample; default the lower end of its range.
+
+    Raises
+    ------
+    ConfigurationError
+        Parts that do not fit together.
+    """
+
+    def __init__(
+        self,
+        estimator: Identifier | Estimator,
+        controller: Controller,
+        trust: Trust | None = None,
+        *,
+        drive: Mapping[str, float] | None = None,
+        before: Mapping[str, float] | None = None,
+    ) -> None:
+        model = controller.model
+        low, high = controller.goal.range(model)
+        if isinstance(estimator, Identifier):
+            given = dict(drive or {})
+            if not given:
+                width = np.where(np.isfinite(high - low), 0.1 * (high - low), 1.0)
+                given = dict(zip(model.controls, width.tolist(), strict=True))
+            nominal = Kalman(
+                model,
+                controller.period,
+                drive=given,
+                x=model.project(estimator.u0),
+            )
+            estimator = Learned(estimator, nominal, trust)
+        elif trust is not None:
+            raise ConfigurationError("Loop: trust is for an Identifier; give it to `Learned`.")
+        self.estimator: Estimator = estimator
+        self.controller = controller
+        start = np.where(np.isfinite(low), low, 0.0)
+        for name, value in (before or {}).items():
+            start[model.controls.index(name)] = float(value)
+        self._before: Array = start
+        self._memory: Array = controller.start()
+        self._disturbances: Array = np.full(len(model.disturbances), np.nan)
+
+    def step(
+        self,
+        t: float,
+        z: Any,
+        inputs: Mapping[str, float] | None = None,
+        *,
+        reference: Future | None = None,
+        forecast: Future | None = None,
+        limits: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    ) -> Action:
+        """Take a sample and return what to set until the next one.
+
+        Parameters
+        ----------
+        t, z
+            As for `Identifier.step`: measurements of the sensors.
+        inputs
+            Measured disturbances; and what a control really applied since the sample before, where
+            that is not what was asked for.
+        reference
+            Tracked output -> a number, or its values at the end of each coming period.
+        forecast
+            Disturbance -> a number, or its values over each coming period; default what it is now.
+        limits
+            Output -> (least, largest), each a number or its values at the end of each coming
+            period; default those of the goal.
+
+        Raises
+        ------
+        SampleError
+            A reference is missing, or something is named that does not exist.
+        """
+        controller, model = self.controller, self.controller.model
+        given = dict(inputs or {})
+        unknown = [name for name in given if name not in model.channels]
+        if unknown:
+            raise SampleError(f"unknown input '{unknown[0]}'; there are {list(model.channels)}.")
+        applied = np.array(
+            [given.get(n, v) for n, v in zip(model.controls, self._before, strict=True)]
+        )
+        held = zip(model.disturbances, self._disturbances, strict=True)
+        now = np.array([float(given.get(name, value)) for name, value in held])
+        if np.isnan(now).any():
+            name = model.disturbances[int(np.flatnonzero(np.isnan(now))[0])]
+            raise SampleError(f"input '{name}' has no value yet; send it with the first sample.")
+        channels = dict(zip(model.controls, applied.tolist(), strict=True))
+        channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
+        plan = self._plan(reference or {}, forecast or {}, now, limits or {})
+        known = self.estimator.step(t, z, channels)
+        decision = controller.decide(known, plan, applied, self._memory)
+        self._before, self._memory = decision.inputs, decision.memory
+        self._disturbances = now
+        y = model.outputs(known.x, model.values(channels))
+        return Action(
+            t,
+            dict(zip(model.controls, decision.inputs.tolist(), strict=True)),
+            known,
+            dict(zip(model.outputs.names, y.tolist(), strict=True)),
+            decision.status,
+            getattr(self.estimator, "estimate", None),
+        )
+
+    def _plan(
+        self,
+        reference: Future,
+        forecast: Future,
+        now: Array,
+        limits: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    ) -> Plan:
+        """Return what is known of the future, checked."""
+        goal, model, count = self.controller.goal, self.controller.model, self.controller.horizon
+        held = [np.array([ends[k] for ends in goal.limits.values()]) for k in (0, 1)]
+        low, high = ({name: ends[k] for name, ends in limits.items()} for k in (0, 1))
+        return Plan(
+            _ahead(reference, tuple(goal.track), None, count, "reference"),
+            _ahead(forecast, model.disturbances, now, count, "forecast"),
+            _ahead(low, tuple(goal.limits), held[0], count, "limits"),
+            _ahead(high, tuple(goal.limits), held[1], count, "limits"),
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the state to a file, from which `load` continues with bit-identical numbers."""
+        leaves = {
+            "estimator": np.frombuffer(self.estimator.dump(), dtype=np.uint8),
+            "before": self._before,
+            "memory": self._memory,
+            "disturbances": self._disturbances,
+        }
+        checkpoint.write(path, checkpoint.packed({"kind": "loop"}, leaves))
+
+    def load(self, path: str | os.PathLike[str]) -> None:
+        """Continue from a saved state; the loop must be built as the one that was saved.
+
+        Raises
+        ------
+        RunError
+            The file is damaged, or of another loop.
+        """
+        where = str(path)
+        header, leaves = checkpoint.unpacked(checkpoint.read(path), where)
+        shapes = {"before": self._before, "disturbances": self._disturbances}
+        wrong = [
+            k for k, mine in shapes.items() if k not in leaves or leaves[k].shape != mine.shape
+        ]
+        if header.get("kind") != "loop" or wrong or leaves["memory"].shape != self._memory.shape:
+            raise RunError(f"{where} is of another loop: build it as it was when it was saved.")
+        self.estimator.restore(leaves["estimator"].tobytes(), where)
+        self._before, self._memory = leaves["before"], leaves["memory"]
+        self._disturbances = leaves["disturbances"]
+
+
+def _ahead(
+    given: Future, names: tuple[str, ...], default: Array | None, horizon: int, what: str
+) -> Array:
+    """Return values over the horizon, shape (horizon, names)."""
+    for name in given:
+        if name not in names:
+            raise SampleError(f"{what} names '{name}'; there are {list(names)}.")
+    columns = []
+    for k, name in enumerate(names):
+        if name in given:
+            values = np.atleast_1d(np.asarray(given[name], dtype=float))
+            if values.ndim > 1 or not len(values) or np.isnan(values).any():
+                raise SampleError(f"{what}['{name}'] must be a number, or one for each period.")
+        elif default is None:
+            raise SampleError(f"{what}: '{name}' has none; give a number, or one for each period.")
+        else:
+            values = default[k : k + 1]
+        flat = values[:horizon]
+        columns.append(np.concatenate([flat, np.full(horizon - len(flat), flat[-1])]))
+    return np.column_stack(columns) if columns else np.zeros((horizon, 0))

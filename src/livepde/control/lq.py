@@ -1,0 +1,99 @@
+"""A linear-quadratic controller on the reduced model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import null_space, solve_discrete_are
+
+from livepde.control.goal import Decision, Goal, Plan, check
+from livepde.control.known import Known
+from livepde.control.reduced import Discrete, ReducedModel
+from livepde.linalg import Array
+
+__all__ = ["LQ"]
+
+TINY = 1e-10  # weight of what costs nothing, relative to the largest: the equation has a root
+
+
+@dataclass(frozen=True, eq=False)
+class LQ:
+    """The stationary linear-quadratic controller about the steady state that meets the reference.
+
+    Changes of the controls are weighed, so that it acts on (x, v before). The target (x, v) is the
+    steady state of the model with the unknown numbers of now, the disturbances of now and the
+    present reference, as near to it as the actuators allow. What comes out is clipped to their
+    ranges. It knows neither limits of outputs nor the future.
+
+    Parameters
+    ----------
+    model, goal
+        Reduced model, and what is to be reached.
+    period
+        Time between two samples.
+    """
+
+    model: ReducedModel
+    goal: Goal
+    period: float
+    horizon: int = 1
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def start(self) -> Array:
+        """Return the memory before the first sample: it has none."""
+        return np.zeros(0)
+
+    def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
+        """Return what to set from now on; as for `Controller`."""
+        model, low, high = self.model, *self.goal.range(self.model)
+        step = model.matrices(known.q, self.period).with_offset(known.offset)
+        try:
+            x, v = self.target(step, plan.reference[0], plan.disturbances[0])
+            gain = self.gain(step)
+        except np.linalg.LinAlgError as error:
+            return Decision(before, f"no gain ({error}): the inputs were held", memory)
+        wanted = before - gain @ np.concatenate([known.x - x, before - v])
+        return Decision(np.clip(wanted, low, high), "ok", memory)
+
+    def _parts(self) -> tuple[list[int], list[int], list[int], Array]:
+        """Return columns of controls and disturbances, rows of tracked outputs, their weights."""
+        model, track = self.model, self.goal.track
+        rows = [model.outputs.names.index(name) for name in track]
+        controls, others = model.columns(model.controls), model.columns(model.disturbances)
+        return controls, others, rows, np.array(list(track.values()))
+
+    def gain(self, step: Discrete) -> Array:
+        """Return the gain from (x, v before) to minus the change of v, (controls, r + controls)."""
+        controls, _, rows, weights = self._parts()
+        r, count = len(step.A), len(controls)
+        B = step.B[:, controls]
+        A = np.block([[step.A, B], [np.zeros((count, r)), np.eye(count)]])
+        B = np.vstack([B, np.eye(count)])
+        C = np.hstack([self.model.outputs.C[rows], self.model.outputs.D[np.ix_(rows, controls)]])
+        Q = C.T @ (weights[:, None] * C)
+        Q += TINY * np.trace(Q) * np.eye(len(Q))
+        R = np.diag([self.goal.move[name] for name in self.model.controls])
+        P = solve_discrete_are(A, B, Q, R)
+        found: Array = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        return found
+
+    def target(self, step: Discrete, reference: Array, disturbances: Array) -> tuple[Array, Array]:
+        """Return the steady state (x, v) that comes nearest to the reference within the ranges."""
+        controls, others, rows, weights = self._parts()
+        model, low, high = self.model, *self.goal.range(self.model)
+        r = len(step.A)
+        steady = np.hstack([np.eye(r) - step.A, -step.B[:, controls]])
+        one = np.linalg.lstsq(steady, step.B[:, others] @ disturbances + step.f, rcond=None)[0]
+        along = null_space(steady)
+        C = np.hstack([model.outputs.C[rows], model.outputs.D[np.ix_(rows, controls)]])
+        offset = model.outputs.D[np.ix_(rows, others)] @ disturbances + model.outputs.d[rows]
+        root = np.sqrt(weights)
+        missed = root * (reference - offset - C @ one)
+        pair = one + along @ np.linalg.lstsq(root[:, None] * (C @ along), missed, rcond=None)[0]
+        v = np.clip(pair[r:], low, high)
+        if not np.array_equal(v, pair[r:]):
+            pair = pair + along @ np.linalg.lstsq(along[r:], v - pair[r:], rcond=None)[0]
+        return np.asarray(pair[:r]), v

@@ -1,0 +1,480 @@
+"""A model in a few coordinates that keeps its unknown numbers as parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import expm
+
+from livepde.control.basis import basis
+from livepde.control.linear import Linear, Linearisation
+from livepde.errors import ConfigurationError, ModelError
+from livepde.fem import Inputs, Moment
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observation, Observed
+from livepde.result import unknown_of
+from livepde.stepping import Advance, Alexander2, simulate
+
+__all__ = ["Discrete", "Output", "ReducedModel", "reduce"]
+
+LIKELY = 0.95  # probability of the range of an unknown number over which responses are taken
+FINER = 8  # steps of the full model between two samples, where it is compared
+LINEAR = 1e-8  # relative error of a system that should be linear in the unknown numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """What is seen of the reduced state: y = C x + D c + d for the channels c.
+
+    Attributes
+    ----------
+    names
+        Of the outputs.
+    C, D, d
+        Shapes (outputs, r), (outputs, channels) and (outputs,).
+    noise
+        Standard deviation of each as a measurement, shape (outputs,); None if it is not known.
+    """
+
+    names: tuple[str, ...]
+    C: Array
+    D: Array
+    d: Array
+    noise: Array | None = None
+
+    def __call__(self, x: Array, c: Array) -> Array:
+        """Return the outputs, shape (outputs,)."""
+        y: Array = self.C @ x + self.D @ c + self.d
+        return y
+
+
+@dataclass(frozen=True, eq=False)
+class Discrete:
+    """One step x+ = A x + B c + f, with the channels c held in between."""
+
+    A: Array
+    B: Array
+    f: Array
+
+    def with_offset(self, offset: Array | None) -> Discrete:
+        """Return the step with something added to the channels, shape (channels,)."""
+        return self if offset is None else replace(self, f=self.f + self.B @ offset)
+
+    def __call__(self, x: Array, c: Array) -> Array:
+        """Return the state at the end of the step."""
+        after: Array = self.A @ x + self.B @ c + self.f
+        return after
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedModel:
+    """x' = -K(q) x + E(q) c + f(q) with K, E and f affine in the unknown numbers q.
+
+    x = V^T M u are the coordinates of the state on a basis V that is orthonormal in the mass M,
+    boundary values included: so no derivative of a boundary channel enters. Made by `reduce`.
+
+    Attributes
+    ----------
+    unknowns, channels, controls
+        Labels of the unknown numbers q (m), names of all channels c, and of those that a controller
+        sets; the others are disturbances.
+    K, E, f
+        The part without q and one for each unknown number, shapes (1 + m, r, r),
+        (1 + m, r, channels) and (1 + m, r).
+    outputs, sensors
+        What is controlled, and what is measured.
+    prior, std
+        Of the unknown numbers, shapes (m,).
+    lower, upper
+        Their bounds, shapes (m,).
+    """
+
+    unknowns: tuple[str, ...]
+    channels: tuple[str, ...]
+    controls: tuple[str, ...]
+    K: Array
+    E: Array
+    f: Array
+    outputs: Output
+    sensors: Output
+    prior: Array
+    std: Array
+    lower: Array
+    upper: Array
+    frame: Frame
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates r."""
+        return int(self.K.shape[1])
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Channels that a controller does not set."""
+        return tuple(name for name in self.channels if name not in self.controls)
+
+    def columns(self, names: Sequence[str]) -> list[int]:
+        """Return where some channels stand among all of them."""
+        return [self.channels.index(name) for name in names]
+
+    def values(self, inputs: Mapping[str, float]) -> Array:
+        """Return the channels as an array, shape (channels,)."""
+        return np.array([float(inputs[name]) for name in self.channels])
+
+    def system(self, q: Array) -> tuple[Array, Array, Array]:
+        """Return K, E and f for unknown numbers of shape (m,)."""
+        weights = np.concatenate([[1.0], q])
+        K, E, f = (np.tensordot(weights, part, axes=1) for part in (self.K, self.E, self.f))
+        return K, E, f
+
+    def matrices(self, q: Array, h: float) -> Discrete:
+        """Return what becomes of the state in a time h in which channels are held: exact in time.
+
+        Parameters
+        ----------
+        q
+            Unknown numbers, shape (m,).
+        """
+        K, E, f = self.system(q)
+        r, columns = self.size, np.column_stack([E, f])
+        whole = np.zeros((r + columns.shape[1], r + columns.shape[1]))
+        whole[:r, :r], whole[:r, r:] = -h * K, h * columns
+        moved = np.asarray(expm(whole))[:r]
+        return Discrete(moved[:, :r], moved[:, r:-1], moved[:, -1])
+
+    def project(self, u: Array) -> Array:
+        """Return the coordinates of a state of the full model, shape (r,)."""
+        x: Array = self.frame.test @ u
+        return x
+
+    def lift(self, x: Array, inputs: Mapping[str, float]) -> Array:
+        """Return the state of the full model with the coordinates x, shape (n,)."""
+        return self.frame.lift(x, self.values(inputs))
+
+    @property
+    def start(self) -> Array:
+        """Coordinates of the state that it was made about, shape (r,)."""
+        return self.project(self.frame.u)
+
+    def numbers(self, q: Array) -> Array:
+        """Return the unknown numbers among the coefficients of a parameter, shape (m,)."""
+        return np.asarray(q[self.frame.rows])
+
+    def seen(self, x: Array, q: Array, inputs: Mapping[str, float]) -> tuple[Array, Array]:
+        """Return what the sensors show, (sensors,), and its derivative in x, (sensors, r).
+
+        Of sensors that are not linear in the state, or see unknown numbers, at x and q.
+        """
+        frame, c = self.frame, self.values(inputs)
+        observed = frame.observed_sensors
+        if type(observed) is Observed and observed.linear:
+            return self.sensors(x, c), self.sensors.C
+        full, moment = frame.q.copy(), Moment(0.0, Inputs(inputs))
+        full[frame.rows] = q
+        u = frame.lift(x, c)
+        H = observed.jacobian(u, full, moment)[0]
+        return observed.predict(u, full, moment), np.asarray(H @ frame.V)
+
+    def about(
+        self,
+        u: Array | None = None,
+        q: Array | None = None,
+        inputs: Mapping[str, float] | None = None,
+    ) -> ReducedModel:
+        """Return the same on the same basis, linearised about another state.
+
+        For a model that is not affine in u, or has unknown fields.
+
+        Parameters
+        ----------
+        u, q
+            Coefficients of state and parameter, shapes (n,) and (m,); default as before.
+        inputs
+            Value of each channel; default as before.
+        """
+        return self.frame.moved(u, q, inputs).build(self.controls)
+
+    def error(
+        self, q: Mapping[str, float] | None = None, *, h: float, samples: int = 100
+    ) -> dict[str, float]:
+        """Return how much it misses of the full model: for each output the largest over all times.
+
+        Each control in turn makes a step of size 1 and holds it; the difference is relative to the
+        largest response of that output.
+
+        Parameters
+        ----------
+        q
+            Unknown numbers by label; default the prior.
+        h, samples
+            Time between samples, and how many are taken.
+        """
+        frame, numbers = self.frame, self.prior.copy()
+        for label, value in (q or {}).items():
+            numbers[self.unknowns.index(label)] = value
+        full = frame.q.copy()
+        full[frame.rows] = numbers
+        step, worst = self.matrices(numbers, h), np.zeros(len(self.outputs.names))
+        model, times = frame.model, (h * np.arange(samples + 1)).tolist()
+        observed = frame.observed(frame.outputs)
+        for control in self.controls:
+            inputs = dict(frame.inputs) | {control: frame.inputs[control] + 1.0}
+            u0 = model.impose(frame.u, Moment(0.0, Inputs(inputs)))
+            states = simulate(
+                model,
+                model.latent.inverse(full),
+                u0,
+                times,
+                Advance(Alexander2(), h / FINER),
+                lambda t, inputs=inputs: inputs,  # type: ignore[misc]
+            )
+            c, x, rows = self.values(inputs), self.project(u0), []
+            for t, u in states:
+                if t > 0.0:
+                    x = step(x, c)
+                exact = observed.predict(u, full, Moment(t, Inputs(inputs)))
+                rows.append((exact, self.outputs(x, c)))
+            exact, found = np.array(rows).transpose(1, 0, 2)
+            size = np.abs(exact - exact[0]).max(axis=0)
+            missed = np.abs(found - exact).max(axis=0)
+            worst = np.maximum(worst, missed / np.where(size > 0.0, size, 1.0))
+        return dict(zip(self.outputs.names, worst.tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a reduced model was made from.
+
+    Attributes
+    ----------
+    model
+        The full model.
+    outputs, sensors
+        Observations of what is controlled, and of what is measured.
+    V, test
+        Basis, shape (n, r), and V^T M, shape (r, n).
+    u, q, inputs
+        Where it is linearised: state, parameter, and each channel.
+    """
+
+    model: Model
+    outputs: Observation
+    sensors: Observation
+    V: Array
+    test: Array
+    u: Array
+    q: Array
+    inputs: Mapping[str, float]
+
+    @property
+    def rows(self) -> list[int]:
+        """Which coefficients of the parameter are unknown numbers."""
+        return list(self.model.parameter_space.labels.values())
+
+    @cached_property
+    def observed_sensors(self) -> Observed:
+        """The sensors, bound to the full model."""
+        return self.observed(self.sensors)
+
+    @cached_property
+    def linearisation(self) -> Linearisation:
+        """The linear systems of the full model."""
+        return Linearisation(self.model, self.u, self.inputs)
+
+    def observed(self, observation: Observation) -> Observed:
+        """Return an observation bound to the full model."""
+        model = self.model
+        return observation.bind(model.state_space, model.X, model.parameter_space)
+
+    @cached_property
+    def boundary(self) -> tuple[Array, Array]:
+        """The lifting of boundary channels and values, as `Linearisation.boundary` has it."""
+        return self.linearisation.boundary()
+
+    def lift(self, x: Array, c: Array) -> Array:
+        """Return the state of the full model for coordinates and channels."""
+        W, known = self.boundary
+        fixed = W @ c + known
+        u: Array = fixed + self.V @ (x - self.test @ fixed)
+        return u
+
+    def moved(self, u: Array | None, q: Array | None, inputs: Mapping[str, float] | None) -> Frame:
+        """Return the same, linearised elsewhere."""
+        return replace(
+            self,
+            u=self.u if u is None else u,
+            q=self.q if q is None else q,
+            inputs=self.inputs if inputs is None else inputs,
+        )
+
+    def values(self) -> list[Array]:
+        """Return parameters between which systems are taken: the reference, one per number."""
+        found, space = [self.q], self.model.parameter_space
+        for label, k in space.labels.items():
+            low, high = likely(space, label, float(self.q[k]))
+            other = self.q.copy()
+            other[k] = high if high > other[k] else low
+            found.append(other)
+        return found
+
+    def build(self, controls: tuple[str, ...]) -> ReducedModel:
+        """Return the reduced model."""
+        values = self.values()
+        systems = [self._projected(self.linearisation.at(q)) for q in values]
+        slopes = [
+            (systems[k + 1] - systems[0]) / (values[k + 1][row] - self.q[row])
+            for k, row in enumerate(self.rows)
+        ]
+        constant = systems[0] - sum(
+            (self.q[row] * slope for row, slope in zip(self.rows, slopes, strict=True)),
+            np.zeros_like(systems[0]),
+        )
+        self._check_linear(values, systems)
+        parts, r = np.array([constant, *slopes]), self.V.shape[1]
+        space, labels = self.model.parameter_space, self.model.parameter_space.labels
+        unknowns = [unknown_of(space, label) for label in labels]
+        return ReducedModel(
+            unknowns=tuple(labels),
+            channels=self.model.channels,
+            controls=controls,
+            K=parts[:, :, :r],
+            E=parts[:, :, r:-1],
+            f=parts[:, :, -1],
+            outputs=self._output(self.outputs),
+            sensors=self._output(self.sensors),
+            prior=space.prior[self.rows],
+            std=np.array([unknown.std for unknown in unknowns]),
+            lower=np.array([_end(unknown, 0) for unknown in unknowns]),
+            upper=np.array([_end(unknown, 1) for unknown in unknowns]),
+            frame=self,
+        )
+
+    def _projected(self, system: Linear) -> Array:
+        """Return K, E and f on the basis side by side, shape (r, r + channels + 1)."""
+        W, known = self.boundary
+        fixed = np.column_stack([W, known])
+        K: Array = self.V.T @ (system.K @ self.V)
+        driven = self.V.T @ (np.column_stack([system.E, system.f]) - system.K @ fixed)
+        return np.column_stack([K, driven + K @ (self.test @ fixed)])
+
+    def _check_linear(self, values: Sequence[Array], systems: Sequence[Array]) -> None:
+        both = self.q + 0.5 * sum((q - self.q for q in values[1:]), np.zeros_like(self.q))
+        expected = systems[0] + 0.5 * sum(
+            (system - systems[0] for system in systems[1:]), np.zeros_like(systems[0])
+        )
+        found = self._projected(self.linearisation.at(both))
+        if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
+            raise ModelError(
+                "reduce: the model is not linear in its unknown numbers, so that it has no reduced "
+                "model in which they are parameters. Write it linear in them: a transform of each "
+                "(transform='log') is no hindrance."
+            )
+
+    def _output(self, observation: Observation) -> Output:
+        observed, moment = self.observed(observation), self.linearisation.moment
+        W, known = self.boundary
+        y = observed.predict(self.u, self.q, moment)
+        H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
+        C = H @ self.V
+        D = H @ W - C @ (self.test @ W)
+        d = y - H @ self.u + H @ known - C @ (self.test @ known)
+        return Output(tuple(observed.names), C, D, d, observed.noise)
+
+
+def _end(unknown: Any, side: int) -> float:
+    """Return a bound of an unknown; the logarithm has none below zero."""
+    bound = float(unknown.bounds[side])
+    return max(bound, 0.0) if unknown.transform == "log" and not side else bound
+
+
+def likely(space: Any, label: str, value: float) -> tuple[float, float]:
+    """Return the ends of the prior's 95 % interval of an unknown number."""
+    unknown = unknown_of(space, label)
+    low, high = unknown.interval(unknown.prior, unknown.std, LIKELY)
+    return float(low), float(high)
+
+
+def reduce(
+    model: Model,
+    outputs: Observation,
+    controls: Sequence[str],
+    *,
+    sensors: Observation | None = None,
+    modes: int = 6,
+    rates: Sequence[float] = (),
+    u: Any = None,
+    q: Any = None,
+    inputs: Mapping[str, float] | None = None,
+) -> ReducedModel:
+    """Return a model in a few coordinates, in which the unknown numbers stay parameters.
+
+    The basis holds the static responses to all channels, with the unknown numbers at the prior and
+    at the ends of its 95 % interval, so that steady states are exact there; and the slowest
+    eigenmodes. The projection is Galerkin's.
+
+    Parameters
+    ----------
+    model
+        The process, linear in its unknown numbers and its input channels. Where it is not affine
+        in u it is linearised.
+    outputs
+        What is controlled or held within limits: any observation.
+    controls
+        The channels that a controller sets. All others are disturbances.
+    sensors
+        What is measured; default `outputs`.
+    modes
+        Eigenmodes beside the static responses.
+    rates
+        Responses at these rates, one over a time, are exact, too: take 1/period where an output
+        lies where a control acts, so that it answers at once.
+    u, q, inputs
+        Where to linearise, as for `Identifier` u0 and q0: default zero, the prior, and zero. Of an
+        unknown field q is its value; see `ReducedModel.about`.
+
+    Raises
+    ------
+    ModelError
+        The model reads the time, or is not linear in what it has to be.
+    ConfigurationError
+        A control that is no channel of the model.
+    """
+    unknown = [name for name in controls if name not in model.channels]
+    if unknown or not controls:
+        raise ConfigurationError(
+            f"reduce: controls={list(controls)}; the channels of the model are "
+            f"{list(model.channels)}: name one or more of them."
+        )
+    if modes < 0:
+        raise ConfigurationError(f"reduce: modes must be at least 0; got {modes}.")
+    given = dict.fromkeys(model.channels, 0.0) | dict(inputs or {})
+    physical = model.latent.value(model.initial_parameter(q))
+    start = model.initial(0.0 if u is None else u, Moment(0.0, Inputs(given)))
+    frame = Frame(
+        model,
+        outputs,
+        outputs if sensors is None else sensors,
+        np.zeros((model.X.dim, 0)),
+        np.zeros((0, model.X.dim)),
+        start,
+        physical,
+        given,
+    )
+    linearisation = frame.linearisation
+    linearisation.check(physical)
+    W, known = frame.boundary
+    values, space = [physical], model.parameter_space
+    for label, row in space.labels.items():
+        for end in likely(space, label, float(physical[row])):
+            other = physical.copy()
+            other[row] = end
+            values.append(other)
+    systems = [linearisation.at(value) for value in values]
+    free = np.flatnonzero(model.X.free)
+    V = basis(model.mass, free, systems, np.column_stack([W, known]), modes, rates)
+    return replace(frame, V=V, test=V.T @ model.mass).build(tuple(controls))

@@ -1,0 +1,74 @@
+"""Whether an estimate is good enough to act on, and what is done if not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.control.reduced import ReducedModel
+from livepde.errors import ConfigurationError
+from livepde.result import Estimate
+
+__all__ = ["Trust"]
+
+
+@dataclass(frozen=True)
+class Trust:
+    """When an estimate is handed to the controller; otherwise the fixed model acts.
+
+    *The rule*: while any of these tests fails, and until `patience` samples in a row have passed
+    them, the controller gets state and unknown numbers from the nominal model, with the unknown
+    numbers at the prior and its own filter, exactly as if nothing were learned.
+
+    - The step of the identifier was taken (status ok).
+    - The model explains the data: the mean square of the normalised innovations is at most
+      `misfit`.
+    - Each unknown number is known: its standard deviation is at most `spread` of its value.
+    - Each lies inside of its bounds, not at one.
+
+    Parameters
+    ----------
+    spread
+        Largest deviation of an unknown number, relative to its value.
+    misfit
+        Largest innovation ratio, 1 where model and noise are right (note "innovation_ratio").
+    patience
+        Samples in a row that have to pass before the estimate is used.
+    """
+
+    spread: float = 0.3
+    misfit: float = 4.0
+    patience: int = 3
+
+    def __post_init__(self) -> None:
+        for name in ("spread", "misfit"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(
+                    f"Trust: {name} must be a positive number; got {getattr(self, name)}."
+                )
+        if self.patience < 1:
+            raise ConfigurationError(f"Trust: patience must be at least 1; got {self.patience}.")
+
+    def doubt(self, estimate: Estimate, model: ReducedModel) -> str:
+        """Return why an estimate is not trusted; empty if it is."""
+        if not estimate.status.ok:
+            return f"the step failed ({estimate.status})"
+        misfit = estimate.notes.get("innovation_ratio", 1.0)
+        if not misfit <= self.misfit:
+            return (
+                f"the model does not explain the data: innovations are {math.sqrt(misfit):.1f} "
+                "times as large as expected"
+            )
+        if estimate.q_std is None:
+            return "the law has no covariance: take SensitivityLaw"
+        q, std = model.numbers(estimate.q), model.numbers(estimate.q_std)
+        for label, value, deviation, low, high in zip(
+            model.unknowns, q, std, model.lower, model.upper, strict=True
+        ):
+            if not np.isfinite(value) or not deviation <= self.spread * abs(value):
+                return f"{label} = {value:.4g} is known to {deviation:.2g} only"
+            if not low < value < high:
+                return f"{label} = {value:.4g} lies at its bound"
+        return ""
