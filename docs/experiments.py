@@ -32,7 +32,7 @@ PAGE = PROJECT / "docs" / "gallery" / "experiments.md"
 KEPT = PAGE.with_suffix("")
 WIDEST, COLOURS = 1100, 48  # pixels and colours of a figure
 LONGEST = 45  # lines of what a script prints that are shown
-OPTIONS = {"auto_bank": ["--quick"]}  # of scripts
+OPTIONS = {"auto_bank": ["--quick"], "control": ["--seeds", "1"]}  # that spare hours
 
 HEAD = """\
 # Gallery: experiments
@@ -167,7 +167,8 @@ def run(name: str) -> None:
         return
     if name in BENCHES:
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "livepde", "bench", name, "--draw", folder, "--json"]
+            command = [sys.executable, "-m", "livepde", "bench", name, *OPTIONS.get(name, ())]
+            command += ["--draw", folder, "--json"]
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
             content = json.loads(done.stdout)
             keep(name, Path(folder), report(content["command"], content))
@@ -229,7 +230,8 @@ def _report(name: str) -> str:
     rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE)
     shown = [f"![{Path(one).stem}](experiments/{one})" for one in pictures]
     rest = re.sub(r"^## (.*)$", r"**\1**", rest, flags=re.MULTILINE)
-    command = f"livepde {'bench' if name in BENCHES else 'reproduce'} {name}"
+    kind = "bench" if name in BENCHES else "reproduce"
+    command = " ".join(["livepde", kind, name, *OPTIONS.get(name, ())])
     lines = [f"### {name}", f"`{command}`", *shown, rest.strip()]
     if title != command:
         lines.insert(1, title)
