@@ -39,6 +39,8 @@ def test_every_example_is_tested():
         "smoothing_sensor",
         "beside",
         "heated_rod",
+        "room_wall",
+        "battery_charge",
     }
 
 
@@ -69,6 +71,24 @@ def test_examples_find_their_truth(name, truth):
 @pytest.mark.parametrize("name", ["own_sensor", "own_law"])
 def test_examples_pass_their_checks(name):
     load(name).main().raise_if_failed()
+
+
+def test_a_battery_is_charged_to_its_limit_and_not_beyond():
+    pytest.importorskip("do_mpc")
+    found = load("battery_charge").main()
+    assert abs(found["D"] - 1.0) < 3 * found["std"] < 0.1
+    assert abs(found["mean"] - 0.75) < 0.005
+    assert 0.8 < found["highest"] <= 0.85
+
+
+def test_a_room_is_warm_when_it_should_be():
+    pytest.importorskip("do_mpc")
+    example = load("room_wall")
+    found = example.main()
+    assert found.pop("hours too cold") == (0.0, 0.0)
+    for name, truth in example.TRUE.items():
+        value, std = found[f"k[{name}]"]
+        assert abs(value - truth) < 3 * std < 0.4
 
 
 def test_sensors_that_blur_need_a_regularised_inverse():
