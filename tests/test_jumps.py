@@ -73,6 +73,17 @@ def test_after_an_alarm_the_samples_since_the_jump_are_taken_again(replay: Any, 
     assert values[-1] == pytest.approx(0.24, abs=0.01)
 
 
+def test_a_sample_without_a_measurement_is_no_evidence():
+    """What the last measured sample showed does not count again in those after it."""
+    nothing = np.full(len(POINTS), np.nan)
+    stream = samples(lambda t: 0.3, 600, 0)
+    mixed = [(t, nothing if k % 5 else z) for k, (t, z) in enumerate(stream)]
+    t, z = stream[500]
+    mixed[500] = (t, z + 2.5 * NOISE)  # by chance: once is no alarm
+    found = run(lp.SensitivityLaw(jumps=Jumps()), mixed)
+    assert not any(estimate.notes["jump"] for estimate in found)
+
+
 def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
     rng, jumps, hits = np.random.default_rng(0), Jumps(), 0
     for length in (1, 3, 10, 30):

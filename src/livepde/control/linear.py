@@ -17,7 +17,7 @@ from livepde.model import Model
 __all__ = ["Linear", "Linearisation"]
 
 SAME = 1e-9  # relative difference that is rounding
-LATER = 3600.0 * 24.0 * np.pi  # a time at which a model that reads the clock is another one
+LATER = 12345.6789  # a time at which a model that reads the clock is another one
 
 
 @dataclass(frozen=True, eq=False)

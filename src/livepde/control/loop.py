@@ -169,8 +169,8 @@ class Loop:
             raise SampleError(f"input '{name}' has no value yet; send it with the first sample.")
         channels = dict(zip(model.controls, applied.tolist(), strict=True))
         channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
-        known = self.estimator.step(t, z, channels)
         plan = self._plan(reference or {}, forecast or {}, now, limits or {})
+        known = self.estimator.step(t, z, channels)
         decision = controller.decide(known, plan, applied, self._memory)
         self._before, self._memory = decision.inputs, decision.memory
         self._disturbances = now

@@ -172,6 +172,8 @@ class ReducedModel:
         """
         frame, c = self.frame, self.values(inputs)
         observed = frame.observed_sensors
+        if type(observed) is Observed and observed.linear:
+            return self.sensors(x, c), self.sensors.C
         full, moment = frame.q.copy(), Moment(0.0, Inputs(inputs))
         full[frame.rows] = q
         u = frame.lift(x, c)

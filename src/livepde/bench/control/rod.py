@@ -38,7 +38,7 @@ TOLERANCE = 1.0  # K: about what a thermocouple there would tell
 LEVELS, HOLD = (45.0, 60.0), 3600.0  # degC, s
 PERIOD, SAMPLES, HORIZON = 60.0, 360, 30
 ROOM = 20.0  # degC
-CELLS = 30
+CELLS, MODES = 30, 2
 FINE = 150, 5.0  # cells, s
 
 
@@ -90,7 +90,7 @@ def rod(seed: int = 0) -> Problem:
     return Problem(
         name="rod",
         title="A heated rod whose conductivity is unknown and jumps",
-        reduced=reduce(model, outputs, ["heater"], sensors=sensors, u=ROOM),
+        reduced=reduce(model, outputs, ["heater"], sensors=sensors, u=ROOM, modes=MODES),
         identifier=lambda: Identifier(model, sensors, law, u0=ROOM, scheme=Alexander2(), hold=True),
         goal=Goal(
             track={"tip": 1.0},

@@ -1,0 +1,476 @@
+"""A reduced model is the full one in few coordinates; what a loop does with it, and when it may."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.util import find_spec
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1
+
+import livepde as lp
+import livepde.control as ct
+from livepde.stepping import ForwardStage
+
+PERIOD, ROOM = 60.0, 20.0
+SENSORS = lp.Points({"T_5": 0.05, "T_10": 0.10}, noise=0.2)
+OUTPUTS = lp.Points({"face": 0.0, "tip": 0.15})
+needs_mpc = pytest.mark.skipif(find_spec("do_mpc") is None, reason="do-mpc is not installed")
+
+
+def rod(cells: int = 20, **options: Any) -> lp.Model:
+    """Return a rod that is heated at the left by a flux and cooled at the right by its boundary."""
+    mesh = lp.interval(0.0, 0.15, cells)
+    given = {
+        "A": lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+        "B": lambda u, v, x: 2000.0 * u * v,
+        "f": [
+            lambda x, t: 2000.0 * x.inputs["room"],
+            lp.On("left", lambda x, t: 60e3 * x.inputs["heater"]),
+        ],
+        **options,
+    }
+    return lp.Model(
+        state=lp.Field(mesh, ElementLineP1()),
+        parameter={"k": lp.Scalar(20.0, std=10.0, transform="log", bounds=(0.0, np.inf))},
+        M=lambda u, v, x: 3.6e6 * u * v,
+        inputs=["heater", "room"],
+        **given,
+    )
+
+
+def reduced(**options: Any) -> ct.ReducedModel:
+    return ct.reduce(rod(), OUTPUTS, ["heater"], sensors=SENSORS, u=ROOM, **options)
+
+
+GOAL = ct.Goal(track={"tip": 1.0}, move={"heater": 500.0}, inputs={"heater": (0.0, 1.0)})
+
+
+def identifier(**options: Any) -> lp.Identifier:
+    given = {"law": lp.SensitivityLaw(), "hold": True, "scheme": lp.Alexander2(), **options}
+    return lp.Identifier(rod(), SENSORS, u0=ROOM, **given)
+
+
+class Plant:
+    """The same rod with another conductivity."""
+
+    def __init__(self, k: float = 26.0) -> None:
+        self.model, self.q = rod(), np.log([k])
+        self.u, self.t = self.model.initial(ROOM), 0.0
+        self.rng = np.random.default_rng(0)
+
+    def run(self, heater: float) -> None:
+        times = [self.t, self.t + PERIOD]
+        control = lp.Advance(lp.Alexander2(), PERIOD / 4)
+        held = {"heater": heater, "room": ROOM}
+        *_, (self.t, self.u) = lp.simulate(
+            self.model, self.q, self.u, times, control, lambda t: held
+        )
+
+    def measure(self) -> Any:
+        exact = np.interp([0.05, 0.10], self.model.mesh.p[0], self.u)
+        return exact + self.rng.normal(0.0, 0.2, 2)
+
+
+def drive(loop: ct.Loop, plant: Plant, count: int) -> list[ct.Action]:
+    found = []
+    for _ in range(count):
+        z = plant.measure()
+        found.append(loop.step(plant.t, z, {"room": ROOM}, reference={"tip": 45.0}))
+        plant.run(found[-1].inputs["heater"])
+    return found
+
+
+# --- reduced model -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [8.0, 20.0, 50.0])
+def test_one_reduced_model_serves_all_conductivities(k):
+    """Seven coordinates for 21 nodes; the conductivity stays a parameter."""
+    model = reduced(modes=2)
+    assert model.size <= 8
+    assert max(model.error({"k": k}, h=PERIOD).values()) < 0.01
+    rebuilt = model.about(q=np.array([k]))
+    for one, other in zip(model.system(np.array([k])), rebuilt.system(np.array([k])), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
+def test_steady_states_at_the_prior_are_exact():
+    model, q = reduced(), np.array([20.0])
+    K, E, f = model.system(q)
+    x = np.linalg.solve(K, E @ [0.4, ROOM] + f)
+    full, u = rod(), rod().initial(ROOM)
+    times = np.linspace(0.0, 1e6, 200).tolist()
+    held = {"heater": 0.4, "room": ROOM}
+    control = lp.Advance(lp.ImplicitEuler())
+    *_, (_, u) = lp.simulate(full, np.log(q), u, times, control, lambda t: held)
+    np.testing.assert_allclose(model.lift(x, held), u, rtol=1e-4)
+    np.testing.assert_allclose(model.project(u), x, atol=1e-4 * np.abs(x).max())
+
+
+def test_a_boundary_value_may_be_a_control_that_jumps():
+    """Boundary values enter without their derivative."""
+    mesh = lp.interval(0.0, 1.0, 16)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot"), "right": 1.0}),
+        {"a": lp.Scalar(0.5, 0.2)},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    small = ct.reduce(model, lp.Points({"middle": 0.5, "end": 0.0}), ["hot"], modes=13)
+    x = small.project(model.impose(np.ones(17), lp.Moment(0.0, {"hot": 1.0})))
+    step, q = small.matrices(np.array([0.7]), 0.05), np.array([0.7])
+    forward, scheme = ForwardStage(model), lp.Alexander2()
+    u = model.impose(np.ones(17), lp.Moment(0.0, {"hot": 1.0}))
+    for k in range(8):
+        hot = 3.0 if k < 4 else -1.0
+        held = {"hot": hot}
+
+        def stage(c: Any, t: float, h: float, moment: Any = lp.Moment(0.0, held)) -> Any:  # noqa: B008
+            return forward.solve(c, q, h, moment)
+
+        for _ in range(100):
+            u = scheme.advance(stage, u, 0.0, 0.0005)
+        x = step(x, np.array([hot]))
+        seen = small.outputs(x, np.array([hot]))
+        np.testing.assert_allclose(seen[0], u[8], atol=1e-4)
+        assert seen[1] == pytest.approx(hot, abs=0.2)
+        np.testing.assert_allclose(small.lift(x, held)[[0, 16]], [hot, 1.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"f": lambda x, t: 1.0 + np.sin(t)}, "reads the time"),
+        ({"B": lambda u, v, x: x.inputs["heater"] * u * v}, "multiplies the state"),
+        ({"f": lambda x, t: x.inputs["heater"] ** 2}, "not linear in its input channels"),
+        (
+            {"A": lambda q, u, v, x: (q.k + q.k**2) * lp.dot(lp.grad(u), lp.grad(v))},
+            "not linear in its unknown numbers",
+        ),
+    ],
+)
+def test_what_has_no_reduced_model_is_told(options, says):
+    with pytest.raises(lp.ModelError, match=says):
+        ct.reduce(rod(**options), OUTPUTS, ["heater"])
+
+
+def test_a_nonlinear_model_is_linearised_where_it_is_said():
+    model = rod(B=lambda u, v, x: 1e-5 * u**4 * v)
+    small = ct.reduce(model, OUTPUTS, ["heater"], u=100.0)
+    moved = small.about(u=model.initial(60.0))
+    for one, u in ((small, 100.0), (moved, 60.0)):
+        K, E, f = one.system(np.array([20.0]))
+        x = one.project(model.initial(u))
+        rate = one.outputs.C @ (-K @ x + E @ [0.0, ROOM] + f)
+        assert rate[1] == pytest.approx((2000.0 * ROOM - 1e-5 * u**4) / 3.6e6, rel=0.05)
+
+
+def test_names_that_do_not_exist_are_told():
+    with pytest.raises(lp.ConfigurationError, match="controls=\\['valve'\\]; the channels"):
+        ct.reduce(rod(), OUTPUTS, ["valve"])
+    with pytest.raises(lp.ConfigurationError, match="track names 'end'"):
+        ct.LQ(reduced(), replace(GOAL, track={"end": 1.0}), PERIOD)
+
+
+# --- filter --------------------------------------------------------------------------------------
+
+
+def test_the_filter_is_kalmans():
+    """Against the recursion of the textbooks, with the gain from the information form."""
+    model = reduced(modes=1)
+    q, rng = np.array([20.0]), np.random.default_rng(0)
+    found = ct.Kalman(model, PERIOD, drive={"heater": 0.1})
+    step, C, R = model.matrices(q, PERIOD), model.sensors.C, 0.04 * np.eye(2)
+    gained = 0.01 * np.outer(step.B[:, 0], step.B[:, 0])
+    gained += 1e-12 * np.trace(gained) * np.eye(model.size)
+    x, P = model.start, gained
+    inputs = {"heater": 0.3, "room": ROOM}
+    for k in range(20):
+        z = np.array([30.0, 25.0]) + rng.normal(0.0, 0.2, 2)
+        if k:
+            x, P = step(x, np.array([0.3, ROOM])), step.A @ P @ step.A.T + gained
+        gain = P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
+        x, P = x + gain @ (z - model.sensors(x, np.array([0.3, ROOM]))), P - gain @ C @ P
+        known = found.step(k * PERIOD, z, inputs)
+        np.testing.assert_allclose(known.x, x, rtol=1e-5, atol=1e-4 * np.abs(x).max())
+
+
+def test_an_offset_removes_the_lasting_error_at_a_sensor():
+    model, plant = reduced(), Plant(40.0)
+    plain = ct.Kalman(model, PERIOD, drive={"heater": 0.001})
+    free = ct.Kalman(model, PERIOD, drive={"heater": 0.001}, offset={"heater": 0.01})
+    inputs, missed = {"heater": 0.3, "room": ROOM}, []
+    for _ in range(200):
+        plant.run(0.3)
+        z = plant.measure()
+        missed.append([e.step(plant.t, z, inputs).x for e in (plain, free)])
+    late = np.array([[z_of(model, x) for x in pair] for pair in missed[-50:]]).mean(axis=0)
+    exact = np.interp(0.05, plant.model.mesh.p[0], plant.u)
+    assert abs(late[0] - exact) > 5 * abs(late[1] - exact)
+
+
+def z_of(model: ct.ReducedModel, x: Any) -> float:
+    return float(model.sensors(x, np.array([0.3, ROOM]))[0])
+
+
+# --- controllers ---------------------------------------------------------------------------------
+
+
+def optimum(
+    model: ct.ReducedModel, goal: ct.Goal, x: Any, q: Any, before: float, count: int
+) -> float:
+    """Return the first of the moves that cost least, without bounds, by one least-squares fit."""
+    step, rows, targets = model.matrices(q, PERIOD), [], []
+    C, weight = model.outputs.C[1], np.sqrt(goal.move["heater"])
+    changes = np.tri(count)  # of the changes to the values
+
+    def tip(values: Any) -> Any:
+        seen, at = [], x
+        for value in values:
+            at = step(at, np.array([value, ROOM]))
+            seen.append(C @ at)
+        return np.array(seen)
+
+    base = tip(np.full(count, before))
+    for k in range(count):
+        rows.append(tip(before + changes[:, k]) - base)
+        targets.append(45.0 - base[k])
+    A = np.vstack([np.array(rows).T, weight * np.eye(count)])
+    moves = np.linalg.lstsq(A, np.concatenate([targets, np.zeros(count)]), rcond=None)[0]
+    return float(before + moves[0])
+
+
+def known(model: ct.ReducedModel, deviation: float = 0.0) -> ct.Known:
+    x = model.project(rod().initial(40.0))
+    return ct.Known(x, np.array([20.0]), np.array([[deviation]]))
+
+
+def plan(count: int, limits: int = 0) -> ct.Plan:
+    far = np.full((count, limits), np.inf)
+    return ct.Plan(np.full((count, 1), 45.0), np.full((count, 1), ROOM), -far, far)
+
+
+def test_the_linear_quadratic_controller_is_optimal():
+    model = reduced()
+    free = replace(GOAL, inputs={})
+    found = ct.LQ(model, free, PERIOD).decide(known(model), plan(1), np.array([0.2]), np.zeros(0))
+    expected = optimum(model, free, known(model).x, np.array([20.0]), 0.2, 300)
+    assert found.inputs[0] == pytest.approx(expected, abs=1e-3)
+    assert abs(expected - 0.2) > 0.02
+
+
+def test_the_target_meets_the_reference_or_stays_within_the_range():
+    model = reduced()
+    controller = ct.LQ(model, GOAL, PERIOD)
+    step = model.matrices(np.array([20.0]), PERIOD)
+    for reference in (45.0, 1000.0):
+        x, v = controller.target(step, np.array([reference]), np.array([ROOM]))
+        np.testing.assert_allclose(step(x, np.array([v[0], ROOM])), x, rtol=1e-6)
+        tip = model.outputs(x, np.array([v[0], ROOM]))[1]
+        assert tip == pytest.approx(reference) if reference < 100.0 else v[0] == 1.0
+
+
+@needs_mpc
+def test_the_predictive_controller_is_optimal_where_nothing_binds():
+    model = reduced(modes=2)
+    controller = ct.MPC(
+        model, replace(GOAL, inputs={"heater": (-9.0, 9.0)}), PERIOD, horizon=25, kappa=0.0
+    )
+    found = controller.decide(known(model), plan(25), np.array([0.2]), controller.start())
+    expected = optimum(model, GOAL, known(model).x, np.array([20.0]), 0.2, 25)
+    assert found.status == "ok"
+    assert found.inputs[0] == pytest.approx(expected, abs=1e-6)
+
+
+@needs_mpc
+def test_limits_are_kept_for_all_that_the_conductivity_may_be():
+    """The less is known, the more cautious; where nothing is possible it does its best."""
+    model = reduced(modes=2)
+    limited = replace(GOAL, limits={"face": (-np.inf, 75.0)}, move={"heater": 1.0})
+    controller = ct.MPC(model, limited, PERIOD, horizon=10)
+    ahead = replace(plan(10), low=np.full((10, 1), -np.inf), high=np.full((10, 1), 75.0))
+    inputs = []
+    for deviation in (0.0, 4.0):
+        now = known(model, deviation)
+        found = controller.decide(now, ahead, np.array([0.0]), controller.start())
+        inputs.append(found.inputs[0])
+        for k in now.scenarios(2.0, 1):
+            after = model.matrices(k, PERIOD)(now.x, np.array([found.inputs[0], ROOM]))
+            assert model.outputs(after, np.array([found.inputs[0], ROOM]))[0] < 75.01
+    assert 0.0 < inputs[1] < inputs[0] - 0.02
+    beyond = replace(ahead, high=np.full((10, 1), 30.0))
+    found = controller.decide(known(model), beyond, np.array([0.5]), controller.start())
+    assert found.status == "ok"
+    assert found.inputs[0] == pytest.approx(0.0, abs=1e-6)
+
+
+@needs_mpc
+def test_a_search_that_fails_holds_the_inputs_and_says_so():
+    model = reduced(modes=2)
+    controller = ct.MPC(model, GOAL, PERIOD, horizon=5)
+    lost = replace(known(model), x=np.full(model.size, np.nan))
+    found = controller.decide(lost, plan(5), np.array([0.37]), controller.start())
+    assert found.inputs.tolist() == [0.37]
+    assert "Ipopt" in found.status
+    assert "held" in found.status
+    again = controller.decide(known(model), plan(5), np.array([0.37]), found.memory)
+    assert again.status == "ok"
+
+
+def test_do_mpc_that_is_missing_is_told(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "do_mpc", None)
+    with pytest.raises(lp.ConfigurationError, match=r"pip install 'livepde\[control\]'"):
+        ct.MPC(reduced(), GOAL, PERIOD)
+
+
+# --- trust ---------------------------------------------------------------------------------------
+
+
+def told(**changes: Any) -> Any:
+    """Return an estimate as trust looks at it."""
+    given = {
+        "status": lp.Status(),
+        "notes": {"innovation_ratio": 1.2},
+        "q": np.array([26.0]),
+        "q_std": np.array([1.0]),
+        **changes,
+    }
+    return SimpleNamespace(**given)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({}, ""),
+        ({"status": lp.Status("singular", "no way")}, "the step failed"),
+        ({"notes": {"innovation_ratio": 9.0}}, "innovations are 3.0 times as large"),
+        ({"q_std": np.array([20.0])}, "known to 20 only"),
+        ({"q_std": np.array([np.nan])}, "only"),
+        ({"q_std": None}, "no covariance"),
+        ({"q": np.array([0.0]), "q_std": np.array([0.0])}, "lies at its bound"),
+    ],
+)
+def test_an_estimate_is_trusted_only_where_all_tests_pass(changes, says):
+    doubt = ct.Trust().doubt(told(**changes), reduced())
+    assert says in doubt
+    assert bool(doubt) == bool(says)
+
+
+def test_without_trust_the_loop_acts_as_the_nominal_model_would():
+    model = reduced()
+    controller = ct.LQ(model, GOAL, PERIOD)
+    never = ct.Loop(identifier(), controller, ct.Trust(spread=1e-9), drive={"heater": 0.1})
+    fixed = ct.Loop(ct.Kalman(model, PERIOD, drive={"heater": 0.1}), controller)
+    mine, theirs = (drive(loop, Plant(), 12) for loop in (never, fixed))
+    assert [a.inputs for a in mine] == [a.inputs for a in theirs]
+    assert all(a.source == "fallback" and "known to" in a.why for a in mine)
+    assert mine[-1].estimate.parameters["k"][0] == pytest.approx(26.0, rel=0.1)
+
+
+def test_what_is_learned_is_used_after_some_good_samples():
+    loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), ct.Trust(patience=4))
+    found = drive(loop, Plant(), 60)
+    first = [a.source for a in found].index("estimate")
+    assert all(a.source == "estimate" and not a.why for a in found[first:])
+    assert "4 good samples" in found[first - 1].why
+    assert found[-1].known.q[0] == pytest.approx(26.0, rel=0.03)
+    assert found[-1].outputs["tip"] == pytest.approx(45.0, abs=0.3)
+    assert all(0.0 <= a.inputs["heater"] <= 1.0 for a in found)
+
+
+# --- loop ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["LQ", pytest.param("MPC", marks=needs_mpc)])
+def test_a_loop_goes_on_where_it_was_saved(kind, tmp_path):
+    def loop() -> ct.Loop:
+        model = reduced(modes=2)
+        controller = (
+            ct.LQ(model, GOAL, PERIOD) if kind == "LQ" else ct.MPC(model, GOAL, PERIOD, horizon=8)
+        )
+        return ct.Loop(identifier(law=lp.SensitivityLaw(jumps=lp.Jumps())), controller)
+
+    whole, plant = loop(), Plant()
+    drive(whole, plant, 7)
+    whole.save(tmp_path / "loop")
+    other = loop()
+    other.load(tmp_path / "loop")
+    twin = Plant()
+    twin.u, twin.t, twin.rng = plant.u, plant.t, np.random.default_rng(1)
+    plant.rng = np.random.default_rng(1)
+    expected, found = drive(whole, plant, 6), drive(other, twin, 6)
+    assert [a.inputs for a in found] == [a.inputs for a in expected]
+    assert [a.known.q.tolist() for a in found] == [a.known.q.tolist() for a in expected]
+    smaller = ct.Loop(identifier(), ct.LQ(reduced(modes=1), GOAL, PERIOD))
+    with pytest.raises(lp.RunError, match="another"):
+        smaller.load(tmp_path / "loop")
+
+
+def test_what_was_really_applied_counts():
+    model = reduced()
+    loop = ct.Loop(ct.Kalman(model, PERIOD, drive={"heater": 1e-6}), ct.LQ(model, GOAL, PERIOD))
+    first = loop.step(0.0, [ROOM, ROOM], {"room": ROOM}, reference={"tip": 45.0})
+    stuck = loop.step(PERIOD, [np.nan] * 2, {"heater": 0.0}, reference={"tip": 45.0})
+    assert first.inputs["heater"] > 0.5
+    assert stuck.outputs["face"] == pytest.approx(ROOM, abs=0.1)
+
+
+def test_references_and_forecasts_are_checked():
+    loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD))
+    z = [ROOM, ROOM]
+    with pytest.raises(lp.SampleError, match="'room' has no value yet"):
+        loop.step(0.0, z, reference={"tip": 45.0})
+    with pytest.raises(lp.SampleError, match="'tip' has none"):
+        loop.step(0.0, z, {"room": ROOM})
+    with pytest.raises(lp.SampleError, match="forecast names 'heater'"):
+        loop.step(0.0, z, {"room": ROOM}, reference={"tip": 1.0}, forecast={"heater": 1.0})
+    with pytest.raises(lp.SampleError, match="unknown input 'wind'"):
+        loop.step(0.0, z, {"wind": ROOM}, reference={"tip": 45.0})
+    with pytest.raises(lp.ConfigurationError, match="hold=True"):
+        ct.Loop(identifier(hold=False), ct.LQ(reduced(), GOAL, PERIOD))
+
+
+def test_inputs_that_are_held_do_not_ramp():
+    """Several substeps see what the sample brings, as many samples with the same input would."""
+    nothing, ends = np.full(2, np.nan), []
+    for hold, parts in ((True, 1), (False, 1), (True, 4)):
+        one = identifier(
+            hold=hold, scheme=lp.ImplicitEuler(), dt_max=15.0 if parts == 1 else np.inf
+        )
+        one.step(0.0, [ROOM, ROOM], {"heater": 0.0, "room": ROOM})
+        for k in range(1, parts):
+            one.step(k * 15.0, nothing, {"heater": 1.0, "room": ROOM})
+        ends.append(one.step(60.0, nothing, {"heater": 1.0, "room": ROOM}).u)
+    np.testing.assert_allclose(ends[0], ends[2], rtol=1e-9)
+    assert ends[1][0] < ends[0][0] - 5.0
+
+
+# --- benchmark -----------------------------------------------------------------------------------
+
+
+@needs_mpc
+def test_the_benchmark_compares_the_same_task():
+    from livepde.bench.control.compare import compare
+    from livepde.bench.control.horizon import Setting
+    from livepde.bench.control.outcome import promises
+    from livepde.bench.control.rod import rod as task
+
+    def make(seed: int) -> Any:
+        return replace(task(seed), samples=14, horizon=5, jump=float("nan"))
+
+    found = compare(make, 1, [Setting(5, 1.0, 1.0)])
+    table = found.table()
+    assert [row[:2] for row in table.rows][:2] == [
+        ["MPC", "true model"],
+        ["MPC", "wrong fixed model"],
+    ]
+    assert {row[0] for row in table.rows} == {"MPC", "LQ"}
+    names = [check.name for check in promises(found)]
+    assert len(set(names)) == len(names)
+    costs = {row[1]: row[2] for row in table.rows if row[0] == "MPC"}
+    assert costs["livepde"] == pytest.approx(found.costs("MPC", "livepde")[0])
+    figure = found.figure(["tip", "face", "heater", "k"])
+    assert len(figure.axes) == 4 * 4
