@@ -41,6 +41,8 @@ def test_every_example_is_tested():
         "smoothing_sensor",
         "beside",
         "heated_rod",
+        "room_wall",
+        "battery_charge",
     }
 
 
@@ -71,6 +73,22 @@ def test_examples_find_their_truth(name, truth):
 @pytest.mark.parametrize("name", ["own_sensor", "own_law"])
 def test_examples_pass_their_checks(name):
     load(name).main().raise_if_failed()
+
+
+def test_a_room_is_warm_in_time_behind_a_wall_that_nobody_knows():
+    pytest.importorskip("do_mpc")
+    found = load("room_wall").main(days=3)
+    assert found["hours too cold"][0] <= 1.0
+    assert found["k[masonry]"][0] == pytest.approx(1.4, rel=0.05)
+    assert found["k[insulation]"][0] == pytest.approx(1.7, rel=0.1)
+
+
+def test_a_battery_is_charged_within_its_limit_while_it_is_learned():
+    pytest.importorskip("do_mpc")
+    found = load("battery_charge").main()
+    assert found["mean"] == pytest.approx(0.75, abs=0.005)
+    assert found["highest"] < 0.855
+    assert abs(found["D"] - 1) < 3 * found["std"] < 0.15
 
 
 def test_sensors_that_blur_need_a_regularised_inverse():
