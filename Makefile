@@ -15,14 +15,22 @@ endif
 endif
 PYTHON ?= python3
 
+# Beside the oldest one of pyproject.toml: Pythons that a fast part of the tests runs on, where found.
+VERSIONS := 3.12 3.13
+FAST := $(patsubst %,tests/test_%.py,public packaging cli cases spaces fem meshes model models linalg \
+  observation stepping gradient sensitivity identifier runs plots table parquet export mqtt opcua \
+  service dashboard)
+UV := UV_PYTHON_DOWNLOADS=never $(BIN)/uv
+PYENV := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test mpi check format docs bench lock clean
+.PHONY: help demo test mpi lowest versions package check format docs bench lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
 	@echo
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) online
 	@$(BIN)/livepde demo
@@ -31,9 +39,33 @@ test: $(READY)  ## Run all tests and doctests, with coverage
 	@$(BIN)/pytest --cov --numprocesses auto --maxprocesses 8 --dist loadfile
 
 mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment of its own
-	@.venv-petsc/bin/python -c 'import petsc4py, livepde, pytest' 2>/dev/null || deploy/petsc.sh .venv-petsc
+	@.venv-petsc/bin/python -c 'import petsc4py, pytest, livepde; livepde.Model' 2>/dev/null || deploy/petsc.sh .venv-petsc
 	@.venv-petsc/bin/python -m pip --disable-pip-version-check --quiet install pytest
 	@.venv-petsc/bin/python -m pytest --quiet tests/test_parallel.py
+
+lowest: $(READY)  ## Run a fast part of the tests with the lowest versions of all dependencies
+	@$(UV) venv --quiet --clear --python 3.11 .venv-lowest
+	@$(UV) pip install --quiet --python .venv-lowest --resolution lowest-direct -e ".[test]"
+	@# What they import in turn is new, and warns them.
+	@.venv-lowest/bin/pytest --quiet --numprocesses auto --maxprocesses 8 --dist loadfile \
+	  -W ignore::DeprecationWarning $(FAST)
+
+versions: $(READY)  ## Run the same on every other Python that is found, with constraints.txt
+	@for version in $(VERSIONS); do \
+	  path="$$PATH$$(printf ':%s' $(PYENV)/$$version*/bin)"; \
+	  if ! python=$$(PATH="$$path" $(UV) python find --system $$version 2>/dev/null); then \
+	    echo "Python $$version: NOT TESTED, there is none here"; \
+	    continue; \
+	  fi; \
+	  echo "Python $$version: $$("$$python" $(VERSION))"; \
+	  $(UV) venv --quiet --clear --python "$$python" .venv-$$version && \
+	  $(UV) pip install --quiet --python .venv-$$version --constraint constraints.txt -e ".[test]" && \
+	  .venv-$$version/bin/pytest --quiet --numprocesses auto --maxprocesses 8 --dist loadfile $(FAST) || \
+	    exit 1; \
+	done
+
+package: $(READY)  ## Build wheel and source distribution into dist/, and try the wheel in an empty environment
+	@$(BIN)/python .ci/package.py
 
 check: $(READY)  ## Check style, format, types and import layers
 	@$(BIN)/ruff check --quiet
@@ -46,7 +78,8 @@ format: $(READY)  ## Format the code and mend what can be mended automatically
 	@$(BIN)/ruff format
 
 docs: $(READY)  ## Build the documentation into site/
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@$(BIN)/python docs/links.py
 	@echo "Built: site/index.html"
 
 bench: $(READY)  ## Measure what one step costs

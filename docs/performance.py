@@ -196,7 +196,7 @@ def section(name: str, content: Mapping[str, Any]) -> str:
     text = markdown(title, shown, checks, content["notes"]).replace("| None |", "| – |")
     lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
     commands = "\n".join(content["commands"])
-    return "\n".join([lines[0], "", f"```\n{commands}\n```", *lines[1:]]) + "\n"
+    return "\n".join([lines[0], "", f"```sh\n{commands}\n```", *lines[1:]]) + "\n"
 
 
 def write(folder: Path = DOCS) -> None:

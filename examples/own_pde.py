@@ -37,4 +37,4 @@ def main():
 
 
 if __name__ == "__main__":
-    print(main())
+    print(*(f"{name} = {v:.3f} ± {s:.3f}" for name, (v, s) in main().items()), sep="\n")

@@ -23,7 +23,8 @@ import numpy as np
 import livepde as lp
 from livepde.bench.accuracy import run_law
 from livepde.bench.offline import fit
-from livepde.bench.problems import FLOW_SIDES, PROBLEMS, Data, Problem
+from livepde.bench.problems import PROBLEMS, Data, Problem
+from livepde.bench.problems.flow import SIDES
 from livepde.bench.scoring import Judge
 from livepde.models import burgers
 
@@ -47,7 +48,7 @@ def data_of(problem: Problem, level: float, seed: int) -> Data:
     if problem.name != "burgers-varying":
         return data
     unknown = lp.Scalar(0.1, 0.05, transform="log")
-    model = burgers(lp.interval(0.0, 1.0, 32), unknown, dirichlet=FLOW_SIDES)
+    model = burgers(lp.interval(0.0, 1.0, 32), unknown, dirichlet=SIDES)
     return replace(data, process=replace(data.process, model=model))
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
+from broker import MOSQUITTO, Server
 
 PROJECT = Path(__file__).resolve().parents[1]
 
@@ -18,3 +20,23 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real measurements: set LIVEPDE_DATA to their folder (looked in {folder})")
     return folder
+
+
+@pytest.fixture
+def server(tmp_path):
+    """A message broker."""
+    if MOSQUITTO is None:
+        pytest.skip("needs the broker mosquitto")
+    folder = tmp_path / "broker"
+    folder.mkdir()
+    running = Server(folder)
+    yield running
+    running.stop()
+
+
+@pytest.fixture
+def ctrl_c():
+    """Let children hear Ctrl-C, also where tests run in the background of a shell."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

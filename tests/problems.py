@@ -133,3 +133,28 @@ def rates(errors: Any) -> np.ndarray:
     """Return the orders of convergence between errors whose step is halved each time."""
     errors = np.asarray(errors)
     return np.log2(errors[:-1] / errors[1:])
+
+
+class Slope:
+    """The factor of a single number."""
+
+    def __init__(self, slope):
+        self.slope = slope
+
+    def solve(self, b):
+        return b / self.slope
+
+
+class Cubic:
+    """x^3 = x for x = y - 5: sweeps go to 1 from x > 0, Newton anywhere."""
+
+    def __init__(self):
+        self.sweeps = []
+
+    def residual(self, y):
+        x = y - 5.0
+        return x**3 - x
+
+    def factor(self, y, sweep):
+        self.sweeps.append(sweep)
+        return Slope(2.0 if sweep else 3.0 * (y[0] - 5.0) ** 2 - 1.0)

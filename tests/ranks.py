@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 import livepde as lp
+from livepde.laws.distributed import Distributed
 from livepde.linalg import Pattern, choose, in_use
 from livepde.parallel import petsc
 from livepde.stepping import Advance, ImplicitEuler, Newton, simulate
@@ -47,6 +48,8 @@ def gradient() -> dict[str, np.ndarray]:
             estimate = identifier.step(t, u[seen])
             assert estimate.status.ok
         found |= {f"{name}.q": estimate.q, f"{name}.u": estimate.u}
+        stage = identifier._work.stage(np.ones(identifier.observed.size, dtype=bool))
+        assert isinstance(stage.way, Distributed) == (engine is not None)
     return found
 
 
@@ -121,4 +124,4 @@ if __name__ == "__main__":
     with petsc() as engine:
         if engine is not None:
             found = everything()
-            np.savez(sys.argv[1], ranks=engine.team.size, shared=engine.stages, **found)
+            np.savez(sys.argv[1], ranks=engine.team.size, **found)

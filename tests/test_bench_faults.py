@@ -10,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import call
+from commands import call
 
 import livepde as lp
 from livepde import cases
 from livepde.bench import faults, soak
+from livepde.bench.faults import breaks, broken, damage, plants, rod
 from livepde.bench.journal import journal
 from livepde.records import Record
 
 MQTT = pytest.mark.skipif(
-    shutil.which("mosquitto", path=f"/usr/bin:{faults.BROKER}") is None,
+    shutil.which("mosquitto", path=f"/usr/bin:{plants.BROKER}") is None,
     reason="needs the broker mosquitto",
 )
 
@@ -57,14 +58,14 @@ def test_broken_rows_have_a_reason_and_right_ones_arrive():
     assert sent >= 1200
 
 
-@pytest.mark.parametrize("kind", [*(faults.JSON | faults.BYTES)])
+@pytest.mark.parametrize("kind", [*(breaks.JSON | breaks.BYTES)])
 def test_every_kind_of_broken_line_is_no_right_one(kind):
-    row = faults._rows(1)[0]
+    row = rod.rod_rows(1)[0]
     rng = np.random.default_rng(4)
     for _ in range(20):
-        line = (faults.JSON | faults.BYTES)[kind](row, faults._json_line, rng)
+        line = (breaks.JSON | breaks.BYTES)[kind](row, breaks.json_line, rng)
         assert isinstance(line, bytes)
-        assert line != faults._json_line(row)
+        assert line != breaks.json_line(row)
 
 
 def record(t: float, value: float = 1.0) -> Record:
@@ -72,8 +73,8 @@ def record(t: float, value: float = 1.0) -> Record:
     return Record(t, np.array([value]), nothing, nothing, 0, 1, {})
 
 
-def found(*records: Record, state: bytes = b"x") -> faults._Found:
-    return faults._Found(records, len(records), state, Counter(), Counter())
+def found(*records: Record, state: bytes = b"x") -> damage.Found:
+    return damage.Found(records, len(records), state, Counter(), Counter())
 
 
 @pytest.mark.parametrize(
@@ -87,23 +88,23 @@ def found(*records: Record, state: bytes = b"x") -> faults._Found:
     ],
 )
 def test_damage_is_seen(other, lost, doubled, different):
-    damage = faults._Damage()
-    damage.compare(other, found(record(0.0), record(1.0)))
-    assert (damage.lost, damage.doubled, damage.different) == (lost, doubled, different)
-    assert all(check.ok for check in damage.checks("x")) == (lost + doubled + different == 0)
+    seen = damage.Damage()
+    seen.compare(other, found(record(0.0), record(1.0)))
+    assert (seen.lost, seen.doubled, seen.different) == (lost, doubled, different)
+    assert all(check.ok for check in seen.checks("x")) == (lost + doubled + different == 0)
 
 
 def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
-    (tmp_path / "case.toml").write_text(faults.CASE.format(source="", silence=1))
-    monkeypatch.setattr(faults, "JSON", {"right": lambda row, write, rng: write(dict(row))})
-    monkeypatch.setattr(faults, "BYTES", {})
-    case, rows = cases.load(tmp_path / "case.toml"), faults._rows(20)
-    fed = faults._fed(case, rows, tmp_path / "rows.jsonl", 20, np.random.default_rng(0))
+    (tmp_path / "case.toml").write_text(rod.case_text())
+    monkeypatch.setattr(broken, "JSON", {"right": lambda row, write, rng: write(dict(row))})
+    monkeypatch.setattr(broken, "BYTES", {})
+    case, rows = cases.load(tmp_path / "case.toml"), rod.rod_rows(20)
+    fed = broken.fed(case, rows, tmp_path / "rows.jsonl", 20, np.random.default_rng(0))
     assert fed.reasons == {"late": 20}
     monkeypatch.setattr(
-        faults, "JSON", {"new": lambda row, write, rng: write({**row, "time": "2027-01-01"})}
+        broken, "JSON", {"new": lambda row, write, rng: write({**row, "time": "2027-01-01"})}
     )
-    fed = faults._fed(case, rows, tmp_path / "rows.jsonl", 2, np.random.default_rng(0))
+    fed = broken.fed(case, rows, tmp_path / "rows.jsonl", 2, np.random.default_rng(0))
     assert fed.reasons["leap"] == 2
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
+from commands import bad, call, shell
 from typer.testing import CliRunner
 
 import livepde
 from livepde import cli, runs
 from livepde.cases.template import write_template
-from livepde.errors import LivepdeError
 from livepde.linalg import using
 from livepde.runs import Check, Outcome, Table
 
@@ -35,6 +35,7 @@ COMMANDS = (
     "watch",
     "export",
     "bench",
+    "citation",
 )
 
 
@@ -49,28 +50,6 @@ def here(tmp_path, monkeypatch):
 def rod(here):
     write_template(here / "rod")
     return "rod/case.toml"
-
-
-def call(*arguments: str, stdin: str | None = None) -> tuple[int, str]:
-    """Return exit code and output of a command that ends as it should."""
-    result = CliRunner().invoke(cli.app, list(arguments), input=stdin)
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.output
-
-
-def shell(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own."""
-    code = "import sys; from livepde.cli import main; sys.exit(main())"
-    command = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, **options)
-
-
-def bad(*arguments: str) -> str:
-    """Return the one sentence of a command that ends with bad input."""
-    with pytest.raises(LivepdeError) as error:
-        call(*arguments)
-    return str(error.value)
 
 
 # --- help and errors -------------------------------------------------------------------------

@@ -308,6 +308,18 @@ def test_limits_are_kept_for_all_that_the_conductivity_may_be():
 
 
 @needs_mpc
+def test_scenarios_stay_where_the_model_makes_sense():
+    """Two deviations of 30 below a conductivity of 20 are none."""
+    model = reduced(modes=2)
+    controller = ct.MPC(model, GOAL, PERIOD, horizon=5)
+    found = controller.decide(known(model, 30.0), plan(5), np.array([0.2]), controller.start())
+    k = np.array(controller.problem.uncertain.master).reshape(3, -1)
+    least = model.matrices(np.array([2.0]), PERIOD).A
+    np.testing.assert_allclose(k[2, : model.size**2], least.ravel("F"))
+    assert found.status == "ok"
+
+
+@needs_mpc
 def test_a_search_that_fails_holds_the_inputs_and_says_so():
     model = reduced(modes=2)
     controller = ct.MPC(model, GOAL, PERIOD, horizon=5)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,11 +14,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 import xarray as xr
+from browser import PATIENCE, chromium, count, text, wait
 from skfem import MeshHex, MeshTri
 from typer.testing import CliRunner
 
@@ -35,7 +34,6 @@ from livepde.runs.journal import Event
 from livepde.runs.web import Address
 
 HOSTILE = "<script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
-PATIENCE = 90.0  # seconds until a browser must have shown something
 
 
 def sided(mesh):
@@ -325,14 +323,6 @@ def test_watch_needs_a_run(tmp_path):
     assert "holds no run" in str(result.exception)
 
 
-@pytest.fixture
-def ctrl_c():
-    """Let children hear Ctrl-C, also where tests run in the background of a shell."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def test_watch_says_where_and_ends_with_ctrl_c(tmp_path, ctrl_c):
     begun(tmp_path, identifier()).close()
     command = [sys.executable, "-m", "livepde", "watch", str(tmp_path), "--address", "0"]
@@ -358,64 +348,6 @@ def served(folder: Path, **options):
         yield server.url
     finally:
         server.close()
-
-
-@contextmanager
-def chromium(width: int = 1280):
-    """Start a browser, and see at the end that it had nothing to complain of and asked only us."""
-    browser, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if browser is None or driver is None:
-        pytest.skip("no Chromium: apt-get install chromium chromium-driver")
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = browser
-    for argument in (
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-dev-shm-usage",
-        "--use-angle=swiftshader",
-        "--enable-unsafe-swiftshader",
-        f"--window-size={width},1400",
-    ):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    page = webdriver.Chrome(options=options, service=Service(driver))
-    try:
-        yield page
-        assert [line for line in page.get_log("browser") if line["level"] == "SEVERE"] == []
-        here = urlsplit(page.current_url).netloc
-        assert {urlsplit(url).netloc for url in requested(page)} <= {here, ""}
-    finally:
-        page.quit()
-
-
-def requested(page) -> list[str]:
-    """Return the addresses that a page has asked for."""
-    messages = [json.loads(line["message"])["message"] for line in page.get_log("performance")]
-    urls = [
-        message["params"]["request"]["url"]
-        for message in messages
-        if message["method"] == "Network.requestWillBeSent"
-    ]
-    assert urls
-    return [url for url in urls if urlsplit(url).scheme in ("http", "https", "ws", "wss")]
-
-
-def wait(page, condition):
-    """Return what a condition on the page gives, as soon as it is true."""
-    from selenium.common.exceptions import StaleElementReferenceException as Stale
-    from selenium.webdriver.support.ui import WebDriverWait
-
-    return WebDriverWait(page, PATIENCE, 0.2, ignored_exceptions=[Stale]).until(condition)
-
-
-def text(page, selector: str) -> str:
-    return page.execute_script(
-        "return [...document.querySelectorAll(arguments[0])].map(e => e.innerText).join('\\n')",
-        selector,
-    )
 
 
 def profile(page, name: str) -> list[float] | None:
@@ -445,11 +377,6 @@ def colours(page, selector: str, visibility: str = "visible") -> int:
     )
     with Image.open(BytesIO(element.screenshot_as_png)) as picture:
         return len(picture.convert("RGB").getcolors(2**24))
-
-
-def count(page) -> int:
-    words = text(page, "#facts").split()
-    return int(words[0]) if words else 0
 
 
 CHILD = """

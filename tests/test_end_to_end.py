@@ -9,10 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pytest
-from test_dashboard import chromium, count, text, wait
-from test_mqtt import MOSQUITTO, server  # noqa: F401 (a fixture)
-from test_service import start, stopped, until
+from browser import chromium, count, text, wait
+from commands import start, stopped, until
 
 from livepde import cases, runs
 from livepde.runs import drive
@@ -40,8 +38,7 @@ def publish(port: int, rows: list[dict[str, object]]) -> None:
     client.loop_stop()
 
 
-@pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
-def test_soil_from_a_broker_to_a_browser(tmp_path, monkeypatch, data_dir, server):  # noqa: F811
+def test_soil_from_a_broker_to_a_browser(tmp_path, monkeypatch, data_dir, server):
     monkeypatch.chdir(tmp_path)
     file = data_dir / "soil_temperature" / "soil_2025_mar_jun.csv"
     table = pd.read_csv(file, dtype=str, keep_default_na=False)

@@ -269,7 +269,7 @@ def volume(points, kind, corners) -> float:
 
 def test_pandas_opens_what_is_over_time(rod, tmp_path):
     export(rod, tmp_path / "rod.csv")
-    found = pd.read_csv(tmp_path / "rod.csv", parse_dates=["date"])
+    found = pd.read_csv(tmp_path / "rod.csv", parse_dates=["date"], float_precision="round_trip")
     data = rod.dataset
     assert found["date"].iloc[1] == pd.Timestamp("2025-04-01 06:01")
     assert np.array_equal(found["time [s]"], data["time"])
@@ -429,6 +429,21 @@ def test_a_report_says_what_there_is_to_say(tmp_path):
         assert said in page.text
     with pytest.raises(RunError, match=r"run\.html exists"):
         call("export", run.path, tmp_path / "run.html")
+
+
+def test_all_formats_are_looked_at_before_one_is_written(tmp_path, monkeypatch):
+    run = watched_run(tmp_path / "run")
+    monkeypatch.setitem(sys.modules, "meshio", None)  # as if it were not there
+    with pytest.raises(ConfigurationError, match=r"rod\.xdmf: this format needs meshio: pip"):
+        call("export", run.path, tmp_path / "rod.csv", tmp_path / "rod.xdmf")
+    assert not (tmp_path / "rod.csv").exists()
+
+
+def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
+    run = watched_run(tmp_path / "run")
+    (run.path / "case.toml").write_bytes('title = "Fühler"'.encode("cp1252"))
+    write_report(run, tmp_path / "run.html")
+    assert 'title = "F\N{REPLACEMENT CHARACTER}hler"' in Page(tmp_path / "run.html").text
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,8 @@ from skfem import ElementLineHermite, ElementLineP1, ElementQuad1, MeshQuad
 
 import livepde as lp
 from livepde.fem import Moment
-from livepde.laws.coupled import CoupledStage, Gains
+from livepde.laws.coupled import CoupledStage
+from livepde.laws.gains import Gains
 from livepde.stepping import ForwardStage, StepFailed
 
 EXACT = lp.Newton(tolerance=1e-13)

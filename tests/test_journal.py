@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_live import CLOCK, COLUMNS, identifier, journal, live, rows, same, write
+from live_rod import CLOCK, COLUMNS, identifier, journal, live, rows, same, write
 
 import livepde as lp
 from livepde import checkpoint

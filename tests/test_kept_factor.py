@@ -6,12 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_stepping import Cubic
+from problems import Cubic
 
 import livepde as lp
 from livepde.bench.step import problem
-from livepde.laws.coupled import CoupledStage, Gains, _BilinearEquation
+from livepde.laws.bilinear import Bilinear, BilinearEquation
+from livepde.laws.coupled import CoupledStage
+from livepde.laws.gains import Gains
+from livepde.laws.warm import Misses
 from livepde.linalg import SuperLUSolver
+from livepde.stepping import Near
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +44,7 @@ def test_a_kept_factor_changes_no_number(plate, monkeypatch):
 
     monkeypatch.setattr(SuperLUSolver, "factorise", counted)
     kept, few = run()
-    monkeypatch.setattr(CoupledStage, "keeps", False)
+    monkeypatch.setattr(Bilinear, "keeps", False)
     fresh, many = run()
     assert few < many
     for one, other in zip(kept, fresh, strict=True):
@@ -81,11 +85,11 @@ def rod(newton, scheme=None, gain=1e4, given=ROD):
     with pytest.MonkeyPatch.context() as patch:
         count = [0]
 
-        def counted(self, y, residual=_BilinearEquation.residual):
+        def counted(self, y, residual=BilinearEquation.residual):
             count[0] += 1
             return residual(self, y)
 
-        patch.setattr(_BilinearEquation, "residual", counted)
+        patch.setattr(BilinearEquation, "residual", counted)
         for t, u in given.forward(given.q_true):
             if t > 0.0:
                 count[0] = 0
@@ -121,13 +125,13 @@ def test_a_scheme_of_second_order_solves_its_stages_to_the_end():
 
 def test_noise_is_no_error_of_the_time_step():
     """With it the starts miss something new in each step, and stages are solved further."""
-    shares = CoupledStage._shares(np.array([0.9, -0.4, 0.3]))
-    assert shares == (0.9, 0.0, 0.3)
+    misses = Misses(np.ones(2), np.array([0.0, 1.0]), 1.0, size=3)
+    assert misses.shares(np.array([0.9, -0.4, 0.3])) == (0.9, 0.0, 0.3)
     near, start = np.array([6.01]), np.array([5.6])
     cubic = Cubic()
-    found = lp.Newton().solve(cubic, start, lagged=True, near=near, shares=(0.0,))
+    found = lp.Newton().solve(cubic, start, lagged=True, near=Near(near, shares=(0.0,)))
     assert abs(found.y[0] - 6.0) < 1e-6
-    rough = lp.Newton().solve(cubic, start, lagged=True, near=near)
+    rough = lp.Newton().solve(cubic, start, lagged=True, near=Near(near))
     assert rough.updates < found.updates
 
 
@@ -138,8 +142,8 @@ def test_misses_that_follow_each_other_show_in_each_part():
         Gains(1.0, lp.ResidualDamping(), 0.0, 0.0, ROD.model.mass, ROD.model.mass),
         lp.Newton(),
     )
-    before = np.random.default_rng(0).standard_normal(stage.size)
+    before, misses = np.random.default_rng(0).standard_normal(stage.size), stage.misses
     factors = np.array([0.5, -0.25, 3.0])
-    trend = stage._trend(before * (factors @ stage.members), before)
+    trend = misses.trend(before * misses.spread(factors), before)
     np.testing.assert_allclose(trend, [0.5, -0.25, 1.0])
-    np.testing.assert_array_equal(stage._trend(before, 0.0 * before), 0.0)
+    np.testing.assert_array_equal(misses.trend(before, 0.0 * before), 0.0)

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from live_rod import CLOCK, COLUMNS, OPENED, identifier, journal, live, rows, same, write
 
 import livepde as lp
-from livepde.result import layout_of
-from livepde.runs.feeds import Gathered, Samples
+from livepde.runs.feeds import Samples
 from livepde.runs.journal import Event, Journal
 from livepde.runs.live import Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
@@ -30,39 +30,7 @@ from livepde.runs.web import Address
 from livepde.stepping import Advance, ImplicitEuler
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Follow, Rows, json_row
-from livepde.streams.table import Clock, Column
-
-COLUMNS = {name: Column((name,)) for name in ("a", "b", "left")}
-CLOCK = Clock("t")
-
-
-def identifier() -> lp.Identifier:
-    mesh = lp.interval(0.0, 1.0, 10)
-    model = lp.Model(
-        state=lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("left"), "right": 0.0}),
-        parameter={"k": lp.Scalar(0.05, std=0.03)},
-        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
-    return lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=8)))
-
-
-def rows(count: int):
-    rng = np.random.default_rng(0)
-    for k in range(count):
-        t = 0.1 * k
-        left = 1.0 + math.sin(t)
-        a, b = (left * f + 0.01 * rng.standard_normal() for f in (0.7, 0.4))
-        yield {"t": t, "a": a, "b": b, "left": left}
-
-
-def journal(path: Path) -> Journal:
-    who = identifier()
-    layout = layout_of(who.model, who.observed, who.withheld)
-    return Journal.create(path, ("a", "b", "left"), layout)
-
-
-OPENED: list = []
+from livepde.streams.table import Column
 
 
 @pytest.fixture(autouse=True)
@@ -70,33 +38,6 @@ def closed():
     yield
     while OPENED:
         OPENED.pop().close()
-
-
-def live(folder: Path, source=None, **options) -> Live:
-    path = folder / "journal.sqlite"
-    kept = Journal.open(path, write=True) if path.exists() else journal(path)
-    if source is None:
-        source = Follow(folder / "data.csv", position=kept.position)
-    OPENED.append(source)
-    intake = Intake(COLUMNS, CLOCK, origin=0.0, last=kept.last)
-    return Live(identifier(), Gathered(source, intake), kept, fields_every=10, **options)
-
-
-def write(folder: Path, count: int) -> None:
-    lines = ["t,a,b,left", *(",".join(map(repr, row.values())) for row in rows(count))]
-    (folder / "data.csv").write_text("\n".join(lines) + "\n")
-
-
-def same(one: Journal, other: Journal) -> None:
-    mine, yours = list(one), list(other)
-    assert len(mine) == len(yours) > 0
-    for a, b in zip(mine, yours, strict=True):
-        for name in ("t", "numbers", "innovation", "status", "steps"):
-            assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
-        assert (a.snapshot is None) == (b.snapshot is None)
-        if a.snapshot is not None:
-            for name, values in a.snapshot.profiles.items():
-                assert np.array_equal(values, b.snapshot.profiles[name])
 
 
 def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
@@ -139,7 +80,7 @@ CHILD = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_live import live
+from live_rod import live
 run = live(Path(sys.argv[1]))
 run.resume()
 run.run()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import queue
-import shutil
-import socket
 import subprocess
 import sys
 import threading
@@ -16,59 +14,18 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from test_live import COLUMNS, live, rows
+from broker import MOSQUITTO, Server
+from live_rod import COLUMNS, live, rows
 
 import livepde as lp
 from livepde.runs.feeds import Gathered
+from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
 from livepde.streams.sources import Rows
-from livepde.streams.table import Clock
 
 pytest.importorskip("paho.mqtt")
-MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
 pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
-
-
-class Server:
-    def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
-        self.config = folder / "mosquitto.conf"
-        self.config.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence true\n"
-            f"persistence_location {folder}/\nautosave_interval 1\nautosave_on_changes true\n"
-            "max_queued_messages 0\nuser root\n"
-        )
-        self.folder = folder
-        self.start()
-
-    def start(self) -> None:
-        self.process = subprocess.Popen(
-            [str(MOSQUITTO), "-c", str(self.config)],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for _ in range(100):
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
-                    return
-            time.sleep(0.05)
-        raise RuntimeError("mosquitto does not listen")
-
-    def stop(self) -> None:
-        self.process.terminate()
-        self.process.wait(10)
-
-
-@pytest.fixture
-def server(tmp_path):
-    folder = tmp_path / "broker"
-    folder.mkdir()
-    running = Server(folder)
-    yield running
-    running.stop()
 
 
 def source(server: Server, topics=None, **options) -> MqttSource:

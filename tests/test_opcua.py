@@ -10,7 +10,7 @@ import time
 from datetime import UTC, datetime
 
 import pytest
-from test_live import live
+from live_rod import live
 
 import livepde as lp
 from livepde.streams.opcua import OpcuaSource

@@ -15,8 +15,10 @@ import pytest
 from pyarrow import parquet
 
 from livepde.errors import DataError, SampleError, TimeOrderError
+from livepde.streams.clock import Clock
+from livepde.streams.csvfile import read_csv
 from livepde.streams.parquet import read_parquet
-from livepde.streams.table import Clock, Column, read_csv
+from livepde.streams.table import Column
 
 COLUMNS = {"a": Column(("T 1",)), "b": Column(("T 1", "T 2"), 2.0, 1.0)}
 CLOCK = Clock("time")
@@ -86,7 +88,7 @@ def test_dates(written, times):
     [
         pa.array([1, None, 3], pa.int8()),
         pa.array([1, None, 3], pa.uint64()),
-        pa.array([1, None, 3], pa.float16()),
+        pa.array([np.float16(1), None, np.float16(3)], pa.float16()),
         pa.array([Decimal(1), None, Decimal(3)]),
     ],
     ids=lambda column: str(column.type),
@@ -126,7 +128,7 @@ def test_only_the_columns_that_are_needed_are_read(written):
         ({"T 1": [date(2025, 1, 1)] * 3}, SampleError, "column 'T 1' is of type date32"),
         ({"T 1": [1.0, np.inf, 1.0]}, SampleError, "column 'T 1' is infinite in sample 1"),
         ({"time": [0.0, None, 1.0]}, SampleError, "sample 1, times 'time': got None; expected"),
-        ({"time": [0.0, 2.0, 2.0]}, TimeOrderError, "sample 2: the time is not later"),
+        ({"time": [0.0, 2.0, 2.0]}, TimeOrderError, "sample 2: the time is that of"),
         ({name: pa.array([], pa.float64()) for name in NUMBERS}, SampleError, "holds no samples"),
     ],
 )
@@ -140,7 +142,9 @@ def test_what_cannot_be_used_is_named(written, columns, error, said):
 def test_files_that_are_not_parquet(tmp_path):
     (tmp_path / "a.parquet").write_text("time,a\n0,1\n")
     (tmp_path / "empty.parquet").touch()
-    for name in ("a.parquet", "empty.parquet", "none.parquet", "."):
+    with pytest.raises(DataError, match="there is no file"):
+        read_parquet(tmp_path / "none.parquet", COLUMNS, CLOCK)
+    for name in ("a.parquet", "empty.parquet", "."):
         with pytest.raises(DataError, match="cannot be read as a Parquet file: "):
             read_parquet(tmp_path / name, COLUMNS, CLOCK)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import re
@@ -9,29 +10,65 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import livepde
 from livepde import errors
+from livepde.bench.startup import BASE, SCRIPT, startup
+
+DOCUMENTED = (
+    ".models",
+    ".diagnostics",
+    ".cases",
+    ".runs",
+    ".dashboard",
+    ".reproduce",
+    ".plots",
+    ".streams",
+    ".streams.mqtt",
+    ".streams.opcua",
+    ".laws",
+    ".observation",
+    ".stepping",
+    ".fem",
+    ".linalg",
+    ".spaces",
+    ".parallel",
+)
 
 
 def test_exports_are_complete_and_sorted():
-    names = {
-        name
-        for name, value in vars(livepde).items()
-        if not name.startswith("_") and not inspect.ismodule(value) and name != "annotations"
-    }
-    assert set(livepde.__all__) - {"__version__"} == names
+    """What runs and what type checkers see is the same list."""
+    stub = ast.parse(Path(livepde.__file__).with_suffix(".pyi").read_text())
+    lists = [
+        ast.literal_eval(node.value)
+        for node in stub.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
+    ]
+    assert lists == [livepde.__all__]
     assert livepde.__all__ == sorted(livepde.__all__)
+    for name in livepde.__all__:
+        assert not inspect.ismodule(getattr(livepde, name))
+    assert set(livepde.__all__) <= set(dir(livepde))
+
+
+def test_what_is_not_there_is_said():
+    with pytest.raises(AttributeError, match="nothing_here"):
+        livepde.nothing_here  # noqa: B018
 
 
 def test_the_reference_holds_what_is_exported():
     """Pages are made of docstrings; helpers of scikit-fem have none there and stand in a table."""
-    reference = (Path(__file__).parents[1] / "docs" / "reference.md").read_text()
+    docs = Path(__file__).parents[1] / "docs"
+    reference = (docs / "reference.md").read_text()
     helpers = re.findall(r"`(\w+)\(", reference)
     for name in livepde.__all__:
         owner = getattr(getattr(livepde, name), "__module__", "livepde")
         assert owner.startswith("livepde") != (name in helpers), name
-    for package in ("", ".models", ".diagnostics", ".cases", ".runs", ".streams", ".streams.mqtt"):
-        assert f"::: livepde{package}\n" in reference
+    pages = "\n".join(path.read_text() for path in [docs / "reference.md", *docs.glob("api/*.md")])
+    for package in ("", *DOCUMENTED):
+        whole, rest = f"::: livepde{package}\n", f"<!-- members of livepde{package} -->\n"
+        assert (whole in pages) != (rest in pages), package
         module = importlib.import_module(f"livepde{package}")
         for name in module.__all__:
             value = getattr(module, name)
@@ -39,14 +76,43 @@ def test_the_reference_holds_what_is_exported():
                 assert inspect.getdoc(value), name
 
 
-def test_import_is_light():
-    code = (
-        "import sys, livepde; heavy = {'matplotlib', 'mpi4py', 'pint', 'pydantic', 'typer', "
-        "'flask', 'dash', 'plotly', 'cheroot', 'prometheus_client', 'paho', 'asyncua', 'meshio', "
-        "'zarr', 'h5py'} & set(sys.modules); print(sorted(heavy))"
-    )
+def loaded(code):
+    """Return the names of the modules that a fresh interpreter has after `code`."""
+    code += "; import sys; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    return set(done.stdout.split())
+
+
+def test_import_loads_nothing():
+    """What livepde exports is loaded on first use."""
+    modules = loaded("import livepde")
+    assert {name for name in modules if name.split(".")[0] == "livepde"} == {"livepde"}
+    assert not {"numpy", "scipy", "skfem"} & modules
+
+
+def test_what_a_script_uses_is_light():
+    """Beside SciPy and scikit-fem, a model and an identifier load nothing but the library's core.
+
+    Neither pandas, xarray, Matplotlib, pydantic, rich, MPI and a web framework, nor the parts of
+    SciPy that are slow to load: special, optimize, spatial, stats.
+    """
+    more = loaded(SCRIPT) - loaded(f"{BASE}, skfem.helpers")
+    assert {"livepde.identifier", "livepde.laws.sensitivity"} <= more
+    assert {name.split(".")[0] for name in more} - sys.stdlib_module_names == {
+        "lazy_loader",
+        "livepde",
+    }
+    assert not {"asyncio", "decimal", "multiprocessing", "sqlite3", "ssl"} & more
+    above = "bench cases cli dashboard diagnostics fleet models reproduce runs streams"
+    assert not {f"livepde.{name}" for name in above.split()} & more
+
+
+def test_the_benchmark_of_the_import():
+    outcome = startup(rounds=1)
+    assert [check.name for check in outcome.checks] == ["import livepde", SCRIPT]
+    nothing, used = (check.value for check in outcome.checks)
+    assert 0.0 < nothing < 1.0 < used  # one loads no library, the other the same and more
+    assert [check.bound for check in outcome.checks] == [1.5, 1.5]
 
 
 def test_the_tree_of_exceptions_is_as_drawn():

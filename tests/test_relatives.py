@@ -10,7 +10,8 @@ from problems import excited, excited_q, excited_u, laplace, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.coupled import CoupledStage, Gains
+from livepde.laws.coupled import CoupledStage
+from livepde.laws.gains import Gains
 from livepde.laws.relatives import _Linear
 from livepde.model import mass_form
 from livepde.reproduce.relatives import EXPECTED, LAWS, law

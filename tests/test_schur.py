@@ -11,7 +11,8 @@ import livepde as lp
 from livepde.bench import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
-from livepde.laws import coupled, schur
+from livepde.laws import jacobian, schur
+from livepde.laws.bilinear import Bilinear
 from livepde.linalg import choice
 
 EXACT = lp.Newton(tolerance=1e-11, share=0.0)
@@ -41,25 +42,25 @@ def data(model, sensors, times):
 
 def run(model, sensors, law, monkeypatch, large, samples=5, **options):
     """Return (u, q) of each step, and the iterations of each solve by blocks."""
-    monkeypatch.setattr(coupled, "LARGE", 1 if large else 10**9)
+    monkeypatch.setattr(schur, "LARGE", 1 if large else 10**9)
     monkeypatch.setattr(choice, "WIDEST_BAND", 10)  # as it would be on a finer mesh
     times = 0.05 * np.arange(samples)
     ident = lp.Identifier(model, sensors, law, q0=0.5, u0=2.0, **options)
     counts = []
-    solve = schur.Jacobian.solve
+    solve = jacobian.Jacobian.solve
 
     def counted(self, b):
         x = solve(self, b)
         counts.append(self.solver.iterations[-1])
         return x
 
-    monkeypatch.setattr(schur.Jacobian, "solve", counted)
+    monkeypatch.setattr(jacobian.Jacobian, "solve", counted)
     found = []
     for t, z in zip(times, data(model, sensors, times), strict=True):
         estimate = ident.step(t, z)
         assert estimate.status.ok
         found.append(np.concatenate([estimate.u, estimate.q]))
-    monkeypatch.setattr(schur.Jacobian, "solve", solve)
+    monkeypatch.setattr(jacobian.Jacobian, "solve", solve)
     return np.array(found), counts
 
 
@@ -124,26 +125,26 @@ def test_blocks_serve_the_second_order_scheme_and_averages(monkeypatch):
 
 
 def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
-    monkeypatch.setattr(coupled, "LARGE", 1)
+    monkeypatch.setattr(schur, "LARGE", 1)
     monkeypatch.setattr(choice, "WIDEST_BAND", 10)
     law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(c1))
     ident = lp.Identifier(model, sensors or lp.Full(), law, q0=0.5, u0=2.0)
     stage = ident._work.stage(np.ones(ident.observed.size, dtype=bool))
     u = model.initial(lambda x: 2.0 + x[0] * (1 - x[0]) * x[1] * (1 - x[1]))
     c = np.concatenate([u, model.initial_parameter(0.5)])
-    equation = coupled.BlockEquation(stage.by_blocks, c, 0.05, Moment(0.05), stage.split.R @ u)
+    equation = schur.BlockEquation(stage.way, c, 0.05, Moment(0.05), stage.split.R @ u)
     return stage, equation, c
 
 
 def test_iterations_with_new_factors(monkeypatch):
     """To 1e-8, on two meshes: they hardly depend on the mesh."""
-    monkeypatch.setattr(coupled, "LARGE", 1)
+    monkeypatch.setattr(schur, "LARGE", 1)
     monkeypatch.setattr(choice, "WIDEST_BAND", 10)
     outcome = scale.iterations((1600, 2500))
     assert len(outcome.checks) == 2 * len(scale.ITERATIONS)
     assert [check.name for check in outcome.checks if not check.ok] == []
     assert all("LU" in row[4] and row[5] for row in outcome.tables[0].rows)
-    monkeypatch.setattr(coupled, "LARGE", 10**9)
+    monkeypatch.setattr(schur, "LARGE", 10**9)
     with pytest.raises(ConfigurationError, match="take more"):
         scale.iterations((300,))
 
@@ -157,7 +158,7 @@ def test_the_jacobian_by_blocks_is_the_derivative(monkeypatch):
     y = c + 0.1 * free * rng.standard_normal(len(c))
     direction = free * rng.standard_normal(len(c))
     equation.residual(y)
-    found = equation.jacobian(y, sweep=False).apply(direction)
+    found = equation.factor(y, sweep=False).apply(direction)
     step = 1e-5
     difference = equation.residual(y + step * direction) - equation.residual(y - step * direction)
     np.testing.assert_allclose(found, difference / (2 * step), atol=1e-6 * abs(found).max())
@@ -167,10 +168,10 @@ def test_the_jacobian_by_blocks_is_the_derivative(monkeypatch):
 def test_one_update_takes_off_nearly_all_of_the_error(sensors, monkeypatch):
     stage, equation, c = first_stage(plane(24), 1.0, monkeypatch, sensors, c1=0.0)
     residual = equation.residual(c)
-    K = equation.jacobian(c, sweep=False)
-    stage.by_blocks.tolerance = 1e-12
+    K = equation.factor(c, sweep=False)
+    stage.way.tolerance = 1e-12
     exact = K.solve(residual)
-    left = K.approximate().solve(residual) - exact
+    left = stage.way.approximate(K).solve(residual) - exact
     for part in (slice(0, stage.n), slice(stage.n, None)):
         assert np.linalg.norm(left[part]) < 0.05 * np.linalg.norm(exact[part])
 
@@ -179,9 +180,9 @@ def test_the_observed_part_follows_from_the_rest(monkeypatch):
     """What A q moves next to the observed part reaches it in the same update."""
     stage, equation, c = first_stage(plane(32), 1.0, monkeypatch, lp.Subdomain(inside), c1=0.0)
     equation.residual(c)
-    K = equation.jacobian(c, sweep=False)
-    approximate = K.approximate()
-    assert "S, observed" not in stage.by_blocks.engines  # a few products serve
+    K = equation.factor(c, sweep=False)
+    approximate = stage.way.approximate(K)
+    assert "S, observed" not in stage.way.engines  # a few products serve
     n, model = stage.n, stage.model
     free, seen = model.X.free > 0, stage.split.R.diagonal() > 0
     x = np.concatenate([model.initial(lambda x: x[0] * (1 - x[0]) * x[1] * (1 - x[1])), c[n:]])
@@ -195,21 +196,21 @@ def test_stiff_observed_parts_are_factorised(monkeypatch):
     stage, equation, c = first_stage(plane(32), 1.0, monkeypatch, sensors, c1=10.0)
     c[: stage.n] *= 1.1  # r, and theta with it
     equation.residual(c)
-    equation.jacobian(c, sweep=False).approximate()
-    assert "S, observed" in stage.by_blocks.engines
+    stage.way.approximate(equation.factor(c, sweep=False))
+    assert "S, observed" in stage.way.engines
 
 
 def test_factors_are_kept_and_renewed_where_they_fail(monkeypatch):
     stage, equation, c = first_stage(plane(), 1e3, monkeypatch)
-    blocks = stage.by_blocks
+    blocks = stage.way
     residual = equation.residual(c)
     equation.factor(c, sweep=True).solve(residual)
     first = blocks.made
-    blocks.begin(first)
+    blocks.resume(first)
     equation.factor(0.9 * c, sweep=True).solve(residual)
     assert blocks.made is None
-    monkeypatch.setattr(schur, "PATIENCE", 1)
-    far = coupled.BlockEquation(stage.by_blocks, c, 50.0, Moment(50.0), c[: stage.n])
+    monkeypatch.setattr(jacobian, "PATIENCE", 1)
+    far = schur.BlockEquation(stage.way, c, 50.0, Moment(50.0), c[: stage.n])
     residual = far.residual(c)
     x = far.factor(c, sweep=True).solve(residual)
     assert blocks.made is not first  # one iteration with the factors of h = 0.05 is too few
@@ -237,7 +238,7 @@ def settled(model, sensors, samples, identifier=None):
 
 @pytest.fixture
 def stream(monkeypatch):
-    monkeypatch.setattr(coupled, "LARGE", 1)
+    monkeypatch.setattr(schur, "LARGE", 1)
     monkeypatch.setattr(choice, "WIDEST_BAND", 10)
     model, sensors = plane(), lp.Subdomain(inside)
     times = 0.05 * np.arange(30)
@@ -282,7 +283,7 @@ def test_a_good_start_makes_factors_without_sweeps(stream, monkeypatch):
     monkeypatch.setattr(schur, "SPENT", -1)  # none lives longer than a stage more
     identifier = fresh()
     settled(model, sensors, samples[:20], identifier)
-    monkeypatch.setattr(schur.Jacobian, "solve", None)
+    monkeypatch.setattr(jacobian.Jacobian, "solve", None)
     estimates, made = settled(model, sensors, samples[20:], identifier)
     assert all(estimate.status.ok for estimate in estimates)
     assert sum(made) > 2
@@ -290,7 +291,7 @@ def test_a_good_start_makes_factors_without_sweeps(stream, monkeypatch):
 
 def test_nothing_of_the_size_of_the_square_is_made(monkeypatch):
     """64 times the unknowns may take at most 100 times the memory of a step."""
-    monkeypatch.setattr(coupled, "LARGE", 1)
+    monkeypatch.setattr(schur, "LARGE", 1)
     monkeypatch.setattr(choice, "WIDEST_BAND", 2)
 
     def peak(cells):
@@ -310,10 +311,10 @@ def test_nothing_of_the_size_of_the_square_is_made(monkeypatch):
 
 def test_a_system_that_does_not_converge_is_a_status(monkeypatch):
     stage, equation, c = first_stage(plane(), 1e6, monkeypatch)
-    monkeypatch.setattr(schur, "ITERATIONS", 1)
-    monkeypatch.setattr(schur, "PATIENCE", 1)
+    monkeypatch.setattr(jacobian, "ITERATIONS", 1)
+    monkeypatch.setattr(jacobian, "PATIENCE", 1)
     monkeypatch.setattr(schur, "TOLERANCE", 0.0)
-    stage.by_blocks.tolerance = 0.0
+    stage.way.tolerance = 0.0
     residual = equation.residual(c)
     with pytest.raises(LinearAlgebraError, match="smaller gain or a smaller time step"):
         equation.factor(c, sweep=True).solve(residual)
@@ -330,14 +331,14 @@ def test_a_system_that_does_not_converge_is_a_status(monkeypatch):
 def test_infinite_coefficients_are_refused(monkeypatch):
     _, equation, c = first_stage(plane(), 1.0, monkeypatch)
     residual = equation.residual(c)
-    K = equation.jacobian(c, sweep=True)
+    K = equation.factor(c, sweep=True)
     K.S.data[:] = np.inf
     with pytest.raises(LinearAlgebraError, match="finite"):
         K.solve(residual)
 
 
 def test_banded_problems_are_factorised_at_any_size(monkeypatch):
-    monkeypatch.setattr(coupled, "LARGE", 1)
+    monkeypatch.setattr(schur, "LARGE", 1)
     mesh = lp.interval(0.0, 1.0, 40)
     model = lp.Model(
         state=lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
@@ -346,4 +347,5 @@ def test_banded_problems_are_factorised_at_any_size(monkeypatch):
         B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
     )
     ident = lp.Identifier(model, lp.Full(), lp.GradientLaw(), q0=0.5, u0=0.0)
-    assert ident._work.stage(np.ones(ident.observed.size, dtype=bool)).by_blocks is None
+    stage = ident._work.stage(np.ones(ident.observed.size, dtype=bool))
+    assert isinstance(stage.way, Bilinear)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_live import identifier, live, rows
+from live_rod import identifier, live, rows
 from typer.testing import CliRunner
 
 import livepde as lp
@@ -24,9 +24,10 @@ from livepde import cases, checkpoint, runs
 from livepde.cli.program import app
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import LONGEST_BODY, THREADS, Address, Server
+from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake
 from livepde.streams.sources import LONGEST, Follow, Lines, Rows, json_row
-from livepde.streams.table import Clock, Column
+from livepde.streams.table import Column
 
 TOKEN = "long-enough-to-be-a-token"
 

@@ -6,8 +6,6 @@ import json
 import math
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from datetime import datetime, timedelta
@@ -15,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import bad, call
-from test_mqtt import MOSQUITTO, server  # noqa: F401 (a fixture)
+from commands import bad, call, start, stopped, until
 
 import livepde as lp
 from livepde import cases, runs
@@ -87,20 +84,6 @@ def case(data='file = "rows.csv"\nfollow = true', intake="", habit="") -> str:
     return "case.toml"
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "livepde", "run", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def until(what, process: subprocess.Popen[str], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        if process.poll() is not None or time.monotonic() > end:
-            process.kill()
-            raise AssertionError(process.communicate())
-        time.sleep(0.02)
-
-
 def estimates(folder: str) -> int:
     path = Path(folder) / JOURNAL
     if not path.exists():
@@ -110,14 +93,6 @@ def estimates(folder: str) -> int:
             return len(journal)
     except lp.RunError:  # it is being made
         return 0
-
-
-def stopped(process: subprocess.Popen[str], how: signal.Signals = signal.SIGTERM) -> str:
-    process.send_signal(how)
-    output, errors = process.communicate(timeout=60)
-    assert process.returncode == 0, errors
-    assert "Traceback" not in errors
-    return output
 
 
 def test_it_follows_a_file_stops_gracefully_and_goes_on(here):
@@ -256,8 +231,7 @@ def test_a_finished_file_is_replayed_at_its_pace():
     assert max(slept) <= 0.5
 
 
-@pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
-def test_from_a_broker_and_back(here, server):  # noqa: F811
+def test_from_a_broker_and_back(here, server):
     from paho.mqtt.client import Client
     from paho.mqtt.enums import CallbackAPIVersion
 

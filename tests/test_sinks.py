@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_live import live, rows
+from live_rod import live, rows
 
 from livepde.runs.logs import configure
 from livepde.runs.sinks import JsonLinesSink
@@ -57,7 +57,7 @@ CHILD = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from test_live import live, rows
+from live_rod import live, rows
 from livepde.runs.sinks import JsonLinesSink
 from livepde.streams.sources import Rows
 run = live(Path(sys.argv[1]), Rows(rows(30)), sinks=[JsonLinesSink(sys.stdout)])

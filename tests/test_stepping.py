@@ -8,13 +8,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from problems import laplace, line, product, rates, reaction, truth
+from problems import Cubic, Slope, laplace, line, product, rates, reaction, truth
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Pattern, analyse
-from livepde.stepping import TINY, ForwardStage, Parts, StepFailed, advance, simulate
+from livepde.stepping import TINY, ForwardStage, Near, Parts, StepFailed, advance, simulate
 
 SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
 
@@ -230,31 +230,6 @@ def test_newton_keeps_its_factor_while_it_is_good():
     assert equation.factors == 1
 
 
-class Slope:
-    """The factor of a single number."""
-
-    def __init__(self, slope):
-        self.slope = slope
-
-    def solve(self, b):
-        return b / self.slope
-
-
-class Cubic:
-    """x^3 = x for x = y - 5: sweeps go to 1 from x > 0, Newton anywhere."""
-
-    def __init__(self):
-        self.sweeps = []
-
-    def residual(self, y):
-        x = y - 5.0
-        return x**3 - x
-
-    def factor(self, y, sweep):
-        self.sweeps.append(sweep)
-        return Slope(2.0 if sweep else 3.0 * (y[0] - 5.0) ** 2 - 1.0)
-
-
 @pytest.mark.parametrize(
     ("near", "kept", "made"),
     [
@@ -267,7 +242,7 @@ def test_newton_begins_where_the_start_is_good(near, kept, made):
     equation = Cubic()
     start = np.array([5.6])
     exact = lp.Newton(share=0.0)
-    y = exact.solve(equation, start, lagged=True, near=np.array([near]), kept=kept).y
+    y = exact.solve(equation, start, lagged=True, near=Near(np.array([near]), kept)).y
     np.testing.assert_allclose(y, 6.0, rtol=1e-7)
     assert equation.sweeps == made
 
@@ -275,8 +250,8 @@ def test_newton_begins_where_the_start_is_good(near, kept, made):
 def test_a_factor_in_the_place_of_a_kept_one_is_believed():
     """Two updates by the kept one, and one by its own: that is enough for a share of the miss."""
     equation = Cubic()
-    near = np.array([6.01])
-    found = lp.Newton().solve(equation, np.array([5.6]), lagged=True, near=near, kept=Slope(5.0))
+    near = Near(np.array([6.01]), Slope(5.0))
+    found = lp.Newton().solve(equation, np.array([5.6]), lagged=True, near=near)
     assert found.updates == 3
     assert equation.sweeps == [False]
     assert abs(found.y[0] - 6.0) < 0.01 * 0.01
@@ -285,18 +260,14 @@ def test_a_factor_in_the_place_of_a_kept_one_is_believed():
 @pytest.mark.parametrize(("expected", "trusted", "updates"), [(0.02, 0.01, 1), (0.02, 1e-4, 2)])
 def test_newton_stops_at_a_share_of_what_the_start_missed(expected, trusted, updates):
     """A factor that goes on at a hundredth: one update serves, if it is believed."""
-    newton, start, near = lp.Newton(share=0.03), np.array([5.6]), np.array([6.01])
-    kept = Slope(2.0 / 1.01)
-    found = newton.solve(
-        Cubic(), start, lagged=True, near=near, kept=kept, expected=expected, trusted=trusted
-    )
+    newton, start = lp.Newton(share=0.03), np.array([5.6])
+    near = Near(np.array([6.01]), Slope(2.0 / 1.01), expected, trusted)
+    found = newton.solve(Cubic(), start, lagged=True, near=near)
     assert found.updates == updates
     assert abs(found.y[0] - 6.0) < 0.03 * 0.01
     assert found.missed == pytest.approx(0.01 / 6.0, rel=0.03)
     assert (updates == 1) == math.isnan(found.rate)
-    exact = lp.Newton(share=0.0).solve(
-        Cubic(), start, lagged=True, near=near, kept=kept, expected=expected, trusted=trusted
-    )
+    exact = lp.Newton(share=0.0).solve(Cubic(), start, lagged=True, near=near)
     assert exact.updates > updates
     assert updates == 1 or found.rate == pytest.approx(exact.rate, rel=1e-3)
 
@@ -306,7 +277,7 @@ def test_sweeps_choose_where_newton_goes_far(near):
     """From there Newton goes to 4, or far below."""
     equation, swept = Cubic(), Cubic()
     start = np.array([5.6])
-    y = lp.Newton().solve(equation, start, lagged=True, near=np.array([near])).y
+    y = lp.Newton().solve(equation, start, lagged=True, near=Near(np.array([near]))).y
     assert equation.sweeps[:2] == [False, True]
     assert np.array_equal(y, lp.Newton().solve(swept, start, lagged=True).y)
     assert equation.sweeps[1:] == swept.sweeps

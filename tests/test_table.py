@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+from contextlib import closing
+from dataclasses import replace
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
 
 from livepde.errors import DataError, SampleError, TimeOrderError
-from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines
+from livepde.streams import Clock, Column, Follow, JsonLines, Table, read_csv, read_json_lines
+from livepde.streams.intake import Intake
 
 COLUMNS = {"T": Column(("a",)), "mean": Column(("a", "b"), factor=2.0, offset=1.0)}
 
@@ -57,6 +61,13 @@ def test_what_counts_as_missing(csv, missing):
         ("t,a,b\n0,1,1\nlater,1,1\n", "row 3, column 't': got 'later'"),
         ("t,a,b\n0,1,1\n,1,1\n", "row 3, column 't'"),
         ("t,a,b\n2025-01-01,1,1\n5,1,1\n", "expected a date"),
+        ("t,a,b\ns,K,K\n0,1,1\n1,1,1\n", "row 2, column 't': got 's'; expected a number"),
+        ("t,a,b\n0,'1,5',1\n", "row 2: 4 fields, but the header has 3; decimals need a point"),
+        ('t,a,b\n0,"1,5",1\n', "got '1,5'; if that is a decimal comma, say decimal = ','"),
+        ('t,a,b\n"0,5",1,1\n"0,6",1,1\n', "got '0,5'; if that is a decimal comma"),
+        ("t,a,b\n1.4.2025 9:05,1,1\n", "say time_format, perhaps '%d.%m.%Y %H:%M'"),
+        ("t;a;b\n0;1;1\n", "3 with ';': say separator = ';'."),
+        ("t;a;b\n0;1,5;1\n", "3 with ';': say separator = ';' and decimal = ','."),
         ("t,a,b\n", "no rows"),
         ("", "cannot be read"),
     ],
@@ -72,6 +83,52 @@ def test_bad_tables_name_file_row_and_column(csv, text, named):
     assert str(path) in str(error.value)
 
 
+EXCEL = "Zeit;a;b\r\n01.04.2025 12:00;1,5;-0,5\r\n01.04.2025 12:30;;1e3\r\n"
+GERMAN = Clock("Zeit", zone=ZoneInfo("Europe/Berlin"), format="%d.%m.%Y %H:%M", decimal=",")
+COMMAS = {name: replace(column, decimal=",") for name, column in COLUMNS.items()}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+def test_as_a_german_excel_writes_it(tmp_path, encoding):
+    path = tmp_path / "a.csv"
+    path.write_bytes(EXCEL.replace("Zeit", "Uhr ü").encode(encoding))
+    clock, how = replace(GERMAN, name="Uhr ü"), {"separator": ";"}
+    if encoding in ("cp1252", "utf-16"):
+        with pytest.raises(DataError) as error:
+            read_csv(path, COLUMNS, Clock("Uhr ü"))
+        assert str(error.value).endswith(
+            f"in row 1): say encoding = '{encoding}', separator = ';', decimal = ',' and "
+            "time_format = '%d.%m.%Y %H:%M'; or save it as 'CSV UTF-8'."
+        )
+        with pytest.raises(DataError, match=f": say encoding = '{encoding}'; or save it"):
+            read_csv(path, COMMAS, clock, **how)
+        how["encoding"] = encoding
+    table = read_csv(path, COMMAS, clock, **how)
+    assert table.t.tolist() == [0.0, 1800.0]
+    assert np.allclose(table.values, [[1.5, 2.0], [np.nan, np.nan]], equal_nan=True)
+    assert str(table.origin) == "2025-04-01 10:00:00"
+    if encoding == "utf-16":
+        with pytest.raises(DataError, match="cannot be read while it grows"):
+            Follow(path, **how)
+        return
+    intake = Intake(COMMAS, clock)
+    with closing(Follow(path, **how)) as source:
+        outcomes = [*map(intake.take, (row.values for row in source.poll(0.0))), intake.flush()]
+    assert [one.t for found in outcomes for one in found.ready] == table.t.tolist()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("1,5", "1.234", "row 2, column 'a': got '1.234'; expected a number"),
+        ("01.04.2025 12:30", "31.02.2025 12:30", "as time_format has it, '%d.%m.%Y %H:%M'"),
+    ],
+)
+def test_a_point_is_no_decimal_comma_and_a_format_is_kept(csv, old, new, named):
+    with pytest.raises(DataError, match=re.escape(named)):
+        read_csv(csv(EXCEL.replace(old, new)), COMMAS, GERMAN, separator=";")
+
+
 @pytest.mark.parametrize("times", ["0,2,1", "0,1,1"])
 def test_time_has_to_increase(csv, times):
     rows = "".join(f"{t},1,1\n" for t in times.split(","))
@@ -80,7 +137,10 @@ def test_time_has_to_increase(csv, times):
 
 
 def test_missing_file(tmp_path):
-    with pytest.raises(DataError, match="cannot be read"):
+    (tmp_path / "nine.csv").touch()
+    with pytest.raises(
+        DataError, match=r"there is no file .*none\.csv'; did you mean 'nine\.csv'\?"
+    ):
         read_csv(tmp_path / "none.csv", COLUMNS, Clock("t"))
 
 
@@ -134,14 +194,14 @@ def test_json_lines_with_dates_and_bounds(tmp_path):
     assert [s.z["T"] for s in samples] == [2.0, 4.0]
     assert math.isnan(samples[0].z["mean"])
     assert str(stream.origin) == "2025-04-02 00:00:00"
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="there is no file"):
         read_json_lines(tmp_path / "none.jsonl", COLUMNS, clock)
     for line, told in (
         ("[" * 100_000, "line 7: is not JSON"),
         (f'{{"t": {"9" * 5000}}}', "line 7: is not JSON"),
         ('{"a": 1}', "line 7: there is no column 't'"),
         ('{"t": "2025-04-06", "a": "warm"}', "line 7, 'a': got 'warm'"),
-        ('{"t": "2025-04-03"}', "line 7: the time is not later"),
+        ('{"t": "2025-04-03"}', "line 7: the time is earlier"),
     ):
         path.write_text("\n".join([*rows, "", line]))
         with pytest.raises(DataError, match=re.escape(told)):
@@ -152,12 +212,13 @@ def test_json_lines_with_dates_and_bounds(tmp_path):
     ("line", "named"),
     [
         ("not json", "is not JSON"),
+        ('{"t": "later", "a": 1}', "got 'later'; expected a number, as in the other rows"),
         ("[1, 2]", "expected an object"),
         ('{"time": 1}', "there is no 't'"),
         ('{"t": 1, "a": "warm"}', "line 2, 'a': got 'warm'"),
         ('{"t": 1, "a": true}', "got True"),
         ('{"t": 1, "a": 1e999}', "must be finite"),
-        ('{"t": 0, "a": 1}', "not later than the one before"),
+        ('{"t": 0, "a": 1}', "that of the one before"),
         ('{"t": true, "a": 1}', "got True"),
     ],
 )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,11 +22,13 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
+from livepde.forecast import Forecast, ahead
 from livepde.laws import AnyLaw, Belief, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
+from livepde.samples import Sample, number, numbers, plan, readings
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
@@ -34,26 +36,6 @@ __all__ = ["Identifier", "Sample"]
 FORMAT = 2  # of the checkpoint
 NOTHING = np.zeros(0)  # withheld sensors without a value
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One moment of a stream.
-
-    Attributes
-    ----------
-    t
-        Time, in the unit of the model.
-    z
-        Measurements: an array of shape (sensors,), or channel name -> value for everything that
-        was measured at t (sensors, inputs, withheld channels). NaN or absent: missing.
-    inputs
-        Input and boundary channels, if they are not in z.
-    """
-
-    t: float
-    z: ArrayLike | Mapping[str, float]
-    inputs: Mapping[str, float] | None = None
 
 
 class Identifier:
@@ -150,6 +132,12 @@ class Identifier:
         other._inputs = Inputs(dict(begun))
         return other
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
+        """Return an identifier that goes on by itself; model, law and matrices are shared."""
+        other = copy.copy(self)
+        other._state, other._z = copy.deepcopy((self._state, self._z), memo)
+        return other
+
     def _check_names(self) -> None:
         hidden = self.withheld.names if self.withheld else ()
         both = [name for name in hidden if name in self.observed.names]
@@ -160,13 +148,17 @@ class Identifier:
             )
 
     def _begin(self, inputs: Inputs) -> None:
+        self._state = self._start(inputs)
+        self._inputs = inputs
+
+    def _start(self, inputs: Inputs) -> Any:
+        """Return the state of the law at the initial time."""
         moment = Moment(self._t, inputs)
         if self.model.form_initial is not None:
             u0 = self.model.initial_state(self._q0, moment)
         else:
             u0 = self.model.impose(self._u0, moment)
-        self._state = self.law.start(self._work, self._q0, u0, moment)
-        self._inputs = inputs
+        return self.law.start(self._work, self._q0, u0, moment)
 
     @property
     def u0(self) -> Array:
@@ -219,18 +211,13 @@ class Identifier:
             An input has no value yet; a later gap holds the last value and is noted. The position
             of a moving sensor may be missing, and is not held.
         """
-        t = _number(t, "time t")
+        t = number(t, "time t")
         if math.isnan(t):
             raise SampleError("time t is NaN; give the time of the sample.")
         measured, withheld, named = self._parse(z, inputs or {})
-        values, held = self._filled(named)
+        values, held = self._filled(named, self._inputs)
         first = self._samples == 0
-        if t - self._t > MOST_SUBSTEPS * self.problem.control.dt_max:
-            raise SampleError(
-                f"the sample at t = {t:g} is more than {MOST_SUBSTEPS} substeps of dt_max = "
-                f"{self.problem.control.dt_max:g} after t = {self._t:g}: check its time, or take a "
-                "longer dt_max."
-            )
+        self._reachable(t)
         if t < self._t or (t == self._t and not first):
             raise TimeOrderError(
                 f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}: "
@@ -280,8 +267,6 @@ class Identifier:
             error = withheld - self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
         return Estimate(
             t=t,
-            q=belief.q,
-            u=belief.u,
             belief=belief,
             innovation=measured - report.predicted,
             withheld_error=error,
@@ -311,10 +296,67 @@ class Identifier:
         report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
+    def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
+        """Return what the sensors will show if nothing more is measured; nothing is learned.
+
+        Unknowns that evolve go on as their prior says, and deviations grow with them.
+
+        Parameters
+        ----------
+        times
+            Later than the last sample and increasing; the first may be its time, for what the
+            sensors show now.
+        inputs
+            Channel -> its value, or one for each time. What is missing (left out, NaN) holds its
+            last value.
+
+        Raises
+        ------
+        SampleError
+            Another shape, text, infinity, or an unknown input.
+        TimeOrderError
+            Times that do not increase.
+        MissingInputError
+            An input has no value yet.
+
+        Examples
+        --------
+        >>> import livepde as lp
+        >>> from livepde.models import heat
+        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Scalar(0.1, std=0.05))
+        >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}), lp.GradientLaw(), u0=20.0)
+        >>> rod.forecast([1.0, 2.0])["middle"].round(6)
+        array([20., 20.])
+        """
+        t = np.atleast_1d(numbers(times, "forecast: times"))
+        if t.ndim != 1 or not np.isfinite(t).all():
+            raise SampleError(f"forecast: times must be finite numbers; got {times!r}.")
+        if not len(t) or t[0] < self._t or np.any(np.diff(t) <= 0.0):
+            raise TimeOrderError(
+                f"forecast: times must increase from the last sample at t = {self._t!r} on; got "
+                f"{t.tolist()}."
+            )
+        self._reachable(float(t[-1]))
+        planned = self._planned(inputs or {}, len(t))
+        state, before = self._state, self._inputs
+        if state is None:
+            state, before = self._start(planned[0]), planned[0]
+        blank = np.full(self.observed.size, np.nan)
+        ends = [(end, then, blank) for end, then in zip(t.tolist(), planned, strict=True)]
+        intervals = [
+            Interval(t0, t1, inputs0, inputs1, z0, z1)
+            for (t0, inputs0, z0), (t1, inputs1, z1) in pairwise(
+                [(self._t, before, self._z), *ends]
+            )
+        ]
+        sensors = [item for item in (self.observed, self.withheld) if item is not None]
+        return ahead(self.law, self._work, self.problem, sensors, state, intervals)
+
     def run(
         self,
         stream: Iterable[Any],
         *,
+        on_estimate: Callable[[Estimate], object] | None = None,
         progress: bool = False,
         total: int | None = None,
         fields_every: int = 1,
@@ -325,6 +367,9 @@ class Identifier:
         ----------
         stream
             (t, z), (t, z, inputs), or `Sample` items.
+        on_estimate
+            Called with each estimate before the next sample is asked for: a controller, say. What
+            it returns is ignored, what it raises ends the run.
         progress
             Show a bar with rate and time left.
         total
@@ -335,8 +380,20 @@ class Identifier:
         result = Result(self.model, self.observed, self.withheld, fields_every)
         for item in _watched(stream, progress, total):
             sample = item if isinstance(item, Sample) else Sample(*item)
-            result.add(self.step(sample.t, sample.z, sample.inputs))
+            estimate = self.step(sample.t, sample.z, sample.inputs)
+            result.add(estimate)
+            if on_estimate is not None:
+                on_estimate(estimate)
         return result
+
+    def _reachable(self, t: float) -> None:
+        """Refuse a time that is too many substeps away."""
+        if t - self._t > MOST_SUBSTEPS * self.problem.control.dt_max:
+            raise SampleError(
+                f"the sample at t = {t:g} is more than {MOST_SUBSTEPS} substeps of dt_max = "
+                f"{self.problem.control.dt_max:g} after t = {self._t:g}: check its time, or take a "
+                "longer dt_max."
+            )
 
     def _parse(
         self, z: ArrayLike | Mapping[str, float], inputs: Mapping[str, float]
@@ -349,33 +406,48 @@ class Identifier:
                 raise SampleError(
                     f"unknown channel '{unknown[0]}'; this identifier has {list(self.channels)}."
                 )
-            values = {name: _number(value, f"channel '{name}'") for name, value in z.items()}
+            values = {name: number(value, f"channel '{name}'") for name, value in z.items()}
             measured = np.array([values.get(name, np.nan) for name in self.observed.names])
             withheld = np.array([values.get(name, np.nan) for name in hidden])
             named = {name: values[name] for name in self.inputs if name in values}
         else:
-            measured = _array(z, self.observed)
+            measured = readings(z, self.observed)
             withheld, named = np.full(len(hidden), np.nan) if hidden else NOTHING, {}
+        return measured, withheld, named | self._named(inputs)
+
+    def _named(self, inputs: Mapping[str, float]) -> dict[str, float]:
+        """Return inputs, checked."""
+        named = {}
         for name, value in inputs.items():
             if name not in self.inputs:
                 raise SampleError(
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
-            named[name] = _number(value, f"input '{name}'")
-        return measured, withheld, named
+            named[name] = number(value, f"input '{name}'")
+        return named
 
-    def _filled(self, named: dict[str, float]) -> tuple[Inputs, tuple[str, ...]]:
-        """Return all inputs; a missing one holds its last value."""
+    def _planned(self, inputs: Mapping[str, ArrayLike], count: int) -> list[Inputs]:
+        """Return all inputs at each of some times to come."""
+        plans = {name: plan(name, values, count) for name, values in inputs.items()}
+        known, planned = self._inputs, []
+        for k in range(count):
+            named = self._named({name: float(values[k]) for name, values in plans.items()})
+            known, _ = self._filled(named, known)
+            planned.append(known)
+        return planned
+
+    def _filled(self, named: Mapping[str, float], known: Inputs) -> tuple[Inputs, tuple[str, ...]]:
+        """Return all inputs; a missing one holds its last known value."""
         if not self.inputs:
-            return self._inputs, ()
-        values, held, last = {}, [], dict(self._inputs)
+            return known, ()
+        values, held, last = {}, [], dict(known)
         for name in self.inputs:
             value = named.get(name, np.nan)
             if np.isnan(value) and name not in self.optional_inputs:
                 if name not in last:
                     needed = [c for c in self.inputs if c not in self.optional_inputs]
                     raise MissingInputError(
-                        f"input '{name}' has no value in the first sample; start the stream where "
+                        f"input '{name}' has no value in the first sample, nor before; start where "
                         f"all of {needed} have one."
                     )
                 value = last[name]
@@ -452,50 +524,6 @@ class Identifier:
         self._state = state
         if state is None and not self.inputs:
             self._begin(inputs)
-
-
-def _number(value: Any, what: str) -> float:
-    """Return a float; None is missing (NaN)."""
-    if type(value) is float and math.isfinite(value):
-        return value
-    if value is None:
-        return np.nan
-    if isinstance(value, str | bytes | bool):
-        raise SampleError(f"{what}: got {value!r}; expected a number (NaN if it is missing).")
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise SampleError(f"{what}: got {value!r}; expected a number (NaN if missing).") from None
-    if np.isinf(number):
-        raise SampleError(f"{what}: got {number}; send NaN for a missing sample, never infinity.")
-    return number
-
-
-def _array(z: Any, observed: Observed) -> Array:
-    usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
-    if usual and np.isfinite(z).all():
-        return np.array(z)
-    if (
-        np.asarray(z).dtype.kind in "USb"
-        if not isinstance(z, list | tuple)
-        else any(isinstance(value, str | bytes | bool) for value in z)
-    ):
-        raise SampleError(f"z = {z!r} is not an array of numbers.")
-    try:
-        array = np.asarray(z, dtype=float)
-    except (TypeError, ValueError):
-        raise SampleError(f"z = {z!r} holds something that is not a number.") from None
-    if array.ndim == 0 and observed.size == 1:
-        array = array.reshape(1)
-    if array.shape != (observed.size,):
-        raise SampleError(
-            f"z has shape {array.shape}; the observation has {observed.size} sensors, so it "
-            f"needs ({observed.size},), NaN where a sample is missing."
-        )
-    if np.isinf(array).any():
-        where = observed.names[int(np.flatnonzero(np.isinf(array))[0])]
-        raise SampleError(f"channel '{where}' is infinite; send NaN for a missing sample.")
-    return array.copy()
 
 
 def _watched(stream: Iterable[Any], progress: bool, total: int | None) -> Iterable[Any]:

@@ -108,6 +108,8 @@ class Model:
         Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
         projection is where u begins. Unknowns in it belong to the initial state.
 
+    Notes
+    -----
     `A`, `B`, `f` and `M` may each be a list of terms; `On("left", form)` restricts a term to a
     named boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time.
 

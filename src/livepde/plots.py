@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
 if TYPE_CHECKING:
+    import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -266,7 +266,7 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
     runs
         Name -> dataset with the quantities over `time`, and where there are such, what each should
         be (`_reference`), its limits (`_low`, `_high`), what it is (`_truth`), its deviation
-        (`_std`).
+        (`_std`). With the attribute `held` values are held from sample to sample.
     rows
         Names of the quantities.
 
@@ -285,14 +285,22 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
             ax, values = grid[row][column], data[name].values
             for end, style in (("reference", "--"), ("truth", "-"), ("low", ":"), ("high", ":")):
                 if f"{name}_{end}" in data:
-                    colour = PALETTE[1] if end in ("low", "high") else PALETTE[-1]
-                    name_of = "limit" if end in ("low", "high") else end
-                    other = data[f"{name}_{end}"].values
-                    ax.plot(t, other, style, color=colour, linewidth=1.0, label=name_of)
+                    limit = end in ("low", "high")
+                    said = ax.get_legend_handles_labels()[1]
+                    meaning = "limit" if limit else end
+                    ax.plot(
+                        t,
+                        data[f"{name}_{end}"].values,
+                        style,
+                        color=PALETTE[1] if limit else PALETTE[-1],
+                        linewidth=1.0,
+                        label="" if meaning in said else meaning,
+                    )
             if f"{name}_std" in data:
                 half = NORMAL_95 * data[f"{name}_std"].values
                 ax.fill_between(t, values - half, values + half, color=PALETTE[0], alpha=0.25)
-            ax.plot(t, values, color=PALETTE[0], linewidth=1.2, drawstyle="default")
+            drawstyle: Any = "steps-post" if "held" in data[name].attrs else "default"
+            ax.plot(t, values, color=PALETTE[0], linewidth=1.2, drawstyle=drawstyle)
             if row == 0:
                 ax.set_title(label, fontsize="medium")
             if column == 0:

@@ -35,7 +35,8 @@ def watched(stream: Iterable[Any], total: int | None, what: str = "samples") -> 
         _Rate(),
         TimeRemainingColumn(),
     )
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
+    if not console.is_terminal:
+        yield from stream
+        return
+    with Progress(*columns, console=console, transient=True) as bar:
         yield from bar.track(stream, total=total, description=what)

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import xarray as xr
 
 from livepde.linalg import Array
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["STATUS_CODES", "Layout", "Record", "Records", "Snapshot", "bare"]
 
@@ -123,6 +125,8 @@ class Layout:
 
     def dataset(self, records: Sequence[Record]) -> xr.Dataset:
         """Return records as a dataset; see `Result.to_xarray`."""
+        import xarray as xr
+
         kept = [(row.t, row.snapshot) for row in records if row.snapshot is not None]
         times = np.array([row.t for row in records], dtype=float)
         coords: dict[str, Any] = {

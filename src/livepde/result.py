@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from livepde import plots
 from livepde.errors import ConfigurationError
@@ -17,6 +16,9 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import STATUS_CODES, Layout, Record, Records, Snapshot
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = [
     "Estimate",
@@ -37,8 +39,8 @@ class Estimate:
     ----------
     t
         Time of the sample.
-    q, u
-        Coefficients of parameter and state, shapes (m,) and (n,).
+    belief
+        Coefficients of parameter and state, and how well they are known.
     innovation
         Measured minus expected before the sample was used, shape (sensors,); NaN where missing.
         For `GradientLaw`, which pulls the state to the sample within the step, the output error
@@ -58,8 +60,6 @@ class Estimate:
     """
 
     t: float
-    q: Array
-    u: Array
     belief: Belief
     innovation: Array
     withheld_error: Array
@@ -68,6 +68,16 @@ class Estimate:
     notes: Mapping[str, float]
     held: tuple[str, ...]
     space: FunctionSpace
+
+    @property
+    def q(self) -> Array:
+        """Coefficients of the parameter, shape (m,)."""
+        return self.belief.q
+
+    @property
+    def u(self) -> Array:
+        """Coefficients of the state, shape (n,)."""
+        return self.belief.u
 
     @property
     def q_std(self) -> Array | None:

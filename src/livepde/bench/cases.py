@@ -8,6 +8,7 @@ step, of which the cost of the law is a multiple.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -338,16 +339,18 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
 
 
 def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
-    """Write gallery.md: for each case its figure, the table of its runs, and its checks."""
+    """Write gallery.md: for each case its figure, the tables of its runs, and its checks."""
     parts = []
     for path in dict.fromkeys(job.path for job, _ in runs):
         some = [(job, run) for job, run in runs if job.path == path]
         job, run = some[0]
         checks = [check for pair in some for check in _checks(*pair)]
         source = [f"Reference: {run.source}"] if run.source else []
-        figures = [job.figure.name] if job.figure and job.figure.exists() else []
-        text = markdown(run.title or path.stem, _tables(some), checks, source, figures)
-        parts.append(text.replace("\n## ", "\n### ").replace("# ", "## ", 1))
+        report = markdown("", _tables(some), checks, source).removeprefix("# \n\n")
+        lines = [f"## {run.title or path.stem}", f"`livepde bench cases --only {path.stem}`"]
+        if job.figure and job.figure.exists():
+            lines.append(f"![{path.stem}]({job.figure.name})")
+        parts.append("\n\n".join([*lines, re.sub("(?m)^## (.*)$", r"**\1**", report)]))
     target = folder / "gallery.md"
     target.write_text(GALLERY + "\n".join(parts), encoding="utf-8")
     return target

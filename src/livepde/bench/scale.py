@@ -30,7 +30,9 @@ from livepde.errors import ConfigurationError
 from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
-from livepde.laws.coupled import CoupledStage, Gains
+from livepde.laws.coupled import CoupledStage
+from livepde.laws.gains import Gains
+from livepde.laws.schur import BlockSolver
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
 from livepde.observation import Full, Subdomain
@@ -334,8 +336,8 @@ def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, s
     M_op = model.bilinear(h1_form)
     gains = Gains(gain, ResidualDamping(c1), 0.0, 0.0, M_op, M_op)
     stage = CoupledStage(model, observed.split(), gains, Newton(iterations=1))
-    blocks = stage.by_blocks
-    if blocks is None:
+    blocks = stage.way
+    if not isinstance(blocks, BlockSolver):
         raise ConfigurationError(
             f"bench scale: a problem with {model.X.dim} nodes is not solved by blocks; take more."
         )

@@ -17,24 +17,18 @@ from livepde.cases.data import assimilation_start, clock_of, read_data, reader_o
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import expanded
+from livepde.cases.laws import law_of
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
-from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec, VariantSpec
-from livepde.cases.sensors import columns_of, initial_of, noise_of, observation_of
+from livepde.cases.schema import VariantSpec
+from livepde.cases.sensors import columns_of, initial_of, observation_of
 from livepde.cases.settings import apply, to_toml
-from livepde.errors import DataError, LawError
+from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
 from livepde.laws import (
     AnyLaw,
-    AutoLaw,
-    ConstantDamping,
-    Damping,
     GradientLaw,
-    Jumps,
-    Replay,
-    ResidualDamping,
-    SensitivityLaw,
 )
 from livepde.model import Model
 from livepde.observation import Observation, Points
@@ -293,42 +287,7 @@ class Case:
     @cached_property
     def law(self) -> AnyLaw:
         """The update law."""
-        spec = self.frame.spec.law
-        try:
-            if isinstance(spec, GradientSpec):
-                return _gradient(spec)
-            return self._auto(spec) if isinstance(spec, AutoSpec) else self._sensitivity(spec)
-        except LawError as error:
-            raise self.frame.error("law", str(error)) from None
-
-    def _sensitivity(self, spec: SensitivitySpec) -> SensitivityLaw:
-        frame, time = self.frame, self.frame.equation.time_unit
-        noise, memory = self._noise(spec), float(np.inf)
-        if noise is None and noise_of(frame, "sensor") is None:
-            raise frame.missing(
-                "law.noise",
-                "the sensitivity law weighs the sensors by their noise (a standard deviation); "
-                "give it here or with every sensor.",
-            )
-        if spec.memory is not None:
-            memory = frame.positive(spec.memory, time, "law.memory")
-        drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
-        replay = Replay() if spec.replay is True else None
-        if not isinstance(spec.replay, bool):
-            replay = Replay(**spec.replay.model_dump())
-        jumps = Jumps() if spec.jumps is True else None
-        if not isinstance(spec.jumps, bool):
-            jumps = Jumps(**spec.jumps.model_dump())
-        gate = spec.gate or np.inf
-        return SensitivityLaw(spec.modes, noise, drift, memory, replay, gate=gate, jumps=jumps)
-
-    def _auto(self, spec: AutoSpec) -> AutoLaw:
-        return AutoLaw(spec.modes, self._noise(spec), gate=spec.gate or np.inf)
-
-    def _noise(self, spec: AutoSpec | SensitivitySpec) -> float | None:
-        if spec.noise is None:
-            return None
-        return self.frame.positive(spec.noise, self.frame.equation.state.unit, "law.noise")
+        return law_of(self.frame)
 
     @cached_property
     def scheme(self) -> Scheme:
@@ -432,10 +391,3 @@ class Case:
         prepared = Prepared(self, first, (), start, origin)
         prepared.identifier_with(self.law).step(first.t, first.z)  # raises what is missing
         return prepared
-
-
-def _gradient(spec: GradientSpec) -> GradientLaw:
-    damping: Damping = ResidualDamping(1.0 if spec.c1 is None else spec.c1)
-    if spec.mu is not None:
-        damping = ConstantDamping(spec.mu)
-    return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)

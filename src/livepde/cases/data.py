@@ -18,6 +18,7 @@ from livepde.cases.schema import CaseSpec
 from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
+from livepde.streams.names import no_file
 from livepde.streams.table import JSON_LINES
 
 __all__ = ["assimilation_start", "clock_of", "data_file", "read_data", "reader_of"]
@@ -32,7 +33,16 @@ def clock_of(frame: Frame) -> Clock:
     rule = conversion(data.time_unit or unit, unit, frame.where("data.time_unit"))
     second = conversion("s", unit, frame.where("data.time")).factor if unit else 1.0
     start, stop = _instant(frame, data.start, "start"), _instant(frame, data.stop, "stop")
-    return Clock(data.time, rule.factor, start, stop, second, _zone(frame))
+    return Clock(
+        data.time,
+        rule.factor,
+        start,
+        stop,
+        second,
+        zone=_zone(frame),
+        format=data.time_format,
+        decimal=data.decimal,
+    )
 
 
 def _zone(frame: Frame) -> tzinfo:
@@ -78,6 +88,7 @@ def read_data(
         every=spec.every,
         missing=spec.missing,
         separator=spec.separator,
+        encoding=spec.encoding,
     )
 
 
@@ -134,7 +145,7 @@ def data_file(frame: Frame) -> Path:
         given = given.replace(VARIABLE, str(_data_folder(frame)))
     path = frame.path.parent / Path(given).expanduser()
     if not path.is_file() and not frame.spec.data.follow:
-        raise frame.error("data.file", f"there is no file '{path}'.")
+        raise frame.error("data.file", str(no_file(path)))
     return path
 
 

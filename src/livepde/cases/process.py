@@ -167,9 +167,12 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     low, high = -np.inf, np.inf
     if spec.bounds is not None:
         low, high = (value(bound, "bounds") for bound in spec.bounds)
-        if not low <= prior <= high or low == high:
-            text = f"got {list(spec.bounds)}; expected low < high with the prior {spec.prior!r}"
-            raise frame.error(f"{key}.bounds", f"{text} between them.")
+        if not low < high:
+            text = f"got [{low:g}, {high:g}] {unit}".rstrip()
+            raise frame.error(f"{key}.bounds", f"{text}; needs the lower one first.")
+        if not low <= prior <= high:
+            text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
+            raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     prior_of: dict[str, Any] = {"prior": prior, "std": std, "bounds": (low, high), "unit": unit}
     prior_of["transform"] = spec.transform
     if spec.evolution is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -18,6 +19,8 @@ from livepde.cases.schema import (
     DataSpec,
     EvolutionSpec,
     GradientSpec,
+    GuardsSpec,
+    JumpsSpec,
     MeshSpec,
     OutputSpec,
     ReplaySpec,
@@ -31,6 +34,8 @@ from livepde.errors import CaseError
 __all__ = ["did_you_mean", "read_spec", "read_text", "read_toml"]
 
 LONGEST = 1_000_000  # bytes of a case file
+DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no case
+SHOWN = 60  # characters of a line that is shown
 
 EXPECTED = {
     "int_type": "a whole number",
@@ -55,6 +60,8 @@ TABLES: dict[str, type[BaseModel]] = {
     "output": OutputSpec,
     "unknowns.*": UnknownSpec,
     "channels.*": ChannelSpec,
+    "law.guards": GuardsSpec,
+    "law.jumps": JumpsSpec,
     "law.replay": ReplaySpec,
     "variants.*": VariantSpec,
     "*.evolution": EvolutionSpec,
@@ -71,25 +78,45 @@ def read_text(path: Path) -> str:
             raise CaseError(f"{path}: is longer than {LONGEST} bytes; data belong to a data file.")
         return content.decode("utf-8").replace("\r\n", "\n")
     except FileNotFoundError:
-        near = difflib.get_close_matches(path.name, _cases_in(path.parent), n=1)
-        hint = f" Did you mean '{path.parent / near[0]}'?" if near else ""
-        raise CaseError(
-            f"{path}: there is no such case file; 'livepde init DIR' writes one.{hint}"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaseError(f"{path}: cannot be read as text ({error}).") from error
+        near = _nearest(path.parent, path.name)
+        raise CaseError(f"{path}: there is no such case file; {near}") from None
+    except IsADirectoryError:
+        near = _nearest(path, "case.toml")
+        raise CaseError(f"{path}: is a folder, not a case file; {near}") from None
+    except UnicodeDecodeError as error:
+        row = error.object.count(b"\n", 0, error.start) + 1
+        raise CaseError(f"{path}: row {row} is not UTF-8 text; save it as UTF-8.") from error
+    except OSError as error:
+        raise CaseError(f"{path}: cannot be read ({error.strerror or error}).") from error
 
 
-def _cases_in(folder: Path) -> list[str]:
-    return [file.name for file in folder.glob("*.toml")] if folder.is_dir() else []
+def _nearest(folder: Path, name: str) -> str:
+    """Return where a case of this name may be: in a folder, or one below."""
+    known = [*folder.glob("*.toml"), *folder.glob("*/*.toml")]
+    names = difflib.get_close_matches(name, [item.name for item in known], n=1, cutoff=0.75)
+    near = [item for item in known if item.name in names] or known[: len(known) == 1]
+    return f"did you mean '{near[0]}'?" if near else "'livepde init DIR' writes one."
 
 
 def read_toml(text: str, where: str) -> dict[str, Any]:
     """Return the document of a case file; raises `CaseError`."""
+    if where.endswith(DATA):
+        raise CaseError(f"{where}: is data, not a case: 'livepde run CASE --data {where}'.")
     try:
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except RecursionError as error:
         raise CaseError(f"{where}: is not valid TOML: {error}.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise CaseError(f"{where}: is not valid TOML: {error}{_line(text, str(error))}.") from None
+
+
+def _line(text: str, reason: str) -> str:
+    """Return the line of a TOML file about which a reason speaks, with what is mostly wrong."""
+    number = re.search(r"at line (\d+)", reason)
+    line = re.split(r"\s+#", text.splitlines()[int(number[1]) - 1])[0].strip() if number else ""
+    if not line:
+        return ""
+    return f": {line[:SHOWN]}; text needs quotes at both ends, decimals a point"
 
 
 def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
@@ -110,8 +137,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
-    # A misspelt key makes two errors, one extra and one missing: the extra one says it better.
-    found = sorted(error.errors(), key=lambda item: item["type"] != "extra_forbidden")[0]
+    # A misspelt key makes two errors, one extra and one missing: the extra one says it better. And
+    # where true, false or a table may stand, a table is not wrong for being no boolean.
+    def rank(item: Any) -> tuple[bool, bool]:
+        table = item["type"] == "bool_type" and isinstance(item["input"], dict)
+        return item["type"] != "extra_forbidden", table
+
+    found = min(error.errors(), key=rank)
     path = _path(found["loc"], raw)
     key = ".".join(path)
     kind, got = found["type"], found["input"]

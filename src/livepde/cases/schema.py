@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from datetime import date, datetime
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -18,8 +20,9 @@ from pydantic import (
     model_validator,
 )
 
-from livepde.laws import Jumps, Replay
+from livepde.laws import Guards, Jumps, Replay
 from livepde.runs.outcome import Bound, Sense
+from livepde.streams.csvfile import UTF_8
 
 __all__ = [
     "AutoSpec",
@@ -61,6 +64,24 @@ def _bound(value: Any) -> Any:
     raise ValueError('expected [low, high], "<= number" or ">= number"')
 
 
+def _encoding(value: str) -> str:
+    try:
+        codecs.lookup(value)
+    except LookupError:
+        raise ValueError("expected the name of an encoding, as 'utf-8', 'cp1252'") from None
+    return value
+
+
+def _time_format(value: str) -> str:
+    moment = datetime(2001, 2, 3, 4)
+    try:
+        if datetime.strptime(moment.strftime(value), value).date() == moment.date():
+            return value
+    except ValueError:
+        pass
+    raise ValueError("expected year, month, day and time, as '%d.%m.%Y %H:%M'")
+
+
 def _flat(value: Any) -> Any:
     """{"k": {"error": x}} -> {"k.error": x}: TOML reads k.error = x as a table."""
     if not isinstance(value, dict):
@@ -80,6 +101,7 @@ Pair: TypeAlias = tuple[Quantity, Quantity]
 Point: TypeAlias = Quantity | tuple[Quantity, ...]
 Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
 Instant: TypeAlias = date | datetime | float | str
+Encoding: TypeAlias = Annotated[str, AfterValidator(_encoding)]
 Name: TypeAlias = Annotated[str, Field(min_length=1)]
 Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 
@@ -171,10 +193,13 @@ class DataSpec(Spec):
     mqtt: MqttSpec | None = None
     opcua: OpcuaSpec | None = None
     separator: Annotated[str, Field(min_length=1, max_length=1)] = ","
+    decimal: Literal[".", ","] = "."
+    encoding: Encoding = UTF_8
     reader: Name | None = None
     options: dict[Identifier, Any] = Field(default_factory=dict)
     time: Name = "time"
     time_unit: str | None = None
+    time_format: Annotated[str, AfterValidator(_time_format)] = ""
     zone: Name = "UTC"
     start: Instant | None = None
     stop: Instant | None = None
@@ -334,6 +359,16 @@ class JumpsSpec(Spec):
     settle: NonNegativeInt = Jumps.settle
 
 
+class GuardsSpec(Spec):
+    """When the law is out of its depth: how far a sample moves an unknown, and when to restart."""
+
+    reach: PositiveFloat = Guards.reach
+    iterations: PositiveInt = Guards.iterations
+    temperings: NonNegativeInt = Guards.temperings
+    runaway: PositiveFloat = Guards.runaway
+    past: PositiveInt = Guards.past
+
+
 class SensitivitySpec(Spec):
     """The law for sparse, noisy sensors."""
 
@@ -345,6 +380,7 @@ class SensitivitySpec(Spec):
     replay: StrictBool | ReplaySpec = False
     gate: PositiveFloat | None = None
     jumps: StrictBool | JumpsSpec = False
+    guards: StrictBool | GuardsSpec = True
 
 
 class AutoSpec(Spec):

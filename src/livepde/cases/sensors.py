@@ -42,7 +42,14 @@ def columns_of(frame: Frame) -> dict[str, Column]:
         if channel.valid is not None:
             valid = frame.pair(channel.valid, unit, f"channels.{name}.valid")
         needed = channel.missing == "skip"
-        found[name] = Column(channel.sources, rule.factor, rule.offset, valid, needed)
+        found[name] = Column(
+            channel.sources,
+            rule.factor,
+            rule.offset,
+            valid,
+            needed,
+            decimal=frame.spec.data.decimal,
+        )
     return found
 
 

@@ -19,12 +19,19 @@ BARE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789
 
 
 def parse(assignments: Iterable[str]) -> dict[str, Any]:
-    """Return key -> value of texts such as 'law.noise=2 K'; values are TOML, or else text."""
-    found = {}
+    """Return key -> value of texts such as 'law.noise=2 K'; values are TOML, or else text.
+
+    >>> parse(["law.noise=2 K", "data.every=2", "expect="])
+    {'law.noise': '2 K', 'data.every': 2, 'expect': None}
+    """
+    found: dict[str, Any] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
         if not (equals and key.strip()):
             raise CaseError(f"--set {text}: expected key=value, as law.memory='3 d'.")
+        if not value.strip():
+            found[key.strip()] = None
+            continue
         try:
             (found[key.strip()],) = tomllib.loads(f"value = {value}").values()
         except (tomllib.TOMLDecodeError, ValueError):
@@ -41,14 +48,14 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
         The parsed case.
     settings
         Key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table
-        sets the keys in it and leaves the others.
+        sets the keys in it and leaves the others; None takes the key away.
     where
         For messages.
 
     Raises
     ------
     CaseError
-        A key that is none, or an unknown or channel that the case does not have.
+        A key that is none, or an unknown, a channel or a key to take away that the case has not.
     """
     changed = copy.deepcopy(dict(document))
     for key, given in settings.items():
@@ -63,7 +70,13 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
                 if not isinstance(here.get(part), dict):
                     here[part] = {}
                 here = here[part]
-            here[path[-1]] = value
+            if value is not None:
+                here[path[-1]] = value
+            elif here.pop(path[-1], None) is None:
+                raise CaseError(
+                    f"{where}: there is no key '{'.'.join(path)}' to take away; "
+                    f"{did_you_mean(path[-1], here)}"
+                )
     return changed
 
 

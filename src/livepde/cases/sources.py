@@ -50,7 +50,13 @@ def source_of(frame: Frame, data: Data, position: str) -> Source:
         )
     path = Path(data) if data is not None else data_file(frame)
     follow = spec.follow and data is None
-    return Follow(path, separator=spec.separator, follow=follow, position=position)
+    return Follow(
+        path,
+        separator=spec.separator,
+        encoding=spec.encoding,
+        follow=follow,
+        position=position,
+    )
 
 
 def publishers_of(frame: Frame) -> list[Sink]:

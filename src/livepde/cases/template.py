@@ -20,6 +20,7 @@ CASE = """\
 #   livepde check {case}     what is in here, and what its sensors can tell
 #   livepde run {case}       identify; writes a run directory
 # Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
+# With data of your own: say so in "data", "channels" and the prior, and drop "expect" at the end.
 title = "A metal rod, heated and cooled at its left end"
 equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
                                # or your own as "file.py:function" (run it with --allow-code)
@@ -34,6 +35,8 @@ cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells 
 file = "{data}"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
 time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
 time_unit = "s"
+# dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
+# as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
 # start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
 
 [unknowns.alpha]               # names are those of the equation
@@ -43,7 +46,7 @@ bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
 # by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
 # as a field: field = true, length = "10 cm"   (and no bounds)
 
-[channels]                     # name = {{ role, column, ... }}; unit = that of the column
+[channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
 T_left = {{ role = "boundary", column = "T_left", at = "left" }}
 T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "{noise} K" }}
 T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
@@ -59,7 +62,7 @@ replay = true                  # constant unknowns; for drifting ones drift = "0
 scheme = "alexander2"          # second order; or "implicit-euler"
 dt_max = "20 s"                # longer intervals between samples are divided
 
-[expect]                       # optional: numbers that run --json checks
+[expect]                       # of these very data: drop it, or say what you expect of yours
 alpha = [9e-5, 1.05e-4]        # the rod's data were made with {alpha:g} m^2/s
 rmse = "<= 0.15"           # its noise is {noise} K; the rest is learning
 """

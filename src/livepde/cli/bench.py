@@ -8,13 +8,18 @@ from typing import Annotated
 
 import typer
 
-from livepde.cli.options import JsonOption
+from livepde.cli.options import JsonOption, names_in
 from livepde.cli.printing import can_draw, named, report_outcome, terminal
 
 __all__ = ["bench"]
 
 ProblemsOption = Annotated[
-    list[str] | None, typer.Option("--only", help="Only this problem. Repeat it for more.")
+    list[str] | None,
+    typer.Option(
+        "--only",
+        help="Only this problem. Repeat it for more.",
+        autocompletion=names_in("livepde.bench.problems:PROBLEMS"),
+    ),
 ]
 
 LevelsOption = Annotated[
@@ -58,6 +63,21 @@ def step(
     command += [word for nodes in size or () for word in ("--size", str(nodes))]
     command += [word for count in modes or () for word in ("--modes", str(count))]
     report_outcome(benchmark(size or SIZES, modes or MODES), command, as_json)
+
+
+@bench.command("import")
+def startup(
+    rounds: Annotated[int, typer.Option(min=1, help="Fresh processes of each.")] = 15,
+    as_json: JsonOption = False,
+) -> None:
+    """Time the import of livepde, in fresh processes, against that of SciPy and scikit-fem.
+
+    Example:  livepde bench import --json
+    """
+    from livepde.bench.startup import startup as benchmark
+
+    command = ["livepde", "bench", "import", "--rounds", str(rounds)]
+    report_outcome(benchmark(rounds), command, as_json)
 
 
 @bench.command()
@@ -270,7 +290,10 @@ def faults(
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="One of file, mqtt, restart, malformed, messages. Repeat it."),
+        typer.Option(
+            help="One of file, mqtt, restart, malformed, messages. Repeat it.",
+            autocompletion=names_in("livepde.bench.faults:PARTS"),
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from livepde.cli.options import names_in
 from livepde.cli.printing import (
     named,
     print_table,
@@ -33,7 +34,13 @@ def init(
 
 
 def equations(
-    name: Annotated[str, typer.Argument(help="Name of an equation; 'list' shows them.")] = "list",
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="Name of an equation; 'list' shows them.",
+            autocompletion=names_in("livepde.models:EQUATIONS"),
+        ),
+    ] = "list",
 ) -> None:
     """Show the ready-made equations, and what a case says about one of them.
 

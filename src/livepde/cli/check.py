@@ -81,6 +81,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     """Print what the sensors can tell; return sentences on it."""
     from livepde.cases.preview import preview
     from livepde.runs import Table
+    from livepde.runs.doubts import TELLING
 
     found = preview(prepared, prepared.stream)
     rows = [
@@ -88,7 +89,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
             item.name,
             f"{item.prior:.3g}",
             f"{item.posterior:.3g}",
-            f"{100 * item.left:.2g} %",
+            _percent(item.left),
             item.unit,
             "hardly identified" if item.hardly else "",
         )
@@ -98,7 +99,16 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
         columns = ("unknown", "prior deviation", "after", "left", "unit", "")
         title = f"What {found.samples} samples can tell, at best"
         print_table(console, Table(title, columns, rows))
-    return found.sentences
+    hardly = [
+        f"{item.name}: these data can tell hardly anything; {TELLING}"
+        for item in found.unknowns
+        if item.hardly
+    ]
+    return [*hardly, *found.sentences]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.{2 if share < 0.995 else 3}g} %"
 
 
 def _show_advice(console: Console, prepared: Prepared) -> None:
@@ -109,10 +119,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
     found = advise(prepared, prepared.stream)
     unit = prepared.case.frame.equation.length_unit
     at = ", ".join(f"{x:.3g}" for x in found.position)
-    rows = [
-        (name, f"{100 * left:.2g} %", f"{100 * found.then[name]:.2g} %")
-        for name, left in found.now.items()
-    ]
+    rows = [(name, _percent(left), _percent(found.then[name])) for name, left in found.now.items()]
     title = f"One more sensor helps most at {at} {unit}".rstrip()
     columns = ("unknown", "deviation left", "with the sensor")
     print_table(console, Table(title, columns, rows))

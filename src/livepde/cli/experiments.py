@@ -12,6 +12,7 @@ from livepde import __version__
 from livepde.cli.options import (
     JsonOption,
     OutOption,
+    names_in,
 )
 from livepde.cli.printing import (
     can_draw,
@@ -68,7 +69,13 @@ def demo(out: OutOption = None) -> None:
 
 
 def reproduce(
-    name: Annotated[str, typer.Argument(help="Name of the experiment; 'list' shows them.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="Name of the experiment; 'list' shows them.",
+            autocompletion=names_in("livepde.reproduce:EXPERIMENTS"),
+        ),
+    ],
     truth: Annotated[
         str | None,
         typer.Option(

@@ -46,17 +46,21 @@ def export(
     ParaView: livepde export runs/mycase mycase.xdmf
     """
     from livepde import runs
-    from livepde.runs.export import FORMATS, refuse_file
+    from livepde.runs.export import FORMATS, NEEDS, need, refuse_file
     from livepde.runs.export import export as write
 
     opened = runs.open(folder)
     known = [*FORMATS, REPORT]
-    for target in targets:
-        if target.suffix.lower() not in known:
+    for target in targets:  # all of them, before one is written
+        ending = target.suffix.lower()
+        if ending not in known:
             raise ConfigurationError(
                 f"{target}: there is no format '{target.suffix}'; expected one of "
                 f"{', '.join(known)}."
             )
+        if ending == REPORT:
+            need(target, ["plotly", "jinja2"], "dashboard")
+        need(target, NEEDS.get(ending, []))
         refuse_file(target, force)
     moment = None if at is None else _moment(at, opened.dataset)
     for target in targets:

@@ -135,7 +135,10 @@ def _observers(
     from livepde.runs.web import Address
 
     if how.page is not None:
-        Address.read(how.page, 0, how.token)  # what is no address is said before all else
+        from livepde.dashboard import check_installed
+
+        Address.read(how.page, 0, how.token)  # what is wrong with it is said before all else
+        check_installed()
     sinks: list[Sink] = [_Heartbeat()]
     if how.estimates:
         from livepde.runs.sinks import JsonLinesSink

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from enum import StrEnum
 from functools import wraps
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -23,6 +24,7 @@ __all__ = [
     "OutOption",
     "SetOption",
     "load_case",
+    "names_in",
     "with_engine",
 ]
 
@@ -52,7 +54,8 @@ SetOption = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Another value than the case has, as law.noise='2 K'. Repeat it for more.",
+        help="Another value than the case has, as law.noise='2 K'; nothing after the = takes the "
+        "key away. Repeat it for more.",
         show_default=False,
     ),
 ]
@@ -64,6 +67,18 @@ EngineOption = Annotated[
     ),
 ]
 CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show_default=False)]
+
+
+def names_in(place: str) -> Callable[[str], list[str]]:
+    """Return what the shell asks after Tab: names in `module:MAPPING` that begin as the word does.
+
+    The module is loaded by then only.
+    """
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in resolve_name(place) if name.startswith(incomplete)]
+
+    return complete
 
 
 def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:

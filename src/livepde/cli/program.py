@@ -13,9 +13,11 @@ from livepde import __version__
 from livepde.cli.bench import bench
 from livepde.cli.cases import equations, init
 from livepde.cli.check import check
+from livepde.cli.citation import citation
 from livepde.cli.experiments import demo, reproduce
 from livepde.cli.export import export
 from livepde.cli.fleet import fleet
+from livepde.cli.fmu import fmu
 from livepde.cli.printing import BAD_INPUT, terminal
 from livepde.cli.report import report
 from livepde.cli.run import run
@@ -30,12 +32,25 @@ app = typer.Typer(
 
     Start with:  livepde demo,  then  livepde init mycase,  livepde run mycase/case.toml""",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (demo, init, check, run, fleet, watch, report, export, equations, reproduce):
+COMMANDS = (
+    demo,
+    init,
+    check,
+    run,
+    fleet,
+    watch,
+    report,
+    export,
+    fmu,
+    equations,
+    reproduce,
+    citation,
+)
+for command in COMMANDS:
     app.command()(command)
 app.add_typer(bench)
 

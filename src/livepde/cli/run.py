@@ -180,6 +180,7 @@ def run(
         console.print(f"[bold]{escape(loaded.title)}[/]  {len(driven.result)} samples")
         show(console, shown, checks, notes)
         console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+        console.print(f"Look at it: livepde watch {escape(str(folder))}", soft_wrap=True)
     if driven.status == "interrupted" and not live:
         raise typer.Exit(INTERRUPTED)
     if as_json and not all(item.ok for item in checks):

@@ -48,9 +48,11 @@ def watch(
     Example:    livepde watch runs/mycase
     Elsewhere:  livepde watch runs/mycase --address 0.0.0.0:8050
     """
+    from livepde import runs
     from livepde.dashboard import serve
     from livepde.runs.web import Address
 
+    runs.open(folder)  # what is no run is said before all else
     server = serve(folder, Address.read(address, PORT, token))
     if attached:  # to a run that may be killed without a word
         Thread(target=_end_with_input, args=(server,), daemon=True).start()

@@ -20,6 +20,7 @@ from livepde.linalg import Array
 __all__ = ["MPC", "packages", "quiet"]
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
+FARTHEST = 0.9  # of the way from the estimate to a bound that a scenario goes
 FAR = 1e12  # stands for a limit that is infinite for a while
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
@@ -155,8 +156,9 @@ class MPC:
         mpc, model = self.problem, self.model
         found = known.scenarios(self.kappa, (self.scenarios - 1) // 2)
         q = np.vstack([found, np.tile(known.q, (self.scenarios - len(found), 1))])
-        q = np.clip(q, model.lower, model.upper)
-        q = np.where(np.isfinite(q), q, known.q)
+        q = np.clip(
+            q, *(known.q + FARTHEST * (end - known.q) for end in (model.lower, model.upper))
+        )
         for k, values in enumerate(q):
             step = model.matrices(values, self.period).with_offset(known.offset)
             mpc.uncertain["_p", k] = np.concatenate([step.A.ravel("F"), step.B.ravel("F"), step.f])

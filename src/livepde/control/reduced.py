@@ -349,8 +349,8 @@ class Frame:
             sensors=self._output(self.sensors),
             prior=space.prior[self.rows],
             std=np.array([unknown.std for unknown in unknowns]),
-            lower=np.array([unknown.bounds[0] for unknown in unknowns]),
-            upper=np.array([unknown.bounds[1] for unknown in unknowns]),
+            lower=np.array([_end(unknown, 0) for unknown in unknowns]),
+            upper=np.array([_end(unknown, 1) for unknown in unknowns]),
             frame=self,
         )
 
@@ -384,6 +384,12 @@ class Frame:
         D = H @ W - C @ (self.test @ W)
         d = y - H @ self.u + H @ known - C @ (self.test @ known)
         return Output(tuple(observed.names), C, D, d, observed.noise)
+
+
+def _end(unknown: Any, side: int) -> float:
+    """Return a bound of an unknown; the logarithm has none below zero."""
+    bound = float(unknown.bounds[side])
+    return max(bound, 0.0) if unknown.transform == "log" and not side else bound
 
 
 def likely(space: Any, label: str, value: float) -> tuple[float, float]:

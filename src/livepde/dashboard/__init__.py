@@ -10,7 +10,17 @@ from pathlib import Path
 from livepde.errors import ConfigurationError
 from livepde.runs.web import Address, Server
 
-__all__ = ["serve"]
+__all__ = ["check_installed", "serve"]
+
+
+def check_installed() -> None:
+    """Raise `ConfigurationError` if the page cannot be shown for want of a package."""
+    import importlib.util
+
+    if any(importlib.util.find_spec(name) is None for name in ("dash", "plotly", "cheroot")):
+        raise ConfigurationError(
+            "The live page needs Dash, Plotly and cheroot: pip install 'livepde[dashboard]'."
+        )
 
 
 def serve(path: Path, address: Address) -> Server:
@@ -30,12 +40,7 @@ def serve(path: Path, address: Address) -> Server:
     ConfigurationError
         Dash is not installed.
     """
-    try:
-        import dash  # noqa: F401
-    except ImportError:
-        raise ConfigurationError(
-            "The live page needs Dash and Plotly: pip install 'livepde[dashboard]'."
-        ) from None
+    check_installed()
     from livepde.dashboard.page import page
 
     return Server(page(path).server, address)

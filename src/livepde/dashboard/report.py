@@ -87,7 +87,7 @@ def page_of(run: Run) -> str:
             for event in events[: -MOST_EVENTS - 1 : -1]
         ],
         counts=[(kind, channel or "–", number) for (kind, channel), number in counts.items()],
-        case=case.read_text(encoding="utf-8") if case.is_file() else "",
+        case=case.read_text(encoding="utf-8", errors="replace") if case.is_file() else "",
         drawings={panel.name: json.loads(panel.figure.to_json()) for panel in drawn},
         config=CONFIG,
         written=_written(run),

@@ -270,6 +270,8 @@ class Spaces:
         Integrands of other squared norms for both parts; default those of M and N themselves, for
         which c_M = C_M = c_N = C_N = 1.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> from skfem import ElementLineP2
     >>> mesh = lp.interval(0.0, 1.0, 8)

@@ -111,6 +111,8 @@ class Excitation:
     gain
         That of the law.
 
+    Examples
+    --------
     >>> import livepde as lp, numpy as np
     >>> from skfem import ElementLineP1
     >>> rod = lp.Field(lp.interval(0, 1, 4), ElementLineP1())

@@ -126,6 +126,8 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     ConfigurationError
         The law has no covariance.
 
+    Examples
+    --------
     >>> import livepde as lp, numpy as np
     >>> from skfem import ElementLineP1
     >>> model = lp.Model(

@@ -49,6 +49,8 @@ def check_law(
     CheckReport
         Print it, or call `raise_if_failed`, which raises `LawError`.
 
+    Examples
+    --------
     >>> import numpy as np
     >>> import livepde as lp
     >>> from skfem import ElementLineP1

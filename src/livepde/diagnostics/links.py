@@ -71,6 +71,8 @@ def link(
     start
         T_lambda or T_kappa: earlier times do not count.
 
+    Examples
+    --------
     >>> t = np.linspace(0, 10, 101)
     >>> found = link(t, np.exp(-t), np.exp(-2 * t), window=1.0)
     >>> round(found.exponent, 6), found.holds

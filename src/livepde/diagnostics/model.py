@@ -60,6 +60,8 @@ def check_model(
     CheckReport
         Print it, or call `raise_if_failed`, which raises `ModelError`.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> from skfem import ElementLineP1
     >>> mesh = lp.interval(0.0, 1.0, 8)

@@ -57,6 +57,8 @@ def check_observation(
     CheckReport
         Print it, or call `raise_if_failed`, which raises `ObservationError`.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> from skfem import ElementLineP1
     >>> mesh = lp.interval(0.0, 1.0, 8)

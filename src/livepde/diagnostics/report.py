@@ -60,6 +60,8 @@ class CheckReport:
     error
         What `raise_if_failed` raises.
 
+    Examples
+    --------
     >>> line = CheckLine.at_most("P P = P", 3e-16, 1e-12, "")
     >>> print(CheckReport("observation", (line,)))
     observation: ok

@@ -25,6 +25,8 @@ def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
     seed
         Of the random vectors.
 
+    Examples
+    --------
     >>> import scipy.sparse as sp
     >>> import livepde as lp
     >>> check_space(lp.HilbertSpace(sp.csr_array([[2.0, 1.0], [1.0, 2.0]]))).ok

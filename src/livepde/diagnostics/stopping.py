@@ -142,6 +142,8 @@ class OnlineStopping:
     constants
         Of the model; only C_M/c_M enters.
 
+    Examples
+    --------
     >>> stop = OnlineStopping(Constants(1.0, 1.0))
     >>> state = stop.add(stop.init(), 0.0, Norms(1.0, 3.0, 9.0), Norms(0.01, 0.1, 1.0))
     >>> stop.add(state, 1.0, Norms(0.1, 0.3, 0.9), Norms(0.01, 0.1, 1.0)).T

@@ -3,217 +3,32 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from copy import copy
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from skfem import Basis, Dofs, FacetBasis, MappingAffine, Mesh
-from skfem.element import DiscreteField, ElementH1, ElementQuadBFS
-from skfem.generic_utils import OrientedBoundary
-from skfem.quadrature import get_quadrature
+from skfem import Basis, Dofs
+from skfem.element import DiscreteField, ElementQuadBFS
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elements import own
 from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Scalars, Unknown, is_nodal
+from livepde.fem.measure import Measure
 from livepde.fem.periodic import tied
 from livepde.fem.place import Moment, Place
 from livepde.fem.scatter import scatter, shared
 from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
-__all__ = ["Block", "FieldBlock", "Local", "Measure", "ScalarBlock", "block_of"]
+__all__ = ["Block", "FieldBlock", "Local", "ScalarBlock", "block_of"]
 
 JETS = ("value", "grad", "hess")
-KEPT = 300_000  # quadrature points up to which what is evaluated on them is kept
-PIECE = 30_000  # quadrature points of a piece of a larger measure
 PROJECTED = 1e-13  # residual of a projection that is found by iterations
 ITERATIONS = 1000
 SEARCHED = 5_000_000  # pairs of a point and a cell that are looked at together
 FINER = "give coefficients, or an element of first order."
-
-
-@dataclass(frozen=True, eq=False)
-class Measure:
-    """Where a form is integrated: the whole mesh, a subdomain, or a boundary; with its order.
-
-    Parameters
-    ----------
-    members
-        Which cells, or facets of a boundary, are part of it; default all.
-    thin
-        Only the first quadrature point of each, to see what an integrand is like.
-    """
-
-    mesh: Mesh
-    order: int
-    name: str | None = None
-    members: IntArray | None = None
-    thin: bool = False
-
-    @property
-    def on_boundary(self) -> bool:
-        """True if the name is one of a boundary."""
-        return self.name is not None and self.name in (self.mesh.boundaries or {})
-
-    @cached_property
-    def _whole(self) -> IntArray | None:
-        """All cells or facets that the name stands for; None: all cells of the mesh."""
-        if self.name is None:
-            return None
-        for named in (self.mesh.boundaries or {}, self.mesh.subdomains or {}):
-            if self.name in named:
-                found: IntArray = named[self.name]
-                return found
-        known = [*(self.mesh.boundaries or {}), *(self.mesh.subdomains or {})]
-        raise SpaceError(f"On('{self.name}', ...): the mesh names {known or 'nothing'}.")
-
-    @property
-    def _where(self) -> IntArray | None:
-        return self._whole if self.members is None else self.members
-
-    def on(self, cells: IntArray) -> Measure:
-        """Return the part of it on some cells of the mesh, or on their facets."""
-        mine = self.cells
-        mine = np.arange(self.mesh.nelements) if mine is None else mine
-        at = np.flatnonzero(np.isin(mine, cells))
-        where = self._where
-        return replace(self, members=mine[at] if where is None else _chosen(where, at))
-
-    @property
-    def kept(self) -> bool:
-        """True if it is so small that what is evaluated on it is kept."""
-        elements, points = self.shape
-        return elements * points <= KEPT
-
-    def pieces(self) -> Iterator[tuple[slice, Measure]]:
-        """Yield parts that are small enough to be evaluated at once, and which these are."""
-        elements, points = self.shape
-        if self.kept:
-            yield slice(0, elements), self
-            return
-        where, width = self._where, max(1, PIECE // points)
-        for start in range(0, elements, width):
-            at = slice(start, min(start + width, elements))
-            members = np.arange(at.start, at.stop) if where is None else _chosen(where, at)
-            yield at, replace(self, members=members)
-
-    @cached_property
-    def _rule(self) -> tuple[Array, Array]:
-        """Points and weights on the reference cell or facet."""
-        mesh = self.mesh
-        X, W = get_quadrature(mesh.brefdom if self.on_boundary else mesh.refdom, self.order)
-        return (X[:, :1], W[:1]) if self.thin else (X, W)
-
-    @cached_property
-    def shape(self) -> tuple[int, int]:
-        """Number of elements and of quadrature points on each."""
-        where = self._where
-        return self.mesh.nelements if where is None else len(where), len(self._rule[1])
-
-    @cached_property
-    def mapping(self) -> Any:
-        """scikit-fem's mapping; one of its own for a part, which keeps nothing for other cells."""
-        where = self._where
-        if where is None and self.kept and not self.thin:
-            return self.mesh._mapping()
-        if self.mesh.affine and where is not None:
-            return MappingAffine(self.mesh, where)
-        return self._empty_mapping()
-
-    def _empty_mapping(self) -> Any:
-        """Return scikit-fem's mapping for all cells without what that of the mesh has cached."""
-        mapping = copy(self.mesh._mapping())
-        for name in [name for name in vars(mapping) if name.startswith("_")]:
-            delattr(mapping, name)
-        return mapping
-
-    def facets(self, element: Any, dofs: Any) -> FacetBasis:
-        """Return scikit-fem's basis of an element on a boundary."""
-        options = {"mapping": self._empty_mapping(), "dofs": dofs, "disable_doflocs": True}
-        return FacetBasis(self.mesh, element, facets=self._where, quadrature=self._rule, **options)
-
-    @cached_property
-    def _sides(self) -> _Sides:
-        """What a boundary knows of its facets."""
-        basis = self.facets(own(self.mesh.elem()), self.mesh.dofs)
-        x, normals = basis.global_coordinates(), basis.normals
-        return _Sides(basis.tind, np.asarray(x), np.asarray(basis.dx), np.asarray(normals))
-
-    @property
-    def cells(self) -> IntArray | None:
-        """The cells, on a boundary those behind its facets; None: all of the mesh."""
-        return self._sides.cells if self.on_boundary else self._where
-
-    @cached_property
-    def points(self) -> Array:
-        """Coordinates of the quadrature points, shape (d, elements, points)."""
-        return self._sides.points if self.on_boundary else self.mapped(self._rule[0])
-
-    @cached_property
-    def weights(self) -> Array:
-        """Quadrature weights, shape (elements, points)."""
-        if self.on_boundary:
-            return self._sides.weights
-        X, W = self._rule
-        dx: Array = np.abs(self.mapping.detDF(X, tind=self._where)) * W
-        return dx
-
-    @property
-    def normal(self) -> Array | None:
-        """Outward normals on a boundary."""
-        return self._sides.normals if self.on_boundary else None
-
-    @cached_property
-    def diameter(self) -> Array:
-        """Largest distance of two vertices of each cell, shape (elements, 1)."""
-        cells = slice(None) if self.cells is None else self.cells
-        corners = self.mesh.p[:, self.mesh.t[:, cells]]
-        distances = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=0)
-        found: Array = distances.max(axis=(0, 1))[:, None]
-        return found
-
-    def gbasis(self, element: Any, i: int) -> DiscreteField:
-        """Return a shape function of an element at the quadrature points of cells."""
-        field: DiscreteField = element.gbasis(self.mapping, self._rule[0], i, tind=self._where)[0]
-        return field
-
-    def lbasis(self, element: Any, count: int) -> Array | None:
-        """Return the values of all shape functions, (local, points), if all cells see the same."""
-        if self.on_boundary or not isinstance(element, ElementH1):
-            return None
-        X = self._rule[0]
-        values = [element.lbasis(X, i)[0] for i in range(count)]
-        return np.array([np.broadcast_to(value, X.shape[1:]) for value in values])
-
-    def mapped(self, X: Array) -> Array:
-        """Return where points of the reference cell lie, shape (d, elements, points)."""
-        x: Array = self.mapping.F(X, tind=self._where)
-        return x
-
-    def place(self, moment: Moment) -> Place:
-        """Return what an integrand sees as x at a moment."""
-        return Place(self.points, self.normal, moment, lambda: self.diameter)
-
-
-class _Sides(NamedTuple):
-    """The facets of a boundary: cells behind them, quadrature points and weights, normals."""
-
-    cells: IntArray
-    points: Array
-    weights: Array
-    normals: Array
-
-
-def _chosen(members: IntArray, at: Any) -> IntArray:
-    """Return some of the members of a measure; facets keep their side."""
-    chosen: IntArray = np.asarray(members)[at]
-    if isinstance(members, OrientedBoundary):
-        chosen = OrientedBoundary(chosen, members.ori[at])
-    return chosen
 
 
 class Local:

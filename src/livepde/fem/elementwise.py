@@ -106,20 +106,20 @@ class ElementTensor:
     slots: tuple[str, str, str]
     places: Scatter
 
-    def _blocks(self, *slots: str) -> Iterator[tuple[int, slice, Array, list[IntArray], Array]]:
+    def _blocks(self) -> Iterator[tuple[int, slice, Array, list[IntArray], Array]]:
         """Yield term, elements, tensors with their axes as `slots`, coefficients, and shares."""
-        axes = [self.products.order.index(slot) for slot in slots]
+        axes = [self.products.order.index(slot) for slot in self.slots]
         for number, term in enumerate(self.products.terms):
             tensors = np.ascontiguousarray(term.tensors.transpose(*axes, 3))
             for start in range(0, term.shares.shape[1], BLOCK):
                 at = slice(start, start + BLOCK)
-                dofs = [term.dofs[slot][:, at] for slot in slots]
+                dofs = [term.dofs[slot][:, at] for slot in self.slots]
                 yield number, at, tensors, dofs, term.shares[:, at]
 
     def __matmul__(self, w: Array) -> Array:
         """Return the data, in the order of the pattern."""
         data = np.zeros(self.places.pattern.nnz)
-        for number, at, tensors, (_, _, third), shares in self._blocks(*self.slots):
+        for number, at, tensors, (_, _, third), shares in self._blocks():
             i, j, n, r = tensors.shape
             mixed = (w[third][:, None] * shares).reshape(n * r, shares.shape[1])
             local = tensors.reshape(i * j, n * r) @ mixed
@@ -128,19 +128,10 @@ class ElementTensor:
 
     def apply(self, w: Array, x: Array) -> Array:
         """Return the product of the matrix and x, shape (rows,), without the matrix."""
-        return self._product(w, x, *self.slots)
-
-    def applied_transposed(self, w: Array, y: Array) -> Array:
-        """Return the product of the transpose and y, shape (columns,), without the matrix."""
-        rows, cols, third = self.slots
-        return self._product(w, y, cols, rows, third)
-
-    def _product(self, w: Array, x: Array, rows: str, cols: str, third: str) -> Array:
-        height = self.places.pattern.shape[0 if rows == self.slots[0] else 1]
-        result = np.zeros(height)
-        for _, _, tensors, (into, from_, of), shares in self._blocks(rows, cols, third):
+        result = np.zeros(self.places.pattern.shape[0])
+        for _, _, tensors, (rows, cols, third), shares in self._blocks():
             i, j, n, r = tensors.shape
-            mixed = x[from_][:, None, None] * w[of][:, None] * shares
+            mixed = x[cols][:, None, None] * w[third][:, None] * shares
             local = tensors.reshape(i, j * n * r) @ mixed.reshape(j * n * r, shares.shape[1])
-            np.add.at(result, into.ravel(), local.ravel())
+            np.add.at(result, rows.ravel(), local.ravel())
         return result

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from statistics import NormalDist
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -170,6 +169,8 @@ class _Prior:
         value, std
             Estimates and their deviations, of any one shape.
         """
+        from statistics import NormalDist
+
         if not 0.0 < level < 1.0:
             raise SpaceError(f"interval: level must lie between 0 and 1; got {level}.")
         z = NormalDist().inv_cdf(0.5 + 0.5 * level)

@@ -31,9 +31,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
-from livepde.fem.blocks import Measure
 from livepde.fem.elementwise import ElementProducts, ElementTensor
 from livepde.fem.fields import Integrand, On
+from livepde.fem.measure import Measure
 from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.scatter import Scatter, scatter
 from livepde.fem.space import FunctionSpace, LocalSpace

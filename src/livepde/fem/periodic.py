@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from skfem.element import ElementLineHermite, ElementQuadBFS
 from skfem.element.element_global import ElementGlobal
 
@@ -67,7 +67,7 @@ def _matched(field: Field, block: Any, one: str, other: str) -> tuple[IntArray, 
             continue
         a, b = block.places[:, left], block.places[:, right]
         shift = (b.mean(axis=1) - a.mean(axis=1))[:, None]
-        found, nearest = cKDTree((a + shift).T).query(b.T)
+        found, nearest = scipy.spatial.cKDTree((a + shift).T).query(b.T)
         distance = float(np.max(found))
         size = np.ptp(field.mesh.p, axis=1).max()
         if distance > SLACK * size or len(np.unique(nearest)) < len(left):

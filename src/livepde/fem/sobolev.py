@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, eigsh
-from scipy.special import gamma
 from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
 
 from livepde.errors import SpaceError
@@ -58,6 +58,8 @@ class Sobolev:
     factor
         Of the inner product; `pointwise` chooses it.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> from skfem import ElementLineP1
     >>> q = lp.Field(lp.interval(0, 1, 20), ElementLineP1(), inner=Sobolev(0.75, length=0.2))
@@ -90,6 +92,8 @@ class Sobolev:
         SpaceError
             Unless s > dimension/2: values at points have no finite deviation.
 
+        Examples
+        --------
         >>> round(Sobolev(1, length=0.25).pointwise(1).factor, 12)  # 1/(2 length)
         2.0
         """
@@ -99,6 +103,7 @@ class Sobolev:
                 f"Sobolev({self.s:g}).pointwise({dimension}): values at points have a finite "
                 f"deviation for s > {half:g} only; take a larger s."
             )
+        gamma = scipy.special.gamma
         volume = (4.0 * np.pi) ** half * self.length**dimension
         return replace(self, factor=float(gamma(self.s - half) / gamma(self.s) / volume))
 

@@ -12,8 +12,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.blocks import FieldBlock, Local, Measure, block_of
+from livepde.fem.blocks import FieldBlock, Local, block_of
 from livepde.fem.fields import Unknown
+from livepde.fem.measure import Measure
 from livepde.fem.place import Moment
 from livepde.linalg import Array, IntArray
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from livepde.fem import FunctionSpace
 from livepde.fleet.engine import Beliefs
@@ -15,6 +14,9 @@ from livepde.laws import Belief, Status
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import STATUS_CODES, Layout
 from livepde.result import Estimate
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["FleetEstimate", "FleetResult"]
 
@@ -89,12 +91,9 @@ class FleetEstimate:
         """Return the estimate of one member, by name or number, as `Identifier.step` does."""
         k = name if isinstance(name, int) else self.members.index(name)
         notes = {key: float(values[k]) for key, values in self.notes.items()}
-        belief = self.belief(k)
         return Estimate(
             t=self.t,
-            q=belief.q,
-            u=belief.u,
-            belief=belief,
+            belief=self.belief(k),
             innovation=self.innovation[k],
             withheld_error=self.withheld_error[k],
             status=self.statuses[k],
@@ -152,6 +151,8 @@ class FleetResult:
         Scalar unknowns, with `_std` variables beside them, status, steps and notes are over
         (`member`, `time`); innovations over (`member`, `time`, `sensor`).
         """
+        import xarray as xr
+
         rows, layout, both = self._rows, self.layout, ("member", "time")
         times = np.array([row.t for row in rows])
         data = xr.Dataset(

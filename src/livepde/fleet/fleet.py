@@ -63,6 +63,8 @@ class Fleet:
     ConfigurationError
         Parts that do not fit together.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> from livepde.models import heat
     >>> model = heat(lp.interval(0, 1, 20), lp.Scalar(0.5, 0.2), {"left": 0.0, "right": 0.0})

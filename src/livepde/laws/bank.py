@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from math import comb
 
 import numpy as np
+import scipy
 from scipy.linalg import cho_factor, cho_solve
-from scipy.special import logsumexp
 
 from livepde.errors import LawError
 from livepde.fem import Moment
@@ -84,7 +84,7 @@ class Bank:
     def chances(self) -> Array:
         """Logarithms of the weights before the first sample."""
         chances = np.log([candidate.chance for candidate in self.candidates])
-        return np.asarray(chances - logsumexp(chances))
+        return np.asarray(chances - scipy.special.logsumexp(chances))
 
     def filter(self, k: int, tick: float, noise: Array) -> Filter:
         """Return the filter of a candidate, for samples a time `tick` apart.
@@ -335,7 +335,7 @@ class AutoLaw(Law[Bank, AutoState]):
         if interval.present.any():
             weights = work.chances + (1.0 - 1.0 / MEMORY) * (weights - work.chances) + gained
         weights = np.where(np.isfinite(gained), weights, -np.inf)
-        weights = weights - logsumexp(weights)
+        weights = weights - scipy.special.logsumexp(weights)
         now = replace(
             state,
             tick=tick,
@@ -380,7 +380,7 @@ class AutoLaw(Law[Bank, AutoState]):
             member if np.isfinite(weight) else _asleep(state.start)
             for member, weight in zip(state.members, weights, strict=True)
         )
-        weights = weights - logsumexp(weights)
+        weights = weights - scipy.special.logsumexp(weights)
         return replace(state, members=members, weights=weights), False
 
     def _woken(self, work: Bank, state: AutoState, alarm: bool) -> AutoState:
@@ -414,7 +414,7 @@ class AutoLaw(Law[Bank, AutoState]):
         return replace(
             state,
             members=tuple(members),
-            weights=weights - logsumexp(weights),
+            weights=weights - scipy.special.logsumexp(weights),
             until=until,
             due=state.count + pause,
             pause=2 * pause,

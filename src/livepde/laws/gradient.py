@@ -11,11 +11,13 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Notes, Problem, Report, Status
-from livepde.laws.coupled import PULL, CoupledStage, Gains, Warm
+from livepde.laws.coupled import CoupledStage
 from livepde.laws.damping import Damping, ResidualDamping
+from livepde.laws.gains import PULL, Gains
 from livepde.laws.memory import Learned, Learning
 from livepde.laws.rest import Excitation, Probes, Rest
 from livepde.laws.smoothing import Balance, Smoother, smooths
+from livepde.laws.warm import Warm
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.observation import Reconstructed, Split

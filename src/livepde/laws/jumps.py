@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaincc
+import scipy
 
 from livepde.errors import LawError
 from livepde.laws.consistency import Consistency
@@ -96,7 +96,7 @@ class Jumps:
             return new, False
         lengths = 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
         sums, freedom = np.cumsum(new.squares)[lengths], np.cumsum(new.counts)[lengths]
-        chance = gammaincc(0.5 * freedom, 0.5 * sums / usual.scatter**2)
+        chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums / usual.scatter**2)
         if float(chance.min()) * len(lengths) >= self.probability:
             return new, False
         return self.start(), True

@@ -54,7 +54,7 @@ import scipy.sparse as sp
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled import PULL, Metric
+from livepde.laws.gains import PULL, Metric
 from livepde.linalg import Array, Pattern
 from livepde.model import Model
 from livepde.observation import Split

@@ -21,8 +21,8 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report
-from livepde.laws.coupled import Gains
 from livepde.laws.damping import Damping, Residual
+from livepde.laws.gains import Gains
 from livepde.laws.gradient import GradientLaw, GradientState, GradientWork
 from livepde.linalg import Array
 from livepde.model import h1_form, mass_form

@@ -34,10 +34,8 @@ def conjugate_gradients(
 
     Returns
     -------
-    x
-        The solution.
-    iterations
-        How many it took.
+    x, iterations
+        The solution, and how many it took.
 
     Raises
     ------
@@ -88,23 +86,17 @@ def gmres(
 
     Parameters
     ----------
-    apply, precondition
-        Products with the matrix and with the approximate inverse.
+    apply, precondition, limit, remedy
+        As for `conjugate_gradients`; all directions are kept.
     b
         Shape (n,).
     tolerance
         Bound on the preconditioned residual, about the error, relative to that of x = 0.
-    limit
-        At most this many iterations; all directions are kept.
-    remedy
-        What to do if they do not suffice.
 
     Returns
     -------
-    x
-        The solution.
-    iterations
-        How many it took.
+    x, iterations
+        The solution, and how many it took.
 
     Raises
     ------

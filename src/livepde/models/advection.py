@@ -68,6 +68,8 @@ def advection_diffusion(
     ModelError
         Neither v nor K, or a length or ratio that is not positive.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> bed = lp.interval(0.0, 0.4, 40)
     >>> sides = {"left": lp.Channel("T_river"), "right": lp.Channel("T_40")}

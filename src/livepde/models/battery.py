@@ -52,6 +52,8 @@ def battery_particle(
     element
         Element of the state; default of first order.
 
+    Notes
+    -----
     The current in A is the input channel "I".
 
     Raises
@@ -59,6 +61,8 @@ def battery_particle(
     ModelError
         area or c_max is not positive, or the mesh does not begin at 0.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> D = lp.Scalar(1e-14, 1e-14, transform="log")
     >>> model = battery_particle(lp.interval(0.0, 1e-5, 40), D, area=1.0, c_max=30000.0)

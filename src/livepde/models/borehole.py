@@ -78,6 +78,8 @@ def grouted_borehole(
     T0
         Undisturbed temperature.
 
+    Notes
+    -----
     The power in W is the input channel "Q".
 
     Raises

@@ -52,6 +52,8 @@ def heat(
     unit
         Unit of u.
 
+    Notes
+    -----
     With `loss` or `transfer` the temperature of the surroundings is the input channel "ambient".
 
     Raises
@@ -59,6 +61,8 @@ def heat(
     ModelError
         `transfer` without a boundary that is free for it.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> model = heat(lp.interval(0, 1, 10), lp.Scalar(5e-7, 2e-7), {"left": lp.Channel("T0")})
     >>> model.channels
@@ -100,6 +104,8 @@ def conduction(
     ModelError
         C is not positive, or `transfer` without a boundary that is free for it.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> layers = lp.interval(0.0, 0.5, 50)
     >>> dry, wet = 1.3e6, 2.9e6

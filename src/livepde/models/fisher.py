@@ -42,6 +42,8 @@ def fisher_kpp(
     unit
         Unit of u.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> D, r = lp.Scalar(0.01, 0.01, transform="log"), lp.Scalar(1.0, 0.5, transform="log")
     >>> fisher_kpp(lp.interval(0.0, 1.9, 38), D, r, K=1700.0).affine

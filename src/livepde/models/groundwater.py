@@ -36,6 +36,8 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
     b
         Thickness of the aquifer in m; with 1 m the unknowns are transmissivity and storativity.
 
+    Notes
+    -----
     The rate in m^3/s, positive when water is taken out, is the input channel "Q".
 
     Raises
@@ -105,6 +107,8 @@ def groundwater(
         A well outside of the mesh or in cells wider than its radius, or S of a kind that is not
         possible.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> mesh = lp.rectangle((-50.0, 50.0), (-50.0, 50.0), (40, 40))
     >>> T, S = (lp.Scalar(x, x, transform="log") for x in (1e-2, 1e-2))

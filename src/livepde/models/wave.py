@@ -54,6 +54,8 @@ def wave(
     ModelError
         A boundary value of w may move, but its velocity is not given.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> model = wave(lp.interval(0, 1, 20), lp.Scalar(1.0, 0.3), dirichlet={"left": 0.0})
     >>> list(model.state_space.blocks)

@@ -30,6 +30,8 @@ class Combined(Observation):
         Observations; the names of all their sensors differ. Each has its own `noise`, unless
         `noise` is given here for all sensors.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> sensors = Combined(
     ...     [lp.Points({"T_1": 0.3}, noise=0.1), lp.Averages({"wall": "right"}, noise=0.5)]
@@ -145,6 +147,8 @@ class Calibrated(Observation):
         region or name: q.k[1], q.offset["T_10"]), and x for x.t and x.inputs["Q"]; returns readings
         of shape (sensors,).
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> sensors = Calibrated(lp.Points([0.3, 0.7]), lambda y, q, x: q.gain * y, noise=0.01)
     """

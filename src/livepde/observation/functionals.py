@@ -34,6 +34,8 @@ class Functionals(Observation):
     order
         Quadrature order; default that of the state, exact for products of u with fields of q.
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> flux = Functionals(
     ...     {"Q": lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))}, noise=0.01

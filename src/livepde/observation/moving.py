@@ -30,6 +30,8 @@ class Moving(Observation):
         Sensor name -> channel of its position; in more than one dimension one channel for each
         coordinate.
 
+    Examples
+    --------
     >>> Moving({"probe": ("probe_x", "probe_y")}, noise=0.1).inputs
     ('probe_x', 'probe_y')
     """

@@ -61,6 +61,8 @@ class Transformed(Observation):
     `noise` is that of the readings z. A `reconstruction` by a noise level sees the linearised data
     y + (z - g(y))/g'(y), whose noise is larger by 1/g'(y).
 
+    Examples
+    --------
     >>> import livepde as lp
     >>> pyrometers = Transformed(lp.Points([0.3, 0.6]), lambda T: T**4, noise=0.01)
     """

@@ -18,9 +18,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 import scipy.linalg as sl
 import scipy.sparse as sp
-from scipy.optimize import brentq
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, ddot, dot, grad, hess
@@ -168,7 +168,9 @@ class Discrepancy(Alpha):
             return float(np.exp(low))
         if misfit(float(np.exp(high))) <= target:
             return float(np.exp(high))
-        root = brentq(lambda s: misfit(float(np.exp(s))) - target, low, high, xtol=ROOT)
+        root = scipy.optimize.brentq(
+            lambda s: misfit(float(np.exp(s))) - target, low, high, xtol=ROOT
+        )
         return float(np.exp(root))
 
 

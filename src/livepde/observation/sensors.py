@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Predicate
-from livepde.fem.blocks import Measure
+from livepde.fem.measure import Measure
 from livepde.linalg import Array
 from livepde.observation.base import Direct, Observation
 
@@ -31,6 +31,8 @@ class Points(Observation):
         Sensor name -> (q, x) for sensors that see a parameter directly, linear in q:
         z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b * x.inputs["Q"] / H}.
 
+    Examples
+    --------
     >>> Points({"TS_10": 0.10, "TS_20": 0.20}, noise=0.1, unit="degC").names(2)
     ('TS_10', 'TS_20')
     """
@@ -74,6 +76,8 @@ class Averages(Observation):
         Sensor name -> name of a subdomain or boundary of the mesh, or a predicate on x, evaluated
         at the quadrature points of the mesh.
 
+    Examples
+    --------
     >>> sensors = Averages({"core": lambda x: x[0] < 0.1, "wall": "right"}, noise=0.1)
     """
 
@@ -132,6 +136,8 @@ class LineIntegrals(Observation):
     mean
         Divide by the length.
 
+    Examples
+    --------
     >>> beams = LineIntegrals({"beam": ([0.0, 0.2], [1.0, 0.7])}, mean=True, noise=0.01)
     """
 

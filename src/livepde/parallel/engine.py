@@ -22,13 +22,10 @@ class PetscEngine:
     ----------
     team
         The ranks.
-    stages
-        How many stages of the gradient law all ranks evaluate together so far.
     """
 
     def __init__(self, team: Team) -> None:
         self.team = team
-        self.stages = 0
         self._recipes: dict[int, tuple[Model, Callable[..., Model], tuple[Any, ...]]] = {}
         self._models: dict[int, Handle] = {}
 

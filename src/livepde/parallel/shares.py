@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.fem.blocks import Measure
+from livepde.fem.measure import Measure
 from livepde.linalg import IntArray
 from livepde.model import Model
 from livepde.parallel.team import Team

@@ -36,7 +36,7 @@ REMEDY = "take a smaller gain or a smaller time step."
 
 @dataclass(frozen=True)
 class Weights:
-    """Numbers of the law; see `livepde.laws.coupled.Gains`."""
+    """Numbers of the law; see `livepde.laws.gains.Gains`."""
 
     gain: float
     nu: float
@@ -221,7 +221,7 @@ class SharedEquation:
         stage, weights = self.stage, self.stage.weights
         got = np.empty(len(stage.u.reach) + len(stage.q.reach))
         self.team.scatter(values, got)
-        self.at_u = u = _spread(got[: len(stage.u.reach)], stage.u)
+        u = _spread(got[: len(stage.u.reach)], stage.u)
         self.at_q = q = _spread(got[len(stage.u.reach) :], stage.q)
         self.r = r = stage.observed * u - self.u_alpha
         self.w = w = u if weights.at_estimate else u - r

@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 import math
@@ -44,6 +45,7 @@ __all__ = [
 ]
 
 FORMAT = 1
+RUNS = "runs"  # where the command line puts them
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
 JOURNAL, PARTIAL = "journal.sqlite", "run.json.partial"
@@ -77,6 +79,21 @@ def _only_begun(path: Path, case: str) -> bool:
     if CASE not in names or names - {CASE, PARTIAL}:
         return False
     return case.encode().startswith((path / CASE).read_bytes())
+
+
+def _nearest(folder: Path) -> str:
+    """Return where the run may be that is not in this folder: below it, or in runs/."""
+    near = difflib.get_close_matches(folder.name, _runs_in(folder.parent), n=1)
+    likely = [folder.parent / name for name in near]
+    for place in (folder, folder / RUNS, folder.parent / RUNS):
+        known = _runs_in(place)
+        named = [name for name in known if name == folder.name] or known[-1:]
+        likely += [place / name for name in named]
+    return f"did you mean '{likely[0]}'?" if likely else "'livepde run CASE' makes one in runs/."
+
+
+def _runs_in(folder: Path) -> list[str]:
+    return sorted(item.parent.name for item in folder.glob(f"*/{RECORD}"))
 
 
 class RunWriter:
@@ -283,7 +300,7 @@ class Run:
         for word in self.record.get("command", [])[2:]:
             original = Path(str(word))
             if original.suffix == ".toml" and original.is_file():
-                text = original.read_text(encoding="utf-8")
+                text = original.read_text(encoding="utf-8", errors="replace")
                 if hashlib.sha256(text.encode()).hexdigest() == self.record.get("case_sha256"):
                     return original
         return copy
@@ -303,7 +320,7 @@ class Run:
         begun = (self.path / JOURNAL).is_file() or not (self.path / ESTIMATES).exists()
         if not (self.path / CASE).is_file() or not begun:
             raise RunError(f"{self.path} has no case and journal: it cannot be resumed.")
-        same = (self.path / CASE).read_text(encoding="utf-8") == case
+        same = (self.path / CASE).read_text(encoding="utf-8", errors="replace") == case
         if not same or self.settings != list(settings):
             raise RunError(
                 f"{self.path} was run with another case or other settings: resume it with those, "
@@ -347,9 +364,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
             raise RunError(f"{folder / RECORD} is longer than {LONGEST} bytes.")
         record = json.loads(text)
     except FileNotFoundError:
-        raise RunError(
-            f"{folder} holds no run (no {RECORD}); 'livepde run CASE --out {folder}' makes one."
-        ) from None
+        raise RunError(f"{folder} holds no run (no {RECORD}); {_nearest(folder)}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:

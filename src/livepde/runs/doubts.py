@@ -23,6 +23,7 @@ MOST_SENSORS = 6  # that are named
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
+TELLING = "longer data, with larger changes nearer to the sensors, would tell more."
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 
 
@@ -119,8 +120,8 @@ def _unknowns(data: xr.Dataset) -> list[str]:
         prior = float(attrs.get("prior_std", math.nan))
         if std > FLAT * prior:
             found.append(
-                f"{label}: the data have told hardly anything; its deviation is still about "
-                "that of the prior."
+                f"{label}: the data have told hardly anything, its deviation is still about "
+                f"that of the prior; {TELLING}"
             )
     return found
 

@@ -29,10 +29,12 @@ from livepde.runs.summary import SECONDS, scalars
 __all__ = [
     "AT_ONE_TIME",
     "FORMATS",
+    "NEEDS",
     "cf",
     "export",
     "instants",
     "into_place",
+    "need",
     "refuse_file",
     "udunits",
 ]
@@ -309,18 +311,30 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
     ConfigurationError
         There is no such format, or it needs a package that is not installed.
     """
-    write = FORMATS.get(target.suffix.lower())
-    if write is None:
+    ending = target.suffix.lower()
+    if ending not in FORMATS:
         raise ConfigurationError(
             f"{target}: there is no format '{target.suffix}'; expected one of {', '.join(FORMATS)}."
         )
-    if at is not None and target.suffix.lower() not in AT_ONE_TIME:
+    need(target, NEEDS.get(ending, []))
+    if at is not None and ending not in AT_ONE_TIME:
         raise ConfigurationError(
             f"{target}: holds all times; a time is chosen for {' and '.join(AT_ONE_TIME)}."
         )
     if not run.dataset.sizes["time"]:
         raise RunError(f"{run.path} holds no estimates yet: there is nothing to export.")
-    into_place(target, lambda path: write(run, path, at), force=force)
+    into_place(target, lambda path: FORMATS[ending](run, path, at), force=force)
+
+
+def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
+    """Raise `ConfigurationError` if a package is missing that writes such a file."""
+    import importlib.util
+
+    for name in packages:
+        if importlib.util.find_spec(name) is None:
+            raise ConfigurationError(
+                f"{target}: this format needs {name}: pip install 'livepde[{extra}]'."
+            )
 
 
 def into_place(target: Path, write: Callable[[Path], None], *, force: bool = False) -> None:
@@ -380,7 +394,6 @@ def _netcdf(run: Run, path: Path, at: float | None) -> None:
 
 
 def _zarr(run: Run, path: Path, at: float | None) -> None:
-    _need("zarr")
     # The second format has text of fixed length, which the third has not settled yet.
     _conventional(run).to_zarr(path, zarr_format=2, consolidated=True)
 
@@ -410,7 +423,6 @@ def _csv(run: Run, path: Path, at: float | None) -> None:
 
 def _series(run: Run, path: Path, at: float | None) -> None:
     """Write the fields of all times as XDMF, with their numbers in an HDF5 file beside it."""
-    _need("meshio", "h5py")
     import h5py  # type: ignore[import-untyped]
     from meshio.xdmf import TimeSeriesWriter
 
@@ -431,7 +443,6 @@ def _series(run: Run, path: Path, at: float | None) -> None:
 
 def _vtk(run: Run, path: Path, at: float | None) -> None:
     """Write the fields of one time."""
-    _need("meshio")
     import meshio
 
     data = _with_fields(run)
@@ -460,14 +471,6 @@ def _fields(data: xr.Dataset, k: int) -> dict[str, Any]:
     return {free: data[name].values[k] for name, free in names.items()}
 
 
-def _need(*packages: str) -> None:
-    import importlib.util
-
-    for name in packages:
-        if importlib.util.find_spec(name) is None:
-            raise ConfigurationError(f"this format needs {name}: pip install 'livepde[formats]'.")
-
-
 Writer: TypeAlias = Callable[[Run, Path, float | None], None]
 FORMATS: dict[str, Writer] = {
     ".nc": _netcdf,
@@ -477,4 +480,5 @@ FORMATS: dict[str, Writer] = {
     ".vtu": _vtk,
     ".vtk": _vtk,
 }
+NEEDS = {".zarr": ["zarr"], ".xdmf": ["meshio", "h5py"], ".vtu": ["meshio"], ".vtk": ["meshio"]}
 AT_ONE_TIME = (".vtu", ".vtk")

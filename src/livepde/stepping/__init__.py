@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.newton import TINY, Newton, Parts, Solution, StepFailed
+from livepde.stepping.newton import TINY, Near, Newton, Parts, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.state import ForwardStage, Kept, simulate
 
@@ -15,6 +15,7 @@ __all__ = [
     "ImplicitEuler",
     "Interval",
     "Kept",
+    "Near",
     "Newton",
     "Parts",
     "Scheme",

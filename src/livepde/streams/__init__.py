@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from livepde.streams.clock import Clock
+from livepde.streams.csvfile import read_csv
 from livepde.streams.smoothing import (
     Exponential,
     LocalPolynomial,
@@ -11,11 +13,9 @@ from livepde.streams.smoothing import (
 )
 from livepde.streams.sources import Follow, Lines, Row, Rows, Source
 from livepde.streams.table import (
-    Clock,
     Column,
     JsonLines,
     Table,
-    read_csv,
     read_json_lines,
     tabulated,
 )

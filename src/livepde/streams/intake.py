@@ -14,7 +14,8 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 from livepde.errors import DataError, SampleError
-from livepde.streams.table import Clock, Column, channel_value, row_time
+from livepde.streams.clock import Clock
+from livepde.streams.table import Column, channel_value, row_time
 
 __all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark", "gather"]
 
@@ -282,7 +283,7 @@ class Intake:
 
     def _time(self, row: Mapping[str, Any]) -> float | None:
         """Return the time of a row, None if it is outside of what is used."""
-        t, dates = row_time(row, self.clock)
+        t, dates = row_time(row, self.clock, before=self._dates)
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
             return None

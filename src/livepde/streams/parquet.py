@@ -8,7 +8,9 @@ from typing import Any
 
 from livepde.errors import DataError, SampleError
 from livepde.linalg import Array
-from livepde.streams.table import Clock, Column, Table, check_columns, tabulated
+from livepde.streams.clock import Clock
+from livepde.streams.names import check_columns, no_file
+from livepde.streams.table import Column, Table, tabulated
 
 __all__ = ["read_parquet"]
 
@@ -47,6 +49,8 @@ def read_parquet(
         with ParquetFile(path) as file:
             check_columns(where, needed, file.schema_arrow.names)
             frame = file.read(columns=needed)
+    except FileNotFoundError:
+        raise no_file(Path(path)) from None
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise DataError(f"{where} cannot be read as a Parquet file: {reason}.") from error

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
+from livepde.streams.csvfile import UTF_8
+from livepde.streams.names import no_file
 from livepde.streams.table import JSON_LINES
 
 __all__ = ["Follow", "Lines", "Row", "Rows", "Source", "drained", "json_row"]
@@ -115,8 +117,8 @@ class Follow:
     ----------
     path
         The file; it need not exist yet if `follow`.
-    separator
-        Of a CSV file.
+    separator, encoding
+        Of a CSV file; an encoding in which the letters of English are single bytes.
     follow
         Wait for more at the end of the file.
     position
@@ -128,12 +130,13 @@ class Follow:
         path: str | os.PathLike[str],
         *,
         separator: str = ",",
+        encoding: str = UTF_8,
         follow: bool = False,
         position: str = "",
     ) -> None:
         self.path = Path(path)
         self.follow = follow
-        self._separator = separator
+        self._separator, self._encoding = separator, encoding
         self._json = self.path.suffix in JSON_LINES
         self._resumed = tuple(map(int, position.split())) if position else None
         self._file: io.BufferedReader | None = None
@@ -142,8 +145,13 @@ class Follow:
         self._header: list[str] | None = None
         self._offset = 0
         self._ended = False
+        if b"a\n".decode(encoding, "replace") != "a\n":
+            raise DataError(
+                f"{self.path}: a file in {encoding} cannot be read while it grows; write it in "
+                "UTF-8, or run it without --realtime when it is complete."
+            )
         if not follow and not self.path.is_file():
-            raise DataError(f"there is no file {self.path}.")
+            raise no_file(self.path)
 
     @property
     def done(self) -> bool:
@@ -250,7 +258,7 @@ class Follow:
             return Row({}, token, f"longer than {LONGEST} characters")
         try:
             cells = self._cells(line)
-        except (UnicodeDecodeError, csv.Error) as error:
+        except (UnicodeError, csv.Error) as error:
             return Row({}, token, f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
             self._header = cells
@@ -261,7 +269,7 @@ class Follow:
         return Row(dict(zip(self._header, cells, strict=False)), token)
 
     def _cells(self, line: bytes) -> list[str]:
-        text = line.decode("utf-8-sig")
+        text = line.decode(self._encoding)
         found = csv.reader([text], delimiter=self._separator, skipinitialspace=True)
         return [cell.strip() for cell in next(found, [])]
 

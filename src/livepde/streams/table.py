@@ -1,40 +1,38 @@
-"""Samples from files of CSV and JSON lines, and from JSON lines as they come."""
+"""Samples from files of JSON lines, from JSON lines as they come, and from columns in memory."""
 
 from __future__ import annotations
 
-import csv
-import difflib
 import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, date, datetime, tzinfo
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.identifier import Sample
 from livepde.linalg import Array
+from livepde.streams.clock import COMMA, Clock, has_decimal_comma, number_of, read_times
+from livepde.streams.names import check_columns, hint, no_file
 
 __all__ = [
     "JSON_LINES",
-    "Clock",
     "Column",
     "JsonLines",
     "Table",
+    "cell_number",
     "channel_value",
-    "check_columns",
-    "read_csv",
     "read_json_lines",
     "row_time",
     "tabulated",
+    "to_table",
 ]
 
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "#n/a"})
-Instant: TypeAlias = float | str | date | datetime
 
 
 @dataclass(frozen=True)
@@ -49,6 +47,8 @@ class Column:
         A value outside is missing.
     needed
         A sample without this channel is left out.
+    decimal
+        Of numbers as text: "." or ",".
     """
 
     names: tuple[str, ...]
@@ -56,67 +56,7 @@ class Column:
     offset: float = 0.0
     valid: tuple[float, float] = (-math.inf, math.inf)
     needed: bool = False
-
-
-@dataclass(frozen=True)
-class Clock:
-    """How the time column is read, and what of it is used.
-
-    Attributes
-    ----------
-    name
-        The time column: numbers, or dates and times in ISO format.
-    factor
-        Multiplies numbers to give the model's time; dates become seconds divided by `second`.
-    start, stop
-        First and last time used, in the terms of the column: a number (in the model's unit) or
-        a date.
-    second
-        One second in the model's unit of time.
-    zone
-        Of dates that name none.
-    """
-
-    name: str
-    factor: float = 1.0
-    start: Instant | None = None
-    stop: Instant | None = None
-    second: float = 1.0
-    zone: tzinfo = UTC
-
-    def bounds(self, dates: bool, where: str) -> tuple[float, float]:
-        """Return start and stop in model time (dates: since 1970)."""
-        low, high = -math.inf, math.inf
-        if self.start is not None:
-            low = self._bound(self.start, dates, f"{where}: start")
-        if self.stop is not None:
-            high = self._bound(self.stop, dates, f"{where}: stop")
-            if dates and _whole_day(self.stop):
-                high += 86399.999 * self.second  # a day includes its hours
-        return low, high
-
-    def stamp(self, value: Any) -> float | None:
-        """Return seconds since 1970 of a date or a date as text, None if it is neither."""
-        try:
-            if isinstance(value, str):
-                value = datetime.fromisoformat(value.strip())
-            if isinstance(value, date) and not isinstance(value, datetime):
-                value = datetime(value.year, value.month, value.day)
-            if not isinstance(value, datetime):
-                return None
-            return (value if value.tzinfo else value.replace(tzinfo=self.zone)).timestamp()
-        except (ValueError, OverflowError):
-            return None
-
-    def _bound(self, value: Instant, dates: bool, what: str) -> float:
-        if dates:
-            stamp = self.stamp(value)
-            if stamp is None:
-                raise SampleError(f"{what}: got {value!r}; the times are dates, as 2025-04-01.")
-            return stamp * self.second
-        if isinstance(value, str | date):
-            raise SampleError(f"{what}: got {str(value)!r}; the times are numbers, not dates.")
-        return float(value)
+    decimal: str = "."
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,72 +92,6 @@ class Table:
             yield Sample(t, dict(zip(self.names, row, strict=True)))
 
 
-def read_csv(
-    path: str | Path,
-    columns: Mapping[str, Column],
-    clock: Clock,
-    *,
-    every: int = 1,
-    missing: Iterable[float] = (),
-    separator: str = ",",
-) -> Table:
-    """Read channels from a CSV file with one header line.
-
-    Parameters
-    ----------
-    columns
-        Channel -> where it comes from.
-    every
-        Keep every so many rows.
-    missing
-        Numbers that mean a missing sample (-9999). Empty cells and NaN always do.
-    separator
-        What stands between two fields, as "," or ";".
-
-    Raises
-    ------
-    DataError
-        No such file or column; text or infinity in a channel; times that do not increase. The
-        message names file, row (the header is row 1) and column.
-    """
-    import pandas as pd
-
-    path = Path(path)
-    needed = [clock.name, *(name for column in columns.values() for name in column.names)]
-    try:
-        header = list(pd.read_csv(path, nrows=0, skipinitialspace=True, sep=separator).columns)
-        _check_separator(path, header, separator)
-        check_columns(str(path), needed, header)
-        _check_widths(path, len(header), separator)
-        frame = pd.read_csv(
-            path,
-            usecols=sorted(set(needed)),
-            dtype=str,
-            keep_default_na=False,
-            skipinitialspace=True,
-            sep=separator,
-            skip_blank_lines=False,
-        )
-    except (OSError, pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
-    blank = (frame == "").all(axis=1)
-    rows = np.flatnonzero(~blank.to_numpy()) + 2
-    frame = frame.loc[~blank]
-    if not len(frame):
-        raise DataError(f"{path}: holds no rows beside its header.")
-    times, dates = _times(
-        frame[clock.name].tolist(), clock, lambda k: f"{path}, row {rows[k]}, column"
-    )
-
-    def numbers(name: str, use: Any) -> Array:
-        return _numbers(frame[name].to_numpy()[use], rows[use], f"{path}", name)
-
-    def where(k: int) -> str:
-        return f"{path}, row {rows[k]}, column '{clock.name}'"
-
-    return _table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
-
-
 def read_json_lines(
     path: str | Path,
     columns: Mapping[str, Column],
@@ -241,6 +115,8 @@ def read_json_lines(
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").split("\n")
+    except FileNotFoundError:
+        raise no_file(Path(path)) from None
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read: {error}.") from error
     places = [f"{path}, line {k}" for k, line in enumerate(lines, start=1) if line.strip()]
@@ -252,13 +128,13 @@ def read_json_lines(
         check_columns(place, [clock.name], list(row))
     needed = [name for column in columns.values() for name in column.names]
     check_columns(str(path), needed, [*dict.fromkeys(name for row in rows for name in row)])
-    times, dates = _times([row[clock.name] for row in rows], clock, lambda k: f"{places[k]},")
+    times, dates = read_times([row[clock.name] for row in rows], clock, lambda k: f"{places[k]},")
 
     def numbers(name: str, use: Any) -> Array:
-        return np.array([_number(rows[k].get(name), f"{places[k]}, '{name}'") for k in use])
+        return np.array([cell_number(rows[k].get(name), f"{places[k]}, '{name}'") for k in use])
 
     where = (str(path), places.__getitem__)
-    return _table(times, dates, numbers, columns, clock, every, missing, where)
+    return to_table(times, dates, numbers, columns, clock, every, missing, where)
 
 
 def tabulated(
@@ -294,7 +170,7 @@ def tabulated(
         raise SampleError(f"{where}: holds no samples.")
     needed = [name for column in columns.values() for name in column.names]
     check_columns(where, needed, list(values))
-    found, dates = _times(moments, clock, lambda k: f"{where}, sample {k}, times")
+    found, dates = read_times(moments, clock, lambda k: f"{where}, sample {k}, times")
 
     def numbers(name: str, use: Any) -> Array:
         try:
@@ -317,10 +193,10 @@ def tabulated(
     def here(k: int) -> str:
         return f"{where}, sample {k}"
 
-    return _table(found, dates, numbers, columns, clock, every, missing, (where, here))
+    return to_table(found, dates, numbers, columns, clock, every, missing, (where, here))
 
 
-def _table(
+def to_table(
     times: Array,
     dates: bool,
     numbers: Callable[[str, Any], Array],
@@ -339,7 +215,9 @@ def _table(
     use = use[::every]
     late = np.flatnonzero(np.diff(times[use]) <= 0)
     if len(late):
-        raise _disorder(row(int(use[late[0] + 1])))
+        raise _disorder(
+            row(int(use[late[0] + 1])), bool(times[use[late[0]]] == times[use[late[0] + 1]])
+        )
     holes = tuple(float(number) for number in missing)
     names = dict.fromkeys(name for column in columns.values() for name in column.names)
     found = {name: numbers(name, use) for name in names}
@@ -393,14 +271,14 @@ class JsonLines:
         self.origin: datetime | None = None
 
     def __iter__(self) -> Iterator[Sample]:
-        clock, kept, last = self._clock, 0, -math.inf
+        clock, kept, last, dates = self._clock, 0, -math.inf, None
         zero: float | None = None
         for number, line in enumerate(self._lines, start=1):
             if not line.strip():
                 continue
             where = f"{self._where}, line {number}"
             row = _object(line, where)
-            t, dates = row_time(row, clock, where)
+            t, dates = row_time(row, clock, where, dates)
             low, high = clock.bounds(dates, self._where)
             if t > high:
                 return
@@ -410,7 +288,7 @@ class JsonLines:
             if (kept - 1) % self._every:
                 continue
             if t <= last:
-                raise _disorder(where)
+                raise _disorder(where, t == last)
             last = t
             if zero is None:
                 zero = t if dates else 0.0
@@ -431,11 +309,16 @@ class JsonLines:
                 yield Sample(t - zero, values)
 
 
-def row_time(row: Mapping[str, Any], clock: Clock, where: str = "row") -> tuple[float, bool]:
-    """Return the time of a row in the model's unit, and whether it is a date (then since 1970)."""
+def row_time(
+    row: Mapping[str, Any], clock: Clock, where: str = "row", before: bool | None = None
+) -> tuple[float, bool]:
+    """Return the time of a row in the model's unit, and whether it is a date (then since 1970).
+
+    `before`: whether the times of earlier rows were dates.
+    """
     if clock.name not in row:
-        raise SampleError(f"{where}: there is no '{clock.name}'{_hint(clock.name, list(row))}")
-    times, dates = _times([row[clock.name]], clock, lambda _: f"{where},")
+        raise SampleError(f"{where}: there is no '{clock.name}'{hint(clock.name, list(row))}")
+    times, dates = read_times([row[clock.name]], clock, lambda _: f"{where},", before)
     return float(times[0]), dates
 
 
@@ -445,39 +328,9 @@ def channel_value(
     """Return the value of a channel in a row, NaN if it is missing."""
     numbers = []
     for name in column.names:
-        value = _number(row.get(name), f"{where}, '{name}'")
+        value = cell_number(row.get(name), f"{where}, '{name}'", column.decimal)
         numbers.append(math.nan if value in missing else value)
     return column.factor * sum(numbers) / len(numbers) + column.offset
-
-
-def check_columns(where: str, needed: Iterable[str], known: list[str]) -> None:
-    """Raise `SampleError` with a hint if a column is not there."""
-    for name in needed:
-        if name not in known:
-            raise SampleError(f"{where}: there is no column '{name}'{_hint(name, known)}")
-
-
-def _check_separator(path: Path, header: list[str], separator: str) -> None:
-    """Refuse a header that another separator would divide."""
-    if len(header) > 1:
-        return
-    for other in {",", ";", "\t"} - {separator}:
-        if header and other in header[0]:
-            raise SampleError(
-                f"{path}: the header is one field with {separator!r} between fields, and "
-                f"{header[0].count(other) + 1} with {other!r}: say separator = {other!r}."
-            )
-
-
-def _check_widths(path: Path, width: int, separator: str) -> None:
-    """Refuse a row with more fields than the header: pandas would cut it without a word."""
-    with path.open(newline="", encoding="utf-8") as file:
-        for number, row in enumerate(csv.reader(file, delimiter=separator), start=1):
-            if any(field.strip() for field in row[width:]):
-                raise SampleError(
-                    f"{path}, row {number}: {len(row)} fields, but the header has {width}; "
-                    "decimals need a point, and fields with a comma in them quotes."
-                )
 
 
 def _object(line: str, where: str) -> dict[str, Any]:
@@ -491,18 +344,16 @@ def _object(line: str, where: str) -> dict[str, Any]:
     return row
 
 
-def _number(value: Any, where: str) -> float:
+def cell_number(value: Any, where: str, decimal: str = ".") -> float:
     """Return a float, NaN if it is missing."""
     if value is None or (isinstance(value, str) and value.strip().lower() in MISSING):
         return math.nan
-    try:
-        if isinstance(value, bool):
-            raise TypeError
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise SampleError(
-            f"{where}: got {value!r}; expected a number (leave it empty if it is missing)."
-        ) from None
+    number = number_of(value, decimal)
+    if number is None:
+        remedy = "expected a number (leave it empty if it is missing)."
+        if decimal == "." and has_decimal_comma(value):
+            remedy = COMMA
+        raise SampleError(f"{where}: got {value!r}; {remedy}")
     if math.isinf(number):
         raise SampleError(
             f"{where}: got {value!r}; a channel must be finite (leave it empty if it is missing)."
@@ -510,63 +361,7 @@ def _number(value: Any, where: str) -> float:
     return number
 
 
-def _numbers(cells: Any, rows: Any, where: str, name: str) -> Array:
-    """Return a column of text as numbers; its row is looked for only if one is wrong."""
-    try:
-        found: Array = np.array([c if c else "nan" for c in cells], dtype=float)
-    except ValueError:
-        found = np.full(len(cells), np.inf)
-    if np.isinf(found).any():
-        found = np.array(
-            [
-                _number(cell, f"{where}, row {row}, column '{name}'")
-                for cell, row in zip(cells, rows, strict=True)
-            ]
-        )
-    return found
-
-
-def _times(cells: list[Any], clock: Clock, where: Callable[[int], str]) -> tuple[Array, bool]:
-    """Return times in the model's unit, and whether they are dates; `where` names a cell."""
-    first = cells[0]
-    dates = isinstance(first, date) or (isinstance(first, str) and not _is_number(first))
-    times = np.empty(len(cells))
-    for k, cell in enumerate(cells):
-        value = clock.stamp(cell) if dates else _float(cell)
-        if value is None or not math.isfinite(value):
-            raise SampleError(
-                f"{where(k)} '{clock.name}': got {cell!r}; expected "
-                + ("a date and time as 2025-04-01 12:00." if dates else "a number, as before.")
-            )
-        times[k] = value
-    return times * (clock.second if dates else clock.factor), dates
-
-
-def _float(cell: Any) -> float | None:
-    try:
-        return None if isinstance(cell, bool) else float(cell)
-    except (TypeError, ValueError, OverflowError):
-        return None
-
-
-def _is_number(cell: str) -> bool:
-    return _float(cell) is not None
-
-
-def _whole_day(value: Any) -> bool:
-    if isinstance(value, str):
-        return len(value.strip()) == len("2025-04-01")
-    return isinstance(value, date) and not isinstance(value, datetime)
-
-
-def _disorder(where: str) -> TimeOrderError:
-    return TimeOrderError(
-        f"{where}: the time is not later than the one before; sort the rows and drop repeated ones."
-    )
-
-
-def _hint(name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1)
-    if close:
-        return f"; did you mean '{close[0]}'?"
-    return f"; there are {', '.join(known[:12])}{', ...' if len(known) > 12 else ''}."
+def _disorder(where: str, repeated: bool) -> TimeOrderError:
+    if repeated:
+        return TimeOrderError(f"{where}: the time is that of the one before; drop repeated rows.")
+    return TimeOrderError(f"{where}: the time is earlier than the one before; sort the rows.")

@@ -91,7 +91,9 @@ class Comparison:
             found = found | (run.t > problem.jump) & (run.t <= self.learned_at(seed, controller))
         return found
 
-    def costs(self, controller: str, row: str, *, late: bool = False, paid: bool = True) -> Array:
+    def costs(
+        self, controller: str, row: str, *, late: bool = False, paid: bool | None = None
+    ) -> Array:
         """Return the cost of each seed.
 
         Parameters
@@ -99,16 +101,14 @@ class Comparison:
         late
             Only after livepde has learned the jump.
         paid
-            With what violations cost.
+            With what violations cost; default for `MPC`, as `LQ` does not know limits.
         """
-        return np.array(
-            [
-                run.cost(problem, self.learned_at(k, controller) if late else -math.inf, paid=paid)
-                for k, (problem, run) in enumerate(
-                    zip(self.problems, self.runs[controller, row], strict=True)
-                )
-            ]
-        )
+        charged = controller == "MPC" if paid is None else paid
+        found = []
+        for k, run in enumerate(self.runs[controller, row]):
+            since = self.learned_at(k, controller) if late else -math.inf
+            found.append(run.cost(self.problems[k], since, paid=charged))
+        return np.array(found)
 
     def violations(self, controller: str, row: str, *, learning: bool | None = None) -> int:
         """Return at how many samples of all seeds a limit was violated.
@@ -128,10 +128,20 @@ class Comparison:
             total += int(found.sum())
         return total
 
-    def seconds(self, controller: str, row: str, *, whole: bool = False) -> float:
-        """Return the mean processor time of a sample: of the estimator, or of all."""
-        runs = self.runs[controller, row]
-        return float(np.mean([run.whole if whole else run.estimating for run in runs]))
+    def times(self, controller: str, row: str, *, whole: bool = False) -> float:
+        """Return the processor time of a sample over livepde's: the median of the seeds' ratios.
+
+        Parameters
+        ----------
+        whole
+            Of all, not of the estimator alone.
+        """
+        both = zip(self.runs[controller, row], self.runs[controller, LEARNED], strict=True)
+        pairs = [
+            (one.whole, mine.whole) if whole else (one.estimating, mine.estimating)
+            for one, mine in both
+        ]
+        return float(np.median([one.mean() / mine.mean() for one, mine in pairs]))
 
     def table(self) -> Table:
         """Return cost, violations and time of every row."""
@@ -148,8 +158,6 @@ class Comparison:
                 float(run.beyond(problem).max(initial=0.0))
                 for problem, run in zip(self.problems, runs, strict=True)
             ]
-            base = self.seconds(controller, LEARNED)
-            whole = self.seconds(controller, LEARNED, whole=True)
             rows.append(
                 [
                     controller,
@@ -163,8 +171,8 @@ class Comparison:
                     self.violations(controller, row),
                     self.violations(controller, row, learning=True),
                     max(beyond),
-                    self.seconds(controller, row) / base,
-                    self.seconds(controller, row, whole=True) / whole,
+                    self.times(controller, row),
+                    self.times(controller, row, whole=True),
                     f"{np.mean([1.0 - run.trusted.mean() for run in runs]):.1%}",
                     sum(run.failed for run in runs),
                 ]
@@ -213,18 +221,23 @@ def compare(
     def run(controller: str, seed: int, estimator: Estimator) -> Run:
         return closed_loop(problems[seed], estimator, controllers[controller][seed], seed)
 
-    jobs = [(controller, row, seed) for controller in used for row in ROWS for seed in range(seeds)]
-    for controller, row, seed in watched(jobs, len(jobs), "loops") if progress else jobs:
-        found = run(controller, seed, ROWS[row](problems[seed]))
+    setting: Setting | None = None
+    rows: dict[str, Callable[[Problem], Estimator]] = dict(ROWS)
+    if settings:
+        tried = [
+            run("MPC", 0, MovingHorizon(problems[0], each)).cost(problems[0])
+            for each in (watched(settings, len(settings), "settings") if progress else settings)
+        ]
+        setting = best = settings[int(np.argmin(tried))]
+        rows[HORIZON] = lambda problem: MovingHorizon(problem, best)
+    # Those of a seed right after each other: their times are compared.
+    jobs = [
+        (controller, seed, row)
+        for controller in used
+        for seed in range(seeds)
+        for row in (rows if controller == "MPC" else ROWS)
+    ]
+    for controller, seed, row in watched(jobs, len(jobs), "loops") if progress else jobs:
+        found = run(controller, seed, rows[row](problems[seed]))
         runs.setdefault((controller, row), []).append(found)
-    if not settings:
-        return Comparison(problems, runs, None)
-    tried: list[Run] = []
-    for setting in watched(settings, len(settings), "horizons") if progress else settings:
-        tried.append(run("MPC", 0, MovingHorizon(problems[0], setting)))
-    best = int(np.argmin([found.cost(problems[0]) for found in tried]))
-    runs["MPC", HORIZON] = [tried[best]]
-    rest = range(1, seeds)
-    for seed in watched(rest, len(rest), "moving horizon") if progress else rest:
-        runs["MPC", HORIZON].append(run("MPC", seed, MovingHorizon(problems[seed], settings[best])))
-    return Comparison(problems, runs, settings[best])
+    return Comparison(problems, runs, setting)

@@ -77,7 +77,7 @@ def room(t: float) -> Mapping[str, float]:
 
 def rod(seed: int = 0) -> Problem:
     """Return the task; the same for all seeds, which draw the noise."""
-    sensors, outputs = Points(SENSORS, noise=NOISE), Points(OUTPUTS)
+    sensors, outputs = Points(SENSORS, noise=NOISE), Points(OUTPUTS, unit="degC")
     model, fine = process(CELLS), process(FINE[0])
     law = SensitivityLaw(jumps=Jumps())
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from livepde.bench.control.problem import Problem
 from livepde.control import Controller, Estimator, Kalman, Known, Learned, Loop
 from livepde.linalg import Array
+from livepde.result import unknown_of
 
 __all__ = ["Run", "Told", "closed_loop", "learned", "nominal", "offset_free", "told"]
 
@@ -69,7 +70,17 @@ class Run:
             found[f"{name}_low"], found[f"{name}_high"] = (
                 np.full(len(times), v) for v in (low, high)
             )
-        data = {name: ("time", np.asarray(values)) for name, values in found.items()}
+        space = model.frame.model.parameter_space
+        units = dict.fromkeys(model.outputs.names, model.frame.outputs.unit)
+        units |= {label: unknown_of(space, label).unit for label in model.unknowns}
+        data = {
+            name: (
+                "time",
+                np.asarray(values),
+                {"units": units.get(name, "")} | ({"held": 1} if name in model.controls else {}),
+            )
+            for name, values in found.items()
+        }
         unit = model.frame.model.time_unit
         return xr.Dataset(data, coords={"time": ("time", self.t, {"units": unit})})
 

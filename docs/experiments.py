@@ -1,0 +1,254 @@
+"""Make docs/gallery/experiments.md, with: python docs/experiments.py [NAME ...].
+
+Runs what `livepde reproduce` knows, the scripts of experiments/ and the programs of examples/, each
+by the name of its experiment or file; without names all of them, which takes an hour. What they
+print and draw is kept in docs/gallery/experiments/, and the page is made of all that is there.
+`--draw` runs nothing. The data of the cases are read from $LIVEPDE_DATA.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import indent
+
+from matplotlib.figure import Figure
+from PIL import Image
+
+from livepde.plots import PALETTE, figure
+from livepde.reproduce import EXPERIMENTS
+
+PROJECT = Path(__file__).resolve().parents[1]
+PAGE = PROJECT / "docs" / "gallery" / "experiments.md"
+KEPT = PAGE.with_suffix("")
+WIDEST, COLOURS = 1100, 48  # pixels and colours of a figure
+LONGEST = 45  # lines of what a script prints that are shown
+OPTIONS = {"auto_bank": ["--quick"]}  # of scripts
+
+HEAD = """\
+# Gallery: experiments
+
+What the paper shows, what follows from it, and what needs the truth or hindsight, which the library
+must never see. Each with its figure, its table and its command. Written by `python
+docs/experiments.py`. The cases on data of others have [a page of their own](gallery.md).
+"""
+PARTS = {
+    "reproduce": "Published and stated experiments; commands and tests check their bounds.",
+    "experiments": "Scripts that use the truth or hindsight. A dot is a number of the table below.",
+    "examples": "Programs to start from.",
+}
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """How the table that a script prints is drawn: a line of it is a row of dots.
+
+    Attributes
+    ----------
+    row
+        Pattern of a line; its groups are `label` and numbers, each by its name on the axis; a
+        group `NAME_std` is the deviation of NAME.
+    heading
+        Pattern of a line whose group comes before the labels of the lines after it.
+    scale
+        Of the axis.
+    last
+        Only the last paragraph is shown, and drawn; what comes before it is single runs.
+    """
+
+    row: str
+    heading: str = "$^"
+    scale: str = "log"
+    last: bool = False
+
+
+NUMBER = r"[-+]?[\d.]+(?:e[-+]?\d+)?"
+SKETCHES = {
+    "jumps": Sketch(
+        rf"^│ (?P<label>.+?) +│ (?P<error_before_the_jump>{NUMBER}) +│ \S+ +"
+        rf"│ (?P<error_at_the_end>{NUMBER})"
+    ),
+    "oracle": Sketch(
+        rf"^(?P<label>\S.+?)  +(?P<error_of_q>{NUMBER}) +(?P<energy_end_over_start>{NUMBER}) +\S+$",
+        heading=r"(noise \d+%)",
+    ),
+    "stopping": Sketch(
+        rf"^ *(?P<label>\S+ +\S+ +\S+ +\S+) +(?P<T>{NUMBER}) +(?P<surrogate>{NUMBER}) +\S"
+    ),
+    "hindsight": Sketch(
+        rf"^ +(?P<label>{NUMBER}) +{NUMBER} +(?P<error_of_q>{NUMBER})(?:   <- least)?$",
+        heading=r"^partial exact data, (gain \d+)",
+    ),
+    "scratch": Sketch(rf"^(?P<label>\d+ 000 .+?) +(?P<D>0\.0\d+) +(?P<r>{NUMBER}) +{NUMBER}$"),
+    "batch": Sketch(rf"^(?P<label>\d+ cm) +(?P<D>{NUMBER}) +(?P<v>{NUMBER}).* (?P<left>{NUMBER})$"),
+    "borehole": Sketch(
+        rf"^(?P<label>\S.+?)  +(?P<k>{NUMBER}) ± (?P<k_std>{NUMBER}) .* "
+        rf"(?P<k_after_10_h>{NUMBER}) ± (?P<k_after_10_h_std>{NUMBER})  ",
+        scale="linear",
+    ),
+    "auto_bank": Sketch(
+        rf"^(?P<label>\S+ +\d+%) +(?P<auto>{NUMBER}) +\S+ +{NUMBER} +{NUMBER} "
+        rf"+(?P<best_of_grid>{NUMBER})"
+    ),
+    "auto_gain": Sketch(
+        rf"^(?P<label>\S+ +\d+%) +(?P<auto>{NUMBER}) +(?P<best_of_grid>{NUMBER}) ", last=True
+    ),
+    "outside": Sketch(
+        r"^(?P<label>\S.+?) +(?P<error_in_omega>\d+\.\d{3}) *(?P<error_outside>\d+\.\d{3}) ",
+        heading=r"^(reaction|rod), ",
+    ),
+}
+
+
+def shown(name: str, text: str) -> str:
+    """Return the part of a script's output that the page shows."""
+    text = text.strip("\n")
+    if name in SKETCHES and SKETCHES[name].last:
+        text = text.rsplit("\n\n", 1)[-1]
+    rows = text.splitlines()
+    if len(rows) > LONGEST:
+        rows = [*rows[:LONGEST], f"... ({len(rows) - LONGEST} lines more)"]
+    return "\n".join(rows)
+
+
+def drawn(name: str, text: str) -> Figure | None:
+    """Return the figure of a script's table, None if it has none."""
+    sketch = SKETCHES.get(name)
+    rows = list(_rows(sketch, text)) if sketch else []
+    if sketch is None or not rows:
+        return None
+    names = [name for name in rows[0] if name != "label" and not name.endswith("_std")]
+    picture, (ax,) = figure()
+    picture.set_size_inches(7.0, 1.2 + 0.24 * len(rows))
+    for k, what in enumerate(names):
+        values = [float(row[what]) for row in rows]
+        width = [float(row.get(f"{what}_std") or "nan") for row in rows]
+        style = {"color": PALETTE[k], "marker": "osD"[k], "linestyle": "none", "markersize": 5}
+        ax.errorbar(values, range(len(rows)), xerr=width, label=what.replace("_", " "), **style)
+    ax.set(yticks=range(len(rows)), yticklabels=[row["label"] for row in rows])
+    ax.set_xscale(sketch.scale)
+    ax.invert_yaxis()
+    ax.grid(True, alpha=0.3, linewidth=0.6)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(fontsize="small", frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3)
+    return picture
+
+
+def _rows(sketch: Sketch, text: str) -> Iterator[dict[str, str]]:
+    heading = ""
+    for line in text.splitlines():
+        if (head := re.search(sketch.heading, line)) is not None:
+            heading = f"{head[1]}, "
+        elif (found := re.search(sketch.row, line)) is not None:
+            label = re.sub(r" {2,}", "  ", found["label"])
+            yield {**found.groupdict(), "label": heading + label}
+
+
+def run(name: str) -> None:
+    """Run one experiment, script or example, and keep what it printed and drew."""
+    sys.stderr.write(f"runs: {name}\n")
+    if name in EXPERIMENTS:
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "run"
+            command = [sys.executable, "-m", "livepde", "reproduce", name, "--out", str(out)]
+            subprocess.run(command, check=False)  # a bound that is missed is said in the report
+            keep(name, out)
+        return
+    script = scripts()[name]
+    command = [sys.executable, str(script), *OPTIONS.get(name, ())]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    (KEPT / f"{name}.txt").write_text(done.stdout, encoding="utf-8")
+
+
+def keep(name: str, out: Path) -> None:
+    """Keep the report of a run directory, and its figures, smaller."""
+    text = (out / "report.md").read_text(encoding="utf-8")
+    for path in sorted(out.glob("*.png")):
+        small(path, KEPT / f"{name}-{path.name}")
+        text = text.replace(f"({path.name})", f"({name}-{path.name})")
+    (KEPT / f"{name}.txt").write_text(text, encoding="utf-8")
+
+
+def small(path: Path, target: Path) -> None:
+    """Write a picture with fewer pixels and a palette of few colours."""
+    with Image.open(path) as large:
+        picture = large.convert("RGB")
+    picture.thumbnail((WIDEST, 10 * WIDEST))
+    picture.quantize(COLOURS).save(target, optimize=True)
+
+
+def scripts() -> dict[str, Path]:
+    """Return name -> file of scripts and examples."""
+    return {
+        path.stem: path
+        for folder in ("experiments", "examples")
+        for path in sorted((PROJECT / folder).glob("*.py"))
+    }
+
+
+def page() -> str:
+    """Return the page of all that is kept."""
+    parts = [HEAD]
+    for title, words in PARTS.items():
+        parts.append(f"## {title.capitalize()}\n\n{words}\n")
+        if title == "reproduce":
+            parts += [_report(name) for name in EXPERIMENTS if _kept(name).exists()]
+        else:
+            mine = [path for path in scripts().values() if path.parent.name == title]
+            parts += [_script(path) for path in mine if _kept(path.stem).exists()]
+    return "\n".join(parts)
+
+
+def _kept(name: str) -> Path:
+    return KEPT / f"{name}.txt"
+
+
+def _report(name: str) -> str:
+    """Return the part of a published experiment: figures first."""
+    text = _kept(name).read_text(encoding="utf-8").replace("| None |", "| – |")
+    title, rest = text.removeprefix("# ").split("\n", 1)
+    pictures = re.findall(r"^!\[.*\]\((.*)\)$\n?", rest, flags=re.MULTILINE)
+    rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE)
+    shown = [f"![{Path(one).stem}](experiments/{one})" for one in pictures]
+    rest = re.sub(r"^## (.*)$", r"**\1**", rest, flags=re.MULTILINE)
+    lines = [f"### {name}", title, f"`livepde reproduce {name}`", *shown, rest.strip()]
+    return "\n\n".join(lines) + "\n"
+
+
+def _script(path: Path) -> str:
+    """Return the part of a script: what it is for, its figure, and what it prints."""
+    about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    printed = _kept(path.stem).read_text(encoding="utf-8")
+    lines = [f"### {path.stem}", about.split("\n\n")[0]]
+    command = ["python", f"{path.parent.name}/{path.name}", *OPTIONS.get(path.stem, ())]
+    lines.append(f"`{' '.join(command)}`")
+    if (picture := drawn(path.stem, printed)) is not None:
+        target = KEPT / f"{path.stem}.png"
+        picture.savefig(target, dpi=120)
+        small(target, target)
+        lines.append(f"![{path.stem}](experiments/{target.name})")
+    lines.append(indent(shown(path.stem, printed), "    "))
+    return "\n\n".join(lines) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run what is named, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[[], *EXPERIMENTS, *scripts()], metavar="NAME")
+    parser.add_argument("--draw", action="store_true", help="run nothing")
+    chosen = parser.parse_args(arguments)
+    KEPT.mkdir(exist_ok=True)
+    for name in () if chosen.draw else chosen.names or (*EXPERIMENTS, *scripts()):
+        run(name)
+    PAGE.write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""What the program writes into pages while the site is built, in the place of comments.
+
+<!-- command line -->             the help of all commands
+<!-- keys of a case -->           tables of all keys of a case file
+<!-- members of livepde.ROOM -->  what a room exports beside what livepde itself does
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any
+
+import livepde
+from livepde.cases.schema import CaseSpec
+
+Schema = Mapping[str, Any]
+
+DEFINED = "#/$defs/"
+BOUND = '`[low, high]`, `"<= number"` or `">= number"`'  # what the validator of `expect` reads
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill a page in; MkDocs calls this for each of them."""
+    for comment, write in WRITERS.items():
+        if comment in markdown:
+            markdown = markdown.replace(comment, write())
+    return re.sub(r"<!-- members of (\S+) -->", lambda found: members(found[1]), markdown)
+
+
+def command_line() -> str:
+    """Return the help of all commands, as Typer writes it."""
+    command = [sys.executable, "-m", "typer", "livepde.cli", "utils", "docs", "--name", "livepde"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    text = done.stdout
+    # What every command has, and lists of commands with their words cut off, are of no use here.
+    text = re.sub(r"^\*\*Commands\*\*:\n\n(\*.*\n)+\n?", "", text, flags=re.MULTILINE)
+    text = text.replace("* `--help`: Show this message and exit.\n", "")
+    text = text.replace("**Options**:\n\n\n", "").split("\n\n", 1)[1]
+    # Examples are words to Typer: a line for each, and as code.
+    example = r"^(.*?)(Example|Replay|Service|Parallel): +(\S.*)$"
+    return re.sub(example, r"\1\n\n\2: `\3`", text, flags=re.MULTILINE)
+
+
+def members(room: str) -> str:
+    """Return a directive for mkdocstrings that shows what only this room exports."""
+    names = [name for name in import_module(room).__all__ if name not in livepde.__all__]
+    options = {"show_root_heading": False, "show_root_toc_entry": False, "members": names}
+    return f"::: {room}\n    options: {json.dumps(options)}\n"
+
+
+def keys_of_a_case() -> str:
+    """Return what each table of a case file may hold, from the models that validate it."""
+    schema = CaseSpec.model_json_schema(by_alias=True)
+    return "\n".join(_section("", schema, schema["$defs"]))
+
+
+def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
+    """Yield the section of one table, then those of the tables in it."""
+    title = f"`[{path}]`" if path else "At the top"
+    kind = model["properties"].get("kind", {}).get("const")
+    if kind:
+        title += f", `kind = {json.dumps(kind)}`"
+    yield f"## {title}\n\n{model['description']}\n\n| key | value | default |\n|---|---|---|"
+    needed = model.get("required", ())
+    inner: list[tuple[str, str]] = []
+    for key, value in model["properties"].items():
+        name = f"{path}.{key}" if path else key
+        default = json.dumps(value.get("default"), ensure_ascii=False)
+        default = (
+            "" if default in ("null", "[]", '""') or "default" not in value else f"`{default}`"
+        )
+        words = f"a table: name = {BOUND}" if key == "expect" else _alternatives(value)
+        yield f"| `{key}` | {words} | {'required' if key in needed else default} |"
+        inner += _tables(name, value)
+    yield ""
+    for where, found in inner:
+        yield from _section(where, models[found], models)
+
+
+def _alternatives(value: Schema) -> str:
+    """Return in words what a value may be."""
+    return " or ".join(dict.fromkeys(_words(value)))
+
+
+def _words(value: Schema) -> Iterator[str]:
+    choices = value.get("anyOf") or value.get("oneOf")
+    if choices:
+        kinds = [choice.get("type") for choice in choices if "const" not in choice]
+        quantity = "number" in kinds and "string" in kinds
+        if quantity:
+            dates = any("format" in choice for choice in choices)
+            yield "a date or a time" if dates else "a quantity"
+        for choice in choices:
+            free = "const" not in choice and choice.get("type") in ("number", "string")
+            if choice.get("type") != "null" and not (quantity and free):
+                yield from _words(choice)
+    elif "enum" in value or "const" in value:
+        for item in value.get("enum", [value.get("const")]):
+            yield f"`{json.dumps(item)}`"
+    elif value.get("type") == "array" and "prefixItems" in value:
+        yield f"[{', '.join(map(_alternatives, value['prefixItems']))}]"
+    elif value.get("type") == "array":
+        yield f"[{_alternatives(value['items'])}, ...]"
+    elif value.get("type") == "object":
+        yield f"a table: name = {_alternatives(_values(value))}"
+    else:
+        yield "a table" if "$ref" in value else SIMPLE[value.get("type", "")]
+
+
+def _values(value: Schema) -> Schema:
+    """Return what the values of a table of any names may be."""
+    patterns = list(value.get("patternProperties", {}).values())
+    found = value.get("additionalProperties") or (patterns or [{}])[0]
+    return found if isinstance(found, dict) else {}
+
+
+def _tables(path: str, value: Schema) -> Iterator[tuple[str, str]]:
+    """Yield the tables inside of a value, each with its path and its model."""
+    if "$ref" in value:
+        yield path, value["$ref"].removeprefix(DEFINED)
+    for choice in value.get("anyOf", value.get("oneOf", ())):
+        yield from _tables(path, choice)
+    if value.get("type") == "object":
+        yield from _tables(f"{path}.NAME", _values(value))
+    if value.get("type") == "array" and "items" in value:
+        yield from _tables(f"[{path}]", value["items"])
+
+
+SIMPLE = {
+    "": "anything",
+    "boolean": "true or false",
+    "integer": "a whole number",
+    "number": "a number",
+    "string": "text",
+}
+WRITERS = {"<!-- command line -->": command_line, "<!-- keys of a case -->": keys_of_a_case}

@@ -1,0 +1,82 @@
+"""What a run leaves behind, held against what one leaves that nobody disturbs."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from livepde.records import Record
+from livepde.runs import JOURNAL, Check, Journal
+
+__all__ = ["Damage", "Found", "same"]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a run leaves behind."""
+
+    records: Sequence[Record]
+    samples: int
+    state: bytes
+    events: Counter[str]
+    counts: Counter[str]
+
+    @classmethod
+    def of(cls, folder: Path) -> Found:
+        with Journal.open(folder / JOURNAL) as journal:
+            counts: Counter[str] = Counter()
+            for (kind, _), number in journal.counts.items():
+                counts[kind] += number
+            events = Counter(event.kind for event in journal.events)
+            records = list(journal)
+            state = (folder / "checkpoint.npz").read_bytes()
+            return cls(records, journal.accepted, state, events, counts)
+
+
+@dataclass
+class Damage:
+    """What has become of runs that were disturbed."""
+
+    runs: int = 0
+    lost: int = 0
+    doubled: int = 0
+    different: int = 0
+
+    def compare(self, found: Found, expected: Found) -> None:
+        """Hold a run against the one that nobody disturbed."""
+        times = Counter(record.t for record in found.records)
+        wanted = {record.t for record in expected.records}
+        self.runs += 1
+        self.lost += len(wanted - set(times)) + max(len(wanted) - found.samples, 0)
+        self.doubled += sum(times.values()) - len(times) + max(found.samples - len(wanted), 0)
+        pairs = zip(found.records, expected.records, strict=False)
+        self.different += sum(not same(mine, yours) for mine, yours in pairs)
+        self.different += found.state != expected.state
+
+    def checks(self, name: str) -> list[Check]:
+        """Nothing may be lost, doubled or different."""
+        return [
+            Check(f"{name}: samples lost", self.lost, 0, "<="),
+            Check(f"{name}: samples doubled", self.doubled, 0, "<="),
+            Check(f"{name}: estimates and states that differ in a bit", self.different, 0, "<="),
+        ]
+
+
+def same(one: Record, other: Record) -> bool:
+    """Return whether two records agree in every bit."""
+    names = ("numbers", "innovation", "withheld_error")
+    if any(getattr(one, name).tobytes() != getattr(other, name).tobytes() for name in names):
+        return False
+    if (one.t, one.status, one.steps) != (other.t, other.status, other.steps):
+        return False
+    if json.dumps(dict(one.notes)) != json.dumps(dict(other.notes)):  # NaN is NaN here
+        return False
+    mine, yours = one.snapshot, other.snapshot
+    if mine is None or yours is None:
+        return mine is yours
+    return mine.told == yours.told and all(
+        values.tobytes() == yours.profiles[name].tobytes() for name, values in mine.profiles.items()
+    )

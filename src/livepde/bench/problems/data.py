@@ -1,0 +1,225 @@
+"""What a benchmark problem is, and the data that are drawn of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from livepde.fem import Inputs
+from livepde.identifier import Sample
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observation, Observed
+from livepde.stepping import Advance, ForwardStage, ImplicitEuler, Interval, Scheme, advance
+
+__all__ = ["WARM_UP", "Data", "Problem", "Process"]
+
+WARM_UP = 2  # samples whose time does not count: matrices are built that are built once
+LEVELS = (0.0, 0.01, 0.05, 0.1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Process:
+    """What an estimator is given, and the truth behind it.
+
+    Attributes
+    ----------
+    model, observation, u0, scheme, dt_max, inputs, withheld, assimilate_from
+        As an `Identifier` takes them; `inputs` are the channels at each time.
+    times
+        Of the samples, shape (times,); the first is the initial time.
+    exact
+        Data without noise, shape (times, sensors).
+    q_true
+        Coefficients of the exact parameter at each time, shape (times, m); None for a real
+        process, of which nobody knows them.
+    hidden
+        Measured values of the withheld sensors, shape (times, withheld).
+    weights
+        Gram matrix of Z, shape (sensors, sensors); None: Euclidean.
+    """
+
+    model: Model
+    observation: Observation
+    times: Array
+    exact: Array
+    q_true: Array | None
+    u0: Any
+    scheme: Scheme = field(default_factory=ImplicitEuler)
+    dt_max: float = np.inf
+    inputs: Sequence[Mapping[str, float]] | None = None
+    weights: Array | None = None
+    withheld: Observation | None = None
+    hidden: Array | None = None
+    assimilate_from: float = -np.inf
+
+    @cached_property
+    def size(self) -> Array:
+        """Share of each sensor in the root mean square of the exact data, shape (sensors,)."""
+        weights = np.eye(self.exact.shape[1]) if self.weights is None else self.weights
+        square = np.einsum("ti,ij,tj->t", self.exact, weights, self.exact).mean()
+        return np.asarray(np.sqrt(square / (len(weights) * np.diag(weights))))
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """One noisy data set of a problem.
+
+    Attributes
+    ----------
+    problem, process
+        Where it comes from.
+    observation
+        The sensors, with the noise level that estimators are told.
+    noise
+        That level for each sensor, shape (sensors,).
+    z
+        Measurements, shape (times, sensors).
+    """
+
+    problem: Problem
+    process: Process
+    observation: Observation
+    noise: Array
+    z: Array
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def __iter__(self) -> Iterator[Sample]:
+        process = self.process
+        names = self.observed.names
+        hidden = process.withheld.names(0) if process.withheld is not None else ()
+        for k, t in enumerate(process.times):
+            z: Any = self.z[k]
+            if process.hidden is not None:
+                z = dict(zip(names, z, strict=True)) | dict(
+                    zip(hidden, process.hidden[k], strict=True)
+                )
+            yield Sample(float(t), z, process.inputs[k] if process.inputs else None)
+
+    @cached_property
+    def observed(self) -> Observed:
+        """The sensors bound to the model."""
+        model = self.process.model
+        return self.observation.bind(model.state_space, model.X, model.parameter_space)
+
+    @cached_property
+    def forward(self) -> float:
+        """Processor time of a forward step with the parameter at its prior: the unit of cost."""
+        return float(np.median([self._forward() for _ in range(3)]))
+
+    def _forward(self) -> float:
+        process, model = self.process, self.process.model
+        stage_of, control = ForwardStage(model), Advance(process.scheme, process.dt_max)
+        q, none = model.latent.prior, np.zeros(0)
+        rows = [Inputs(dict(row)) for row in process.inputs or [{}] * len(self)]
+        times = process.times.tolist()
+        at = Interval(times[0], times[0], rows[0], rows[0], none, none)
+        u = model.initial(process.u0, at.end)
+        start = process_time()
+        for k in range(1, len(times)):
+            interval = Interval(times[k - 1], times[k], rows[k - 1], rows[k], none, none)
+
+            def stage(c: Array, t: float, h: float, of: Interval = interval) -> Array:
+                return stage_of.solve(c, q, h, of.at(t))
+
+            u, _, failure = advance(control, stage, u, interval)
+            if failure is not None:
+                raise failure
+            if k == WARM_UP:
+                start = process_time()
+        return (process_time() - start) / (len(times) - 1 - WARM_UP)
+
+    @property
+    def modes(self) -> dict[str, int]:
+        """Modes of each field, as `SensitivityLaw` takes them."""
+        return dict.fromkeys(self.process.model.parameter_space.fields, self.problem.modes)
+
+    def until(self, at: int) -> Data:
+        """Return the data up to the sample with this number."""
+        process, stop = self.process, at + 1
+
+        def cut(values: Any) -> Any:
+            return None if values is None else values[:stop]
+
+        shorter = replace(
+            process,
+            times=process.times[:stop],
+            exact=process.exact[:stop],
+            q_true=cut(process.q_true),
+            inputs=cut(process.inputs),
+            hidden=cut(process.hidden),
+        )
+        return replace(self, process=shorter, z=self.z[:stop])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A benchmark problem.
+
+    Parameters
+    ----------
+    name, summary
+        What it is called, and one sentence.
+    make
+        Seed -> process.
+    floor
+        Told instead of a smaller noise level, relative to the data: what the estimator's mesh and
+        step leave unexplained.
+    levels
+        Noise levels relative to the root mean square of the data; None: the data are measured.
+    modes
+        Modes of a field in the reduced coordinates that all estimators share.
+    gain
+        Of the gradient law, set by hand; None where the law is not meant for the sensors.
+    varying
+        The parameter moves: the score is the mean over the second half instead of the end.
+    """
+
+    name: str
+    summary: str
+    make: Callable[[int], Process]
+    floor: float = 1e-3
+    levels: tuple[float | None, ...] = LEVELS
+    modes: int = 12
+    gain: float | None = None
+    varying: bool = False
+
+    def data(self, level: float | None, seed: int) -> Data:
+        """Return the data of a seed, which draws truth and noise."""
+        process = self.make(seed)
+        if level is None:
+            observed = process.observation.bind(
+                process.model.state_space, process.model.X, process.model.parameter_space
+            )
+            noise = observed.noise
+            told = np.ones(observed.size) if noise is None else noise
+            return Data(self, process, process.observation, told, process.exact)
+        rng = np.random.default_rng([seed, 1])
+        noise = process.size * rng.standard_normal(process.exact.shape)
+        told = max(level, self.floor) * process.size
+        observation = replace(process.observation, noise=told.tolist())
+        return Data(self, process, observation, told, process.exact + level * noise)
+
+    def chosen(self, levels: Sequence[float] | None) -> Sequence[float | None]:
+        """Return the noise levels to run: those given, if the data are not measured."""
+        return self.levels if levels is None or None in self.levels else levels
+
+    def error(self, process: Process, q: Array, at: int = -1) -> float:
+        """Return the relative error of q at a time: the root mean square over the unknowns."""
+        if process.q_true is None:
+            return float("nan")
+        model, exact = process.model, process.q_true[at]
+        shares = []
+        for name in model.parameter_space.blocks:
+            part = model.parameter_space.part(name)
+            mass = model.parameter_mass[part, part]
+            e, true = (q - exact)[part], exact[part]
+            shares.append(float(e @ (mass @ e)) / float(true @ (mass @ true)))
+        return float(np.sqrt(np.mean(shares)))

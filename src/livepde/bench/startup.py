@@ -1,0 +1,67 @@
+"""What `import livepde` costs against the import of the libraries that it stands on.
+
+Every import is timed in a fresh process, by the processor time of the statement alone: the start of
+the interpreter is not counted. In each round the imports follow each other, and the ratio is that
+of one round, so that a slow moment of the machine hits both. Bytecode is written once beforehand,
+as pip does for what it installs.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from livepde.runs.outcome import Check, Outcome, Table
+
+__all__ = ["BASE", "SCRIPT", "startup"]
+
+BASE = "import scipy.sparse.linalg, skfem"
+IMPORT = "import livepde"
+NAMES = ("Model", "Identifier", "SensitivityLaw", "Points", "Scalar", "Field")
+SCRIPT = "import livepde as lp; " + ", ".join(f"lp.{name}" for name in NAMES)
+BOUND = 1.5
+
+_TIMED = """
+from time import process_time
+begun = process_time()
+{}
+print(process_time() - begun)
+"""
+
+
+def startup(rounds: int = 15) -> Outcome:
+    """Time the import of livepde, and the import with what a short script uses of it.
+
+    Parameters
+    ----------
+    rounds
+        Fresh processes of each import.
+    """
+    codes = (BASE, IMPORT, SCRIPT)
+    with TemporaryDirectory() as cache:
+        for code in codes:
+            _seconds(code, cache)  # writes the bytecode
+        times = [[_seconds(code, cache) for code in codes] for _ in range(rounds)]
+    rows, checks = [], []
+    for k, code in enumerate(codes[1:], start=1):
+        low, middle, high = np.quantile([row[k] / row[0] for row in times], (0.0, 0.5, 1.0))
+        rows.append((code, low, middle, high))
+        checks.append(Check(code, middle, BOUND, "<="))
+    table = Table(f"Time over that of: {BASE}", ("code", "min", "median", "max"), rows)
+    note = f"Ratios of processor times of {rounds} fresh processes of each, round by round."
+    return Outcome(tables=[table], checks=checks, notes=[note])
+
+
+def _seconds(code: str, cache: str) -> float:
+    given = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONDONTWRITEBYTECODE", "EAGER_IMPORT")
+    }
+    command = [sys.executable, "-X", f"pycache_prefix={cache}", "-c", _TIMED.format(code)]
+    done = subprocess.run(command, env=given, capture_output=True, text=True, check=True)
+    return float(done.stdout)

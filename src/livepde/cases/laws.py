@@ -1,0 +1,90 @@
+"""The update law of a case."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from livepde.cases.frame import Frame
+from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
+from livepde.cases.sensors import noise_of
+from livepde.errors import LawError
+from livepde.laws import (
+    AnyLaw,
+    AutoLaw,
+    ConstantDamping,
+    Damping,
+    GradientLaw,
+    Guards,
+    Jumps,
+    Replay,
+    ResidualDamping,
+    SensitivityLaw,
+)
+
+__all__ = ["law_of"]
+
+
+def law_of(frame: Frame) -> AnyLaw:
+    """Return the law; raises `CaseError`."""
+    spec = frame.spec.law
+    try:
+        if isinstance(spec, GradientSpec):
+            return _gradient(spec)
+        return _auto(frame, spec) if isinstance(spec, AutoSpec) else _sensitivity(frame, spec)
+    except LawError as error:
+        raise frame.error("law", str(error)) from None
+
+
+def _gradient(spec: GradientSpec) -> GradientLaw:
+    damping: Damping = ResidualDamping(1.0 if spec.c1 is None else spec.c1)
+    if spec.mu is not None:
+        damping = ConstantDamping(spec.mu)
+    return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
+
+
+def _auto(frame: Frame, spec: AutoSpec) -> AutoLaw:
+    noise = None if spec.noise is None else _level(frame, spec.noise)
+    return AutoLaw(spec.modes, noise, gate=spec.gate or np.inf)
+
+
+def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
+    time, memory = frame.equation.time_unit, float(np.inf)
+    if spec.memory is not None:
+        memory = frame.positive(spec.memory, time, "law.memory")
+    drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
+    more: dict[str, Any] = {
+        "gate": spec.gate or np.inf,
+        "jumps": _chosen(Jumps, spec.jumps),
+        "guards": _chosen(Guards, spec.guards),
+    }
+    replay = _chosen(Replay, spec.replay)
+    return SensitivityLaw(spec.modes, _noise(frame, spec), drift, memory, replay, **more)
+
+
+def _chosen(kind: Any, given: Any) -> Any:
+    """Return an option of a law that a case has as true, false or a table."""
+    if isinstance(given, bool):
+        return kind() if given else None
+    return kind(**given.model_dump())
+
+
+def _noise(frame: Frame, spec: SensitivitySpec) -> float | str | None:
+    """Return the noise of the law, which needs it here or from every sensor."""
+    if spec.noise is not None and spec.noise != "auto":
+        return _level(frame, spec.noise)
+    if noise_of(frame, "sensor") is None:
+        if spec.noise == "auto":
+            text = "got 'auto', which begins with a guess: give every sensor its noise."
+            raise frame.error("law.noise", text)
+        raise frame.missing(
+            "law.noise",
+            "the sensitivity law weighs the sensors by their noise (a standard deviation); "
+            "give it here or with every sensor.",
+        )
+    return None if spec.noise is None else "auto"
+
+
+def _level(frame: Frame, noise: float | str) -> float:
+    return frame.positive(noise, frame.equation.state.unit, "law.noise")

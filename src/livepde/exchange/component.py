@@ -1,0 +1,93 @@
+"""The state of a co-simulation unit: an identifier, and what goes in and came out last."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from livepde import checkpoint
+from livepde.errors import LivepdeError
+from livepde.exchange.process import REFUSED, WAITING, Process
+from livepde.identifier import Identifier
+from livepde.linalg import Array
+from livepde.records import STATUS_CODES
+from livepde.samples import Sample
+
+__all__ = ["Component"]
+
+
+class Component:
+    """Takes one sample at each communication point; what cannot be used is a status.
+
+    Parameters
+    ----------
+    process
+        What it runs.
+
+    Attributes
+    ----------
+    inputs
+        The channels as they are now, NaN: missing.
+    outputs, status
+        What goes out, in the order of `Process.outputs`, and how the last step went.
+    """
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self.inputs = [math.nan] * len(process.inputs)
+        self.outputs = process.unknown()
+        self.status = WAITING
+        self._first = np.zeros(0)
+        self._identifier: Identifier | None = None
+
+    def take(self, seconds: float) -> str:
+        """Take what the inputs hold as the sample of a time; return what is to be told, or ''."""
+        process, t = self.process, seconds * self.process.second
+        try:
+            z = {
+                port.name: port.taken(value, process.missing)
+                for port, value in zip(process.inputs, self.inputs, strict=True)
+            }
+            for port in process.inputs:
+                if port.column.needed and math.isnan(z[port.name]):
+                    return ""  # as data without that channel are left out
+            if self._identifier is None:
+                self._identifier = self._begun(np.array([t, *z.values()]))
+            estimate = self._identifier.step(t, z)
+        except LivepdeError as error:
+            self.status = WAITING if self._identifier is None else REFUSED
+            return f"t = {seconds:g} s: {error}"
+        self.status = STATUS_CODES.index(estimate.status.code)
+        self.outputs = process.shown(self._identifier, estimate)
+        return "" if estimate.status.ok else f"t = {seconds:g} s: {estimate.status}"
+
+    def dump(self) -> bytes:
+        """Return all that evolves, from which `restore` goes on with the same numbers."""
+        leaves = {"inputs": self.inputs, "outputs": self.outputs, "status": self.status}
+        if self._identifier is not None:
+            leaves["first"] = self._first
+            leaves["identifier"] = np.frombuffer(self._identifier.dump(), dtype=np.uint8)
+        return checkpoint.packed({}, leaves)
+
+    def restore(self, content: bytes) -> None:
+        """Go on from what `dump` returned; raises `RunError` if it is of another unit."""
+        where = "the state of the unit"
+        _, leaves = checkpoint.unpacked(content, where)
+        self.inputs, self.outputs = leaves["inputs"].tolist(), leaves["outputs"].tolist()
+        self.status = int(leaves["status"])
+        if "identifier" not in leaves:
+            self._identifier = None
+            return
+        if self._identifier is None or not np.array_equal(
+            self._first, leaves["first"], equal_nan=True
+        ):
+            self._identifier = self._begun(leaves["first"])
+        self._identifier.restore(leaves["identifier"].tobytes(), where)
+
+    def _begun(self, first: Array) -> Identifier:
+        """Return the identifier that begins with a first sample: its time, then the inputs."""
+        self._first = first
+        names = [port.name for port in self.process.inputs]
+        z = dict(zip(names, first[1:].tolist(), strict=True))
+        return self.process.begin(Sample(float(first[0]), z))

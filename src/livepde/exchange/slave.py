@@ -1,0 +1,147 @@
+"""A process behind the interface of the exporters: one class for FMI 2.0 and 3.0."""
+
+from __future__ import annotations
+
+import atexit
+import copy
+import gc
+import importlib
+import sys
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement
+
+from livepde import __version__
+from livepde.cases.units import in_si
+from livepde.exchange.component import Component
+from livepde.exchange.process import STATUS, Output, Process
+from livepde.exchange.recipe import opened
+
+__all__ = ["FOLDER", "IdentifierSlave"]
+
+FOLDER = "process"  # of the resources
+
+if not sys.orig_argv:
+    # In a program that is no Python the exporters end the interpreter from a thread of their own,
+    # and its last collection of cycles crashes. The program ends or goes on: nothing is lost.
+    atexit.register(gc.freeze)
+
+
+class IdentifierSlave:
+    """What a unit does; its class has `Fmi2Slave` or `Fmi3Slave` as second base.
+
+    Attributes
+    ----------
+    fmi
+        2 or 3.
+    """
+
+    fmi: int
+    log: Callable[..., None]  # of the second base, as the next
+    register_variable: Callable[..., None]
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        process = opened(Path(options["resources"]) / FOLDER)
+        self.component = Component(process)
+        self.description = process.title
+        if (times := process.experiment) is not None:
+            experiment = self._kit("DefaultExperiment")
+            self.default_experiment = experiment(times.start, times.stop, times.step)
+        self._units: dict[str, str] = {}
+        self._register(process)
+
+    def _kit(self, name: str) -> Any:
+        """Return something of the exporter: DefaultExperiment, or {}Status as Fmi2Status."""
+        exporter = "pythonfmu" if self.fmi == 2 else "pythonfmu3"
+        module = f"{exporter}.enums" if name == "{}Status" else exporter
+        return getattr(importlib.import_module(module), name.format(f"Fmi{self.fmi}"))
+
+    def _register(self, process: Process) -> None:
+        causality, variability = self._kit("{}Causality"), self._kit("{}Variability")
+        real, whole = (("Real", "Integer"), ("Float64", "Int32"))[self.fmi - 2]
+
+        def add(kind: str, item: Output, cause: Any, get: Any, **more: Any) -> None:
+            about = {"description": item.text, "causality": cause, "getter": get, **more}
+            about.setdefault("variability", variability.discrete)
+            self.register_variable(self._kit(kind)(item.name, **about), nested=False)
+            self._units[item.name] = item.unit
+
+        if self.fmi == 3:
+            time = Output("time", "s", "Time.")
+            add(real, time, causality.independent, float, variability=variability.continuous)
+        for k, port in enumerate(process.inputs):
+            put = partial(self._put, k)
+            item = Output(port.name, port.unit, port.text)
+            add(real, item, causality.input, partial(self._input, k), setter=put)
+        for k, item in enumerate(process.outputs()):
+            add(real, item, causality.output, partial(self._output, k))
+        add(whole, Output("status", "", STATUS), causality.output, self._status)
+
+    def _put(self, k: int, value: float) -> None:
+        self.component.inputs[k] = value
+
+    def _input(self, k: int) -> float:
+        return self.component.inputs[k]
+
+    def _output(self, k: int) -> float:
+        return self.component.outputs[k]
+
+    def _status(self) -> int:
+        return self.component.status
+
+    def to_xml(self, *options: Any) -> Element:
+        """Return the description of the unit, with what the exporter leaves out."""
+        root: Element = super().to_xml(*options)  # type: ignore[misc]
+        root.set("variableNamingConvention", "flat")
+        root.set("generationTool", f"livepde {__version__} by {root.get('generationTool')}")
+        if any(self._units.values()):
+            root.insert(1, _definitions(set(self._units.values()) - {""}))
+        for variable in root.findall("ModelVariables/*"):
+            real = variable.find("Real") if self.fmi == 2 else variable
+            if real is None:
+                continue
+            if unit := self._units[variable.attrib["name"]]:
+                real.set("unit", unit)
+            if real.get("start") == "nan":
+                real.set("start", "NaN")  # as XML writes it
+        outputs = root.find("ModelStructure/Outputs")
+        if self.fmi == 2 and outputs is not None:
+            unknown = Element("InitialUnknowns")
+            unknown.extend(copy.deepcopy(list(outputs)))
+            root.find("ModelStructure").append(unknown)  # type: ignore[union-attr]
+        return root
+
+    def do_step(self, current_time: float, step_size: float) -> bool:
+        """Take the inputs as the sample of the current time; what is wrong is a status."""
+        told = self.component.take(current_time)
+        if told:
+            self.log(told, self._kit("{}Status").warning)
+        return True
+
+    def _get_fmu_state(self) -> bytes:
+        return self.component.dump()
+
+    def _set_fmu_state(self, state: bytes) -> None:
+        self.component.restore(state)
+
+    @staticmethod
+    def _fmu_state_to_bytes(state: bytes) -> bytes:
+        return state
+
+    @staticmethod
+    def _fmu_state_from_bytes(state: bytes) -> bytes:
+        return state
+
+
+def _definitions(units: Iterable[str]) -> Element:
+    """Return what units of measurement are in those of the SI, where they have any there."""
+    found = Element("UnitDefinitions")
+    for name in sorted(units):
+        unit, si = SubElement(found, "Unit", name=name), in_si(name)
+        if si is not None:
+            powers = {base: str(power) for base, power in si.exponents.items()}
+            SubElement(unit, "BaseUnit", powers, factor=repr(si.factor), offset=repr(si.offset))
+    return found

@@ -1,0 +1,102 @@
+"""Samples of a stream, and what may stand in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from livepde.errors import SampleError
+from livepde.linalg import Array
+from livepde.observation import Observed
+
+__all__ = ["Sample", "number", "numbers", "plan", "readings"]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One moment of a stream.
+
+    Attributes
+    ----------
+    t
+        Time, in the unit of the model.
+    z
+        Measurements: an array of shape (sensors,), or channel name -> value for everything that
+        was measured at t (sensors, inputs, withheld channels). NaN or absent: missing.
+    inputs
+        Input and boundary channels, if they are not in z.
+    """
+
+    t: float
+    z: ArrayLike | Mapping[str, float]
+    inputs: Mapping[str, float] | None = None
+
+
+def number(value: Any, what: str) -> float:
+    """Return a float; None is missing (NaN). `what` names it in messages."""
+    if type(value) is float and math.isfinite(value):
+        return value
+    if value is None:
+        return np.nan
+    if isinstance(value, str | bytes | bool):
+        raise SampleError(f"{what}: got {value!r}; expected a number (NaN if it is missing).")
+    try:
+        found = float(value)
+    except (TypeError, ValueError):
+        raise SampleError(f"{what}: got {value!r}; expected a number (NaN if missing).") from None
+    if np.isinf(found):
+        raise SampleError(f"{what}: got {found}; send NaN for a missing sample, never infinity.")
+    return found
+
+
+def numbers(values: Any, what: str) -> Array:
+    """Return an array of floats. `what` names it in messages."""
+    try:
+        array: Array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise SampleError(f"{what} = {values!r} holds something that is not a number.") from None
+    return array
+
+
+def plan(name: str, values: Any, count: int) -> Array:
+    """Return the values of an input at each of some times."""
+    found = numbers(values, f"input '{name}'")
+    if found.shape not in ((), (count,)):
+        raise SampleError(
+            f"input '{name}' has shape {found.shape}; needs one number, or {count}: one for each "
+            "time."
+        )
+    return np.broadcast_to(found, (count,))
+
+
+def readings(z: Any, observed: Observed) -> Array:
+    """Return the measurements of all sensors, shape (sensors,), as an array of their own."""
+    usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
+    if usual and np.isfinite(z).all():
+        return np.array(z)
+    if (
+        np.asarray(z).dtype.kind in "USb"
+        if not isinstance(z, list | tuple)
+        else any(isinstance(value, str | bytes | bool) for value in z)
+    ):
+        raise SampleError(f"z = {z!r} is not an array of numbers.")
+    try:
+        array = np.asarray(z, dtype=float)
+    except (TypeError, ValueError):
+        raise SampleError(f"z = {z!r} holds something that is not a number.") from None
+    if array.ndim == 0 and observed.size == 1:
+        array = array.reshape(1)
+    if array.shape != (observed.size,):
+        raise SampleError(
+            f"z has shape {array.shape}; the observation has {observed.size} sensors, so it "
+            f"needs ({observed.size},), NaN where a sample is missing."
+        )
+    if np.isinf(array).any():
+        where = observed.names[int(np.flatnonzero(np.isinf(array))[0])]
+        raise SampleError(f"channel '{where}' is infinite; send NaN for a missing sample.")
+    return array.copy()

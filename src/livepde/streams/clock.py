@@ -1,0 +1,190 @@
+"""How the times of data are read: numbers, or dates."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, tzinfo
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from livepde.errors import SampleError
+from livepde.linalg import Array
+
+__all__ = [
+    "COMMA",
+    "POINT",
+    "Clock",
+    "guessed_format",
+    "has_decimal_comma",
+    "number_of",
+    "read_times",
+]
+
+Instant: TypeAlias = float | str | date | datetime
+COMMA = "if that is a decimal comma, say decimal = ','."
+POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals is no number
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How the time column is read, and what of it is used.
+
+    Attributes
+    ----------
+    name
+        The time column: numbers, or dates and times.
+    factor
+        Multiplies numbers to give the model's time; dates become seconds divided by `second`.
+    start, stop
+        First and last time used, in the terms of the column: a number (in the model's unit) or
+        a date in ISO format.
+    second
+        One second in the model's unit of time.
+    zone
+        Of dates that name none.
+    format
+        Of dates as text, as "%d.%m.%Y %H:%M"; empty: ISO format.
+    decimal
+        Of numbers as text: "." or ",".
+    """
+
+    name: str
+    factor: float = 1.0
+    start: Instant | None = None
+    stop: Instant | None = None
+    second: float = 1.0
+    zone: tzinfo = UTC
+    format: str = ""
+    decimal: str = "."
+
+    def bounds(self, dates: bool, where: str) -> tuple[float, float]:
+        """Return start and stop in model time (dates: since 1970)."""
+        low, high = -math.inf, math.inf
+        if self.start is not None:
+            low = self._bound(self.start, dates, f"{where}: start")
+        if self.stop is not None:
+            high = self._bound(self.stop, dates, f"{where}: stop")
+            if dates and _whole_day(self.stop):
+                high += 86399.999 * self.second  # a day includes its hours
+        return low, high
+
+    def stamp(self, value: Any, form: str = "") -> float | None:
+        """Return seconds since 1970 of a date or a date as text, None if it is neither."""
+        try:
+            if isinstance(value, str):
+                text = value.strip()
+                value = datetime.strptime(text, form) if form else datetime.fromisoformat(text)
+            if isinstance(value, date) and not isinstance(value, datetime):
+                value = datetime(value.year, value.month, value.day)
+            if not isinstance(value, datetime):
+                return None
+            return (value if value.tzinfo else value.replace(tzinfo=self.zone)).timestamp()
+        except (ValueError, OverflowError):
+            return None
+
+    def _bound(self, value: Instant, dates: bool, what: str) -> float:
+        if dates:
+            stamp = self.stamp(value)
+            if stamp is None:
+                raise SampleError(f"{what}: got {value!r}; the times are dates, as 2025-04-01.")
+            return stamp * self.second
+        if isinstance(value, str | date):
+            raise SampleError(f"{what}: got {str(value)!r}; the times are numbers, not dates.")
+        return float(value)
+
+
+def read_times(
+    cells: list[Any], clock: Clock, where: Callable[[int], str], before: bool | None = None
+) -> tuple[Array, bool]:
+    """Return times in the model's unit, and whether they are dates.
+
+    Parameters
+    ----------
+    where
+        Names a cell.
+    before
+        Whether earlier ones were dates, if there were any.
+
+    Raises
+    ------
+    SampleError
+        A time that cannot be read, with the likely remedy.
+    """
+    dates = _are_dates(cells, clock, before)
+    times = np.empty(len(cells))
+    for k, cell in enumerate(cells):
+        value = clock.stamp(cell, clock.format) if dates else number_of(cell, clock.decimal)
+        if value is None or not math.isfinite(value):
+            raise SampleError(
+                f"{where(k)} '{clock.name}': got {cell!r}; {_remedy(cell, clock, dates)}"
+            )
+        times[k] = value
+    return times * (clock.second if dates else clock.factor), dates
+
+
+def number_of(cell: Any, decimal: str = ".") -> float | None:
+    """Return a number or a number as text, None if it is neither."""
+    try:
+        if isinstance(cell, str) and decimal != ".":
+            cell = cell.translate(POINT)
+        return None if isinstance(cell, bool) else float(cell)
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def has_decimal_comma(cell: Any) -> bool:
+    """Return whether a cell is a number if its comma is one of decimals."""
+    return isinstance(cell, str) and "," in cell and number_of(cell, ",") is not None
+
+
+def guessed_format(text: str) -> str:
+    """Return in which format a text may be a date; empty if none is known.
+
+    >>> guessed_format("01.04.2025 12:00"), guessed_format("noon")
+    ('%d.%m.%Y %H:%M', '')
+    """
+    from pandas.tseries.api import guess_datetime_format
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it says which comes first, day or month: so do we
+        return guess_datetime_format(text.strip(), dayfirst="." in text[:5]) or ""
+
+
+def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
+    """Return whether times are dates: the first tells; if it is neither, those before, or most."""
+
+    def number(cell: Any) -> bool:
+        return number_of(cell, clock.decimal) is not None
+
+    first = cells[0]
+    if not isinstance(first, str):
+        return isinstance(first, date)
+    if clock.format:
+        return True
+    if number(first) or clock.stamp(first) is not None:
+        return not number(first)
+    if before is not None:
+        return before
+    return 2 * sum(map(number, cells)) < len(cells)
+
+
+def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
+    if clock.decimal == "." and not clock.format and has_decimal_comma(cell):
+        return COMMA
+    if not dates:
+        return "expected a number, as in the other rows."
+    if clock.format:
+        return f"expected a date as time_format has it, {clock.format!r}."
+    expected = "expected a date and time as 2025-04-01 12:00"
+    format = guessed_format(cell) if isinstance(cell, str) else ""
+    return expected + (f"; say time_format, perhaps {format!r}." if format else ".")
+
+
+def _whole_day(value: Any) -> bool:
+    if isinstance(value, str):
+        return len(value.strip()) == len("2025-04-01")
+    return isinstance(value, date) and not isinstance(value, datetime)

@@ -1,0 +1,181 @@
+"""Samples from CSV files."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import DataError, SampleError
+from livepde.linalg import Array
+from livepde.streams.clock import (
+    POINT,
+    Clock,
+    guessed_format,
+    has_decimal_comma,
+    number_of,
+    read_times,
+)
+from livepde.streams.names import check_columns, no_file
+from livepde.streams.table import Column, Table, cell_number, to_table
+
+__all__ = ["UTF_8", "read_csv"]
+
+UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
+SEPARATORS = (",", ";", "\t")
+LOOK = 100_000  # characters that are looked at to say how a file is written
+
+
+def read_csv(
+    path: str | Path,
+    columns: Mapping[str, Column],
+    clock: Clock,
+    *,
+    every: int = 1,
+    missing: Iterable[float] = (),
+    separator: str = ",",
+    encoding: str = UTF_8,
+) -> Table:
+    """Read channels from a CSV file with one header line.
+
+    Parameters
+    ----------
+    columns
+        Channel -> where it comes from.
+    every
+        Keep every so many rows.
+    missing
+        Numbers that mean a missing sample (-9999). Empty cells and NaN always do.
+    separator
+        What stands between two fields, as "," or ";".
+    encoding
+        How the text is written, as "cp1252" or "utf-16".
+
+    Raises
+    ------
+    DataError
+        No such file or column; text or infinity in a channel; times that do not increase. The
+        message names file, row (the header is row 1) and column.
+    """
+    import pandas as pd
+
+    path = Path(path)
+    needed = [clock.name, *(name for column in columns.values() for name in column.names)]
+    how: dict[str, Any] = {"skipinitialspace": True, "sep": separator, "encoding": encoding}
+    try:
+        header = list(pd.read_csv(path, nrows=0, **how).columns)
+        _check_separator(path, header, separator, encoding, clock)
+        check_columns(str(path), needed, header)
+        _check_widths(path, len(header), separator, encoding)
+        frame = pd.read_csv(
+            path,
+            usecols=sorted(set(needed)),
+            dtype=str,
+            keep_default_na=False,
+            skip_blank_lines=False,
+            **how,
+        )
+    except FileNotFoundError:
+        raise no_file(path) from None
+    except UnicodeError as error:
+        raise _not_text(path, separator, encoding, clock) from error
+    except (OSError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+        raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
+    blank = (frame == "").all(axis=1)
+    rows = np.flatnonzero(~blank.to_numpy()) + 2
+    frame = frame.loc[~blank]
+    if not len(frame):
+        raise DataError(f"{path}: holds no rows beside its header.")
+    times, dates = read_times(
+        frame[clock.name].tolist(), clock, lambda k: f"{path}, row {rows[k]}, column"
+    )
+    decimals = {name: column.decimal for column in columns.values() for name in column.names}
+
+    def numbers(name: str, use: Any) -> Array:
+        cells = frame[name].to_numpy()[use]
+        return _numbers(cells, rows[use], f"{path}", name, decimals[name])
+
+    def where(k: int) -> str:
+        return f"{path}, row {rows[k]}, column '{clock.name}'"
+
+    return to_table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
+
+
+def _check_separator(
+    path: Path, header: list[str], separator: str, encoding: str, clock: Clock
+) -> None:
+    """Refuse a header that another separator would divide."""
+    others = [other for other in SEPARATORS if other != separator and other in header[0]]
+    if len(header) == 1 and others:
+        raise SampleError(
+            f"{path}: the header is one field with {separator!r} between fields, and "
+            f"{header[0].count(others[0]) + 1} with {others[0]!r}: "
+            f"say {_as_written(path, others[0], encoding, clock, f'separator = {others[0]!r}')}."
+        )
+
+
+def _as_written(path: Path, separator: str, encoding: str, clock: Clock, known: str) -> str:
+    """Return what to say of how a file is written: what is known, and how two lines of it look."""
+    with path.open(encoding=encoding, errors="replace") as file:
+        header, row, *_ = [*file.read(LOOK).splitlines(), "", ""]
+    said = [known]
+    other = max(SEPARATORS, key=header.count)
+    if separator not in header and other in header:
+        separator = other
+        said.append(f"separator = {separator!r}")
+    cells = row.split(separator)
+    if clock.decimal == "." and any(map(has_decimal_comma, cells)):
+        said.append("decimal = ','")
+    texts = (c for c in cells if number_of(c, ",") is None and clock.stamp(c) is None)
+    formats = list(filter(None, map(guessed_format, texts)))
+    if formats and not clock.format:
+        said.append(f"time_format = {formats[0]!r}")
+    return " and ".join(filter(None, (", ".join(said[:-1]), said[-1])))
+
+
+def _check_widths(path: Path, width: int, separator: str, encoding: str) -> None:
+    """Refuse a row with more fields than the header: pandas would cut it without a word."""
+    with path.open(newline="", encoding=encoding) as file:
+        for number, row in enumerate(csv.reader(file, delimiter=separator), start=1):
+            if any(field.strip() for field in row[width:]):
+                raise SampleError(
+                    f"{path}, row {number}: {len(row)} fields, but the header has {width}; "
+                    "decimals need a point, and fields with a comma in them quotes."
+                )
+
+
+def _not_text(path: Path, separator: str, encoding: str, clock: Clock) -> DataError:
+    """Return an error about a file that is no text in this encoding."""
+    content, row, byte = path.read_bytes(), 1, ""
+    try:
+        content.decode(encoding)
+    except UnicodeDecodeError as error:
+        row, byte = content.count(b"\n", 0, error.start) + 1, f"byte 0x{content[error.start]:02x} "
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    likely = "utf-16" if wide else "cp1252" if encoding == UTF_8 else "utf-8"
+    said = _as_written(path, separator, likely, clock, f"encoding = {likely!r}")
+    return DataError(
+        f"{path} is not text in {encoding.removesuffix('-sig').upper()} ({byte}in row {row}): say "
+        f"{said}; or save it as 'CSV UTF-8'."
+    )
+
+
+def _numbers(cells: Any, rows: Any, where: str, name: str, decimal: str) -> Array:
+    """Return a column of text as numbers; its row is looked for only if one is wrong."""
+    try:
+        plain = cells if decimal == "." else [cell.translate(POINT) for cell in cells]
+        found: Array = np.array([c if c else "nan" for c in plain], dtype=float)
+    except ValueError:
+        found = np.full(len(cells), np.inf)
+    if np.isinf(found).any():
+        found = np.array(
+            [
+                cell_number(cell, f"{where}, row {row}, column '{name}'", decimal)
+                for cell, row in zip(cells, rows, strict=True)
+            ]
+        )
+    return found

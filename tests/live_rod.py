@@ -1,0 +1,75 @@
+"""A rod whose rows come from a file that grows, and its run."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+import livepde as lp
+from livepde.result import layout_of
+from livepde.runs.feeds import Gathered
+from livepde.runs.journal import Journal
+from livepde.runs.live import Live
+from livepde.streams.clock import Clock
+from livepde.streams.intake import Intake
+from livepde.streams.sources import Follow
+from livepde.streams.table import Column
+
+COLUMNS = {name: Column((name,)) for name in ("a", "b", "left")}
+CLOCK = Clock("t")
+OPENED: list = []  # sources, closed after each test of the module that opened them
+
+
+def identifier() -> lp.Identifier:
+    mesh = lp.interval(0.0, 1.0, 10)
+    model = lp.Model(
+        state=lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("left"), "right": 0.0}),
+        parameter={"k": lp.Scalar(0.05, std=0.03)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
+    return lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=8)))
+
+
+def rows(count: int):
+    rng = np.random.default_rng(0)
+    for k in range(count):
+        t = 0.1 * k
+        left = 1.0 + math.sin(t)
+        a, b = (left * f + 0.01 * rng.standard_normal() for f in (0.7, 0.4))
+        yield {"t": t, "a": a, "b": b, "left": left}
+
+
+def journal(path: Path) -> Journal:
+    who = identifier()
+    layout = layout_of(who.model, who.observed, who.withheld)
+    return Journal.create(path, ("a", "b", "left"), layout)
+
+
+def live(folder: Path, source=None, **options) -> Live:
+    path = folder / "journal.sqlite"
+    kept = Journal.open(path, write=True) if path.exists() else journal(path)
+    if source is None:
+        source = Follow(folder / "data.csv", position=kept.position)
+    OPENED.append(source)
+    intake = Intake(COLUMNS, CLOCK, origin=0.0, last=kept.last)
+    return Live(identifier(), Gathered(source, intake), kept, fields_every=10, **options)
+
+
+def write(folder: Path, count: int) -> None:
+    lines = ["t,a,b,left", *(",".join(map(repr, row.values())) for row in rows(count))]
+    (folder / "data.csv").write_text("\n".join(lines) + "\n")
+
+
+def same(one: Journal, other: Journal) -> None:
+    mine, yours = list(one), list(other)
+    assert len(mine) == len(yours) > 0
+    for a, b in zip(mine, yours, strict=True):
+        for name in ("t", "numbers", "innovation", "status", "steps"):
+            assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+        assert (a.snapshot is None) == (b.snapshot is None)
+        if a.snapshot is not None:
+            for name, values in a.snapshot.profiles.items():
+                assert np.array_equal(values, b.snapshot.profiles[name])

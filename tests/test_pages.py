@@ -1,0 +1,337 @@
+"""Every block of code of README and docs runs, or is named here with the test that stands for it.
+
+The blocks of a page are run one after the other, as a reader types them, in a folder of their own
+that holds links to `cases` and `examples`. What a block is says the word behind its fence:
+
+    python    is run; all blocks of a page share their names
+    sh        a command a line: livepde, a Python file, or what ELSEWHERE names
+    toml      is a case file, or a part of one
+    csv, json are read
+    text      is what the block before it printed
+
+A block with title="FILE" is a file of that name for the blocks after it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import doctest
+import importlib
+import io
+import json
+import os
+import re
+import runpy
+import shlex
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from livepde.cases.read import read_spec
+from livepde.cases.schema import CaseSpec
+from livepde.cli import app
+from livepde.errors import LivepdeError
+from livepde.reproduce import EXPERIMENTS
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FENCE = re.compile(
+    r'^```(?P<kind>\w*)(?: title="(?P<title>[^"]+)")?\n(?P<text>.*?)^```$',
+    re.MULTILINE | re.DOTALL,
+)
+ALIKE = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+ROUNDED = ("conditions.md",)  # prints numbers of the size of rounding: only words are compared
+COMPLETES = ROOT / "cases" / "soil_layers.toml"  # gives what a part of a case leaves out
+
+# Commands that need minutes, a broker, several ranks, or that go on for ever: the beginnings of
+# those for which a test stands. `.ci/run` calls make; what installs is tried with the packages.
+ELSEWHERE = {
+    "test_pages.py": ["make", "python3 -m venv .venv", ". .venv/bin/activate", "pip install"],
+    "test_cli.py": ["livepde bench step"],
+    "test_schur.py": ["livepde bench scale"],
+    "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["livepde bench fleet"],
+    "test_benchmarks.py::test_steps_are_ratios": ["python benchmarks/suite/costs.py"],
+    "test_cli_fleet.py::test_each_row_is_a_run_of_its_own": ["livepde fleet mycase"],
+    "test_dashboard.py::test_watch_says_where_and_ends_with_ctrl_c": ["livepde watch"],
+    "test_dashboard.py::test_the_page_follows_a_run_and_looks_back": [
+        "livepde run mycase/case.toml --watch",
+    ],
+    "test_dashboard.py::test_a_solid_is_drawn_and_a_token_is_asked_for": [
+        "LIVEPDE_TOKEN=... livepde watch",
+    ],
+    "test_service.py::test_it_follows_a_file_stops_gracefully_and_goes_on": [
+        "livepde run case.toml",
+    ],
+    "test_end_to_end.py::test_soil_from_a_broker_to_a_browser": [
+        "livepde run cases/soil_layers.toml --realtime",
+    ],
+    "test_parallel.py::test_a_case_runs_on_two_ranks_and_only_one_of_them_writes": [
+        "mpirun -n 4 livepde",
+        "deploy/petsc.sh",
+    ],
+    "test_deploy.py::test_the_unit_is_one": [
+        "useradd --system",
+        "python3.11 -m venv /opt",
+        "install -",
+        "cp deploy/",
+        "systemctl",
+    ],
+    "test_deploy.py::test_options_exist": ["docker build", "LIVEPDE_TOKEN=$(openssl"],
+}
+BEGINNINGS = [start for several in ELSEWHERE.values() for start in several]
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block of code, with the lines before it, so that errors have the page's line."""
+
+    kind: str
+    title: str | None
+    text: str
+    above: int
+
+    @property
+    def commands(self) -> list[str]:
+        """The lines of a block of commands."""
+        lines = self.text.replace("\\\n", " ").splitlines()
+        return [line for line in lines if shlex.split(line, comments=True)]
+
+
+@dataclass
+class Session:
+    """What a reader has in front of him: names, and what was printed last."""
+
+    page: Path
+    names: dict[str, Any] = field(default_factory=lambda: {"__name__": "__main__"})
+    printed: str | None = None
+    refused: str = ""
+
+    def run(self, block: Block) -> None:
+        if block.title is not None:
+            Path(block.title).write_text(block.text, encoding="utf-8")
+        if block.kind != "text":
+            self.end()
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            getattr(self, f"_{block.kind}")(block)
+        self.printed = printed.getvalue() if block.kind in ("python", "sh") else None
+
+    def end(self) -> None:
+        """What was refused has to be shown in the text that follows."""
+        assert not self.refused, self.refused
+
+    def _python(self, block: Block) -> None:
+        exec(compile("\n" * block.above + block.text, str(self.page), "exec"), self.names)
+
+    def _sh(self, block: Block) -> None:
+        for command in block.commands:
+            if _stands_elsewhere(command):
+                continue
+            program, *arguments = shlex.split(command, comments=True)
+            if program == "python":
+                runpy.run_path(arguments[0], run_name="__main__")
+            else:
+                self._livepde(command, arguments)
+
+    def _livepde(self, command: str, arguments: list[str]) -> None:
+        try:
+            done = CliRunner().invoke(app, arguments, catch_exceptions=False)
+        except LivepdeError as error:
+            self.refused = f"{command}: {error}"
+            print(f"Error: {error}")
+        else:
+            assert done.exit_code == 0, f"{command}: {done.output}"
+            print(done.stdout)
+
+    def _toml(self, block: Block) -> None:
+        case = tomllib.loads(block.text)
+        if not {"equation", "data"} <= set(case):
+            case = tomllib.loads(COMPLETES.read_text(encoding="utf-8")) | case
+        read_spec(case, self.page.name)
+
+    def _csv(self, block: Block) -> None:
+        assert len({len(row) for row in csv.reader(io.StringIO(block.text))}) == 1
+
+    def _json(self, block: Block) -> None:
+        json.loads(block.text)
+
+    def _text(self, block: Block) -> None:
+        assert self.printed is not None, "text has to follow what prints it"
+        texts = [block.text, self.printed]
+        if self.page.name in ROUNDED:
+            texts = [re.sub(r"-?\d+(\.\d+)?(e[-+]?\d+)?", "#", text) for text in texts]
+        self.refused = ""
+        if not doctest.OutputChecker().check_output(*texts, ALIKE):
+            pytest.fail(f"{self.page.name}:{block.above}: the program prints\n{self.printed}")
+
+
+def _stands_elsewhere(command: str) -> str | None:
+    """Return the beginning of a command that another test stands for."""
+    return next((start for start in BEGINNINGS if command.startswith(start)), None)
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    text = page.read_text(encoding="utf-8")
+    for found in FENCE.finditer(text):
+        above = text.count("\n", 0, found.start("text"))
+        yield Block(found["kind"], found["title"], found["text"], above)
+
+
+def needs_data(page: Path) -> bool:
+    commands = [one for block in blocks(page) if block.kind == "sh" for one in block.commands]
+    return any("cases/" in one and not _stands_elsewhere(one) for one in commands)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_runs(page, tmp_path, monkeypatch, request):
+    if needs_data(page):
+        monkeypatch.setenv("LIVEPDE_DATA", str(request.getfixturevalue("data_dir")))
+    for folder in ("cases", "examples"):
+        os.symlink(ROOT / folder, tmp_path / folder)
+    monkeypatch.chdir(tmp_path)
+    session = Session(page)
+    for block in blocks(page):
+        session.run(block)
+    session.end()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_block_is_of_a_kind_that_runs(page):
+    text = page.read_text(encoding="utf-8")
+    found = list(blocks(page))
+    assert text.count("```") == 2 * len(found), "a fence that is none: see the top of this file"
+    for block in found:
+        assert hasattr(Session, f"_{block.kind}"), f"line {block.above}: '{block.kind}'"
+        for command in block.commands if block.kind == "sh" else ():
+            known = command.startswith(("livepde ", "python ")) or _stands_elsewhere(command)
+            assert known, f"line {block.above}: what tests '{command}'? Say it in ELSEWHERE."
+
+
+def test_the_list_of_commands_is_right():
+    """Each is on a page, and the test that stands for it exists."""
+    shown = [
+        _stands_elsewhere(command)
+        for page in PAGES
+        for block in blocks(page)
+        if block.kind == "sh"
+        for command in block.commands
+    ]
+    assert set(BEGINNINGS) == set(shown) - {None}
+    assert all(map(is_a_test, ELSEWHERE))
+
+
+def is_a_test(name: str) -> bool:
+    """Return whether there is a test of the name `file::function`, or of the name `file`."""
+    file, _, function = name.partition("::")
+    source = (ROOT / "tests" / file).read_text(encoding="utf-8")
+    return not function or re.search(rf"^def {function}\(", source, re.MULTILINE) is not None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_a_page_names_is_there(page):
+    """Commands, experiments, files and tests of the project, in quotes."""
+    program = get_command(app)
+    for name in set(re.findall(r"`([^`\n]+)`", page.read_text(encoding="utf-8"))):
+        words = name.split()
+        if re.fullmatch(r"test_\w+\.py(::\w+)?", name):
+            assert is_a_test(name), name
+        elif re.fullmatch(r"(python )?(experiments|examples|cases)/[a-z_0-9]+\.(py|toml)", name):
+            assert (ROOT / words[-1]).exists(), name
+        elif words[0] == "livepde" and words[1:] and words[1].islower():
+            assert words[1] in program.commands, name
+            if words[1] == "bench" and words[2:]:
+                assert words[2] in program.commands["bench"].commands, name
+            if words[1] == "reproduce" and words[2:] and words[2].islower():
+                assert words[2] in EXPERIMENTS, name
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", "experiments/README.md"])
+def test_links_of_pages_outside_of_the_site_lead_somewhere(name):
+    """`make docs` follows those of the site."""
+    page = ROOT / name
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if "://" in target:
+            continue
+        file, _, anchor = target.partition("#")
+        assert (page.parent / file).exists(), target
+        if anchor:
+            titles = re.findall(r"^#+ (.+)$", (page.parent / file).read_text(), re.MULTILINE)
+            slugs = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
+            assert anchor in slugs, target
+
+
+def test_warnings_of_the_site_are_errors():
+    """--quiet hides them from --strict, too: then nothing would be one."""
+    (command,) = re.findall(r"mkdocs build.*", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    assert "--strict" in command
+    assert "--quiet" not in command
+
+
+def test_the_house_is_drawn_as_it_is_built():
+    """The rows of the developers' page are the layers that `make check` holds, from the top."""
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    layers = contracts["tool"]["importlinter"]["contracts"][0]["layers"]
+    page = (ROOT / "docs" / "developers.md").read_text(encoding="utf-8")
+    table = page[page.index("| room of") : page.index("What holds the rooms")]
+    drawn = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.splitlines()[2:] if line]
+    assert drawn == [re.findall(r"\w+", layer) for layer in layers]
+
+
+def test_pages_that_the_program_writes(monkeypatch):
+    """Every command with its options, and every key with what it may be."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    hooks = importlib.import_module("hooks")
+    assert hooks.on_page_markdown("as it is") == "as it is"
+    commands = hooks.on_page_markdown("<!-- command line -->")
+    program = get_command(app)
+    for name, command in program.commands.items():
+        section = commands[commands.index(f"## `livepde {name}`\n") :]
+        for inner in getattr(command, "commands", ()):
+            assert f"### `livepde {name} {inner}`\n" in section
+        for option in command.params:
+            name = max(option.opts, key=len)
+            assert name in section or not name.startswith("--") or option.hidden, name
+    assert "Example: `livepde run mycase/case.toml`\n" in commands
+    keys = hooks.on_page_markdown("<!-- keys of a case -->")
+    assert "| `prior` | a quantity | required |" in keys
+    assert '| `spacing` | `"uniform"` or `"geometric"` | `"uniform"` |' in keys
+    assert "| `start` | a date or a time |  |" in keys
+    assert "| `cells` | a whole number or [a whole number, a whole number] |  |" in keys
+    assert "## `[unknowns.NAME.evolution]`" in keys
+    assert '## `[law]`, `kind = "gradient"`' in keys
+    assert "| `replay` | true or false or a table | `false` |" in keys
+    assert "## `[[variants]]`" in keys
+
+
+def test_every_key_of_a_case_has_a_meaning():
+    """The page of case files says what each key is for that the schema knows."""
+    page = (ROOT / "docs" / "cases.md").read_text(encoding="utf-8")
+    known = re.findall(r"[a-z_0-9]+", " ".join(re.findall(r"`([^`\n]+)`", page)))
+    for model in (CaseSpec, *_inside(CaseSpec)):
+        for name, item in model.model_fields.items():
+            assert (item.alias or name) in known, f"{model.__name__}: {item.alias or name}"
+
+
+def _inside(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    """Yield the models of a model's tables."""
+    rest = [item.annotation for item in model.model_fields.values()]
+    while rest:
+        kind = rest.pop()
+        rest += getattr(kind, "__args__", ())
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield kind
+            yield from _inside(kind)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_formulas_are_written_in_unicode(page):
+    """The pages load nothing from elsewhere, so that nothing would draw LaTeX."""
+    assert "$$" not in page.read_text(encoding="utf-8")
