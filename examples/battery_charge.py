@@ -63,7 +63,7 @@ def main(D: float = 3e-15) -> dict[str, float]:
         }
     )
     reduced = ct.reduce(
-        model, seen, ["I"], sensors=sensor, modes=0, rates=[1 / PERIOD], u=0.3 * FULL
+        model, seen, ["I"], sensors=sensor, modes=2, rates=[1 / PERIOD], u=0.3 * FULL
     )
     goal = ct.Goal(
         track={"mean": 1.0},

@@ -117,6 +117,55 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
     assert [one.t for found in outcomes for one in found.ready] == table.t.tolist()
 
 
+@pytest.mark.parametrize("follow", [False, True])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "id,t,a,b\n7,0,1,2,\n7,1,3,4,\n",
+        "id,t,a,b,\n7,0,1,2,\n7,1,3,4,\n",
+        "id,t,a,b,\n7,0,1,2,cold\n7,1,3,4\n",
+        '"id", "t", "a", "b"\n7, 0, "1", 2\n7, 1, 3, 4,,\n',
+        'id,t,a,b\n"7,5",0,1,2\n"7,6", 1,3,4\n',
+        '"id", "t", "a", "b"\n"7,5", 0, 1, 2\n7, "1", 3, 4\n',
+    ],
+)
+def test_a_separator_at_the_end_of_a_row_shifts_no_column(csv, text, follow):
+    path = csv(text)
+    if follow:
+        with closing(Follow(path)) as source:
+            rows = [row.values for row in source.poll(0.0)]
+        found = [[float(row[name]) for name in ("t", "a", "b")] for row in rows]
+    else:
+        table = read_csv(path, {"T": Column(("a",)), "S": Column(("b",))}, Clock("t"))
+        found = np.column_stack([table.t, table.values]).tolist()
+    assert found == [[0.0, 1.0, 2.0], [1.0, 3.0, 4.0]]
+
+
+def test_decimal_commas_are_no_fields_beside_an_empty_last_one(csv):
+    path = csv("t,a,b,\n0,1,5,2,\n1,3,4,4,\n")  # a = 1,5
+    with pytest.raises(DataError, match="row 2: 5 fields, but the header has 4; decimals need"):
+        read_csv(path, COLUMNS, Clock("t"))
+    with closing(Follow(path)) as source:
+        assert [row.broken for row in source.poll(0.0)] == ["5 fields, the header has 4"] * 2
+
+
+def test_json_lines_may_have_decimal_commas_as_text(tmp_path):
+    path = tmp_path / "data.jsonl"
+    path.write_text('{"Zeit": "0,5", "a": "1,5", "b": 2.5}\n')
+    clock = Clock("Zeit", decimal=",")
+    (sample,) = read_json_lines(path, COMMAS, clock)
+    (live,) = JsonLines(path.read_text().splitlines(), COMMAS, clock)
+    assert sample == live
+    assert (sample.t, sample.z) == (0.5, {"T": 1.5, "mean": 5.0})
+
+
+@pytest.mark.parametrize("column", ["t", "a"])
+def test_a_column_that_is_there_twice_is_refused(csv, column):
+    path = csv(f"t,a,b,{column},c,c\n0,1,2,3,4,5\n")
+    with pytest.raises(DataError, match=f"two columns are called '{column}'; rename one"):
+        read_csv(path, COLUMNS, Clock("t"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [

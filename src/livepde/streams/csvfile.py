@@ -23,7 +23,7 @@ from livepde.streams.clock import (
 from livepde.streams.names import check_columns, no_file
 from livepde.streams.table import Column, Table, cell_number, to_table
 
-__all__ = ["UTF_8", "read_csv"]
+__all__ = ["UTF_8", "read_csv", "too_wide"]
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
 SEPARATORS = (",", ";", "\t")
@@ -70,13 +70,14 @@ def read_csv(
         header = list(pd.read_csv(path, nrows=0, **how).columns)
         _check_separator(path, header, separator, encoding, clock)
         check_columns(str(path), needed, header)
-        _check_widths(path, len(header), separator, encoding)
+        _check_rows(path, needed, separator, encoding)
         frame = pd.read_csv(
             path,
             usecols=sorted(set(needed)),
             dtype=str,
             keep_default_na=False,
             skip_blank_lines=False,
+            index_col=False,  # else a separator at the end of each row would shift all columns
             **how,
         )
     except FileNotFoundError:
@@ -137,14 +138,28 @@ def _as_written(path: Path, separator: str, encoding: str, clock: Clock, known: 
     return " and ".join(filter(None, (", ".join(said[:-1]), said[-1])))
 
 
-def _check_widths(path: Path, width: int, separator: str, encoding: str) -> None:
-    """Refuse a row with more fields than the header: pandas would cut it without a word."""
+def too_wide(cells: list[str], header: list[str]) -> bool:
+    """Return whether a row is longer than the header, and not only by empty fields.
+
+    A separator at the end of each row, or of the header, is no field.
+    """
+    named = max((k for k, name in enumerate(header, start=1) if name), default=0)
+    return len(cells) > len(header) and any(cell.strip() for cell in cells[named:])
+
+
+def _check_rows(path: Path, needed: list[str], separator: str, encoding: str) -> None:
+    """Refuse what pandas would read without a word: a name twice, more fields than names."""
     with path.open(newline="", encoding=encoding) as file:
-        for number, row in enumerate(csv.reader(file, delimiter=separator), start=1):
-            if any(field.strip() for field in row[width:]):
+        rows = csv.reader(file, delimiter=separator, skipinitialspace=True)
+        header = next((row for row in rows if row), [])
+        for name in needed:
+            if header.count(name) > 1:
+                raise SampleError(f"{path}: two columns are called '{name}'; rename one.")
+        for row in rows:
+            if too_wide(row, header):
                 raise SampleError(
-                    f"{path}, row {number}: {len(row)} fields, but the header has {width}; "
-                    "decimals need a point, and fields with a comma in them quotes."
+                    f"{path}, row {rows.line_num}: {len(row)} fields, but the header has "
+                    f"{len(header)}; decimals need a point, and fields with a comma in them quotes."
                 )
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
-from livepde.streams.csvfile import UTF_8
+from livepde.streams.csvfile import UTF_8, too_wide
 from livepde.streams.names import no_file
 from livepde.streams.table import JSON_LINES
 
@@ -263,7 +263,7 @@ class Follow:
         if self._header is None:
             self._header = cells
             return None
-        if len(cells) > len(self._header):
+        if too_wide(cells, self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
             return Row({}, token, text)
         return Row(dict(zip(self._header, cells, strict=False)), token)

@@ -130,8 +130,11 @@ def read_json_lines(
     check_columns(str(path), needed, [*dict.fromkeys(name for row in rows for name in row)])
     times, dates = read_times([row[clock.name] for row in rows], clock, lambda k: f"{places[k]},")
 
+    decimals = {name: column.decimal for column in columns.values() for name in column.names}
+
     def numbers(name: str, use: Any) -> Array:
-        return np.array([cell_number(rows[k].get(name), f"{places[k]}, '{name}'") for k in use])
+        cells = [(rows[k].get(name), f"{places[k]}, '{name}'") for k in use]
+        return np.array([cell_number(cell, place, decimals[name]) for cell, place in cells])
 
     where = (str(path), places.__getitem__)
     return to_table(times, dates, numbers, columns, clock, every, missing, where)

@@ -108,7 +108,7 @@ def battery(seed: int = 0) -> Problem:
         name="battery",
         title="A battery particle whose diffusivity drifts",
         reduced=reduce(
-            model, fillings(), ["I"], sensors=voltage, modes=0, rates=(1.0 / PERIOD,), u=start
+            model, fillings(), ["I"], sensors=voltage, modes=2, rates=(1.0 / PERIOD,), u=start
         ),
         identifier=lambda: Identifier(
             model, voltage, SensitivityLaw(), u0=start, scheme=Alexander2(), hold=True
@@ -124,7 +124,7 @@ def battery(seed: int = 0) -> Problem:
         samples=round(CYCLES * CYCLE / PERIOD),
         plant=plant,
         truth=truth,
-        drive={"I": 0.1 * ONE},
+        drive={"I": 0.02 * ONE},
         reference=lambda t: {"mean": HIGH if t % CYCLE < CHARGING else LOW},
         disturbances=lambda t: {},
         before={"I": 0.0},

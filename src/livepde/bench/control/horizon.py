@@ -22,7 +22,13 @@ from livepde.result import unknown_of
 __all__ = ["MovingHorizon", "Setting"]
 
 RADAU = ((5 / 12, -1 / 12), (3 / 4, 1 / 4))  # of two stages, the second at the end
-QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 100}
+QUIET = {
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "print_time": 0,
+    "ipopt.max_iter": 100,
+    "show_eval_warnings": False,
+}
 FLOOR = 1e-3  # process noise of each coordinate, relative to the largest
 FARTHEST = 6.0  # prior deviations that an unknown number moves at most: exp must not overflow
 
@@ -125,7 +131,7 @@ class MovingHorizon:
         self.nominal.restore(leaves["nominal"].tobytes(), where)
         self._z, self._c, self._x = leaves["z"], leaves["c"], leaves["x"]
         self._taken = int(leaves["taken"])
-        self.mhe.opt_x_num.master = leaves["solution"]
+        self.mhe.opt_x_num.master = packages()[1].DM(leaves["solution"])
 
     def _begin(self) -> None:
         """Start from the nominal model's states."""
@@ -160,7 +166,8 @@ class MovingHorizon:
         inner = process.set_variable("_z", "inner", (r, len(RADAU)))
         c = process.set_variable("_tvp", "c", (len(model.channels), 1))
         p = process.set_variable("_p", "p", (m, 1))
-        seen = _reading(model, self.scale[:, None] * inner[:, -1], c)
+        with quiet():
+            seen = _reading(model, self.scale[:, None] * inner[:, -1], c)
         process.set_meas("z", seen / casadi.DM(model.sensors.noise), meas_noise=True)
         process.set_rhs("x", inner[:, -1])
         q = [1.0, *self._numbers(p, casadi.exp)]

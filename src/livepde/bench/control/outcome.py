@@ -144,13 +144,13 @@ PROBLEMS: Mapping[str, Contest] = {
     ),
     "wall": Contest(
         wall,
-        [Setting(24, 1.0, 1.0), Setting(48, 1.0, 10.0), Setting(24, 1.0, 0.1)],
+        [Setting(24, 1.0, 1.0), Setting(48, 1.0, 10.0)],
         ["air", "heater", "k[masonry]", "k[insulation]"],
         linear=False,
     ),
     "battery": Contest(
         battery,
-        [Setting(16, 1.0, 1.0), Setting(30, 1.0, 0.1), Setting(30, 0.1, 1.0)],
+        [Setting(16, 1.0, 1.0), Setting(30, 1.0, 1.0)],
         ["mean", "surface", "I", "D"],
         linear=False,
     ),

@@ -1,0 +1,256 @@
+"""The room behind the wall, the battery particle, and do-mpc's moving horizon in the loop."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import livepde.control as ct
+from livepde.bench.control import PROBLEMS, control
+from livepde.bench.control import battery as cell
+from livepde.bench.control import wall as house
+from livepde.bench.control.battery import battery
+from livepde.bench.control.compare import FIXED, HORIZON, LEARNED, TRUE, compare
+from livepde.bench.control.horizon import QUIET, MovingHorizon, Setting
+from livepde.bench.control.problem import Problem, Simulated
+from livepde.bench.control.runs import Run, closed_loop, learned, nominal, told
+from livepde.bench.control.wall import wall
+from livepde.cli import app
+from livepde.errors import ConfigurationError
+
+needs_mpc = pytest.mark.skipif(find_spec("do_mpc") is None, reason="do-mpc is not installed")
+
+
+@pytest.fixture
+def mild(monkeypatch):
+    """Weather without a record: a winter day, again and again."""
+    day = 2.0 + 5.0 * np.sin(2 * np.pi * (np.arange(24 * 7 * 20) - 9.0) / 24.0)
+    monkeypatch.setattr(house, "weather", lambda: day)
+
+
+# --- the room --------------------------------------------------------------------------------
+
+
+def test_the_room_ends_where_its_heat_balance_says(mild):
+    """With a constant heater the air is warmer than outside by v/(airing + 1/resistance)."""
+    problem, factors = wall(), {"masonry": 1.7, "insulation": 0.6, "render": 1.2}
+    true = {f"k[{name}]": value for name, value in factors.items()}
+    starts = {"masonry": 0.03, "insulation": 0.23, "render": 0.28}
+    resistance = 0.01 / 0.08 + 1.0 / house.OUTSIDE
+    for name, factor in factors.items():
+        end, conductivity, *_ = house.WALL[name]
+        resistance += (end - starts[name]) / (conductivity * factor)
+    plant = plant_of(problem, true, start=8.0)
+    for k in range(1, 60):
+        plant.advance(k * house.DAY, {"heater": 20.0, "outside": 5.0})
+    air = plant.outputs()[0]
+    assert air == pytest.approx(5.0 + 20.0 / (house.AIRING + 1.0 / resistance), abs=0.02)
+    # The reduced model ends there, too: its static responses are exact at the prior.
+    c = problem.reduced.values({"heater": 20.0, "outside": 5.0})
+    step = problem.reduced.matrices(np.ones(3), 60 * house.DAY)
+    at_prior = step(problem.reduced.project(np.full(problem.reduced.frame.V.shape[0], 8.0)), c)
+    assert problem.reduced.outputs(at_prior, c)[0] == pytest.approx(
+        5.0 + 20.0 / (house.AIRING + 1.0 / (0.175 + 0.25 + 0.05 / 0.06 + 0.08 / 0.9)), abs=0.01
+    )
+
+
+def plant_of(problem: Problem, truth: Any, start: float, seed: int = 0) -> Simulated:
+    """Return the plant of a problem with another truth."""
+    plant = problem.plant(seed)
+    plant.truth = lambda t: truth
+    assert plant.outputs()[0] == pytest.approx(start)
+    return plant
+
+
+def test_people_are_there_by_day():
+    hours = [5.5, 6.0, 17.5, 18.0, 24.0 + 6.0]
+    assert [house.comfort(3600.0 * h)["air"][0] for h in hours] == [15.0, 20.0, 20.0, 15.0, 20.0]
+
+
+def test_each_seed_has_its_weather_and_its_wall(data_dir, monkeypatch):
+    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+    house.weather.cache_clear()
+    one, other = wall(0), wall(1)
+    assert one.disturbances(0.0) == {"outside": 0.8}  # the first value of the record
+    assert one.disturbances(0.0) != other.disturbances(0.0)
+    assert one.truth(0.0) != other.truth(0.0)
+    # What is foreseen is what comes.
+    told_of = one.ahead(7200.0)["forecast"]["outside"]
+    coming = [7200.0 + one.period * (k + 1) for k in range(one.horizon)]
+    assert told_of == [one.disturbances(t)["outside"] for t in coming]
+
+
+def test_without_its_record_the_wall_says_what_to_set(monkeypatch):
+    monkeypatch.delenv("LIVEPDE_DATA", raising=False)
+    house.weather.cache_clear()
+    with pytest.raises(ConfigurationError, match="LIVEPDE_DATA is not set; set it to the folder"):
+        wall()
+
+
+@needs_mpc
+def test_who_believes_in_a_better_wall_is_late(mild):
+    """Three days behind a wall that loses half as much again: livepde learns to begin in time."""
+    problem = replace(wall(), samples=144)
+    worse = {"k[masonry]": 1.6, "k[insulation]": 1.7, "k[render]": 1.0}
+    runs = held_against(problem, worse, {"wrong": nominal, "livepde": learned})
+    cold = {
+        name: float(run.beyond(problem)[run.t > house.LEARNT].sum()) for name, run in runs.items()
+    }
+    assert cold["wrong"] > 4.0  # kelvins, summed over half hours
+    assert cold["livepde"] < 0.25 * cold["wrong"]
+    estimate = dict(zip(problem.reduced.unknowns, runs["livepde"].q[-1], strict=True))
+    assert estimate["k[masonry]"] == pytest.approx(1.6, rel=0.1)
+    assert estimate["k[insulation]"] == pytest.approx(1.7, rel=0.15)
+
+
+def held_against(problem: Problem, truth: Any, estimators: Any) -> dict[str, Run]:
+    """Return a run of each estimator on a plant with another truth."""
+    start = float(problem.plant(0).outputs()[0])
+    other = replace(
+        problem,
+        truth=lambda t: truth,
+        plant=lambda seed: plant_of(problem, truth, start, seed),
+    )
+    controller = ct.MPC(other.reduced, other.goal, other.period, other.horizon)
+    return {name: closed_loop(other, of(other), controller, 0) for name, of in estimators.items()}
+
+
+# --- the battery -----------------------------------------------------------------------------
+
+
+def test_the_charge_that_flows_is_the_mean_filling():
+    problem = battery()
+    plant = problem.plant(0)
+    for k in range(1, 21):
+        plant.advance(30.0 * k, {"I": -2.0 * cell.ONE})
+    mean, surface = plant.outputs()
+    assert mean == pytest.approx(cell.LOW + 2.0 * 600.0 / 3600.0, abs=1e-4)
+    assert surface > mean + 0.05
+
+
+def test_diffusivities_walk_as_the_model_says():
+    """Over many seeds the logarithm spreads by the prior at the start, and by the walk from it."""
+    paths = np.log([cell.drawn(seed)[1] for seed in range(300)])
+    assert paths[:, 0].std() == pytest.approx(cell.SPREAD, rel=0.15)
+    hours = cell.CYCLES * cell.CYCLE / 3600.0
+    assert (paths[:, -1] - paths[:, 0]).std() == pytest.approx(0.3 * np.sqrt(hours), rel=0.15)
+
+
+def test_the_reduced_particle_misses_little():
+    problem = battery()
+    for factor in (0.4, 1.0, 2.5):
+        missed = problem.reduced.error({"D": factor * cell.D}, h=problem.period)
+        assert missed["mean"] < 1e-5
+        assert missed["surface"] < 2e-3
+
+
+@needs_mpc
+def test_who_believes_in_a_faster_diffusion_goes_over_the_limit():
+    problem = replace(battery(), samples=50)
+    slow = {"D": 0.35 * cell.D}
+    runs = held_against(problem, slow, {"wrong": nominal, "livepde": learned, "true": told})
+    over = {name: float(run.outputs[:, 1].max()) - 0.85 for name, run in runs.items()}
+    assert over["wrong"] > 0.2
+    assert over["livepde"] < 0.03
+    assert over["true"] < 0.01
+    assert runs["livepde"].q[-1, 0] == pytest.approx(0.35 * cell.D, rel=0.2)
+    assert not runs["livepde"].failed
+
+
+# --- the moving horizon ----------------------------------------------------------------------
+
+
+def driven(problem: Problem, estimator: Any, samples: int, begin: int = 0) -> list[ct.Known]:
+    """Return what an estimator says while a current goes in and out."""
+    plant, found = problem.plant(0), []
+    for k in range(samples):
+        inputs = {"I": (-2.0 if k % 20 <= 10 else 1.0) * cell.ONE}
+        if k:
+            plant.advance(problem.period * k, inputs)
+        z = plant.measure()
+        if k >= begin:
+            found.append(estimator.step(problem.period * k, z, inputs))
+    return found
+
+
+@needs_mpc
+def test_the_moving_horizon_finds_the_diffusivity():
+    problem = battery(1)  # far from the prior
+    known = driven(problem, MovingHorizon(problem, Setting(12, 1.0, 0.1)), 40)
+    assert [one.source for one in known[:13]] == 12 * ["fallback"] + ["estimate"]
+    assert "window of 12 samples is not full" in known[0].why
+    truth = problem.truth(39 * problem.period)["D"]
+    assert abs(truth / cell.D - 1.0) > 0.5
+    assert known[-1].q[0] == pytest.approx(truth, rel=0.15)
+    assert known[-1].factor.shape == (1, 0)
+    fillings = problem.reduced.outputs(known[-1].x, np.zeros(1))
+    plant = problem.plant(0)
+    for k in range(1, 40):
+        plant.advance(problem.period * k, {"I": (-2.0 if k % 20 <= 10 else 1.0) * cell.ONE})
+    assert fillings == pytest.approx(plant.outputs(), abs=0.02)
+
+
+@needs_mpc
+def test_the_moving_horizon_goes_on_from_what_it_dumped():
+    problem, setting = battery(1), Setting(8, 1.0, 1.0)
+    whole = driven(problem, MovingHorizon(problem, setting), 24)
+    first = MovingHorizon(problem, setting)
+    driven(problem, first, 16)
+    second = MovingHorizon(problem, setting)
+    second.restore(first.dump())
+    rest = driven(problem, second, 24, begin=16)
+    for one, other in zip(whole[16:], rest, strict=True):
+        assert np.array_equal(one.q, other.q)
+        assert np.array_equal(one.x, other.x)
+
+
+@needs_mpc
+def test_a_failure_of_the_moving_horizon_is_said(monkeypatch):
+    monkeypatch.setitem(QUIET, "ipopt.max_iter", 1)
+    problem = battery(1)
+    estimator = MovingHorizon(problem, Setting(6, 1.0, 1.0))
+    known = driven(problem, estimator, 10)
+    assert estimator.failed > 0
+    assert known[6].source == "fallback"
+    assert known[6].why == "Ipopt: Maximum_Iterations_Exceeded"
+    assert known[6].q.tolist() == [cell.D]
+
+
+@needs_mpc
+def test_a_comparison_has_four_runs_and_their_checks(monkeypatch):
+    """Half an hour of charging: the table, the checks and the figure of the command."""
+    short = replace(PROBLEMS["battery"], settings=[Setting(6, 1.0, 1.0), Setting(8, 1.0, 1.0)])
+    short = replace(short, make=lambda seed: replace(battery(seed), samples=30))
+    found = compare(short.make, 2, short.settings, linear=False)
+    assert {TRUE, FIXED, LEARNED, HORIZON} <= {row for _, row in found.rows}
+    assert found.setting in short.settings
+    costs = [run.cost(found.problems[0]) for run in found.runs["MPC", HORIZON][:1]]
+    tried = [
+        closed_loop(
+            found.problems[0],
+            MovingHorizon(found.problems[0], setting),
+            ct.MPC(
+                found.problems[0].reduced,
+                found.problems[0].goal,
+                found.problems[0].period,
+                found.problems[0].horizon,
+            ),
+            0,
+        ).cost(found.problems[0])
+        for setting in short.settings
+    ]
+    assert costs == [min(tried)]
+    assert all(controller == "MPC" for controller, _ in found.rows)  # LQ knows no limits
+    monkeypatch.setitem(PROBLEMS, "battery", short)
+    result = CliRunner().invoke(
+        app, ["bench", "control", "--only", "battery", "--seeds", "1", "--json"]
+    )
+    printed = json.loads(result.stdout)
+    assert printed["checks"][0]["name"].startswith("battery, MPC")
+    assert "battery" in control(["battery"], 1).figures
