@@ -73,7 +73,7 @@ def test_every_script_has_a_figure_what_it_prints_and_its_command(name, maker):
 def test_every_example_shows_what_it_prints(name):
     text = part("experiments.md", f"### {name}")
     assert f"`python examples/{name}.py`" in text
-    assert re.search(r"^    \S", text, re.MULTILINE)
+    assert re.search(r"^    .*\S", text, re.MULTILINE)
 
 
 def test_a_table_becomes_dots(maker):
