@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 import livepde.control as ct
-from livepde.bench.control import PROBLEMS, control
+from livepde.bench.control import PROBLEMS
 from livepde.bench.control import battery as cell
 from livepde.bench.control import wall as house
 from livepde.bench.control.battery import battery
@@ -223,34 +223,32 @@ def test_a_failure_of_the_moving_horizon_is_said(monkeypatch):
 
 
 @needs_mpc
-def test_a_comparison_has_four_runs_and_their_checks(monkeypatch):
-    """Half an hour of charging: the table, the checks and the figure of the command."""
-    short = replace(PROBLEMS["battery"], settings=[Setting(6, 1.0, 1.0), Setting(8, 1.0, 1.0)])
-    short = replace(short, make=lambda seed: replace(battery(seed), samples=30))
-    found = compare(short.make, 2, short.settings, linear=False)
+def test_a_comparison_has_four_runs_and_the_best_horizon():
+    short = replace(PROBLEMS["battery"], settings=[Setting(4, 1.0, 1.0), Setting(5, 1e6, 1e6)])
+    found = compare(
+        lambda seed: replace(battery(seed), samples=12), 1, short.settings, linear=False
+    )
     assert {TRUE, FIXED, LEARNED, HORIZON} <= {row for _, row in found.rows}
-    assert found.setting in short.settings
-    costs = [run.cost(found.problems[0]) for run in found.runs["MPC", HORIZON][:1]]
+    assert all(controller == "MPC" for controller, _ in found.rows)  # LQ knows no limits
+    problem = found.problems[0]
+    controller = ct.MPC(problem.reduced, problem.goal, problem.period, problem.horizon)
     tried = [
-        closed_loop(
-            found.problems[0],
-            MovingHorizon(found.problems[0], setting),
-            ct.MPC(
-                found.problems[0].reduced,
-                found.problems[0].goal,
-                found.problems[0].period,
-                found.problems[0].horizon,
-            ),
-            0,
-        ).cost(found.problems[0])
+        closed_loop(problem, MovingHorizon(problem, setting), controller, 0).cost(problem)
         for setting in short.settings
     ]
-    assert costs == [min(tried)]
-    assert all(controller == "MPC" for controller, _ in found.rows)  # LQ knows no limits
+    assert found.costs("MPC", HORIZON).tolist() == [min(tried)]
+    assert found.setting == short.settings[int(np.argmin(tried))]
+
+
+@needs_mpc
+def test_the_command_prints_the_checks(monkeypatch):
+    def make(seed: int) -> Problem:
+        return replace(battery(seed), samples=12)
+
+    short = replace(PROBLEMS["battery"], settings=[Setting(4, 1.0, 1.0)], make=make)
     monkeypatch.setitem(PROBLEMS, "battery", short)
-    result = CliRunner().invoke(
-        app, ["bench", "control", "--only", "battery", "--seeds", "1", "--json"]
-    )
-    printed = json.loads(result.stdout)
-    assert printed["checks"][0]["name"].startswith("battery, MPC")
-    assert "battery" in control(["battery"], 1).figures
+    command = ["bench", "control", "--only", "battery", "--seeds", "1", "--json"]
+    printed = json.loads(CliRunner().invoke(app, command).stdout)
+    names = [check["name"] for check in printed["checks"]]
+    assert "battery, MPC: violations" in names
+    assert "battery, moving horizon: its processor time over livepde's" in names
