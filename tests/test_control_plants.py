@@ -16,8 +16,9 @@ from livepde.bench.control import PROBLEMS
 from livepde.bench.control import battery as cell
 from livepde.bench.control import wall as house
 from livepde.bench.control.battery import battery
-from livepde.bench.control.compare import FIXED, HORIZON, LEARNED, TRUE, compare
+from livepde.bench.control.compare import FIXED, HORIZONS, LEARNED, TRUE, compare
 from livepde.bench.control.horizon import QUIET, MovingHorizon, Setting
+from livepde.bench.control.outcome import both
 from livepde.bench.control.problem import Problem, Simulated
 from livepde.bench.control.runs import Run, closed_loop, learned, nominal, told
 from livepde.bench.control.wall import wall
@@ -180,9 +181,13 @@ def driven(problem: Problem, estimator: Any, samples: int, begin: int = 0) -> li
 
 
 @needs_mpc
-def test_the_moving_horizon_finds_the_diffusivity():
+@pytest.mark.parametrize("full", [False, True])
+def test_the_moving_horizon_finds_the_diffusivity(full):
     problem = battery(1)  # far from the prior
-    known = driven(problem, MovingHorizon(problem, Setting(12, 1.0, 0.1)), 40)
+    estimator = MovingHorizon(problem, Setting(12, 1.0, 0.1, full))
+    model = problem.reduced
+    assert estimator.model.size == (len(model.frame.V) if full else model.size)
+    known = driven(problem, estimator, 40)
     assert [one.source for one in known[:13]] == 12 * ["fallback"] + ["estimate"]
     assert "window of 12 samples is not full" in known[0].why
     truth = problem.truth(39 * problem.period)["D"]
@@ -224,20 +229,23 @@ def test_a_failure_of_the_moving_horizon_is_said(monkeypatch):
 
 @needs_mpc
 def test_a_comparison_has_four_runs_and_the_best_horizon():
-    short = replace(PROBLEMS["battery"], settings=[Setting(4, 1.0, 1.0), Setting(5, 1e6, 1e6)])
+    settings = [Setting(4, 1.0, 1.0), Setting(5, 1e6, 1e6), Setting(3, 1.0, 1.0, full=True)]
+    short = replace(PROBLEMS["battery"], settings=settings)
     found = compare(
         lambda seed: replace(battery(seed), samples=12), 1, short.settings, linear=False
     )
-    assert {TRUE, FIXED, LEARNED, HORIZON} <= {row for _, row in found.rows}
+    assert {TRUE, FIXED, LEARNED, *HORIZONS.values()} <= {row for _, row in found.rows}
     assert all(controller == "MPC" for controller, _ in found.rows)  # LQ knows no limits
     problem = found.problems[0]
     controller = ct.MPC(problem.reduced, problem.goal, problem.period, problem.horizon)
     tried = [
         closed_loop(problem, MovingHorizon(problem, setting), controller, 0).cost(problem)
-        for setting in short.settings
+        for setting in settings
     ]
-    assert found.costs("MPC", HORIZON).tolist() == [min(tried)]
-    assert found.setting == short.settings[int(np.argmin(tried))]
+    assert found.costs("MPC", HORIZONS[False]).tolist() == [min(tried[:2])]
+    assert found.costs("MPC", HORIZONS[True]).tolist() == tried[2:]
+    best = {HORIZONS[False]: settings[int(np.argmin(tried[:2]))], HORIZONS[True]: settings[2]}
+    assert found.settings == best
 
 
 @needs_mpc
@@ -245,10 +253,11 @@ def test_the_command_prints_the_checks(monkeypatch):
     def make(seed: int) -> Problem:
         return replace(battery(seed), samples=12)
 
-    short = replace(PROBLEMS["battery"], settings=[Setting(4, 1.0, 1.0)], make=make)
+    short = replace(PROBLEMS["battery"], settings=both(Setting(4, 1.0, 1.0)), make=make)
     monkeypatch.setitem(PROBLEMS, "battery", short)
     command = ["bench", "control", "--only", "battery", "--seeds", "1", "--json"]
     printed = json.loads(CliRunner().invoke(app, command).stdout)
     names = [check["name"] for check in printed["checks"]]
     assert "battery, MPC: violations" in names
-    assert "battery, moving horizon: its processor time over livepde's" in names
+    assert "battery, moving horizon, full model: its processor time over livepde's" in names
+    assert "battery, moving horizon, reduced model: livepde's cost over that with it" in names

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,13 +20,13 @@ from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.runs.outcome import Table
 
-__all__ = ["FIXED", "HORIZON", "LEARNED", "OFFSET", "TRUE", "Comparison", "compare"]
+__all__ = ["FIXED", "HORIZONS", "LEARNED", "OFFSET", "TRUE", "Comparison", "compare"]
 
 TRUE = "true model"
 FIXED = "wrong fixed model"
 OFFSET = "wrong fixed model, offset-free"
 LEARNED = "livepde"
-HORIZON = "do-mpc's moving horizon"
+HORIZONS = {False: "moving horizon, reduced model", True: "moving horizon, full model"}  # do-mpc's
 ROWS: Mapping[str, Callable[[Problem], Estimator]] = {
     TRUE: told,
     FIXED: nominal,
@@ -51,13 +52,13 @@ class Comparison:
         One for each seed.
     runs
         (controller, row) -> a run for each seed.
-    setting
-        Of the moving horizon that did best on the first seed; None if it was not run.
+    settings
+        Row of a moving horizon -> its setting, that which did best on the first seed.
     """
 
     problems: Sequence[Problem]
     runs: Mapping[tuple[str, str], Sequence[Run]]
-    setting: Setting | None
+    settings: Mapping[str, Setting]
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -178,8 +179,7 @@ class Comparison:
                 ]
             )
         title = f"{self.problems[0].title}: {len(self.problems)} seeds"
-        if self.setting is not None:
-            title += f"; moving horizon of {self.setting}"
+        title += "".join(f"; {name}: {setting}" for name, setting in self.settings.items())
         return Table(title, columns, rows)
 
     def figure(self, quantities: Sequence[str], seed: int = 0) -> Any:
@@ -206,8 +206,8 @@ def compare(
     seeds
         How many.
     settings
-        Of the moving horizon; the one with the least cost on the first seed is taken for all, which
-        favours it. Empty: it is not run.
+        Of the moving horizon, on the reduced model and on the full one; of each the one with the
+        least cost on the first seed is taken for all, which favours it. Empty: it is not run.
     linear
         Whether to run `LQ` besides, without the moving horizon.
     progress
@@ -221,15 +221,15 @@ def compare(
     def run(controller: str, seed: int, estimator: Estimator) -> Run:
         return closed_loop(problems[seed], estimator, controllers[controller][seed], seed)
 
-    setting: Setting | None = None
+    best: dict[str, Setting] = {}
     rows: dict[str, Callable[[Problem], Estimator]] = dict(ROWS)
-    if settings:
-        tried = [
-            run("MPC", 0, MovingHorizon(problems[0], each)).cost(problems[0])
-            for each in (watched(settings, len(settings), "settings") if progress else settings)
-        ]
-        setting = best = settings[int(np.argmin(tried))]
-        rows[HORIZON] = lambda problem: MovingHorizon(problem, best)
+    tried: dict[str, list[tuple[float, Setting]]] = {}
+    for setting in watched(settings, len(settings), "settings") if progress else settings:
+        cost = run("MPC", 0, MovingHorizon(problems[0], setting)).cost(problems[0])
+        tried.setdefault(HORIZONS[setting.full], []).append((cost, setting))
+    for name, found in tried.items():
+        best[name] = min(found, key=lambda pair: pair[0])[1]
+        rows[name] = partial(MovingHorizon, setting=best[name])
     # Those of a seed right after each other: their times are compared.
     jobs = [
         (controller, seed, row)
@@ -238,6 +238,6 @@ def compare(
         for row in (rows if controller == "MPC" else ROWS)
     ]
     for controller, seed, row in watched(jobs, len(jobs), "loops") if progress else jobs:
-        found = run(controller, seed, rows[row](problems[seed]))
-        runs.setdefault((controller, row), []).append(found)
-    return Comparison(problems, runs, setting)
+        done = run(controller, seed, rows[row](problems[seed]))
+        runs.setdefault((controller, row), []).append(done)
+    return Comparison(problems, runs, best)

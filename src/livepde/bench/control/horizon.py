@@ -1,14 +1,16 @@
-"""do-mpc's moving-horizon estimator in the loop, on the same reduced model as everybody."""
+"""do-mpc's moving-horizon estimator in the loop: on all coefficients, or on the reduced model."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.linalg import solve_discrete_are
+from scipy.sparse.linalg import splu
 
 from livepde.bench.control.problem import Problem
 from livepde.bench.control.runs import nominal
@@ -29,6 +31,7 @@ QUIET = {
     "ipopt.max_iter": 100,
     "show_eval_warnings": False,
 }
+ROUNDING = 1e-12  # relative size of entries of a matrix that are none
 FLOOR = 1e-3  # process noise of each coordinate, relative to the largest
 FARTHEST = 6.0  # prior deviations that an unknown number moves at most: exp must not overflow
 
@@ -45,11 +48,15 @@ class Setting:
         Weight of the arrival cost: of the state at the start of the window against the last
         solution, in deviations of the steady filter, and of the unknown numbers against their last
         estimate, in prior deviations.
+    full
+        Whether it estimates all coefficients of the finite elements, as whoever writes the equation
+        into do-mpc does; else the few coordinates of our reduced model.
     """
 
     samples: int
     state: float
     unknowns: float
+    full: bool = False
 
     def __str__(self) -> str:
         return f"{self.samples} samples, arrival {self.state:g} and {self.unknowns:g}"
@@ -64,7 +71,7 @@ class MovingHorizon:
     Parameters
     ----------
     problem
-        With the reduced model, whose periods are steps of Radau's method, do-mpc's default.
+        The task; its periods are steps of Radau's method, do-mpc's default.
     setting
         Window and weights.
     """
@@ -74,8 +81,14 @@ class MovingHorizon:
         self.setting = setting
         self.nominal = nominal(problem)
         self.scale = _scale(problem)
+        self.model, self.mass = problem.reduced, sp.csc_array(sp.eye_array(problem.reduced.size))
+        if setting.full:
+            self.model, self.mass = _full(problem.reduced)
+            frame = problem.reduced.frame
+            V = frame.V[np.flatnonzero(frame.model.X.free)]
+            self.scale = np.sqrt((V * self.scale) ** 2 @ np.ones(len(self.scale)))
         self.failed = 0
-        count, model = setting.samples, problem.reduced
+        count, model = setting.samples, self.model
         self._z = np.zeros((count, len(model.sensors.names)))
         self._c = np.zeros((count, len(model.channels)))
         self._x = np.zeros((count + 1, model.size))
@@ -84,10 +97,13 @@ class MovingHorizon:
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         """Take a sample, as an `Estimator` does; the first one describes the start."""
         known = self.nominal.step(t, z, inputs)
-        noise = np.asarray(self.problem.reduced.sensors.noise)
+        noise = np.asarray(self.model.sensors.noise)
+        x = known.x
+        if self.setting.full:
+            x = self.model.project(self.problem.reduced.lift(x, inputs))
         self._z = np.vstack([self._z[1:], np.asarray(z, dtype=float) / noise])
-        self._c = np.vstack([self._c[1:], self.problem.reduced.values(inputs)])
-        self._x = np.vstack([self._x[1:], known.x])
+        self._c = np.vstack([self._c[1:], self.model.values(inputs)])
+        self._x = np.vstack([self._x[1:], x])
         self._taken += 1
         count = self.setting.samples
         if self._taken <= count:  # the first sample describes the start
@@ -110,6 +126,8 @@ class MovingHorizon:
             why = f"Ipopt: {mhe.solver_stats['return_status']}"
             return Known(known.x, known.q, known.factor, "fallback", why)
         x = self.scale * mhe.opt_x_num["_x", -1, -1].full().ravel()
+        if self.setting.full:
+            x = self.problem.reduced.project(self.model.lift(x, inputs))
         q = self._numbers(mhe.opt_x_num["_p_est"].full().ravel(), np.exp)
         return Known(x, np.asarray(q), np.zeros((len(q), 0)))
 
@@ -145,7 +163,7 @@ class MovingHorizon:
 
     def _numbers(self, p: Any, exp: Any) -> list[Any]:
         """Return the unknown numbers for multiples of their prior deviations."""
-        model = self.problem.reduced
+        model = self.model
         space = model.frame.model.parameter_space
         found = []
         for k, (label, prior, std) in enumerate(
@@ -159,7 +177,7 @@ class MovingHorizon:
     def mhe(self) -> Any:
         """do-mpc's object."""
         do_mpc, casadi = packages()
-        problem, model, setting = self.problem, self.problem.reduced, self.setting
+        problem, model, setting = self.problem, self.model, self.setting
         r, m = model.size, len(model.unknowns)
         process = do_mpc.model.Model("discrete")
         x = process.set_variable("_x", "x", (r, 1))
@@ -175,13 +193,15 @@ class MovingHorizon:
         for k in range(len(RADAU)):
             rate = 0.0
             for i, value in enumerate(q):
-                K = model.K[i] * self.scale / self.scale[:, None]
+                K = _sparse(model.K[i] * self.scale / self.scale[:, None])
                 driven = casadi.DM(model.E[i] / self.scale[:, None]) @ c
                 driven += casadi.DM(model.f[i] / self.scale)
-                rate += value * (driven - casadi.DM(K) @ inner[:, k])
+                rate += value * (driven - K @ inner[:, k])
             rates.append(rate)
+        mass = _sparse(self.mass.toarray() * self.scale / self.scale[:, None])
         balance = [
-            inner[:, k] - x - problem.period * sum(a * v for a, v in zip(row, rates, strict=True))
+            mass @ (inner[:, k] - x)
+            - problem.period * sum(a * v for a, v in zip(row, rates, strict=True))
             for k, row in enumerate(RADAU)
         ]
         process.set_alg("balance", casadi.vertcat(*balance))
@@ -206,6 +226,27 @@ class MovingHorizon:
         with quiet():
             mhe.setup()
         return mhe
+
+
+def _full(reduced: ReducedModel) -> tuple[ReducedModel, sp.csc_array]:
+    """Return the model in the free coefficients of its elements, and their mass matrix M_ff.
+
+    K, E and f are those of M_ff x' = -K(q) x + E(q) c + f(q).
+    """
+    frame = reduced.frame
+    free = np.flatnonzero(frame.model.X.free)
+    mass = sp.csr_array(frame.model.mass)
+    inner = sp.csc_array(mass[free][:, free])
+    V = np.zeros((mass.shape[0], len(free)))
+    V[free] = np.eye(len(free))
+    test = splu(inner).solve(mass[free].toarray())
+    return replace(frame, V=V, test=test).build(reduced.controls), inner
+
+
+def _sparse(matrix: Array) -> Any:
+    """Return a matrix without what is rounding, for CasADi."""
+    small = np.abs(matrix) <= ROUNDING * np.abs(matrix).max()
+    return packages()[1].sparsify(packages()[1].DM(np.where(small, 0.0, matrix)))
 
 
 def _scale(problem: Problem) -> Array:
