@@ -124,6 +124,26 @@ def test_a_forecast_begins_where_nothing_was_measured_yet():
     assert np.array_equal(identifier.forecast(0.5).z, found.z)
 
 
+def test_a_sensor_that_moves_is_where_the_last_sample_had_it():
+    fixed = rod(LAWS["sensitivity"])
+    moving = lp.Identifier(
+        fixed.model, SENSORS, fixed.law, withheld=lp.Moving({"c": "x"}, noise=0.1)
+    )
+    for t, z in samples(5):
+        moving.step(t, {**z, "x": 0.8})
+        fixed.step(t, z)
+    times = moving.t + np.array([0.0, 0.1, 0.2])
+    now, planned = moving.forecast(times), moving.forecast(times, {"x": [np.nan, 0.8, np.nan]})
+    expected = fixed.forecast(times)
+    for found, known in ((now, [True, False, False]), (planned, [True, True, False])):
+        for each, fixed_one in ((found.z, expected.z), (found.z_std, expected.z_std)):
+            assert each[:, :2] == pytest.approx(fixed_one[:, :2], rel=1e-12)
+            there = np.where(known, fixed_one[:, 2], np.nan)
+            assert each[:, 2] == pytest.approx(there, rel=1e-12, nan_ok=True)
+    moving.step(float(times[1]), {"T_end": 1.0, "heat": 0.0})
+    assert np.isnan(moving.forecast(times[1])["c"]).all()
+
+
 def test_the_deviation_is_that_of_the_unknown_times_the_derivative():
     """What is known of u0 is exact: all that the sensors may deviate by comes from k."""
     inputs, h = {"T_end": 1.0, "heat": 1.0}, 1e-4

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from contextlib import closing
 from dataclasses import replace
+from datetime import UTC, date, datetime, timedelta
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -183,6 +185,39 @@ def test_time_has_to_increase(csv, times):
     rows = "".join(f"{t},1,1\n" for t in times.split(","))
     with pytest.raises(TimeOrderError, match="row 4, column 't'"):
         read_csv(csv("t,a,b\n" + rows), COLUMNS, Clock("t"))
+
+
+NIGHT = datetime(2025, 10, 25, 22, tzinfo=UTC)  # in Berlin the day begins on which 3:00 is 2:00
+
+
+@pytest.fixture
+def night(csv):
+    def write(minutes, offset):
+        moments = [NIGHT + timedelta(minutes=minutes * k) for k in range(26 * 60 // minutes)]
+        local = [moment.astimezone(GERMAN.zone) for moment in moments]
+        texts = [f"{t if offset else t.replace(tzinfo=None)},1,1\n" for t in local]
+        return csv("t,a,b\n" + "".join(texts))
+
+    return write
+
+
+@pytest.mark.parametrize("stop", ["2025-10-26", date(2025, 10, 26)])
+def test_a_day_includes_its_hours_also_if_it_has_25(night, stop):
+    clock = Clock("t", start="2025-10-26", stop=stop, zone=GERMAN.zone)
+    table = read_csv(night(30, offset=True), COLUMNS, clock)
+    assert table.t.tolist() == [1800.0 * k for k in range(50)]
+
+
+@pytest.mark.parametrize("minutes", [30, 60])
+def test_an_hour_that_comes_twice_is_told(night, minutes):
+    path = night(minutes, offset=False)
+    told = "if clocks were set back, write dates with an offset, as 2025-10-26 02:30"
+    with pytest.raises(TimeOrderError, match=told):
+        read_csv(path, COLUMNS, Clock("t", zone=GERMAN.zone))
+    header, *rows = path.read_text().splitlines()
+    texts = [json.dumps(dict(zip(header.split(","), r.split(","), strict=True))) for r in rows]
+    with pytest.raises(TimeOrderError, match=told):
+        list(JsonLines(texts, COLUMNS, Clock("t", zone=GERMAN.zone)))
 
 
 def test_missing_file(tmp_path):

@@ -28,7 +28,7 @@ class Forecast:
     names
         The assimilated sensors, then the withheld ones.
     z
-        What they will show, shape (times, sensors).
+        What they will show, shape (times, sensors); NaN for a sensor whose position is not known.
     z_std
         Standard deviation of z for what is not known of state and unknowns, without the noise of
         the sensors; NaN for a law without covariance.
@@ -88,4 +88,5 @@ def _seen(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Arr
     factor = H_u @ belief.u_factor
     if H_q is not None:
         factor = factor + H_q @ belief.q_factor
-    return z, belief.inflation * np.linalg.norm(factor, axis=1)
+    std = belief.inflation * np.linalg.norm(factor, axis=1)
+    return z, np.where(np.isnan(z), np.nan, std)

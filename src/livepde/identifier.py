@@ -308,7 +308,7 @@ class Identifier:
             sensors show now.
         inputs
             Channel -> its value, or one for each time. What is missing (left out, NaN) holds its
-            last value.
+            last value; the position of a moving sensor only at the time of the last sample.
 
         Raises
         ------
@@ -337,7 +337,7 @@ class Identifier:
                 f"{t.tolist()}."
             )
         self._reachable(float(t[-1]))
-        planned = self._planned(inputs or {}, len(t))
+        planned = self._planned(inputs or {}, t)
         state, before = self._state, self._inputs
         if state is None:
             state, before = self._start(planned[0]), planned[0]
@@ -426,12 +426,14 @@ class Identifier:
             named[name] = number(value, f"input '{name}'")
         return named
 
-    def _planned(self, inputs: Mapping[str, ArrayLike], count: int) -> list[Inputs]:
+    def _planned(self, inputs: Mapping[str, ArrayLike], times: Array) -> list[Inputs]:
         """Return all inputs at each of some times to come."""
-        plans = {name: plan(name, values, count) for name, values in inputs.items()}
+        plans = {name: plan(name, values, len(times)) for name, values in inputs.items()}
         known, planned = self._inputs, []
-        for k in range(count):
+        for k, t in enumerate(times):
             named = self._named({name: float(values[k]) for name, values in plans.items()})
+            if t == self._t:  # the last sample itself: where sensors are that move is known
+                named = {**known, **{name: v for name, v in named.items() if not np.isnan(v)}}
             known, _ = self._filled(named, known)
             planned.append(known)
         return planned

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, tzinfo
+from datetime import UTC, date, datetime, timedelta, tzinfo
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -68,9 +68,14 @@ class Clock:
             low = self._bound(self.start, dates, f"{where}: start")
         if self.stop is not None:
             high = self._bound(self.stop, dates, f"{where}: stop")
-            if dates and _whole_day(self.stop):
-                high += 86399.999 * self.second  # a day includes its hours
+            if dates and (next_day := _day_after(self.stop)) is not None:
+                high = math.nextafter(self._bound(next_day, dates, f"{where}: stop"), low)
         return low, high
+
+    def set_back(self, t: float) -> bool:
+        """Return whether the clocks of the zone show a time, given since 1970, twice."""
+        here = datetime.fromtimestamp(t / self.second, self.zone)
+        return here.replace(fold=0).utcoffset() != here.replace(fold=1).utcoffset()
 
     def stamp(self, value: Any, form: str = "") -> float | None:
         """Return seconds since 1970 of a date or a date as text, None if it is neither."""
@@ -184,7 +189,10 @@ def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
     return expected + (f"; say time_format, perhaps {format!r}." if format else ".")
 
 
-def _whole_day(value: Any) -> bool:
-    if isinstance(value, str):
-        return len(value.strip()) == len("2025-04-01")
-    return isinstance(value, date) and not isinstance(value, datetime)
+def _day_after(value: Any) -> date | None:
+    """Return the day after one without a time, which includes its hours: 23 to 25; else None."""
+    if isinstance(value, str) and len(value.strip()) == len("2025-04-01"):
+        value = date.fromisoformat(value.strip())
+    if not isinstance(value, date) or isinstance(value, datetime):
+        return None
+    return value + timedelta(days=1)

@@ -218,9 +218,8 @@ def to_table(
     use = use[::every]
     late = np.flatnonzero(np.diff(times[use]) <= 0)
     if len(late):
-        raise _disorder(
-            row(int(use[late[0] + 1])), bool(times[use[late[0]]] == times[use[late[0] + 1]])
-        )
+        last, t = times[use[late[0] : late[0] + 2]]
+        raise _disorder(row(int(use[late[0] + 1])), bool(t == last), dates and clock.set_back(t))
     holes = tuple(float(number) for number in missing)
     names = dict.fromkeys(name for column in columns.values() for name in column.names)
     found = {name: numbers(name, use) for name in names}
@@ -291,7 +290,7 @@ class JsonLines:
             if (kept - 1) % self._every:
                 continue
             if t <= last:
-                raise _disorder(where, t == last)
+                raise _disorder(where, t == last, dates and clock.set_back(t))
             last = t
             if zero is None:
                 zero = t if dates else 0.0
@@ -364,7 +363,10 @@ def cell_number(value: Any, where: str, decimal: str = ".") -> float:
     return number
 
 
-def _disorder(where: str, repeated: bool) -> TimeOrderError:
+def _disorder(where: str, repeated: bool, set_back: bool) -> TimeOrderError:
+    how, remedy = "earlier than the one before", "sort the rows."
     if repeated:
-        return TimeOrderError(f"{where}: the time is that of the one before; drop repeated rows.")
-    return TimeOrderError(f"{where}: the time is earlier than the one before; sort the rows.")
+        how, remedy = "that of the one before", "drop repeated rows."
+    if set_back:
+        remedy = "if clocks were set back, write dates with an offset, as 2025-10-26 02:30+01:00."
+    return TimeOrderError(f"{where}: the time is {how}; {remedy}")
