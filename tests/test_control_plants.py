@@ -249,14 +249,15 @@ def test_a_comparison_has_four_runs_and_the_best_horizon():
 
 
 @needs_mpc
-def test_the_command_prints_the_checks(monkeypatch):
+def test_the_command_prints_the_checks_and_draws(monkeypatch, tmp_path):
     def make(seed: int) -> Problem:
         return replace(battery(seed), samples=12)
 
     short = replace(PROBLEMS["battery"], settings=both(Setting(4, 1.0, 1.0)), make=make)
     monkeypatch.setitem(PROBLEMS, "battery", short)
     command = ["bench", "control", "--only", "battery", "--seeds", "1", "--json"]
-    printed = json.loads(CliRunner().invoke(app, command).stdout)
+    printed = json.loads(CliRunner().invoke(app, [*command, "--draw", str(tmp_path)]).stdout)
+    assert (tmp_path / "battery.png").stat().st_size > 10_000
     names = [check["name"] for check in printed["checks"]]
     assert "battery, MPC: violations" in names
     assert "battery, moving horizon, full model: its processor time over livepde's" in names
