@@ -40,7 +40,7 @@ def data(model, sensors, times):
     return [G @ u for _, u in lp.simulate(model, q, 2.0, times, lp.Advance(lp.ImplicitEuler()))]
 
 
-def run(model, sensors, law, monkeypatch, large, samples=5, **options):
+def run(model, sensors, law, monkeypatch, large, samples=5, missing=None, **options):
     """Return (u, q) of each step, and the iterations of each solve by blocks."""
     monkeypatch.setattr(schur, "LARGE", 1 if large else 10**9)
     monkeypatch.setattr(choice, "WIDEST_BAND", 10)  # as it would be on a finer mesh
@@ -56,8 +56,8 @@ def run(model, sensors, law, monkeypatch, large, samples=5, **options):
 
     monkeypatch.setattr(jacobian.Jacobian, "solve", counted)
     found = []
-    for t, z in zip(times, data(model, sensors, times), strict=True):
-        estimate = ident.step(t, z)
+    for k, (t, z) in enumerate(zip(times, data(model, sensors, times), strict=True)):
+        estimate = ident.step(t, np.full_like(z, np.nan) if k == missing else z)
         assert estimate.status.ok
         found.append(np.concatenate([estimate.u, estimate.q]))
     monkeypatch.setattr(jacobian.Jacobian, "solve", solve)
@@ -92,6 +92,16 @@ def test_blocks_do_not_change_the_result(name, monkeypatch):
     direct, none = run(model, sensors, law, monkeypatch, large=False)
     blocks, counts = run(model, sensors, law, monkeypatch, large=True)
     assert not none
+    assert counts
+    np.testing.assert_allclose(blocks, direct, rtol=0, atol=1e-8 * abs(direct).max())
+
+
+@pytest.mark.parametrize("gain", [1e3, "auto"])
+@pytest.mark.parametrize("sensors", [lp.Full(), lp.Subdomain(inside)], ids=["full", "part"])
+def test_blocks_serve_a_step_in_which_nothing_is_measured(sensors, gain, monkeypatch):
+    model, law = plane(), lp.GradientLaw(gain, newton=EXACT)
+    direct, _ = run(model, sensors, law, monkeypatch, large=False, missing=3)
+    blocks, counts = run(model, sensors, law, monkeypatch, large=True, missing=3)
     assert counts
     np.testing.assert_allclose(blocks, direct, rtol=0, atol=1e-8 * abs(direct).max())
 

@@ -166,6 +166,9 @@ def test_a_column_that_is_there_twice_is_refused(csv, column):
     path = csv(f"t,a,b,{column},c,c\n0,1,2,3,4,5\n")
     with pytest.raises(DataError, match=f"two columns are called '{column}'; rename one"):
         read_csv(path, COLUMNS, Clock("t"))
+    with closing(Follow(path)) as source:
+        (row,) = source.poll(0.0)
+    assert column not in row.values
 
 
 @pytest.mark.parametrize(

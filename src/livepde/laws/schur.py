@@ -188,11 +188,14 @@ class BlockSolver(Way):
 
     @cached_property
     def parts(self) -> tuple[IntArray, IntArray] | None:
-        """Coefficients that are not observed, and those that are; None: S is solved as a whole."""
+        """Coefficients that are not observed, and those that are; None: S is solved as a whole.
+
+        So it is where a sample is missing and nothing is observed.
+        """
         R, W = self.stage.split.R, self.stage.W
         observed, free = R.diagonal(), self.stage.model.X.free
         selects = R.nnz == np.count_nonzero(observed) and bool(np.isin(observed, (0, 1)).all())
-        if not selects or not masked(W, np.ones(len(free)), free).data.any():
+        if not selects or not observed.any() or not masked(W, np.ones(len(free)), free).data.any():
             return None
         return np.flatnonzero(observed == 0.0), np.flatnonzero(observed)
 

@@ -105,6 +105,11 @@ def _line(file: io.BufferedReader) -> bytes:
     return line if piece is line else line + piece[-1:]
 
 
+def _names(cells: list[str]) -> list[str]:
+    """Return the header; of two columns with one name neither is taken: both are missing."""
+    return [name if cells.count(name) == 1 else "" for name in cells]
+
+
 class Follow:
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
@@ -214,7 +219,7 @@ class Follow:
         head = file.read(HEAD)
         if start <= os.fstat(file.fileno()).st_size and zlib.crc32(head[:start]) == known:
             if not self._json and start:
-                self._header = self._cells(head.splitlines()[0])
+                self._header = _names(self._cells(head.splitlines()[0]))
             self._head, self._offset = head[:start], start
         return True
 
@@ -261,7 +266,7 @@ class Follow:
         except (UnicodeError, csv.Error) as error:
             return Row({}, token, f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
-            self._header = cells
+            self._header = _names(cells)
             return None
         if too_wide(cells, self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
