@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from livepde.bench.control.battery import battery
-from livepde.bench.control.compare import FIXED, HORIZONS, LEARNED, TRUE, Comparison, compare
+from livepde.bench.control.compare import FIXED, LEARNED, TRUE, Comparison, compare
 from livepde.bench.control.horizon import Setting
 from livepde.bench.control.problem import Problem
 from livepde.bench.control.rod import rod
