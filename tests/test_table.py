@@ -151,6 +151,20 @@ def test_decimal_commas_are_no_fields_beside_an_empty_last_one(csv):
         assert [row.broken for row in source.poll(0.0)] == ["5 fields, the header has 4"] * 2
 
 
+def test_a_point_in_times_is_none_of_decimals(csv):
+    with pytest.raises(DataError, match=r"row 3, column 't': got '0\.5'; with decimal = ','"):
+        read_csv(csv("t,a,b\n0,1,1\n0.5,1,1\n"), COMMAS, Clock("t", decimal=","))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+@pytest.mark.parametrize("start", [b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"])
+def test_a_workbook_is_no_text_in_any_encoding(tmp_path, start, encoding):
+    path = tmp_path / "book.csv"
+    path.write_bytes(start + b"t,a,b\n0,1,1\n")
+    with pytest.raises(DataError, match=r"book\.csv is a workbook, not text: save its sheet as"):
+        read_csv(path, COLUMNS, Clock("t"), encoding=encoding)
+
+
 def test_json_lines_may_have_decimal_commas_as_text(tmp_path):
     path = tmp_path / "data.jsonl"
     path.write_text('{"Zeit": "0,5", "a": "1,5", "b": 2.5}\n')
@@ -174,7 +188,8 @@ def test_a_column_that_is_there_twice_is_refused(csv, column):
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("1,5", "1.234", "row 2, column 'a': got '1.234'; expected a number"),
+        ("1,5", "1.234", "row 2, column 'a': got '1.234'; with decimal = ',' a point is none of"),
+        ("1,5", "1.234,5", "row 2, column 'a': got '1.234,5'; expected a number"),
         ("01.04.2025 12:30", "31.02.2025 12:30", "as time_format has it, '%d.%m.%Y %H:%M'"),
     ],
 )

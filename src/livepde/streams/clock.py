@@ -16,6 +16,7 @@ from livepde.linalg import Array
 
 __all__ = [
     "COMMA",
+    "NO_POINT",
     "POINT",
     "Clock",
     "guessed_format",
@@ -26,6 +27,7 @@ __all__ = [
 
 Instant: TypeAlias = float | str | date | datetime
 COMMA = "if that is a decimal comma, say decimal = ','."
+NO_POINT = "with decimal = ',' a point is none of decimals."
 POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals is no number
 
 
@@ -181,6 +183,8 @@ def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
     if clock.decimal == "." and not clock.format and has_decimal_comma(cell):
         return COMMA
     if not dates:
+        if clock.decimal != "." and number_of(cell) is not None:
+            return NO_POINT
         return "expected a number, as in the other rows."
     if clock.format:
         return f"expected a date as time_format has it, {clock.format!r}."

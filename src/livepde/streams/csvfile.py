@@ -28,6 +28,7 @@ __all__ = ["UTF_8", "read_csv", "too_wide"]
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
 SEPARATORS = (",", ";", "\t")
 LOOK = 100_000  # characters that are looked at to say how a file is written
+BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .ods, .xls
 
 
 def read_csv(
@@ -67,6 +68,7 @@ def read_csv(
     needed = [clock.name, *(name for column in columns.values() for name in column.names)]
     how: dict[str, Any] = {"skipinitialspace": True, "sep": separator, "encoding": encoding}
     try:
+        _check_text(path)
         header = list(pd.read_csv(path, nrows=0, **how).columns)
         _check_separator(path, header, separator, encoding, clock)
         check_columns(str(path), needed, header)
@@ -104,6 +106,13 @@ def read_csv(
         return f"{path}, row {rows[k]}, column '{clock.name}'"
 
     return to_table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
+
+
+def _check_text(path: Path) -> None:
+    """Refuse a workbook, some of which can be taken for text."""
+    with path.open("rb") as file:
+        if file.read(4).startswith(BOOKS):
+            raise DataError(f"{path} is a workbook, not text: save its sheet as 'CSV UTF-8'.")
 
 
 def _check_separator(

@@ -15,7 +15,7 @@ import numpy as np
 from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.identifier import Sample
 from livepde.linalg import Array
-from livepde.streams.clock import COMMA, Clock, has_decimal_comma, number_of, read_times
+from livepde.streams.clock import COMMA, NO_POINT, Clock, has_decimal_comma, number_of, read_times
 from livepde.streams.names import check_columns, hint, no_file
 
 __all__ = [
@@ -355,6 +355,8 @@ def cell_number(value: Any, where: str, decimal: str = ".") -> float:
         remedy = "expected a number (leave it empty if it is missing)."
         if decimal == "." and has_decimal_comma(value):
             remedy = COMMA
+        elif decimal != "." and number_of(value) is not None:
+            remedy = NO_POINT
         raise SampleError(f"{where}: got {value!r}; {remedy}")
     if math.isinf(number):
         raise SampleError(
