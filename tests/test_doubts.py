@@ -9,7 +9,9 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
+from livepde.reproduce import seed_excited
 from livepde.runs import doubts, measures
+from livepde.stepping import Advance, simulate
 from livepde.streams import AbsoluteNoise, Twin
 
 SENSORS = {"A": 0.25, "B": 0.5, "C": 0.75}
@@ -116,3 +118,56 @@ def test_samples_of_which_nothing_could_be_learned_are_said():
     held[[3, 5]] = 1.0
     data["held"] = ("time", held)
     assert any("In 2 samples, last at t = 0.25" in note for note in doubts(data))
+
+
+def reaction(cells: int) -> lp.Model:
+    """Return u_t - u_xx + q u = f with a field q."""
+    mesh = lp.interval(0.0, 1.0, cells)
+    smooth = lp.Sobolev(1.0, 0.3).pointwise(1)
+    return lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
+        {"q": lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=3.0, std=1.5)},
+        A=lambda q, u, v, x: q.q * u * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+        f=seed_excited.f,
+    )
+
+
+@pytest.mark.parametrize(("cells", "said"), [(60, True), (180, False)])
+def test_a_field_that_has_left_its_prior_is_said(cells: int, said: bool):
+    """Data of 180 cells: 60 leave an equation error that is no noise."""
+    fine, model, times = reaction(180), reaction(cells), 0.05 * np.arange(101)
+    root = np.linalg.inv(np.linalg.cholesky(fine.Q.gram.toarray())).T
+    true = 3.0 + root @ np.random.default_rng(0).standard_normal(fine.Q.dim)
+    nodes = np.sort(model.mesh.p[0])
+    G = lp.Points(nodes[(nodes > 0.3) & (nodes < 0.87)].tolist()).matrix(fine.state_space)
+    control = Advance(lp.Alexander2(), dt_max=0.025)
+    samples = [(t, G @ u) for t, u in simulate(fine, true, 0.0, times.tolist(), control)]
+    identifier = lp.Identifier(
+        model,
+        lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87)),
+        lp.GradientLaw(gain="auto"),
+        u0=0.0,
+        scheme=lp.Alexander2(),
+    )
+    data = identifier.run(samples).to_xarray()
+    assert (data["status"] == 0).all()
+    found = np.interp(np.sort(fine.mesh.p[0]), nodes, data["q"].values[-1])
+    right = true[np.argsort(fine.mesh.p[0])]
+    wrong = np.linalg.norm(found - right) / np.linalg.norm(right)
+    assert wrong > 100 if said else wrong < 0.2
+    sentences = doubts(data)
+    assert len(sentences) == said
+    if said:
+        assert "have left their prior" in sentences[0]
+        assert "sensitivity" in sentences[0]
+
+
+@pytest.mark.parametrize(("last", "said"), [(0.9, False), (1.1, True)])
+def test_only_the_end_counts_for_what_has_left_its_prior(last: float, said: bool):
+    model = rod(lp.Scalar(0.5, 0.3))
+    data = run(model, model)
+    ratio = np.full(data.sizes["time"], 5.0)
+    ratio[-2:] = last, np.nan  # a step that fails notes nothing
+    data["departure"] = ("time", ratio)
+    assert any("have left their prior" in note for note in doubts(data)) == said

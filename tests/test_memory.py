@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from livepde.errors import LawError
+from livepde.laws.memory import Learning
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import Twin
 
@@ -86,8 +89,10 @@ def test_seed_reaches_its_floor_without_a_gain() -> None:
         u_true=seed.u_true,
     )
     identifier = lp.Identifier(model, omega, AUTO, q0=0.0, u0=lambda x: seed.u_true(x, 0.0))
-    errors = [twin.error(identifier.step(s.t, s.z).q) for s in twin]
+    estimates = [identifier.step(s.t, s.z) for s in twin]
+    errors = [twin.error(estimate.q) for estimate in estimates]
     assert errors[-1] <= 0.06  # what is left lies outside of omega
+    assert estimates[-1].notes["departure"] < 0.1
     assert errors[20] <= 0.06  # and it was there at t = 12: kept while the excitation dies
 
 
@@ -104,6 +109,7 @@ def test_excited_twin_with_exact_data() -> None:
     for s in twin:
         estimate = identifier.step(s.t, s.z)
     assert twin.error(estimate.q) <= 0.005
+    assert 0.1 < estimate.notes["departure"] < 0.6  # H1 is rough, and its q is smooth: as expected
 
 
 @pytest.mark.parametrize(
@@ -113,16 +119,54 @@ def test_excited_twin_with_exact_data() -> None:
     "units", [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
 )
 def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> None:
-    _, plain, _ = run(*rod(), **options)
+    _, plain, before = run(*rod(), **options)
     _, scaled, notes = run(*rod(**units), **options)
     size = units.get("q", 1.0)
     assert np.abs(scaled / size - plain).max() <= 1e-6 * np.abs(plain).max()
     assert notes["information"] > 1.0
+    assert 0.0 < notes["departure"] < 0.2
+    assert notes["departure"] == pytest.approx(before["departure"], rel=1e-5)
 
 
 def test_sampling_rate_and_mesh_do_not_matter_without_noise() -> None:
     errors = [run(*rod(**case))[0] for case in ({}, {"dt": 0.05}, {"dt": 0.025}, {"cells": 40})]
     assert max(errors) <= 0.01
+
+
+def test_what_a_right_model_may_do_is_no_departure() -> None:
+    model, _ = rod(cells=40)
+    learning = Learning(model, True)
+    q0 = np.full(model.Q.dim, 2.0)
+    root = np.linalg.inv(np.linalg.cholesky(model.Q.gram.toarray())).T
+    shares = np.linspace(0.0, 1.0, model.Q.dim)  # of the prior variance that the data have taken
+    known = {
+        1.0: replace(learning.init(q0), given=1e9),
+        0.0: replace(learning.init(q0), given=0.0),
+        0.5: replace(learning.init(q0), given=float((shares[:-1] / (1 - shares[:-1])).sum())),
+    }
+    rng = np.random.default_rng(0)
+    for told, learned in known.items():
+        weights = np.sqrt(shares) if told == 0.5 else np.full(model.Q.dim, np.sqrt(told))
+        moved = (root @ (weights[:, None] * rng.standard_normal((model.Q.dim, 2000)))).T
+        found = [learning.departure(learned, 1.0, q0 + one) for one in moved]
+        assert max(found) < 1.0
+        once = root @ np.eye(model.Q.dim)[0]  # one deviation in one direction
+        far = learning.departure(learned, 1.0, q0 + 20.0 * once)
+        assert far > 1.0
+        # Twice the information and the noise are the same knowledge.
+        twice = replace(learned, given=2.0 * learned.given)
+        assert learning.departure(twice, 2.0, q0 + 20.0 * once) == pytest.approx(far)
+
+
+def test_what_has_faded_was_told_all_the_same() -> None:
+    model, twin = rod()
+    law, seen = AUTO, twin.observation
+    identifier = lp.Identifier(model, seen, law, q0=0.0, u0=0.0)
+    for sample in twin:
+        notes = identifier.step(sample.t, sample.z).notes
+    learned = identifier._state.learned
+    assert learned.given == pytest.approx(2.0 * learned.total, rel=0.2)  # J weighs by t/T
+    assert notes["information"] == learned.total / learned.spread
 
 
 def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:

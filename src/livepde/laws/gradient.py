@@ -134,7 +134,9 @@ class GradientLaw(Law[GradientWork, GradientState]):
         (`livepde.laws.smoothing`); exact ones are not. For constant unknowns. What early data
         taught stays when the excitation dies out. The notes of each report hold gain, the scale of
         the inner product before any information, and information, the trace of J G_Q^{-1}/S:
-        beyond 1 the data say more than the prior.
+        beyond 1 the data say more than the prior; and departure, the square of the distance of q
+        from the prior, over what the prior and the data so far allow (`livepde.laws.memory`):
+        beyond 1 model, prior or noise are wrong, and so may q be.
     damping
         Rule for theta = mu / ||r||_V~.
     nu
@@ -331,6 +333,7 @@ class GradientLaw(Law[GradientWork, GradientState]):
             same = np.array_equal(np.isnan(interval.z0), np.isnan(interval.z1))
             learned = learning.learn(learned, spread, seen, r, length, same)
         notes |= {"gain": PULL / (spread * length), "information": learned.total / spread}
+        notes["departure"] = lambda: learning.departure(learned, spread, q)
         after = LearningState(*moved, learned, balance or state.balance)
         return after, Report(Status(), predicted, steps, Notes(notes))
 

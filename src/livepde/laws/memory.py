@@ -39,6 +39,13 @@ Every number above is a ratio of quantities with the same units: scaling u, q (w
 scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
 itself.
 
+Whether q may be where it is says the prior. If all of this holds, q - q0 is Gaussian with the
+covariance that the data have taken from that of the prior, so that ||q - q0||_Q^2 is a sum of
+chi-squares with weights of at most 1, whose sum k is at most m and at most trace(G_Q^{-1} J)/S,
+with a J that has not faded. It is more than k + 2 sqrt(k s) + 2 s with a probability below exp(-s)
+only (Laurent and Massart 2000). Where S is too small for the errors there are (those of the mesh,
+say), q takes them up and leaves its prior by far.
+
 What S does not know is a bias: smoothing that takes too much or too little leaves an equation error
 that moves with w, as a wrong q does, and q takes it up. Counting as noise what is slow in r, too
 (sums of A^T r over an eighth of the elapsed time), was tried: such a bias leaves nothing in r, and
@@ -47,6 +54,7 @@ exact data are learned more slowly. What helps is smoothing without it (`livepde
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -65,6 +73,7 @@ PROBES = 8  # random vectors for the trace
 FORGETS = 2.0  # power of time that weighs a sample in the mean of S
 FADES = 1.0  # power of time that weighs a sample in J
 MOST_DENSE = 4000  # unknowns of which J may be dense
+CHANCE = 1e-6  # that a right model leaves its prior
 RESOLUTION = 1e7  # largest ratio of information to prior: deviations of 1 in 3000
 _RHO = 1.0 / (1.0 + PULL)
 _TURNS = (1.0 + _RHO) / (_RHO**2 * (1.0 - _RHO))
@@ -84,8 +93,8 @@ class Learned:
         S of the last step.
     noise, seen
         The two means of which S is the quotient.
-    total
-        trace(G_Q^{-1} J).
+    total, given
+        trace(G_Q^{-1} J), and what it would be without fading.
     elapsed, samples
         Time and number of samples.
     alike
@@ -100,6 +109,7 @@ class Learned:
     noise: float
     seen: float
     total: float
+    given: float
     elapsed: float
     samples: int
     alike: int
@@ -136,7 +146,7 @@ class Learning:
     def init(self, q0: Array) -> Learned:
         """Return what is known before the first sample: nothing."""
         r = np.zeros(self.model.X.dim)
-        return Learned(q0, np.zeros(self.pattern.nnz), 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, r, r)
+        return Learned(q0, np.zeros(self.pattern.nnz), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, r, r)
 
     def coupling(self, split: Split, w: Array, q: Array, moment: Moment) -> sp.csr_array:
         """Return R^T A(w), on free coefficients, shape (n, m)."""
@@ -162,6 +172,14 @@ class Learning:
         shift = (spread - before) * self.model.Q.dual(q - learned.origin) / h
         information = self.pattern.matrix(learned.information)
         return Metric(spread, information, learned.information, shift)
+
+    def departure(self, learned: Learned, spread: float, q: Array) -> float:
+        """Return ||q - q0||_Q^2 over what a right model exceeds with a chance below `CHANCE`."""
+        away = q - learned.origin
+        told = min(float(self.model.Q.free.sum()), learned.given / spread)
+        rare = -math.log(CHANCE)
+        most = told + 2.0 * math.sqrt(told * rare) + 2.0 * rare
+        return float(away @ self.model.Q.dual(away)) / most
 
     def _stored(self, gained: sp.csr_array) -> Array:
         """Return the data of what J gains, in the order of its pattern."""
@@ -209,6 +227,7 @@ class Learning:
             noise=kept * learned.noise + h * noise,
             seen=kept * learned.seen + h * trace,
             total=faded * learned.total + h * trace,
+            given=learned.given + h * trace,
             elapsed=elapsed,
             samples=learned.samples + 1,
             alike=alike,
