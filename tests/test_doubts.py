@@ -81,7 +81,8 @@ def test_an_unknown_that_nothing_shows_is_said():
     unseen = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
     data = run(rod(unseen), rod(lp.Scalar(0.2)))
     assert doubts(data) == [
-        "b: the data have told hardly anything; its deviation is still about that of the prior."
+        "b: the data have told hardly anything, its deviation is still about that of the prior; "
+        "longer data, with larger changes nearer to the sensors, would tell more."
     ]
     moving = {**unseen, "b": lp.Scalar(1.0, 0.5, evolution=lp.MeanReverting(1.0))}
     assert doubts(run(rod(moving), rod(lp.Scalar(0.2)))) == []
