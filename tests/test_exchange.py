@@ -630,6 +630,16 @@ def test_a_regressor_of_one_sensor_takes_numbers():
         several.learn_one({"t": 0.0, "T_left": 0.0}, 1.0)
 
 
+@pytest.mark.parametrize("sensors", [{"a": 0.3}, {"a": 0.3, "b": 0.6}])
+def test_a_target_that_is_missing_is_not_learned_from(sensors):
+    model = OnlineRegressor(slab(sensors))
+    (x, _), (later, _) = measured(2)
+    for features in (x, later):
+        model.learn_one(features, None)
+    assert (model.current.t, model.estimate.status.ok) == (later["t"], True)
+    assert model.estimate.q[0] == pytest.approx(slab(sensors).model.initial_parameter()[0])
+
+
 def test_rivers_own_evaluation_runs_it():
     evaluate = pytest.importorskip("river.evaluate")
     metrics = pytest.importorskip("river.metrics")
