@@ -69,6 +69,11 @@ def test_quantities(value, unit, expected):
     assert convert(value, unit, "key") == pytest.approx(expected, rel=1e-9)
 
 
+def test_decibels_are_no_unit_of_a_case():
+    with pytest.raises(lp.CaseError, match="here: 'dB' has no linear scale; expected a number"):
+        convert("3 dB", "", "here")
+
+
 def test_deviations_of_temperatures_are_differences():
     assert convert("0.1 K", "degC", "key", difference=True) == pytest.approx(0.1)
     assert convert("0.9 degF", "degC", "key", difference=True) == pytest.approx(0.5)

@@ -29,6 +29,7 @@ from livepde.exchange.component import Component
 from livepde.exchange.process import REFUSED, WAITING, of_code
 from livepde.exchange.recipe import recipe_of
 from livepde.exchange.verify import running
+from livepde.models import heat
 
 fmpy = pytest.importorskip("fmpy")
 validation = pytest.importorskip("fmpy.validation")
@@ -561,6 +562,19 @@ def test_units_of_the_si():
     assert in_si("percent").exponents == {}
     assert in_si("m/s**0.5") is None
     assert in_si("apples") is None
+    assert in_si("dB") is None  # no linear scale
+
+
+@pytest.mark.parametrize(("unit", "step"), [("degC", "K"), ("degF", "degR"), ("m", "m")])
+def test_a_deviation_has_the_unit_of_differences(unit, step):
+    def build():
+        model = heat(lp.interval(0.0, 0.4, 8), lp.Scalar(1.0, std=0.5, unit=unit))
+        return lp.Identifier(model, lp.Points({"T": 0.1}, noise=0.1), lp.SensitivityLaw())
+
+    units = {item.name: item.unit for item in of_code("own.py:build", build).outputs()}
+    assert (units["alpha"], units["alpha_std"]) == (unit, step)
+    assert in_si(step).offset == 0.0
+    assert in_si(step).factor == pytest.approx(in_si(unit).factor)
 
 
 # --- online learners -----------------------------------------------------------------------------
@@ -614,6 +628,16 @@ def test_a_regressor_of_one_sensor_takes_numbers():
     several = OnlineRegressor(slab({"a": 0.3, "b": 0.6}))
     with pytest.raises(lp.SampleError, match="expected a mapping"):
         several.learn_one({"t": 0.0, "T_left": 0.0}, 1.0)
+
+
+@pytest.mark.parametrize("sensors", [{"a": 0.3}, {"a": 0.3, "b": 0.6}])
+def test_a_target_that_is_missing_is_not_learned_from(sensors):
+    model = OnlineRegressor(slab(sensors))
+    (x, _), (later, _) = measured(2)
+    for features in (x, later):
+        model.learn_one(features, None)
+    assert (model.current.t, model.estimate.status.ok) == (later["t"], True)
+    assert model.estimate.q[0] == pytest.approx(slab(sensors).model.initial_parameter()[0])
 
 
 def test_rivers_own_evaluation_runs_it():

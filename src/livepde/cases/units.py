@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -90,8 +91,8 @@ def conversion(given: str, unit: str, where: str) -> Affine:
     pint = _pint()
     registry = _registry()
     try:
-        zero = registry.Quantity(0.0, registry.parse_units(given)).to(unit).magnitude
-        one = registry.Quantity(1.0, registry.parse_units(given)).to(unit).magnitude
+        parsed = registry.parse_units(given)
+        zero, one, two = (registry.Quantity(k, parsed).to(unit).magnitude for k in (0.0, 1.0, 2.0))
     except pint.UndefinedUnitError as error:
         raise CaseError(
             f"{where}: '{error.args[0] if error.args else given}' is not a unit that is known; "
@@ -103,6 +104,8 @@ def conversion(given: str, unit: str, where: str) -> Affine:
         ) from None
     except (pint.PintError, *NOT_A_UNIT):
         raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit, given)}.") from None
+    if not math.isclose(two - one, one - zero):  # decibels
+        raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit, given)}.")
     return Affine(float(one - zero), float(zero))
 
 
@@ -114,9 +117,11 @@ def in_si(unit: str) -> SI | None:
     """
     registry = _registry()
     try:
-        zero = registry.Quantity(0.0, registry.parse_units(unit)).to_base_units()
-        one = registry.Quantity(1.0, registry.parse_units(unit)).to_base_units()
+        parsed = registry.parse_units(unit)
+        zero, one, two = (registry.Quantity(k, parsed).to_base_units() for k in (0.0, 1.0, 2.0))
     except (_pint().PintError, *NOT_A_UNIT):
+        return None
+    if not math.isclose((two - one).magnitude, (one - zero).magnitude):
         return None
     exponents = {BASE[name]: power for name, power in one.dimensionality.items() if name in BASE}
     if len(exponents) < len(one.dimensionality) or any(p != int(p) for p in exponents.values()):

@@ -37,6 +37,7 @@ __all__ = [
 
 REFUSED, WAITING = -2, -1  # beside the indices of `STATUS_CODES`
 LARGEST = 1000  # vertices of a field that become outputs, one for each
+STEPS = {"degC": "K", "degF": "degR"}  # units of differences on scales with a zero of their own
 STATUS = "How the last step went: {}, {} waits for a first sample, {} sample refused.".format(
     ", ".join(f"{k} {code}" for k, code in enumerate(STATUS_CODES)), WAITING, REFUSED
 )
@@ -170,8 +171,7 @@ class Process:
         unit = unknown_of(self.model.parameter_space, label).unit
         yield Output(name, unit, f"Estimate of {name}.")
         if self.covariance:
-            difference = "K" if unit == "degC" else unit
-            yield Output(f"{name}_std", difference, f"Standard deviation of {name}.")
+            yield Output(f"{name}_std", STEPS.get(unit, unit), f"Standard deviation of {name}.")
 
     def unknown(self) -> list[float]:
         """Return the outputs before the first sample: the prior, and NaN for what sensors show."""

@@ -18,7 +18,7 @@ class OnlineRegressor:
 
     A sample has features x, a mapping with the time and the inputs by their names, and a target y:
     what the sensors show, a number if there is one sensor, else a mapping from sensor to number.
-    Missing features hold their last value, missing targets are not learned from.
+    Missing features hold their last value, missing targets (None, NaN) are not learned from.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class OnlineRegressor:
             A sample that cannot be used, as `Identifier.step` says.
         """
         t, inputs = self._features(x)
-        targets = dict(y) if isinstance(y, Mapping) else {self._only(): y}
+        targets = dict(y or {}) if isinstance(y, Mapping | None) else {self._only(): y}
         self.estimate = self.current.step(t, targets, inputs)
 
     def predict_one(self, x: Mapping[str, Any]) -> Any:

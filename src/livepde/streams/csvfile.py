@@ -152,8 +152,10 @@ def too_wide(cells: list[str], header: list[str]) -> bool:
 
     A separator at the end of each row, or of the header, is no field.
     """
+    if len(cells) <= len(header):
+        return False
     named = max((k for k, name in enumerate(header, start=1) if name), default=0)
-    return len(cells) > len(header) and any(cell.strip() for cell in cells[named:])
+    return any(cell.strip() for cell in cells[named:])
 
 
 def _check_rows(path: Path, needed: list[str], separator: str, encoding: str) -> None:
