@@ -24,7 +24,8 @@ class LQ:
     Changes of the controls are weighed, so that it acts on (x, v before). The target (x, v) is the
     steady state of the model with the unknown numbers of now, the disturbances of now and the
     present reference, as near to it as the actuators allow. What comes out is clipped to their
-    ranges. It knows neither limits of outputs nor the future.
+    ranges. It knows neither limits of outputs nor the future. The gain is kept while the unknown
+    numbers stay what they are.
 
     Parameters
     ----------
@@ -43,8 +44,9 @@ class LQ:
         check(self)
 
     def start(self) -> Array:
-        """Return the memory before the first sample: it has none."""
-        return np.zeros(0)
+        """Return the memory before the first sample: unknown numbers and their gain, NaN as yet."""
+        count = len(self.model.controls)
+        return np.full(len(self.model.unknowns) + count * (self.model.size + count), np.nan)
 
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
         """Return what to set from now on; as for `Controller`."""
@@ -52,10 +54,15 @@ class LQ:
         step = model.matrices(known.q, self.period).with_offset(known.offset)
         try:
             x, v = self.target(step, plan.reference[0], plan.disturbances[0])
-            gain = self.gain(step)
+            m, kept = len(known.q), np.isfinite(memory).all()
+            if not (kept and np.array_equal(memory[:m], known.q)):
+                memory = np.concatenate([known.q, self.gain(step).ravel()])
         except np.linalg.LinAlgError as error:
             return Decision(before, f"no gain ({error}): the inputs were held", memory)
+        gain = memory[m:].reshape(len(before), -1)
         wanted = before - gain @ np.concatenate([known.x - x, before - v])
+        if not np.isfinite(wanted).all():
+            return Decision(before, "no finite state or target: the inputs were held", memory)
         return Decision(np.clip(wanted, low, high), "ok", memory)
 
     def _parts(self) -> tuple[list[int], list[int], list[int], Array]:
