@@ -12,7 +12,7 @@ from livepde.checkpoint import packed, unpacked
 from livepde.control.kalman import Kalman
 from livepde.control.known import Known
 from livepde.control.trust import Trust
-from livepde.errors import ConfigurationError
+from livepde.errors import ConfigurationError, RunError
 from livepde.identifier import Identifier
 from livepde.result import Estimate
 
@@ -67,6 +67,15 @@ class Learned:
                 f"Learned: the sensors of the identifier read {missing}, which the reduced model "
                 "does not have; give positions of sensors in another way."
             )
+        for what, mine, theirs in (
+            ("sensors", identifier.observed.names, nominal.model.sensors.names),
+            ("unknown numbers", identifier.model.parameter_space.labels, nominal.model.unknowns),
+        ):
+            if list(mine) != list(theirs):
+                raise ConfigurationError(
+                    f"Learned: the identifier has the {what} {list(mine)}, the reduced model "
+                    f"{list(theirs)}: reduce the identifier's model, with its sensors."
+                )
         self.identifier = identifier
         self.nominal = nominal
         self.trust = trust or Trust()
@@ -75,10 +84,10 @@ class Learned:
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         identifier, model = self.identifier, self.nominal.model
-        if isinstance(z, Mapping):
-            z = np.array([float(z.get(name, np.nan)) for name in identifier.observed.names])
+        self.estimate = estimate = identifier.step(t, z, inputs)  # a bad sample changes nothing
+        if isinstance(z, Mapping):  # with what is withheld, perhaps
+            z = {name: z[name] for name in model.sensors.names if name in z}
         nominal = self.nominal.step(t, z, inputs)
-        self.estimate = estimate = identifier.step(t, z, inputs)
         doubt = self.trust.doubt(estimate, model)
         self._good = 0 if doubt else min(self._good + 1, self.trust.patience)
         if self._good < self.trust.patience:
@@ -98,7 +107,9 @@ class Learned:
         return packed({"kind": "learned"}, leaves)
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
-        _, leaves = unpacked(content, where)
+        header, leaves = unpacked(content, where)
+        if header.get("kind") != "learned":
+            raise RunError(f"{where} is of another estimator: build it as it was then.")
         self.identifier.restore(leaves["identifier"].tobytes(), where)
         self.nominal.restore(leaves["nominal"].tobytes(), where)
         self._good = int(leaves["good"])

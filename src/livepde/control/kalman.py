@@ -10,13 +10,15 @@ from scipy.linalg import block_diag
 
 from livepde.checkpoint import packed, unpacked
 from livepde.control.known import Known
-from livepde.control.reduced import ReducedModel
-from livepde.errors import ConfigurationError, RunError
+from livepde.control.reduced import Discrete, ReducedModel
+from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderError
 from livepde.linalg import Array
+from livepde.samples import number, readings
 
 __all__ = ["Kalman"]
 
 FLOOR = 1e-6  # process noise of each coordinate, relative to the largest
+SAME = 1e-6  # relative difference of two times that is rounding
 
 
 class Kalman:
@@ -30,7 +32,7 @@ class Kalman:
     model
         With the noise of its sensors.
     period
-        Time between two samples.
+        Usual time between two samples.
     drive
         Channel -> standard deviation of its noise, held over a period, in its unit.
     offset
@@ -68,11 +70,11 @@ class Kalman:
         self._moving = model.columns(list(offset or {}))
         self._walk = np.array(list((offset or {}).values()))
         self._noise = np.asarray(model.sensors.noise)
-        self._begun = False
+        self._t = np.nan
         self.set(q or {})
         x = model.start if x is None else np.asarray(x, dtype=float)
         self._x = np.concatenate([x, np.zeros(len(self._moving))])
-        self._P = self._gained
+        self._P = self._usual[2]
 
     @property
     def q(self) -> Array:
@@ -81,27 +83,53 @@ class Kalman:
 
     def set(self, q: Mapping[str, float]) -> None:
         """Take other unknown numbers; those that are not named are the prior's."""
-        values = zip(self.model.unknowns, self.model.prior, strict=True)
-        self._q = np.array([float(q.get(label, prior)) for label, prior in values])
-        self._move = self.model.matrices(self._q, self.period)
-        driven = self._move.B * self.drive
+        self._q = self.model.given(q)
+        self._usual = self._over(self.period)
+
+    def _over(self, h: float) -> tuple[Discrete, Array, Array]:
+        """Return the step over a time h, that of state and offset, and the noise gained in it."""
+        move = self.model.matrices(self._q, h)
+        driven = move.B * self.drive
         gained = driven @ driven.T
         floor = FLOOR**2 * float(np.trace(gained))
         gained = gained + floor * np.eye(len(gained))
-        self._gained: Array = block_diag(gained, np.diag(self._walk**2))
+        noise: Array = block_diag(gained, np.diag(self._walk**2 * (h / self.period)))
         r, count = self.model.size, len(self._moving)
-        added = self._move.B[:, self._moving]
-        self._A = np.block([[self._move.A, added], [np.zeros((count, r)), np.eye(count)]])
+        added = move.B[:, self._moving]
+        A = np.block([[move.A, added], [np.zeros((count, r)), np.eye(count)]])
+        return move, A, noise
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
-        """Take a sample, as an `Estimator` does; the first one describes the start."""
-        seen, r = np.asarray(z, dtype=float), self.model.size
-        if self._begun:
-            driven = self._move.B @ self.model.values(inputs) + self._move.f
-            self._x = self._A @ self._x
-            self._x[:r] += driven
-            self._P = self._A @ self._P @ self._A.T + self._gained
-        self._begun = True
+        """Take a sample, as an `Estimator` does; the first one describes the start.
+
+        A sample that is late or early is stepped to as long as it took.
+
+        Raises
+        ------
+        SampleError
+            Wrong shape, text, infinity, or a sensor that does not exist.
+        TimeOrderError
+            t is not later than the sample before.
+        """
+        sensors, r = self.model.sensors.names, self.model.size
+        if isinstance(z, Mapping):
+            unknown = [name for name in z if name not in sensors]
+            if unknown:
+                raise SampleError(f"unknown sensor '{unknown[0]}'; there are {list(sensors)}.")
+            z = [number(z.get(name), f"sensor '{name}'") for name in sensors]
+        seen = readings(z, self.model.frame.observed_sensors)
+        if not np.isnan(self._t):
+            h = t - self._t
+            if not h > 0.0:
+                raise TimeOrderError(
+                    f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}."
+                )
+            usual = abs(h - self.period) <= SAME * self.period
+            move, A, gained = self._usual if usual else self._over(h)
+            self._x = A @ self._x
+            self._x[:r] += move.B @ self.model.values(inputs) + move.f
+            self._P = A @ self._P @ A.T + gained
+        self._t = t
         expected, H = self.model.seen(self._x[:r], self._q, inputs)
         H = np.hstack([H, np.zeros((len(H), len(self._moving)))])
         used = np.isfinite(seen) & np.isfinite(expected)
@@ -122,7 +150,7 @@ class Kalman:
 
     def dump(self) -> bytes:
         """Return the state."""
-        leaves = {"x": self._x, "P": self._P, "q": self._q, "begun": self._begun}
+        leaves = {"x": self._x, "P": self._P, "q": self._q, "t": self._t}
         return packed({"kind": "kalman"}, leaves)
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
@@ -131,4 +159,4 @@ class Kalman:
         if header.get("kind") != "kalman" or leaves["x"].shape != self._x.shape:
             raise RunError(f"{where} is of another reduced model: build it as it was then.")
         self.set(dict(zip(self.model.unknowns, leaves["q"].tolist(), strict=True)))
-        self._x, self._P, self._begun = leaves["x"], leaves["P"], bool(leaves["begun"])
+        self._x, self._P, self._t = leaves["x"], leaves["P"], float(leaves["t"])
