@@ -168,11 +168,63 @@ def test_a_nonlinear_model_is_linearised_where_it_is_said():
         assert rate[1] == pytest.approx((2000.0 * ROOM - 1e-5 * u**4) / 3.6e6, rel=0.05)
 
 
+def test_the_error_is_relative_to_the_largest_response_to_any_control():
+    """In five seconds a weak heater does not reach the tip; the room does."""
+    sources = [
+        lambda x, t: 2000.0 * x.inputs["room"],
+        lp.On("left", lambda x, t: 0.06 * x.inputs["heater"]),
+    ]
+    missed = [
+        ct.reduce(rod(f=sources), OUTPUTS, controls, modes=1).error(h=1.0, samples=5)["tip"]
+        for controls in (["heater"], ["room"], ["heater", "room"])
+    ]
+    assert missed[0] > 0.1
+    assert missed[2] < 0.01
+
+
+def test_a_mesh_of_few_cells_is_reduced_to_itself():
+    mesh = lp.interval(0.0, 1.0, 2)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot"), "right": 1.0}),
+        {"a": lp.Scalar(0.5, 0.2)},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    small = ct.reduce(model, lp.Points({"middle": 0.5}), ["hot"])
+    assert small.size == 1
+    assert small.error({"a": 0.9}, h=0.05)["middle"] < 1e-3
+
+
 def test_names_that_do_not_exist_are_told():
+    with pytest.raises(lp.ConfigurationError, match="each once"):
+        ct.reduce(rod(), OUTPUTS, ["heater", "heater"])
+    with pytest.raises(lp.ConfigurationError, match="inputs names 'wind'"):
+        ct.reduce(rod(), OUTPUTS, ["heater"], inputs={"wind": 1.0})
+    with pytest.raises(lp.ConfigurationError, match="q names 'c'; the unknown numbers are \\['k'"):
+        reduced().error({"c": 1.0}, h=PERIOD)
+    with pytest.raises(lp.ConfigurationError, match="h must be positive"):
+        reduced().error(h=-1.0)
+    with pytest.raises(lp.ConfigurationError, match="q names 'c'"):
+        ct.Kalman(reduced(), PERIOD, drive={}, q={"c": 1.0})
+    with pytest.raises(lp.ConfigurationError, match="before names 'valve'"):
+        ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"valve": 1.0})
     with pytest.raises(lp.ConfigurationError, match="controls=\\['valve'\\]; the channels"):
         ct.reduce(rod(), OUTPUTS, ["valve"])
     with pytest.raises(lp.ConfigurationError, match="track names 'end'"):
         ct.LQ(reduced(), replace(GOAL, track={"end": 1.0}), PERIOD)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"inputs": {"heater": (0.0, 1.0, 2.0)}}, "least < largest"),
+        ({"inputs": {"heater": 1.0}}, "least < largest"),
+        ({"price": {"heater": np.nan}}, "price\\['heater'\\] must be a number"),
+        ({"penalty": -1.0}, "penalty must be at least 0"),
+    ],
+)
+def test_goals_that_make_no_sense_are_told(changes, says):
+    with pytest.raises(lp.ConfigurationError, match=says):
+        replace(GOAL, **changes)
 
 
 # --- filter --------------------------------------------------------------------------------------
@@ -196,6 +248,29 @@ def test_the_filter_is_kalmans():
         x, P = x + gain @ (z - model.sensors(x, np.array([0.3, ROOM]))), P - gain @ C @ P
         known = found.step(k * PERIOD, z, inputs)
         np.testing.assert_allclose(known.x, x, rtol=1e-5, atol=1e-4 * np.abs(x).max())
+
+
+def test_a_late_sample_is_stepped_to_as_long_as_it_took():
+    model, inputs = reduced(modes=1), {"heater": 0.3, "room": ROOM}
+    nothing, ends = np.full(2, np.nan), []
+    for times in ([0.0, 60.0, 120.0, 180.0], [0.0, 180.0]):
+        one = ct.Kalman(model, PERIOD, drive={"heater": 0.1}, offset={"room": 0.1})
+        ends.append([one.step(t, nothing, inputs).x for t in times][-1])
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-9)
+    with pytest.raises(lp.TimeOrderError, match="not later"):
+        one.step(180.0, nothing, inputs)
+
+
+def test_samples_of_the_filter_are_checked():
+    one, inputs = ct.Kalman(reduced(), PERIOD, drive={}), {"heater": 0.3, "room": ROOM}
+    with pytest.raises(lp.SampleError, match="unknown sensor 'T_6'"):
+        one.step(0.0, {"T_6": 20.0}, inputs)
+    for z in ([1.0, 2.0, 3.0], ["hot", 1.0]):
+        with pytest.raises(lp.SampleError, match="z"):
+            one.step(0.0, z, inputs)
+    by_name = one.step(0.0, {"T_10": 20.0}, inputs).x
+    other = ct.Kalman(reduced(), PERIOD, drive={})
+    assert other.step(0.0, [np.nan, 20.0], inputs).x.tolist() == by_name.tolist()
 
 
 def test_an_offset_removes_the_lasting_error_at_a_sensor():
@@ -256,10 +331,36 @@ def plan(count: int, limits: int = 0) -> ct.Plan:
 def test_the_linear_quadratic_controller_is_optimal():
     model = reduced()
     free = replace(GOAL, inputs={})
-    found = ct.LQ(model, free, PERIOD).decide(known(model), plan(1), np.array([0.2]), np.zeros(0))
+    controller = ct.LQ(model, free, PERIOD)
+    found = controller.decide(known(model), plan(1), np.array([0.2]), controller.start())
     expected = optimum(model, free, known(model).x, np.array([20.0]), 0.2, 300)
     assert found.inputs[0] == pytest.approx(expected, abs=1e-3)
     assert abs(expected - 0.2) > 0.02
+
+
+def test_the_gain_is_kept_while_the_unknown_numbers_stay(monkeypatch):
+    model, asked = reduced(), []
+    controller, before = ct.LQ(model, GOAL, PERIOD), np.array([0.2])
+    gain = ct.LQ.gain
+    monkeypatch.setattr(ct.LQ, "gain", lambda self, step: asked.append(1) or gain(self, step))
+    now, later = known(model), replace(known(model), q=np.array([25.0]))
+    memory, found = controller.start(), []
+    for one in (now, now, later, now):
+        fresh = controller.decide(one, plan(1), before, controller.start())
+        asked.clear()
+        decision = controller.decide(one, plan(1), before, memory)
+        assert decision.inputs.tolist() == fresh.inputs.tolist()
+        memory, found = decision.memory, [*found, len(asked)]
+    assert found == [1, 0, 1, 1]
+
+
+def test_a_state_that_is_lost_holds_the_inputs():
+    model = reduced()
+    controller = ct.LQ(model, GOAL, PERIOD)
+    lost = replace(known(model), x=np.full(model.size, np.nan))
+    found = controller.decide(lost, plan(1), np.array([0.37]), controller.start())
+    assert found.inputs.tolist() == [0.37]
+    assert "held" in found.status
 
 
 def test_the_target_meets_the_reference_or_stays_within_the_range():
@@ -371,6 +472,14 @@ def test_an_estimate_is_trusted_only_where_all_tests_pass(changes, says):
     assert bool(doubt) == bool(says)
 
 
+@pytest.mark.parametrize(
+    "levels", [{"spread": np.nan}, {"misfit": 0.0}, {"patience": 0}, {"patience": 1.5}]
+)
+def test_levels_of_trust_that_make_no_sense_are_told(levels):
+    with pytest.raises(lp.ConfigurationError, match=f"Trust: {next(iter(levels))} must be"):
+        ct.Trust(**levels)
+
+
 def test_without_trust_the_loop_acts_as_the_nominal_model_would():
     model = reduced()
     controller = ct.LQ(model, GOAL, PERIOD)
@@ -428,6 +537,63 @@ def test_what_was_really_applied_counts():
     stuck = loop.step(PERIOD, [np.nan] * 2, {"heater": 0.0}, reference={"tip": 45.0})
     assert first.inputs["heater"] > 0.5
     assert stuck.outputs["face"] == pytest.approx(ROOM, abs=0.1)
+
+
+def test_what_is_not_a_number_is_missing():
+    """A disturbance holds its last value, a control what was asked for."""
+    ends = []
+    for later in ({}, {"room": np.nan, "heater": np.nan}):
+        loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD))
+        loop.step(0.0, [ROOM] * 2, {"room": 15.0}, reference={"tip": 45.0})
+        action = loop.step(PERIOD, [21.0, ROOM], later, reference={"tip": 45.0})
+        ends.append((action.inputs["heater"], action.outputs))
+    assert ends[0] == ends[1]
+    assert np.isfinite(ends[1][0])
+    with pytest.raises(lp.SampleError, match="input 'room': got inf"):
+        loop.step(2 * PERIOD, [ROOM] * 2, {"room": np.inf}, reference={"tip": 45.0})
+
+
+def test_a_sample_that_is_refused_changes_nothing():
+    loops = [ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD)) for _ in range(2)]
+    for loop in loops:
+        loop.step(0.0, [ROOM] * 2, {"room": ROOM}, reference={"tip": 45.0})
+    for z in ([ROOM] * 3, {"T_6": ROOM}):
+        with pytest.raises(lp.SampleError):
+            loops[0].step(PERIOD, z, reference={"tip": 45.0})
+    with pytest.raises(lp.TimeOrderError):
+        loops[0].step(-PERIOD, [ROOM] * 2, reference={"tip": 45.0})
+    mine, theirs = (one.step(PERIOD, [21.0, 20.0], reference={"tip": 45.0}) for one in loops)
+    assert mine.known.x.tolist() == theirs.known.x.tolist()
+    assert mine.estimate.u.tolist() == theirs.estimate.u.tolist()
+
+
+def test_a_reduced_model_of_another_process_is_told():
+    swapped = lp.Points({"T_10": 0.10, "T_5": 0.05}, noise=0.2)
+    other = ct.reduce(rod(), OUTPUTS, ["heater"], sensors=swapped, u=ROOM)
+    with pytest.raises(lp.ConfigurationError, match="the identifier has the sensors"):
+        ct.Loop(identifier(), ct.LQ(other, GOAL, PERIOD))
+    coarse = ct.reduce(rod(10), OUTPUTS, ["heater"], sensors=SENSORS, u=ROOM)
+    with pytest.raises(lp.ConfigurationError, match="21 coefficients"):
+        ct.Loop(identifier(), ct.LQ(coarse, GOAL, PERIOD))
+
+
+def test_a_loop_of_another_estimator_is_not_loaded(tmp_path):
+    controller = ct.LQ(reduced(), GOAL, PERIOD)
+    ct.Loop(ct.Kalman(reduced(), PERIOD, drive={}), controller).save(tmp_path / "loop")
+    with pytest.raises(lp.RunError, match="of another estimator"):
+        ct.Loop(identifier(), controller).load(tmp_path / "loop")
+
+
+def test_a_limit_that_the_goal_does_not_have_is_not_dropped():
+    """The controller is built with the goal's: it would not know it."""
+    limited = replace(GOAL, limits={"face": (-np.inf, 75.0)})
+    loop = ct.Loop(identifier(), ct.LQ(reduced(), limited, PERIOD))
+    step = {"z": [ROOM] * 2, "inputs": {"room": ROOM}, "reference": {"tip": 45.0}}
+    with pytest.raises(lp.SampleError, match="least value, and the goal has none"):
+        loop.step(0.0, **step, limits={"face": (10.0, 75.0)})
+    with pytest.raises(lp.SampleError, match=r"must be \(least, largest\)"):
+        loop.step(0.0, **step, limits={"face": 75.0})
+    loop.step(0.0, **step, limits={"face": (-np.inf, np.inf)})
 
 
 def test_references_and_forecasts_are_checked():

@@ -67,6 +67,8 @@ def _modes(K: sp.csc_array, M: sp.csc_array, count: int, shift: float) -> Array:
     """Return the slowest modes; of an unsymmetric K real and imaginary parts."""
     n = K.shape[0]
     start, count = np.ones(n), min(count, n - 2)
+    if count < 1:  # the static responses are all there is
+        return np.zeros((n, 0))
     if abs(K - K.T).max() <= SYMMETRIC * abs(K).max():
         return np.asarray(eigsh(K, count, M, sigma=-shift, v0=start)[1])
     _, vectors = eigs(K, count, M, sigma=-shift, v0=start)

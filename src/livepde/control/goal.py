@@ -58,12 +58,17 @@ class Goal:
                         f"Goal: {what}['{name}'] must be a positive number; got {weight}."
                     )
         for what, ranges in (("inputs", self.inputs), ("limits", self.limits)):
-            for name, (low, high) in ranges.items():
-                if not low < high:
+            for name, ends in ranges.items():
+                if np.shape(ends) != (2,) or not ends[0] < ends[1]:
                     raise ConfigurationError(
                         f"Goal: {what}['{name}'] must be (least, largest) with least < largest; "
-                        f"got {(low, high)}."
+                        f"got {ends}."
                     )
+        for name, price in self.price.items():
+            if not np.isfinite(price):
+                raise ConfigurationError(f"Goal: price['{name}'] must be a number; got {price}.")
+        if not (np.isfinite(self.beyond) and self.beyond >= 0.0):
+            raise ConfigurationError(f"Goal: penalty must be at least 0; got {self.penalty}.")
 
     @property
     def beyond(self) -> float:

@@ -20,6 +20,7 @@ from livepde.errors import ConfigurationError, RunError, SampleError
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.result import Estimate
+from livepde.samples import number
 
 __all__ = ["Action", "Loop"]
 
@@ -117,6 +118,10 @@ class Loop:
         self.controller = controller
         start = np.where(np.isfinite(low), low, 0.0)
         for name, value in (before or {}).items():
+            if name not in model.controls:
+                raise ConfigurationError(
+                    f"Loop: before names '{name}'; the controls are {list(model.controls)}."
+                )
             start[model.controls.index(name)] = float(value)
         self._before: Array = start
         self._memory: Array = controller.start()
@@ -140,7 +145,8 @@ class Loop:
             As for `Identifier.step`: measurements of the sensors.
         inputs
             Measured disturbances; and what a control really applied since the sample before, where
-            that is not what was asked for.
+            that is not what was asked for. NaN is missing: a disturbance holds its last value, a
+            control what was asked for.
         reference
             Tracked output -> a number, or its values at the end of each coming period.
         forecast
@@ -152,18 +158,20 @@ class Loop:
         Raises
         ------
         SampleError
-            A reference is missing, or something is named that does not exist.
+            A reference is missing, something is named that does not exist, or a limit is given
+            where the goal has none.
         """
         controller, model = self.controller, self.controller.model
-        given = dict(inputs or {})
+        given = {name: number(v, f"input '{name}'") for name, v in (inputs or {}).items()}
         unknown = [name for name in given if name not in model.channels]
         if unknown:
             raise SampleError(f"unknown input '{unknown[0]}'; there are {list(model.channels)}.")
+        given = {name: value for name, value in given.items() if not np.isnan(value)}
         applied = np.array(
             [given.get(n, v) for n, v in zip(model.controls, self._before, strict=True)]
         )
         held = zip(model.disturbances, self._disturbances, strict=True)
-        now = np.array([float(given.get(name, value)) for name, value in held])
+        now = np.array([given.get(name, value) for name, value in held])
         if np.isnan(now).any():
             name = model.disturbances[int(np.flatnonzero(np.isnan(now))[0])]
             raise SampleError(f"input '{name}' has no value yet; send it with the first sample.")
@@ -193,13 +201,26 @@ class Loop:
     ) -> Plan:
         """Return what is known of the future, checked."""
         goal, model, count = self.controller.goal, self.controller.model, self.controller.horizon
-        held = [np.array([ends[k] for ends in goal.limits.values()]) for k in (0, 1)]
-        low, high = ({name: ends[k] for name, ends in limits.items()} for k in (0, 1))
+        for name, ends in dict[str, Any](limits).items():
+            if not isinstance(ends, tuple | list) or len(ends) != 2:
+                raise SampleError(f"limits['{name}'] must be (least, largest); got {ends!r}.")
+        found = []
+        for k, side in enumerate(("least", "largest")):
+            held = np.array([ends[k] for ends in goal.limits.values()])
+            given = {name: ends[k] for name, ends in limits.items()}
+            values = _ahead(given, tuple(goal.limits), held, count, "limits")
+            new = np.isinf(held) & np.isfinite(values).any(axis=0)
+            if new.any():
+                name = list(goal.limits)[int(np.flatnonzero(new)[0])]
+                raise SampleError(
+                    f"limits['{name}'] has a {side} value, and the goal has none; give one in "
+                    "Goal.limits, so that the controller is built with it."
+                )
+            found.append(values)
         return Plan(
             _ahead(reference, tuple(goal.track), None, count, "reference"),
             _ahead(forecast, model.disturbances, now, count, "forecast"),
-            _ahead(low, tuple(goal.limits), held[0], count, "limits"),
-            _ahead(high, tuple(goal.limits), held[1], count, "limits"),
+            *found,
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:

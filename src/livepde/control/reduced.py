@@ -149,7 +149,13 @@ class ReducedModel:
 
     def project(self, u: Array) -> Array:
         """Return the coordinates of a state of the full model, shape (r,)."""
-        x: Array = self.frame.test @ u
+        test = self.frame.test
+        if len(u) != test.shape[1]:
+            raise ConfigurationError(
+                f"A state of {len(u)} coefficients; the reduced model was made from a model with "
+                f"{test.shape[1]}: reduce the model that the identifier has."
+            )
+        x: Array = test @ u
         return x
 
     def lift(self, x: Array, inputs: Mapping[str, float]) -> Array:
@@ -164,6 +170,17 @@ class ReducedModel:
     def numbers(self, q: Array) -> Array:
         """Return the unknown numbers among the coefficients of a parameter, shape (m,)."""
         return np.asarray(q[self.frame.rows])
+
+    def given(self, q: Mapping[str, float] | None) -> Array:
+        """Return unknown numbers by label, the others at the prior, shape (m,)."""
+        numbers = self.prior.copy()
+        for label, value in (q or {}).items():
+            if label not in self.unknowns:
+                raise ConfigurationError(
+                    f"q names '{label}'; the unknown numbers are {list(self.unknowns)}."
+                )
+            numbers[self.unknowns.index(label)] = value
+        return numbers
 
     def seen(self, x: Array, q: Array, inputs: Mapping[str, float]) -> tuple[Array, Array]:
         """Return what the sensors show, (sensors,), and its derivative in x, (sensors, r).
@@ -205,7 +222,7 @@ class ReducedModel:
         """Return how much it misses of the full model: for each output the largest over all times.
 
         Each control in turn makes a step of size 1 and holds it; the difference is relative to the
-        largest response of that output.
+        largest response of that output to any of them.
 
         Parameters
         ----------
@@ -214,12 +231,15 @@ class ReducedModel:
         h, samples
             Time between samples, and how many are taken.
         """
-        frame, numbers = self.frame, self.prior.copy()
-        for label, value in (q or {}).items():
-            numbers[self.unknowns.index(label)] = value
+        if not h > 0.0 or samples < 1:
+            raise ConfigurationError(
+                f"error: h must be positive, and samples at least 1; got {h} and {samples}."
+            )
+        frame, numbers = self.frame, self.given(q)
         full = frame.q.copy()
         full[frame.rows] = numbers
-        step, worst = self.matrices(numbers, h), np.zeros(len(self.outputs.names))
+        step = self.matrices(numbers, h)
+        size, missed = np.zeros((2, len(self.outputs.names)))
         model, times = frame.model, (h * np.arange(samples + 1)).tolist()
         observed = frame.observed(frame.outputs)
         for control in self.controls:
@@ -240,9 +260,9 @@ class ReducedModel:
                 exact = observed.predict(u, full, Moment(t, Inputs(inputs)))
                 rows.append((exact, self.outputs(x, c)))
             exact, found = np.array(rows).transpose(1, 0, 2)
-            size = np.abs(exact - exact[0]).max(axis=0)
-            missed = np.abs(found - exact).max(axis=0)
-            worst = np.maximum(worst, missed / np.where(size > 0.0, size, 1.0))
+            size = np.maximum(size, np.abs(exact - exact[0]).max(axis=0))
+            missed = np.maximum(missed, np.abs(found - exact).max(axis=0))
+        worst = missed / np.where(size > 0.0, size, 1.0)
         return dict(zip(self.outputs.names, worst.tolist(), strict=True))
 
 
@@ -316,7 +336,7 @@ class Frame:
         """Return parameters between which systems are taken: the reference, one per number."""
         found, space = [self.q], self.model.parameter_space
         for label, k in space.labels.items():
-            low, high = likely(space, label, float(self.q[k]))
+            low, high = likely(space, label)
             other = self.q.copy()
             other[k] = high if high > other[k] else low
             found.append(other)
@@ -392,7 +412,7 @@ def _end(unknown: Any, side: int) -> float:
     return max(bound, 0.0) if unknown.transform == "log" and not side else bound
 
 
-def likely(space: Any, label: str, value: float) -> tuple[float, float]:
+def likely(space: Any, label: str) -> tuple[float, float]:
     """Return the ends of the prior's 95 % interval of an unknown number."""
     unknown = unknown_of(space, label)
     low, high = unknown.interval(unknown.prior, unknown.std, LIKELY)
@@ -445,11 +465,16 @@ def reduce(
         A control that is no channel of the model.
     """
     unknown = [name for name in controls if name not in model.channels]
-    if unknown or not controls:
+    if unknown or not controls or len(set(controls)) < len(controls):
         raise ConfigurationError(
             f"reduce: controls={list(controls)}; the channels of the model are "
-            f"{list(model.channels)}: name one or more of them."
+            f"{list(model.channels)}: name one or more of them, each once."
         )
+    for name in inputs or {}:
+        if name not in model.channels:
+            raise ConfigurationError(
+                f"reduce: inputs names '{name}'; the channels are {list(model.channels)}."
+            )
     if modes < 0:
         raise ConfigurationError(f"reduce: modes must be at least 0; got {modes}.")
     given = dict.fromkeys(model.channels, 0.0) | dict(inputs or {})
@@ -470,7 +495,7 @@ def reduce(
     W, known = frame.boundary
     values, space = [physical], model.parameter_space
     for label, row in space.labels.items():
-        for end in likely(space, label, float(physical[row])):
+        for end in likely(space, label):
             other = physical.copy()
             other[row] = end
             values.append(other)

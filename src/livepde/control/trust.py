@@ -48,8 +48,10 @@ class Trust:
                 raise ConfigurationError(
                     f"Trust: {name} must be a positive number; got {getattr(self, name)}."
                 )
-        if self.patience < 1:
-            raise ConfigurationError(f"Trust: patience must be at least 1; got {self.patience}.")
+        if self.patience != int(self.patience) or self.patience < 1:
+            raise ConfigurationError(
+                f"Trust: patience must be a whole number, at least 1; got {self.patience}."
+            )
 
     def doubt(self, estimate: Estimate, model: ReducedModel) -> str:
         """Return why an estimate is not trusted; empty if it is."""
