@@ -421,6 +421,21 @@ def test_scenarios_stay_where_the_model_makes_sense():
 
 
 @needs_mpc
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"horizon": 0}, "horizon must be a whole number"),
+        ({"horizon": 2.5}, "horizon must be a whole number"),
+        ({"kappa": np.inf}, "kappa must be a number"),
+        ({"period": 0.0}, "period must be a positive number"),
+    ],
+)
+def test_settings_of_the_controller_that_make_no_sense_are_told(options, says):
+    with pytest.raises(lp.ConfigurationError, match=says):
+        ct.MPC(reduced(modes=2), GOAL, **{"period": PERIOD, **options})
+
+
+@needs_mpc
 def test_a_search_that_fails_holds_the_inputs_and_says_so():
     model = reduced(modes=2)
     controller = ct.MPC(model, GOAL, PERIOD, horizon=5)

@@ -266,3 +266,14 @@ def test_result_plots_itself() -> None:
     identifier = lp.Identifier(model, lp.Points([0.5]), lp.SensitivityLaw(noise=0.1), u0=1.0)
     result = identifier.run([(0.1 * k, [0.5]) for k in range(4)])
     assert isinstance(drawn(result.plot(title="rod")), Figure)
+
+
+def test_loops_name_a_limit_once():
+    t = np.arange(3.0)
+    names = ["y", "y_low", "y_high", "y_reference"]
+    data = {name: ("time", t + shift) for name, shift in zip(names, (0, -1, 1, 0), strict=True)}
+    run = xr.Dataset(data, coords={"time": ("time", t, {"units": "s"})})
+    figure = plots.loops({"a": run, "b": run}, ["y"])
+    legends = [ax.get_legend() for ax in figure.axes]
+    assert [text.get_text() for text in legends[0].get_texts()] == ["reference", "limit"]
+    assert legends[1] is None

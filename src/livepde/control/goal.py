@@ -191,5 +191,7 @@ def check(controller: Controller) -> None:
         raise ConfigurationError(
             f"{what}: period must be a positive number; got {controller.period}."
         )
-    if controller.horizon < 1:
-        raise ConfigurationError(f"{what}: horizon must be at least 1; got {controller.horizon}.")
+    if controller.horizon != int(controller.horizon) or controller.horizon < 1:
+        raise ConfigurationError(
+            f"{what}: horizon must be a whole number, at least 1; got {controller.horizon}."
+        )

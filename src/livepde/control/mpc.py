@@ -65,8 +65,11 @@ class MPC:
 
     def __post_init__(self) -> None:
         check(self)
-        if not self.kappa >= 0.0 or self.directions < 1:
-            raise ConfigurationError("MPC: kappa must be at least 0, and directions at least 1.")
+        if not (np.isfinite(self.kappa) and self.kappa >= 0.0) or self.directions < 1:
+            raise ConfigurationError(
+                "MPC: kappa must be a number, at least 0, and directions at least 1; got "
+                f"{self.kappa} and {self.directions}."
+            )
         self.problem  # noqa: B018  a package that is missing is told now
 
     @property
