@@ -398,7 +398,8 @@ def test_limits_are_kept_for_all_that_the_conductivity_may_be():
         now = known(model, deviation)
         found = controller.decide(now, ahead, np.array([0.0]), controller.start())
         inputs.append(found.inputs[0])
-        for k in now.scenarios(2.0, 1):
+        for q in now.scenarios(2.0, 1):
+            k = model.shifted(now.q, q - now.q)
             after = model.matrices(k, PERIOD)(now.x, np.array([found.inputs[0], ROOM]))
             assert model.outputs(after, np.array([found.inputs[0], ROOM]))[0] < 75.01
     assert 0.0 < inputs[1] < inputs[0] - 0.02
@@ -418,6 +419,18 @@ def test_scenarios_stay_where_the_model_makes_sense():
     least = model.matrices(np.array([2.0]), PERIOD).A
     np.testing.assert_allclose(k[2, : model.size**2], least.ravel("F"))
     assert found.status == "ok"
+
+
+@needs_mpc
+def test_scenarios_are_deviations_of_what_is_gaussian():
+    """Of the logarithm: 12 in 20 are a factor of exp(0.6)."""
+    model = reduced(modes=2)
+    controller = ct.MPC(model, GOAL, PERIOD, horizon=5)
+    controller.decide(known(model, 12.0), plan(5), np.array([0.2]), controller.start())
+    rows = np.array(controller.problem.uncertain.master).reshape(3, -1)[:, : model.size**2]
+    for k in 20.0 * np.exp([0.0, 1.2, -1.2]):
+        expected = model.matrices(np.array([k]), PERIOD).A.ravel("F")
+        assert np.abs(rows - expected).max(axis=1).min() < 1e-9
 
 
 @needs_mpc

@@ -30,7 +30,8 @@ class MPC:
     """do-mpc's multi-stage controller: limits are kept for the estimate and for what it may be.
 
     At each sample the unknown numbers are set to the estimate and to `kappa` standard deviations to
-    both sides along the leading directions of their covariance; one sequence of inputs begins in
+    both sides along the leading directions of their covariance, where there is a transform of its
+    latent values: half or twice as much, not nothing; one sequence of inputs begins in
     the same way for all of them. With a better estimate they come together, and it acts less
     cautiously. Ranges of actuators are never left; limits of outputs are kept where that is
     possible, and what lies beyond costs the penalty of the goal.
@@ -158,6 +159,7 @@ class MPC:
         """Return what to set from now on; as for `Controller`."""
         mpc, model = self.problem, self.model
         found = known.scenarios(self.kappa, (self.scenarios - 1) // 2)
+        found = np.array([model.shifted(known.q, one - known.q) for one in found])
         q = np.vstack([found, np.tile(known.q, (self.scenarios - len(found), 1))])
         q = np.clip(
             q, *(known.q + FARTHEST * (end - known.q) for end in (model.lower, model.upper))

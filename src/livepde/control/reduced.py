@@ -182,6 +182,15 @@ class ReducedModel:
             numbers[self.unknowns.index(label)] = value
         return numbers
 
+    def shifted(self, q: Array, shift: Array) -> Array:
+        """Return unknown numbers moved by so much to first order, but in latent values, (m,)."""
+        space = self.frame.model.parameter_space
+        moved = [
+            unknown_of(space, label).map.shifted(value, abs(by), np.sign(by))
+            for label, value, by in zip(self.unknowns, q, shift, strict=True)
+        ]
+        return np.array(moved, dtype=float)
+
     def seen(self, x: Array, q: Array, inputs: Mapping[str, float]) -> tuple[Array, Array]:
         """Return what the sensors show, (sensors,), and its derivative in x, (sensors, r).
 
