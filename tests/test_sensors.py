@@ -245,7 +245,7 @@ anything = st.floats(-3.0, 3.0)
 
 EVERY_CLASS = {
     item
-    for item in vars(lp).values()
+    for item in (getattr(lp, name) for name in lp.__all__)
     if isinstance(item, type) and issubclass(item, lp.Observation) and item is not lp.Observation
 }
 
