@@ -86,7 +86,7 @@ class MovingHorizon:
             self.model, self.mass = _full(problem.reduced)
             frame = problem.reduced.frame
             V = frame.V[np.flatnonzero(frame.model.X.free)]
-            self.scale = np.sqrt((V * self.scale) ** 2 @ np.ones(len(self.scale)))
+            self.scale = np.linalg.norm(V * self.scale, axis=1)
         self.failed = 0
         count, model = setting.samples, self.model
         self._z = np.zeros((count, len(model.sensors.names)))
