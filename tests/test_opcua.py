@@ -158,6 +158,26 @@ def test_a_connection_that_breaks_down_ends_the_run(server):
         heard.poll(0.0)
 
 
+def test_a_thread_may_outlive_its_loop(server, monkeypatch):
+    """A refused connection closes its loop; its thread is still seen alive for a moment."""
+    work = OpcuaSource._work
+    leave = threading.Event()
+
+    def lingers(self):
+        work(self)
+        leave.wait(30.0)
+
+    monkeypatch.setattr(OpcuaSource, "_work", lingers)
+    heard = source(server)
+    heard._loop.call_soon_threadsafe(heard._stop.set)
+    while not heard._loop.is_closed():
+        time.sleep(0.01)
+    threading.Timer(0.2, leave.set).start()
+    assert heard._thread.is_alive()
+    heard.close()
+    assert not heard._thread.is_alive()
+
+
 def test_a_run_takes_them(server, tmp_path):
     heard = source(server)
     listen(heard, lambda row: "left" in row.values)

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as OutOfTime
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
@@ -200,9 +201,9 @@ class OpcuaSource:
 
     def close(self) -> None:
         """Take leave of the server."""
-        if self._thread.is_alive():
+        with suppress(RuntimeError):  # the loop has closed by itself: nothing is left to stop
             self._loop.call_soon_threadsafe(self._stop.set)
-            self._thread.join(PATIENCE)
+        self._thread.join(PATIENCE)
 
 
 class _Changes:
