@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
 
+from livepde.control.affine import Discrete, Output
 from livepde.control.basis import basis
-from livepde.control.linear import Linear, Linearisation
-from livepde.errors import ConfigurationError, ModelError
+from livepde.control.frame import Frame, likely
+from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
@@ -20,55 +20,9 @@ from livepde.observation import Observation, Observed
 from livepde.result import unknown_of
 from livepde.stepping import Advance, Alexander2, simulate
 
-__all__ = ["Discrete", "Output", "ReducedModel", "reduce"]
+__all__ = ["ReducedModel", "reduce"]
 
-LIKELY = 0.95  # probability of the range of an unknown number over which responses are taken
 FINER = 8  # steps of the full model between two samples, where it is compared
-LINEAR = 1e-8  # relative error of a system that should be linear in the unknown numbers
-
-
-@dataclass(frozen=True, eq=False)
-class Output:
-    """What is seen of the reduced state: y = C x + D c + d for the channels c.
-
-    Attributes
-    ----------
-    names
-        Of the outputs.
-    C, D, d
-        Shapes (outputs, r), (outputs, channels) and (outputs,).
-    noise
-        Standard deviation of each as a measurement, shape (outputs,); None if it is not known.
-    """
-
-    names: tuple[str, ...]
-    C: Array
-    D: Array
-    d: Array
-    noise: Array | None = None
-
-    def __call__(self, x: Array, c: Array) -> Array:
-        """Return the outputs, shape (outputs,)."""
-        y: Array = self.C @ x + self.D @ c + self.d
-        return y
-
-
-@dataclass(frozen=True, eq=False)
-class Discrete:
-    """One step x+ = A x + B c + f, with the channels c held in between."""
-
-    A: Array
-    B: Array
-    f: Array
-
-    def with_offset(self, offset: Array | None) -> Discrete:
-        """Return the step with something added to the channels, shape (channels,)."""
-        return self if offset is None else replace(self, f=self.f + self.B @ offset)
-
-    def __call__(self, x: Array, c: Array) -> Array:
-        """Return the state at the end of the step."""
-        after: Array = self.A @ x + self.B @ c + self.f
-        return after
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +46,8 @@ class ReducedModel:
         Of the unknown numbers, shapes (m,).
     lower, upper
         Their bounds, shapes (m,).
+    frame
+        What it was made from.
     """
 
     unknowns: tuple[str, ...]
@@ -107,6 +63,28 @@ class ReducedModel:
     lower: Array
     upper: Array
     frame: Frame
+
+    @classmethod
+    def of(cls, frame: Frame, controls: tuple[str, ...]) -> ReducedModel:
+        """Return the reduced model of a frame."""
+        parts, r = frame.parts(), frame.V.shape[1]
+        space = frame.model.parameter_space
+        unknowns = [unknown_of(space, label) for label in space.labels]
+        return cls(
+            unknowns=tuple(space.labels),
+            channels=frame.model.channels,
+            controls=controls,
+            K=parts[:, :, :r],
+            E=parts[:, :, r:-1],
+            f=parts[:, :, -1],
+            outputs=frame.output(frame.outputs),
+            sensors=frame.output(frame.sensors),
+            prior=space.prior[frame.rows],
+            std=np.array([unknown.std for unknown in unknowns]),
+            lower=np.array([_end(unknown, 0) for unknown in unknowns]),
+            upper=np.array([_end(unknown, 1) for unknown in unknowns]),
+            frame=frame,
+        )
 
     @property
     def size(self) -> int:
@@ -223,7 +201,7 @@ class ReducedModel:
         inputs
             Value of each channel; default as before.
         """
-        return self.frame.moved(u, q, inputs).build(self.controls)
+        return ReducedModel.of(self.frame.moved(u, q, inputs), self.controls)
 
     def error(
         self, q: Mapping[str, float] | None = None, *, h: float, samples: int = 100
@@ -275,157 +253,10 @@ class ReducedModel:
         return dict(zip(self.outputs.names, worst.tolist(), strict=True))
 
 
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """What a reduced model was made from.
-
-    Attributes
-    ----------
-    model
-        The full model.
-    outputs, sensors
-        Observations of what is controlled, and of what is measured.
-    V, test
-        Basis, shape (n, r), and V^T M, shape (r, n).
-    u, q, inputs
-        Where it is linearised: state, parameter, and each channel.
-    """
-
-    model: Model
-    outputs: Observation
-    sensors: Observation
-    V: Array
-    test: Array
-    u: Array
-    q: Array
-    inputs: Mapping[str, float]
-
-    @property
-    def rows(self) -> list[int]:
-        """Which coefficients of the parameter are unknown numbers."""
-        return list(self.model.parameter_space.labels.values())
-
-    @cached_property
-    def observed_sensors(self) -> Observed:
-        """The sensors, bound to the full model."""
-        return self.observed(self.sensors)
-
-    @cached_property
-    def linearisation(self) -> Linearisation:
-        """The linear systems of the full model."""
-        return Linearisation(self.model, self.u, self.inputs)
-
-    def observed(self, observation: Observation) -> Observed:
-        """Return an observation bound to the full model."""
-        model = self.model
-        return observation.bind(model.state_space, model.X, model.parameter_space)
-
-    @cached_property
-    def boundary(self) -> tuple[Array, Array]:
-        """The lifting of boundary channels and values, as `Linearisation.boundary` has it."""
-        return self.linearisation.boundary()
-
-    def lift(self, x: Array, c: Array) -> Array:
-        """Return the state of the full model for coordinates and channels."""
-        W, known = self.boundary
-        fixed = W @ c + known
-        u: Array = fixed + self.V @ (x - self.test @ fixed)
-        return u
-
-    def moved(self, u: Array | None, q: Array | None, inputs: Mapping[str, float] | None) -> Frame:
-        """Return the same, linearised elsewhere."""
-        return replace(
-            self,
-            u=self.u if u is None else u,
-            q=self.q if q is None else q,
-            inputs=self.inputs if inputs is None else inputs,
-        )
-
-    def values(self) -> list[Array]:
-        """Return parameters between which systems are taken: the reference, one per number."""
-        found, space = [self.q], self.model.parameter_space
-        for label, k in space.labels.items():
-            low, high = likely(space, label)
-            other = self.q.copy()
-            other[k] = high if high > other[k] else low
-            found.append(other)
-        return found
-
-    def build(self, controls: tuple[str, ...]) -> ReducedModel:
-        """Return the reduced model."""
-        values = self.values()
-        systems = [self._projected(self.linearisation.at(q)) for q in values]
-        slopes = [
-            (systems[k + 1] - systems[0]) / (values[k + 1][row] - self.q[row])
-            for k, row in enumerate(self.rows)
-        ]
-        constant = systems[0] - sum(
-            (self.q[row] * slope for row, slope in zip(self.rows, slopes, strict=True)),
-            np.zeros_like(systems[0]),
-        )
-        self._check_linear(values, systems)
-        parts, r = np.array([constant, *slopes]), self.V.shape[1]
-        space, labels = self.model.parameter_space, self.model.parameter_space.labels
-        unknowns = [unknown_of(space, label) for label in labels]
-        return ReducedModel(
-            unknowns=tuple(labels),
-            channels=self.model.channels,
-            controls=controls,
-            K=parts[:, :, :r],
-            E=parts[:, :, r:-1],
-            f=parts[:, :, -1],
-            outputs=self._output(self.outputs),
-            sensors=self._output(self.sensors),
-            prior=space.prior[self.rows],
-            std=np.array([unknown.std for unknown in unknowns]),
-            lower=np.array([_end(unknown, 0) for unknown in unknowns]),
-            upper=np.array([_end(unknown, 1) for unknown in unknowns]),
-            frame=self,
-        )
-
-    def _projected(self, system: Linear) -> Array:
-        """Return K, E and f on the basis side by side, shape (r, r + channels + 1)."""
-        W, known = self.boundary
-        fixed = np.column_stack([W, known])
-        K: Array = self.V.T @ (system.K @ self.V)
-        driven = self.V.T @ (np.column_stack([system.E, system.f]) - system.K @ fixed)
-        return np.column_stack([K, driven + K @ (self.test @ fixed)])
-
-    def _check_linear(self, values: Sequence[Array], systems: Sequence[Array]) -> None:
-        both = self.q + 0.5 * sum((q - self.q for q in values[1:]), np.zeros_like(self.q))
-        expected = systems[0] + 0.5 * sum(
-            (system - systems[0] for system in systems[1:]), np.zeros_like(systems[0])
-        )
-        found = self._projected(self.linearisation.at(both))
-        if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
-            raise ModelError(
-                "reduce: the model is not linear in its unknown numbers, so that it has no reduced "
-                "model in which they are parameters. Write it linear in them: a transform of each "
-                "(transform='log') is no hindrance."
-            )
-
-    def _output(self, observation: Observation) -> Output:
-        observed, moment = self.observed(observation), self.linearisation.moment
-        W, known = self.boundary
-        y = observed.predict(self.u, self.q, moment)
-        H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
-        C = H @ self.V
-        D = H @ W - C @ (self.test @ W)
-        d = y - H @ self.u + H @ known - C @ (self.test @ known)
-        return Output(tuple(observed.names), C, D, d, observed.noise)
-
-
 def _end(unknown: Any, side: int) -> float:
     """Return a bound of an unknown; the logarithm has none below zero."""
     bound = float(unknown.bounds[side])
     return max(bound, 0.0) if unknown.transform == "log" and not side else bound
-
-
-def likely(space: Any, label: str) -> tuple[float, float]:
-    """Return the ends of the prior's 95 % interval of an unknown number."""
-    unknown = unknown_of(space, label)
-    low, high = unknown.interval(unknown.prior, unknown.std, LIKELY)
-    return float(low), float(high)
 
 
 def reduce(
@@ -511,4 +342,4 @@ def reduce(
     systems = [linearisation.at(value) for value in values]
     free = np.flatnonzero(model.X.free)
     V = basis(model.mass, free, systems, np.column_stack([W, known]), modes, rates)
-    return replace(frame, V=V, test=V.T @ model.mass).build(tuple(controls))
+    return ReducedModel.of(replace(frame, V=V, test=V.T @ model.mass), tuple(controls))

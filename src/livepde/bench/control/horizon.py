@@ -240,7 +240,7 @@ def _full(reduced: ReducedModel) -> tuple[ReducedModel, sp.csc_array]:
     V = np.zeros((mass.shape[0], len(free)))
     V[free] = np.eye(len(free))
     test = splu(inner).solve(mass[free].toarray())
-    return replace(frame, V=V, test=test).build(reduced.controls), inner
+    return ReducedModel.of(replace(frame, V=V, test=test), reduced.controls), inner
 
 
 def _sparse(matrix: Array) -> Any:

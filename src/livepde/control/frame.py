@@ -1,0 +1,157 @@
+"""What a reduced model is made from: the full model, a basis, and where it is linearised."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from livepde.control.affine import Output
+from livepde.control.linear import Linear, Linearisation
+from livepde.errors import ModelError
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observation, Observed
+from livepde.result import unknown_of
+
+__all__ = ["Frame", "likely"]
+
+LIKELY = 0.95  # probability of the range of an unknown number over which responses are taken
+LINEAR = 1e-8  # relative error of a system that should be linear in the unknown numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a reduced model was made from.
+
+    Attributes
+    ----------
+    model
+        The full model.
+    outputs, sensors
+        Observations of what is controlled, and of what is measured.
+    V, test
+        Basis, shape (n, r), and V^T M, shape (r, n).
+    u, q, inputs
+        Where it is linearised: state, parameter, and each channel.
+    """
+
+    model: Model
+    outputs: Observation
+    sensors: Observation
+    V: Array
+    test: Array
+    u: Array
+    q: Array
+    inputs: Mapping[str, float]
+
+    @property
+    def rows(self) -> list[int]:
+        """Which coefficients of the parameter are unknown numbers."""
+        return list(self.model.parameter_space.labels.values())
+
+    @cached_property
+    def observed_sensors(self) -> Observed:
+        """The sensors, bound to the full model."""
+        return self.observed(self.sensors)
+
+    @cached_property
+    def linearisation(self) -> Linearisation:
+        """The linear systems of the full model."""
+        return Linearisation(self.model, self.u, self.inputs)
+
+    def observed(self, observation: Observation) -> Observed:
+        """Return an observation bound to the full model."""
+        model = self.model
+        return observation.bind(model.state_space, model.X, model.parameter_space)
+
+    @cached_property
+    def boundary(self) -> tuple[Array, Array]:
+        """The lifting of boundary channels and values, as `Linearisation.boundary` has it."""
+        return self.linearisation.boundary()
+
+    def lift(self, x: Array, c: Array) -> Array:
+        """Return the state of the full model for coordinates and channels."""
+        W, known = self.boundary
+        fixed = W @ c + known
+        u: Array = fixed + self.V @ (x - self.test @ fixed)
+        return u
+
+    def moved(self, u: Array | None, q: Array | None, inputs: Mapping[str, float] | None) -> Frame:
+        """Return the same, linearised elsewhere."""
+        return replace(
+            self,
+            u=self.u if u is None else u,
+            q=self.q if q is None else q,
+            inputs=self.inputs if inputs is None else inputs,
+        )
+
+    def values(self) -> list[Array]:
+        """Return parameters between which systems are taken: the reference, one per number."""
+        found, space = [self.q], self.model.parameter_space
+        for label, k in space.labels.items():
+            low, high = likely(space, label)
+            other = self.q.copy()
+            other[k] = high if high > other[k] else low
+            found.append(other)
+        return found
+
+    def parts(self) -> Array:
+        """Return K, E and f side by side: the part without q and one for each unknown number.
+
+        Shape (1 + m, r, r + channels + 1).
+        """
+        values = self.values()
+        systems = [self._projected(self.linearisation.at(q)) for q in values]
+        slopes = [
+            (systems[k + 1] - systems[0]) / (values[k + 1][row] - self.q[row])
+            for k, row in enumerate(self.rows)
+        ]
+        constant = systems[0] - sum(
+            (self.q[row] * slope for row, slope in zip(self.rows, slopes, strict=True)),
+            np.zeros_like(systems[0]),
+        )
+        self._check_linear(values, systems)
+        return np.array([constant, *slopes])
+
+    def _projected(self, system: Linear) -> Array:
+        """Return K, E and f on the basis side by side, shape (r, r + channels + 1)."""
+        W, known = self.boundary
+        fixed = np.column_stack([W, known])
+        K: Array = self.V.T @ (system.K @ self.V)
+        driven = self.V.T @ (np.column_stack([system.E, system.f]) - system.K @ fixed)
+        return np.column_stack([K, driven + K @ (self.test @ fixed)])
+
+    def _check_linear(self, values: Sequence[Array], systems: Sequence[Array]) -> None:
+        both = self.q + 0.5 * sum((q - self.q for q in values[1:]), np.zeros_like(self.q))
+        expected = systems[0] + 0.5 * sum(
+            (system - systems[0] for system in systems[1:]), np.zeros_like(systems[0])
+        )
+        found = self._projected(self.linearisation.at(both))
+        if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
+            raise ModelError(
+                "reduce: the model is not linear in its unknown numbers, so that it has no reduced "
+                "model in which they are parameters. Write it linear in them: a transform of each "
+                "(transform='log') is no hindrance."
+            )
+
+    def output(self, observation: Observation) -> Output:
+        """Return what an observation shows of the coordinates."""
+        observed, moment = self.observed(observation), self.linearisation.moment
+        W, known = self.boundary
+        y = observed.predict(self.u, self.q, moment)
+        H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
+        C = H @ self.V
+        D = H @ W - C @ (self.test @ W)
+        d = y - H @ self.u + H @ known - C @ (self.test @ known)
+        return Output(tuple(observed.names), C, D, d, observed.noise)
+
+
+def likely(space: Any, label: str) -> tuple[float, float]:
+    """Return the ends of the prior's 95 % interval of an unknown number."""
+    unknown = unknown_of(space, label)
+    low, high = unknown.interval(unknown.prior, unknown.std, LIKELY)
+    return float(low), float(high)
