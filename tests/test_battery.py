@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 import livepde as lp
+from livepde.bench.control.battery import graphite
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.models import EQUATIONS, battery_particle
@@ -133,18 +134,6 @@ def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
         value, std = estimate.parameters[name]
         assert abs(value - truth) < 3 * std
         assert std < 0.1 * abs(truth)
-
-
-def graphite(x: Any) -> Any:
-    """Open-circuit voltage, Safari and Delacourt (2011)."""
-    return (
-        0.6379
-        + 0.5416 * np.exp(-305.5309 * x)
-        + 0.044 * np.tanh((0.1958 - x) / 0.1088)
-        - 0.1978 * np.tanh((x - 1.0571) / 0.0854)
-        - 0.6875 * np.tanh((x + 0.0117) / 0.0529)
-        - 0.0175 * np.tanh((x - 0.5692) / 0.0875)
-    )
 
 
 def test_an_ageing_diffusivity_is_followed_through_a_voltage():

@@ -186,7 +186,7 @@ def test_the_moving_horizon_finds_the_diffusivity(full):
     problem = battery(1)  # far from the prior
     estimator = MovingHorizon(problem, Setting(12, 1.0, 0.1, full))
     model = problem.reduced
-    assert estimator.model.size == (len(model.frame.V) if full else model.size)
+    assert estimator.coordinates.model.size == (len(model.frame.V) if full else model.size)
     known = driven(problem, estimator, 40)
     assert [one.source for one in known[:13]] == 12 * ["fallback"] + ["estimate"]
     assert "window of 12 samples is not full" in known[0].why

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.linalg import solve_discrete_are
-from scipy.sparse.linalg import splu
 
+from livepde.bench.control.coordinates import Coefficients, Coordinates
 from livepde.bench.control.problem import Problem
 from livepde.bench.control.runs import nominal
 from livepde.checkpoint import packed, unpacked
@@ -32,7 +30,6 @@ QUIET = {
     "show_eval_warnings": False,
 }
 ROUNDING = 1e-12  # relative size of entries of a matrix that are none
-FLOOR = 1e-3  # process noise of each coordinate, relative to the largest
 FARTHEST = 6.0  # prior deviations that an unknown number moves at most: exp must not overflow
 
 
@@ -80,15 +77,9 @@ class MovingHorizon:
         self.problem = problem
         self.setting = setting
         self.nominal = nominal(problem)
-        self.scale = _scale(problem)
-        self.model, self.mass = problem.reduced, sp.csc_array(sp.eye_array(problem.reduced.size))
-        if setting.full:
-            self.model, self.mass = _full(problem.reduced)
-            frame = problem.reduced.frame
-            V = frame.V[np.flatnonzero(frame.model.X.free)]
-            self.scale = np.linalg.norm(V * self.scale, axis=1)
+        self.coordinates = (Coefficients if setting.full else Coordinates).of(problem)
         self.failed = 0
-        count, model = setting.samples, self.model
+        count, model = setting.samples, self.coordinates.model
         self._z = np.zeros((count, len(model.sensors.names)))
         self._c = np.zeros((count, len(model.channels)))
         self._x = np.zeros((count + 1, model.size))
@@ -97,12 +88,10 @@ class MovingHorizon:
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         """Take a sample, as an `Estimator` does; the first one describes the start."""
         known = self.nominal.step(t, z, inputs)
-        noise = np.asarray(self.model.sensors.noise)
-        x = known.x
-        if self.setting.full:
-            x = self.model.project(self.problem.reduced.lift(x, inputs))
+        model = self.coordinates.model
+        noise, x = np.asarray(model.sensors.noise), self.coordinates.here(known.x, inputs)
         self._z = np.vstack([self._z[1:], np.asarray(z, dtype=float) / noise])
-        self._c = np.vstack([self._c[1:], self.model.values(inputs)])
+        self._c = np.vstack([self._c[1:], model.values(inputs)])
         self._x = np.vstack([self._x[1:], x])
         self._taken += 1
         count = self.setting.samples
@@ -125,9 +114,8 @@ class MovingHorizon:
             mhe.opt_x_num.master = before
             why = f"Ipopt: {mhe.solver_stats['return_status']}"
             return Known(known.x, known.q, known.factor, "fallback", why)
-        x = self.scale * mhe.opt_x_num["_x", -1, -1].full().ravel()
-        if self.setting.full:
-            x = self.problem.reduced.project(self.model.lift(x, inputs))
+        last = self.coordinates.scale * mhe.opt_x_num["_x", -1, -1].full().ravel()
+        x = self.coordinates.back(last, inputs)
         q = self._numbers(mhe.opt_x_num["_p_est"].full().ravel(), np.exp)
         return Known(x, np.asarray(q), np.zeros((len(q), 0)))
 
@@ -153,17 +141,17 @@ class MovingHorizon:
 
     def _begin(self) -> None:
         """Start from the nominal model's states."""
-        mhe = self.mhe
-        for k, x in enumerate(self._x / self.scale):
+        mhe, scaled = self.mhe, self._x / self.coordinates.scale
+        for k, x in enumerate(scaled):
             mhe.opt_x_num["_x", k, -1] = x
-        for k, x in enumerate(self._x[1:] / self.scale):
+        for k, x in enumerate(scaled[1:]):
             mhe.opt_x_num["_z", k, -1, "inner"] = np.tile(x, (len(RADAU), 1)).T
         mhe.opt_x_num["_p_est"] = 0.0
         mhe.opt_p_num["_x_prev"] = mhe.opt_x_num["_x", 0, -1]
 
     def _numbers(self, p: Any, exp: Any) -> list[Any]:
         """Return the unknown numbers for multiples of their prior deviations."""
-        model = self.model
+        model = self.coordinates.model
         space = model.frame.model.parameter_space
         found = []
         for k, (label, prior, std) in enumerate(
@@ -177,7 +165,8 @@ class MovingHorizon:
     def mhe(self) -> Any:
         """do-mpc's object."""
         do_mpc, casadi = packages()
-        problem, model, setting = self.problem, self.model, self.setting
+        period, setting = self.problem.period, self.setting
+        model, scale = self.coordinates.model, self.coordinates.scale
         r, m = model.size, len(model.unknowns)
         process = do_mpc.model.Model("discrete")
         x = process.set_variable("_x", "x", (r, 1))
@@ -185,7 +174,7 @@ class MovingHorizon:
         c = process.set_variable("_tvp", "c", (len(model.channels), 1))
         p = process.set_variable("_p", "p", (m, 1))
         with quiet():
-            seen = _reading(model, self.scale[:, None] * inner[:, -1], c)
+            seen = _reading(model, scale[:, None] * inner[:, -1], c)
         process.set_meas("z", seen / casadi.DM(model.sensors.noise), meas_noise=True)
         process.set_rhs("x", inner[:, -1])
         q = [1.0, *self._numbers(p, casadi.exp)]
@@ -193,22 +182,21 @@ class MovingHorizon:
         for k in range(len(RADAU)):
             rate = 0.0
             for i, value in enumerate(q):
-                K = _sparse(model.K[i] * self.scale / self.scale[:, None])
-                driven = casadi.DM(model.E[i] / self.scale[:, None]) @ c
-                driven += casadi.DM(model.f[i] / self.scale)
+                K = _sparse(model.K[i] * scale / scale[:, None])
+                driven = casadi.DM(model.E[i] / scale[:, None]) @ c
+                driven += casadi.DM(model.f[i] / scale)
                 rate += value * (driven - K @ inner[:, k])
             rates.append(rate)
-        mass = _sparse(self.mass.toarray() * self.scale / self.scale[:, None])
+        mass = _sparse(self.coordinates.mass.toarray() * scale / scale[:, None])
         balance = [
-            mass @ (inner[:, k] - x)
-            - problem.period * sum(a * v for a, v in zip(row, rates, strict=True))
+            mass @ (inner[:, k] - x) - period * sum(a * v for a, v in zip(row, rates, strict=True))
             for k, row in enumerate(RADAU)
         ]
         process.set_alg("balance", casadi.vertcat(*balance))
         process.setup()
         mhe = do_mpc.estimator.MHE(process, ["p"])
         mhe.settings.n_horizon = setting.samples
-        mhe.settings.t_step = problem.period
+        mhe.settings.t_step = period
         mhe.settings.meas_from_data = False
         mhe.settings.store_full_solution = False
         mhe.settings.nlpsol_opts = QUIET
@@ -228,38 +216,10 @@ class MovingHorizon:
         return mhe
 
 
-def _full(reduced: ReducedModel) -> tuple[ReducedModel, sp.csc_array]:
-    """Return the model in the free coefficients of its elements, and their mass matrix M_ff.
-
-    K, E and f are those of M_ff x' = -K(q) x + E(q) c + f(q).
-    """
-    frame = reduced.frame
-    free = np.flatnonzero(frame.model.X.free)
-    mass = sp.csr_array(frame.model.mass)
-    inner = sp.csc_array(mass[free][:, free])
-    V = np.zeros((mass.shape[0], len(free)))
-    V[free] = np.eye(len(free))
-    test = splu(inner).solve(mass[free].toarray())
-    return ReducedModel.of(replace(frame, V=V, test=test), reduced.controls), inner
-
-
 def _sparse(matrix: Array) -> Any:
     """Return a matrix without what is rounding, for CasADi."""
     small = np.abs(matrix) <= ROUNDING * np.abs(matrix).max()
     return packages()[1].sparsify(packages()[1].DM(np.where(small, 0.0, matrix)))
-
-
-def _scale(problem: Problem) -> Array:
-    """Return the deviation of each coordinate in the steady filter: units of the state."""
-    model = problem.reduced
-    drive = np.array([problem.drive.get(name, 0.0) for name in model.channels])
-    step = model.matrices(model.prior, problem.period)
-    driven = step.B * drive
-    Q = driven @ driven.T
-    Q += FLOOR**2 * float(np.trace(Q)) * np.eye(len(Q))
-    noise = np.diag(np.asarray(model.sensors.noise) ** 2)
-    P = solve_discrete_are(step.A.T, model.sensors.C.T, Q, noise)
-    return np.asarray(np.sqrt(np.diag(P)))
 
 
 def _reading(model: ReducedModel, x: Any, c: Any) -> Any:

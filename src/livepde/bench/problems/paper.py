@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from types import ModuleType
 
 import numpy as np
 
@@ -13,10 +14,20 @@ from livepde.streams import Twin
 __all__ = ["SEED", "SEED_EXCITED"]
 
 
-def _twin(twin: Twin) -> Process:
+@cache
+def _twin(experiment: ModuleType, std: float) -> Process:
+    """Return an experiment's own twin, with a prior deviation of q."""
+    model, observation = experiment.build(std=std)
+    twin = Twin(
+        model=model,
+        observation=observation,
+        q_true=experiment.q_true,
+        u_true=experiment.u_true,
+        times=experiment.TIMES,
+    )
     return Process(
-        model=twin.model,
-        observation=twin.observation,
+        model=model,
+        observation=observation,
         times=np.asarray(twin.times, dtype=float),
         exact=twin.exact_data,
         q_true=np.tile(twin.q, (len(twin.times), 1)),
@@ -26,38 +37,10 @@ def _twin(twin: Twin) -> Process:
     )
 
 
-@cache
-def _seed(_: int) -> Process:
-    model, omega = seed.build(std=0.01)
-    return _twin(
-        Twin(
-            model=model,
-            observation=omega,
-            q_true=seed.q_true,
-            u_true=seed.u_true,
-            times=seed.TIMES,
-        )
-    )
-
-
-@cache
-def _seed_excited(_: int) -> Process:
-    model, full = seed_excited.build(std=3.0)
-    return _twin(
-        Twin(
-            model=model,
-            observation=full,
-            q_true=seed_excited.q_true,
-            u_true=seed_excited.u_true,
-            times=seed_excited.TIMES,
-        )
-    )
-
-
 SEED = Problem(
     name="seed",
     summary="Paper's example: q(x) from u on (0.3, 0.87), data of the same scheme",
-    make=_seed,
+    make=lambda _: _twin(seed, 0.01),
     floor=1e-5,
     gain=1e8,
 )
@@ -65,6 +48,6 @@ SEED = Problem(
 SEED_EXCITED = Problem(
     name="seed-excited",
     summary="The same equation, excited and fully observed, data of the same scheme",
-    make=_seed_excited,
+    make=lambda _: _twin(seed_excited, 3.0),
     gain=1e2,
 )
