@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cli, runs
-from livepde.dashboard import cards, cuts, figures, serve
+from livepde.dashboard import cards, cuts, fields, figures, panels, serve, times
 from livepde.dashboard import view as views
 from livepde.dashboard.view import Spread, View
 from livepde.models import heat
@@ -98,12 +98,12 @@ def dataset(kind: str = "line", count: int = 6, **options):
 @pytest.mark.parametrize("field", [False, True])
 def test_every_kind_of_run_has_its_panels(kind, field):
     data = dataset(kind, field=field)
-    found = {panel.name: panel for panel in figures.panels(data)}
+    found = {panel.name: panel for panel in panels.panels(data)}
     assert {"field:u", "innovation", "withheld_error", "told", "unknown:loss"} <= {*found}
     assert ("field:alpha" in found) is field
     assert ("correlation" in found) is not field
     for panel in found.values():
-        assert panel.section in figures.SECTIONS
+        assert panel.section in panels.SECTIONS
         assert panel.title
         assert panel.about
         json.loads(panel.figure.to_json())
@@ -112,10 +112,10 @@ def test_every_kind_of_run_has_its_panels(kind, field):
 
 
 def test_a_run_of_one_sample_and_one_without_covariance():
-    assert len(figures.panels(dataset(count=1))) > 3
+    assert len(panels.panels(dataset(count=1))) > 3
     law = lp.GradientLaw(gain=1e-3, damping=lp.ResidualDamping(c1=1.0))
     plain = dataset(law=law)
-    assert not {"told", "correlation"} & {panel.name for panel in figures.panels(plain)}
+    assert not {"told", "correlation"} & {panel.name for panel in panels.panels(plain)}
     assert "no covariance" in str(cards.cards(plain, None))
 
 
@@ -124,7 +124,7 @@ def test_looking_back_shows_the_fields_of_then():
 
     def profile(at):
         (estimate,) = (
-            trace for trace in figures.field_profile(data, "u", at).data if trace.name == "estimate"
+            trace for trace in fields.field_profile(data, "u", at).data if trace.name == "estimate"
         )
         return estimate.y
 
@@ -147,11 +147,11 @@ def test_unknowns_are_drawn_with_their_intervals():
 
 def test_dates_where_the_run_has_an_origin():
     data = dataset()
-    assert figures.when_axis(data).text(0.6) == "0.6 s"
+    assert times.when_axis(data).text(0.6) == "0.6 s"
     data.attrs["origin"] = "2025-04-01 00:00:00"
-    assert figures.when_axis(data).text(3600.0) == "2025-04-01 01:00:00"
+    assert times.when_axis(data).text(3600.0) == "2025-04-01 01:00:00"
     data["time"] = data["time"] * 1e300
-    assert not figures.when_axis(data).dates
+    assert not times.when_axis(data).dates
 
 
 def test_long_series_are_thinned_but_failures_stay():

@@ -15,7 +15,8 @@ import numpy as np
 import xarray as xr
 from dash import html
 
-from livepde.dashboard.figures import at_time, groups, when_axis
+from livepde.dashboard.figures import groups
+from livepde.dashboard.times import at_time, when_axis
 from livepde.dashboard.view import Seen
 from livepde.diagnostics.identifiability import Known
 from livepde.plots import interval_95, labelled

@@ -53,7 +53,9 @@ def page_of(run: Run) -> str:
         raise ConfigurationError(
             "A report as HTML needs Plotly and Jinja2: pip install 'livepde[dashboard]'."
         ) from None
-    from livepde.dashboard.figures import CONFIG, SECTIONS, panels, when_axis
+    from livepde.dashboard.canvas import CONFIG
+    from livepde.dashboard.panels import SECTIONS, panels
+    from livepde.dashboard.times import when_axis
 
     data = run.dataset
     if not data.sizes["time"]:

@@ -1,0 +1,146 @@
+"""The style of figures in a browser: empty ones, over time, bands, what an axis shows.
+
+Names that come from files are shown as text, never as markup.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+import xarray as xr
+
+from livepde.dashboard.times import TimeAxis, when_axis
+from livepde.linalg import Array
+from livepde.plots import PALETTE, labelled
+from livepde.runs import jumps
+
+__all__ = [
+    "CONFIG",
+    "GRID",
+    "MARKS",
+    "band",
+    "empty",
+    "over_time",
+    "show",
+    "text",
+    "unit_label",
+    "unit_of",
+]
+
+DECADES = 100.0  # from which ratio on a scale is logarithmic
+INK, GRID = "#1f2933", "#e4e7eb"
+HEIGHT = 320
+# A second axis, for what is marked at a time and has no value.
+MARKS: Any = {"overlaying": "y", "range": [0, 1], "visible": False, "fixedrange": True}
+CONFIG: Any = {"displayModeBar": False, "responsive": True}  # for Plotly
+
+
+def text(value: object) -> str:
+    """Return text from a file so that Plotly shows it as it stands."""
+    return html.escape(str(value), quote=False)
+
+
+def unit_of(data: xr.Dataset, name: str) -> str:
+    """Return the unit of a variable as it is written."""
+    return str(data[name].attrs.get("units", ""))
+
+
+def unit_label(data: xr.Dataset, name: str) -> str:
+    """Return the unit of a variable for an axis."""
+    return labelled("", unit_of(data, name)).strip().strip("[]")
+
+
+def _rgba(colour: str, alpha: float) -> str:
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    return f"rgba({red},{green},{blue},{alpha})"
+
+
+def empty(xlabel: str = "", ylabel: str = "", height: int = HEIGHT) -> go.Figure:
+    """Return an empty figure in the style of the page."""
+    axis = {"gridcolor": GRID, "zerolinecolor": GRID, "linecolor": "#9aa5b1", "automargin": True}
+    figure = go.Figure()
+    figure.update_layout(
+        template="none",
+        height=height,
+        margin={"l": 12, "r": 12, "t": 8, "b": 8},
+        font={"family": "system-ui, -apple-system, sans-serif", "size": 13, "color": INK},
+        paper_bgcolor="white",
+        plot_bgcolor="white",
+        hovermode="x unified",
+        hoverlabel={"namelength": 24},
+        legend={"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
+        uirevision="kept",  # zoom, camera and hidden lines survive an update
+    )
+    figure.update_xaxes(**axis, title={"text": text(xlabel), "standoff": 6})
+    figure.update_yaxes(**axis, title={"text": text(ylabel), "standoff": 8}, exponentformat="power")
+    return figure
+
+
+def over_time(data: xr.Dataset, ylabel: str, at: float | None) -> tuple[go.Figure, TimeAxis]:
+    """Return a figure over time with what happened: jumps, and the time that is looked at."""
+    axis = when_axis(data)
+    figure = empty("" if axis.dates else labelled("time", axis.unit), ylabel)
+    figure.update_xaxes(type="date" if axis.dates else "linear")
+    for k, jump in enumerate(jumps(data)):
+        t = axis.values([jump.t, jump.t])
+        _upright(figure, t, "jump", PALETTE[1], "dash", legend=k == 0)
+    if at is not None:
+        _upright(figure, axis.values([at, at]), "shown time", INK, "solid", legend=False)
+    return figure, axis
+
+
+def _upright(figure: go.Figure, t: Any, name: str, colour: str, dash: str, *, legend: bool) -> None:
+    line = {"color": colour, "width": 1.2, "dash": dash}
+    figure.add_scatter(
+        x=t,
+        y=[0.0, 1.0],
+        yaxis="y2",
+        mode="lines",
+        line=line,
+        name=name,
+        legendgroup=name,
+        showlegend=legend,
+        hoverinfo="skip",
+    )
+    figure.update_layout(yaxis2=MARKS)
+
+
+def band(
+    figure: go.Figure,
+    x: Any,
+    low: Array,
+    high: Array,
+    colour: str,
+    name: str,
+    opacity: float = 0.2,
+) -> None:
+    """Fill what lies between two lines."""
+    shared: dict[str, Any] = {
+        "mode": "lines",
+        "line": {"width": 0, "color": colour},
+        "legendgroup": name,
+        "showlegend": False,
+    }
+    figure.add_scatter(x=x, y=low, name="from", hoverinfo="skip", **shared)
+    figure.add_scatter(
+        x=x, y=high, fill="tonexty", fillcolor=_rgba(colour, opacity), hoverinfo="skip", **shared
+    )
+
+
+def show(figure: go.Figure, parts: Sequence[Array]) -> None:
+    """Let the axis show all finite values; positive ones over decades on a logarithmic scale."""
+    values = np.concatenate([np.ravel(part) for part in parts])
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return
+    low, high = float(values.min()), float(values.max())
+    if low > 0.0 and high > DECADES * low:
+        low, high = math.log10(low), math.log10(high)
+        figure.update_layout(yaxis_type="log")
+    margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
+    figure.update_layout(yaxis_range=[low - margin, high + margin])

@@ -1,0 +1,68 @@
+"""How times of a run are shown in a browser, and which of them is looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from livepde.plots import time_scale
+from livepde.runs.summary import SECONDS
+
+__all__ = ["TimeAxis", "at_time", "when_axis"]
+
+FAR = 1e11  # seconds from the origin beyond which times are numbers
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """How model times are shown: dates, or numbers in a unit that suits the span.
+
+    Attributes
+    ----------
+    scale, start
+        What is drawn is `start + t * scale`; of dates in milliseconds since 1970, as Plotly has it.
+    unit
+        Of numbers.
+    dates
+        Whether they are dates.
+    """
+
+    scale: float
+    start: float = 0.0
+    unit: str = ""
+    dates: bool = False
+
+    def values(self, t: Any) -> Any:
+        """Return what is drawn for times."""
+        return self.start + np.asarray(t, dtype=float) * self.scale
+
+    def text(self, t: float) -> str:
+        """Return one time as text."""
+        value = self.values(t)
+        if self.dates and np.isfinite(value):
+            return str(np.datetime64(int(value), "ms").astype("datetime64[s]")).replace("T", " ")
+        return f"{value:.5g} {self.unit}".rstrip()
+
+
+def when_axis(data: xr.Dataset) -> TimeAxis:
+    """Return how the times of a dataset are shown."""
+    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
+    times = data["time"].values
+    near = bool((np.abs(times) * SECONDS.get(unit, 1.0) < FAR).all())
+    if origin is not None and unit in SECONDS and near:
+        start = datetime.fromisoformat(str(origin)).replace(tzinfo=UTC).timestamp()
+        return TimeAxis(1000.0 * SECONDS[unit], 1000.0 * start, dates=True)
+    factor, name = time_scale(data)
+    return TimeAxis(1.0 / factor, unit=name)
+
+
+def at_time(data: xr.Dataset, dimension: str, at: float | None) -> int:
+    """Return the index of the last entry up to a time; -1 of an empty dataset."""
+    times = data[dimension].values
+    if at is None or not len(times):
+        return len(times) - 1
+    return max(int(np.searchsorted(times, at, "right")) - 1, 0)
