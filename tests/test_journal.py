@@ -21,8 +21,9 @@ import livepde as lp
 from livepde import checkpoint
 from livepde.records import Record
 from livepde.runs import RunWriter
+from livepde.runs.database import in_use, log_of, written
 from livepde.runs.feeds import Samples
-from livepde.runs.journal import KEPT_EVENTS, Event, Journal, in_use, log_of, written
+from livepde.runs.journal import KEPT_EVENTS, Event, Journal
 from livepde.runs.live import CHECKPOINT, Live, Retention
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Rows, json_row
@@ -756,6 +757,6 @@ def test_an_error_while_a_journal_is_opened_is_told_once(tmp_path, monkeypatch):
     def full(path):
         raise lp.RunError("the disk is full; make room.")
 
-    monkeypatch.setattr("livepde.runs.journal._writer", full)
+    monkeypatch.setattr("livepde.runs.journal.writer", full)
     with pytest.raises(lp.RunError, match=r"^the disk is full; make room\.$"):
         journal(tmp_path / NAME)

@@ -26,8 +26,8 @@ from livepde.observation import Points
 from livepde.progress import watched
 from livepde.result import Estimate
 from livepde.runs import Check, Journal, Outcome, Table, journal_of
+from livepde.runs.database import log_of
 from livepde.runs.feeds import Samples
-from livepde.runs.journal import log_of
 from livepde.runs.live import Live, Retention
 from livepde.stepping import Advance, ImplicitEuler, simulate
 

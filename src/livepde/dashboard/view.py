@@ -17,8 +17,9 @@ from livepde import runs
 from livepde.errors import RunError
 from livepde.records import Layout, Record
 from livepde.runs import Check, Journal
+from livepde.runs.database import in_use, written
 from livepde.runs.directory import JOURNAL
-from livepde.runs.journal import Event, in_use, written
+from livepde.runs.journal import Event
 
 __all__ = ["Seen", "Spread", "View"]
 

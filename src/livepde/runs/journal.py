@@ -21,31 +21,28 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, Snapshot
+from livepde.runs.database import AGAIN, in_memory, locked, reader, released, sound, told, writer
+from livepde.runs.packing import layout_from, packed, unpacked
 
-if TYPE_CHECKING:
-    from pydantic import TypeAdapter
-
-__all__ = ["Event", "Journal", "Taken", "in_use", "log_of", "written"]
+__all__ = ["Event", "Journal", "Taken"]
 
 FORMAT = 1
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
 TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
-LOG_SIZE = 16 * 2**20  # bytes of the write-ahead log that are kept when it was longer
 LONGEST = 2000  # characters of the message of an event
 
 SCHEMA = (
@@ -61,28 +58,6 @@ SCHEMA = (
     "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, "
     "PRIMARY KEY (kind, channel)) WITHOUT ROWID",
 )
-# What a file of somebody else may make of reading it.
-DAMAGE = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    MemoryError,
-    RecursionError,
-    TypeError,
-    ValueError,
-)
-AGAIN = "run the case again into another folder"
-REMEDIES = {  # primary result code of SQLite -> what to do
-    sqlite3.SQLITE_FULL: "make room, and go on with --resume",
-    sqlite3.SQLITE_IOERR: "make room or mend the disk, and go on with --resume",
-    sqlite3.SQLITE_READONLY: "let the folder and its files be written, and go on with --resume",
-    sqlite3.SQLITE_CANTOPEN: "let the folder and its files be read and written",
-    sqlite3.SQLITE_PERM: "let the folder and its files be read and written",
-    sqlite3.SQLITE_BUSY: "stop the other program that holds it, and go on with --resume",
-    sqlite3.SQLITE_LOCKED: "stop the other program that holds it, and go on with --resume",
-    sqlite3.SQLITE_CORRUPT: f"the file is damaged: {AGAIN}",
-    sqlite3.SQLITE_NOTADB: f"the file is damaged: {AGAIN}",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +103,9 @@ class Journal:
         self._lock = lock
         self._failure = ""
         meta = self._meta()
-        with _sound(path):
+        with sound(path):
             self.channels = tuple(map(str, json.loads(meta["channels"])))
-            self.layout = _layout(meta["layout"])
+            self.layout = layout_from(meta["layout"])
         self._vertices = max(map(len, self.layout.coordinates.values()), default=0)
         self._last = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
         self._current = self._last
@@ -150,11 +125,11 @@ class Journal:
             "layout": json.dumps(layout.to_dict()),
         }
         if path is None:
-            connection = sqlite3.connect(MEMORY, factory=_Connection)
+            connection = in_memory()
             _fill(connection, meta)
             return cls(MEMORY, connection, None)
-        lock = _locked(path)
-        with _released(path, lock):
+        lock = locked(path)
+        with released(path, lock):
             if path.exists():
                 raise RunError(
                     f"{path}: there is a journal already; go on with it (--resume), or choose "
@@ -166,16 +141,16 @@ class Journal:
                 new.execute("PRAGMA journal_mode = MEMORY")  # no second file beside it
                 _fill(new, meta)
             partial.replace(path)
-            return cls(path, _writer(path), lock)
+            return cls(path, writer(path), lock)
 
     @classmethod
     def open(cls, path: Path, *, write: bool = False) -> Journal:
         """Open a journal: to go on with it, or to read while another process writes."""
         if not path.is_file():
             raise RunError(f"{path}: there is no journal.")
-        lock = _locked(path) if write else None
-        with _released(path, lock):
-            return cls(path, _writer(path) if write else _reader(path), lock)
+        lock = locked(path) if write else None
+        with released(path, lock):
+            return cls(path, writer(path) if write else reader(path), lock)
 
     def close(self) -> None:
         """Commit and let go."""
@@ -202,7 +177,7 @@ class Journal:
         except sqlite3.Error as error:
             with suppress(sqlite3.Error):
                 self._db.rollback()
-            self._failure = _told(self.path, error)
+            self._failure = told(self.path, error)
             raise RunError(self._failure) from error
 
     def _execute(self, command: str, *values: Any) -> sqlite3.Cursor:
@@ -213,7 +188,7 @@ class Journal:
         try:
             return self._db.execute(command, values).fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter of a damaged file
-            raise RunError(_told(self.path, error)) from error
+            raise RunError(told(self.path, error)) from error
 
     def _one(self, command: str, *values: Any) -> Any:
         return self._read(command, *values)[0][0]
@@ -294,7 +269,7 @@ class Journal:
             "min(last, excluded.last)",
             self._last if last else self._current,
             int(last),
-            _packed(snapshot),
+            packed(snapshot),
         )
 
     def checkpoint(self, state: bytes) -> None:
@@ -374,7 +349,7 @@ class Journal:
     def last(self) -> float:
         """Time of the last accepted sample, -inf before any."""
         rows = self._read("SELECT t FROM samples ORDER BY id DESC LIMIT 1")
-        with _sound(self.path):
+        with sound(self.path):
             return float(rows[0][0]) if rows else -np.inf
 
     @property
@@ -382,7 +357,7 @@ class Journal:
         """Where the source stood after the last accepted sample, or what came after it."""
         rows = self._read("SELECT id, position FROM samples ORDER BY id DESC LIMIT 1")
         last, position = rows[0] if rows else (0, "")
-        with _sound(self.path):
+        with sound(self.path):
             after, later = json.loads(self._meta().get("position", '[-1, ""]'))
             return str(later if after == last else position)
 
@@ -413,7 +388,7 @@ class Journal:
             yield self._taken(*rows[0])
 
     def _taken(self, number: int, t: float, channels: bytes) -> Taken:
-        with _sound(self.path):
+        with sound(self.path):
             if len(channels) != 8 * len(self.channels):
                 raise ValueError(f"sample {number} has not the size of the others")
             values = np.frombuffer(channels).tolist()
@@ -435,7 +410,7 @@ class Journal:
                 TOGETHER,
             )
             for number, *content in rows:
-                with _sound(self.path):
+                with sound(self.path):
                     record = self._record(*content)
                 yield number, record
             if len(rows) < TOGETHER:
@@ -447,33 +422,33 @@ class Journal:
         layout = self.layout
         sizes = [len(layout.numbers), len(layout.sensors), len(layout.withheld or ())]
         values = np.frombuffer(numbers)
-        snapshot = None if content is None else _unpacked(content)
+        snapshot = None if content is None else unpacked(content)
         lengths = set() if snapshot is None else {len(x) for x in snapshot.profiles.values()}
         if len(values) != sum(sizes) or lengths - {self._vertices}:
             raise ValueError(f"the estimate at t = {t} has not the size of the others")
         found, innovation, error, _ = np.split(values, np.cumsum(sizes))
-        told = {str(name): float(number) for name, number in json.loads(notes).items()}
+        said = {str(name): float(number) for name, number in json.loads(notes).items()}
         code = STATUS_CODES.index(STATUS_CODES[status])
-        return Record(float(t), found, innovation, error, code, int(steps), told, snapshot)
+        return Record(float(t), found, innovation, error, code, int(steps), said, snapshot)
 
     def dataset(self) -> xr.Dataset:
         """Return the estimates as a dataset; see `Result.to_xarray`."""
         records = list(self)
-        with _sound(self.path):
+        with sound(self.path):
             return self.layout.dataset(records)
 
     @property
     def events(self) -> list[Event]:
         """All events, in the order in which they happened."""
         rows = self._read("SELECT t, kind, channel, message FROM events ORDER BY id")
-        with _sound(self.path):
+        with sound(self.path):
             return [Event(float(t), *map(str, words)) for t, *words in rows]
 
     @property
     def counts(self) -> dict[tuple[str, str], int]:
         """(kind, channel) -> how often."""
         rows = self._read("SELECT kind, channel, number FROM counts ORDER BY kind, channel")
-        with _sound(self.path):
+        with sound(self.path):
             return {(str(kind), str(channel)): int(number) for kind, channel, number in rows}
 
     # --- bounded growth ------------------------------------------------------------------------
@@ -500,44 +475,6 @@ class Journal:
         self._thinned = max(self._thinned, end)
 
 
-def _packed(snapshot: Snapshot) -> bytes:
-    """Return a snapshot as names and sizes in JSON, a zero byte, and the numbers."""
-    arrays = dict(snapshot.profiles)
-    head: dict[str, Any] = {"told": snapshot.told}
-    head["profiles"] = {name: len(values) for name, values in arrays.items()}
-    body = [values.tobytes() for values in arrays.values()]
-    if snapshot.correlation is not None:
-        head["correlation"] = len(snapshot.correlation)
-        body.append(snapshot.correlation.tobytes())
-    return json.dumps(head).encode() + b"\0" + b"".join(body)
-
-
-def _unpacked(content: bytes) -> Snapshot:
-    text, body = content.split(b"\0", 1)
-    head = json.loads(text)
-    sizes = [*head["profiles"].values()]
-    n = head.get("correlation")
-    numbers = np.frombuffer(body)
-    if len(numbers) != sum(sizes) + (n or 0) ** 2:
-        raise ValueError("fields of another size than they say")
-    *parts, rest = np.split(numbers, np.cumsum(sizes))
-    told = {name: (float(told), int(count)) for name, (told, count) in head["told"].items()}
-    correlation: Array | None = None if n is None else rest.reshape(n, n)
-    return Snapshot(dict(zip(head["profiles"], parts, strict=True)), told, correlation)
-
-
-def _layout(text: str) -> Layout:
-    """Return a layout from JSON, its types checked."""
-    return _reader_of_layouts().validate_json(text)
-
-
-@cache
-def _reader_of_layouts() -> TypeAdapter[Layout]:
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(Layout)
-
-
 def _fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
     """Make the tables of a new journal."""
     with connection:
@@ -545,115 +482,3 @@ def _fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
         for command in SCHEMA:
             connection.execute(command)
         connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
-
-
-def _writer(path: Path) -> sqlite3.Connection:
-    connection = _connect(path, "mode=rw")
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = NORMAL")  # no sync for each commit, see above
-    connection.execute(f"PRAGMA journal_size_limit = {LOG_SIZE}")
-    return connection
-
-
-def _reader(path: Path) -> sqlite3.Connection:
-    connection = _connect(path, "mode=ro")
-    try:
-        connection.execute("SELECT 1 FROM sqlite_schema").close()
-    except sqlite3.OperationalError:
-        log = log_of(path)
-        if log.exists() and log.stat().st_size:
-            raise
-        # A folder in which nothing can be made, and nobody writes.
-        connection.close()
-        connection = _connect(path, "immutable=1")
-    return connection
-
-
-class _Connection(sqlite3.Connection):
-    """Closed when nobody holds it any more; Python 3.13 warns of others."""
-
-    def __del__(self) -> None:
-        with suppress(sqlite3.Error):  # of another thread
-            self.close()
-
-
-def _connect(path: Path, options: str) -> sqlite3.Connection:
-    connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?{options}", uri=True, factory=_Connection
-    )
-    connection.execute("PRAGMA trusted_schema = OFF")
-    connection.execute("PRAGMA cell_size_check = ON")
-    return connection
-
-
-def log_of(path: Path) -> Path:
-    """Return the write-ahead log beside a journal; it need not be there."""
-    return path.with_name(path.name + "-wal")
-
-
-def written(path: Path) -> float:
-    """Return when a journal was written last, in seconds since 1970; 0 if there is none."""
-    times = [0.0]
-    for file in (path, log_of(path)):
-        with suppress(OSError):  # the log goes away with its writer
-            times.append(file.stat().st_mtime)
-    return max(times)
-
-
-def in_use(path: Path) -> bool:
-    """Return whether a process holds a journal to write it."""
-    lock = _lock_of(path)
-    try:
-        lock.acquire(timeout=0)
-    except (Timeout, OSError):
-        return True
-    lock.release()
-    return False
-
-
-def _lock_of(path: Path) -> FileLock:
-    return FileLock(path.with_name(path.name + ".lock"))
-
-
-def _locked(path: Path) -> FileLock:
-    lock = _lock_of(path)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise RunError(
-            f"{path.parent} is being written by another process: stop it, or choose another folder."
-        ) from None
-    except OSError as error:
-        raise RunError(f"{path.parent} cannot be written: {error.strerror or error}.") from error
-    return lock
-
-
-@contextmanager
-def _released(path: Path, lock: FileLock | None) -> Iterator[None]:
-    """Let go of a journal that cannot be opened, and say why in one sentence."""
-    try:
-        yield
-    except (OSError, sqlite3.Error, UnicodeDecodeError, RunError) as error:
-        if lock is not None:
-            lock.release()
-        if isinstance(error, sqlite3.Error | UnicodeDecodeError):
-            raise RunError(_told(path, error)) from error
-        if not isinstance(error, RunError):
-            raise RunError(f"{path} cannot be written: {error.strerror or error}.") from error
-        raise
-
-
-@contextmanager
-def _sound(path: Path) -> Iterator[None]:
-    """What a damaged file, or one made to do harm, makes of its content is one sentence."""
-    try:
-        yield
-    except DAMAGE as error:
-        reason = str(error).split("\n", 1)[0] or type(error).__name__
-        raise RunError(f"{path} is damaged ({reason[:200]}): {AGAIN}.") from error
-
-
-def _told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
-    remedy = REMEDIES.get(code & 0xFF, "mend the folder, and go on with --resume")
-    return f"{path}: {error}. What was written before is safe; {remedy}."

@@ -17,7 +17,7 @@ from livepde.bench.faults.plants import PATIENCE, GrowingFile, Mosquitto, Topic,
 from livepde.bench.faults.rod import Row, case_text, rod_rows
 from livepde.errors import RunError
 from livepde.runs import JOURNAL, Journal
-from livepde.runs.journal import log_of
+from livepde.runs.database import log_of
 
 __all__ = ["Run", "hearing", "undisturbed"]
 

@@ -1,0 +1,171 @@
+"""The SQLite file of a journal: opened, locked, and what is said when it fails or is damaged."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from livepde.errors import RunError
+
+__all__ = [
+    "AGAIN",
+    "in_memory",
+    "in_use",
+    "locked",
+    "log_of",
+    "reader",
+    "released",
+    "sound",
+    "told",
+    "writer",
+    "written",
+]
+
+LOG_SIZE = 16 * 2**20  # bytes of the write-ahead log that are kept when it was longer
+# What a file of somebody else may make of reading it.
+DAMAGE = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
+AGAIN = "run the case again into another folder"
+REMEDIES = {  # primary result code of SQLite -> what to do
+    sqlite3.SQLITE_FULL: "make room, and go on with --resume",
+    sqlite3.SQLITE_IOERR: "make room or mend the disk, and go on with --resume",
+    sqlite3.SQLITE_READONLY: "let the folder and its files be written, and go on with --resume",
+    sqlite3.SQLITE_CANTOPEN: "let the folder and its files be read and written",
+    sqlite3.SQLITE_PERM: "let the folder and its files be read and written",
+    sqlite3.SQLITE_BUSY: "stop the other program that holds it, and go on with --resume",
+    sqlite3.SQLITE_LOCKED: "stop the other program that holds it, and go on with --resume",
+    sqlite3.SQLITE_CORRUPT: f"the file is damaged: {AGAIN}",
+    sqlite3.SQLITE_NOTADB: f"the file is damaged: {AGAIN}",
+}
+
+
+def in_memory() -> sqlite3.Connection:
+    """Open one that is in memory only."""
+    return sqlite3.connect(":memory:", factory=_Connection)
+
+
+def writer(path: Path) -> sqlite3.Connection:
+    """Open a file to write it."""
+    connection = _connect(path, "mode=rw")
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")  # no sync for each commit, see the journal
+    connection.execute(f"PRAGMA journal_size_limit = {LOG_SIZE}")
+    return connection
+
+
+def reader(path: Path) -> sqlite3.Connection:
+    """Open a file to read it, while another process may write."""
+    connection = _connect(path, "mode=ro")
+    try:
+        connection.execute("SELECT 1 FROM sqlite_schema").close()
+    except sqlite3.OperationalError:
+        log = log_of(path)
+        if log.exists() and log.stat().st_size:
+            raise
+        # A folder in which nothing can be made, and nobody writes.
+        connection.close()
+        connection = _connect(path, "immutable=1")
+    return connection
+
+
+class _Connection(sqlite3.Connection):
+    """Closed when nobody holds it any more; Python 3.13 warns of others."""
+
+    def __del__(self) -> None:
+        with suppress(sqlite3.Error):  # of another thread
+            self.close()
+
+
+def _connect(path: Path, options: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?{options}", uri=True, factory=_Connection
+    )
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute("PRAGMA cell_size_check = ON")
+    return connection
+
+
+def log_of(path: Path) -> Path:
+    """Return the write-ahead log beside a journal; it need not be there."""
+    return path.with_name(path.name + "-wal")
+
+
+def written(path: Path) -> float:
+    """Return when a journal was written last, in seconds since 1970; 0 if there is none."""
+    times = [0.0]
+    for file in (path, log_of(path)):
+        with suppress(OSError):  # the log goes away with its writer
+            times.append(file.stat().st_mtime)
+    return max(times)
+
+
+def in_use(path: Path) -> bool:
+    """Return whether a process holds a journal to write it."""
+    lock = _lock_of(path)
+    try:
+        lock.acquire(timeout=0)
+    except (Timeout, OSError):
+        return True
+    lock.release()
+    return False
+
+
+def _lock_of(path: Path) -> FileLock:
+    return FileLock(path.with_name(path.name + ".lock"))
+
+
+def locked(path: Path) -> FileLock:
+    """Become the one writer of a file, or say that there is one."""
+    lock = _lock_of(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise RunError(
+            f"{path.parent} is being written by another process: stop it, or choose another folder."
+        ) from None
+    except OSError as error:
+        raise RunError(f"{path.parent} cannot be written: {error.strerror or error}.") from error
+    return lock
+
+
+@contextmanager
+def released(path: Path, lock: FileLock | None) -> Iterator[None]:
+    """Let go of a journal that cannot be opened, and say why in one sentence."""
+    try:
+        yield
+    except (OSError, sqlite3.Error, UnicodeDecodeError, RunError) as error:
+        if lock is not None:
+            lock.release()
+        if isinstance(error, sqlite3.Error | UnicodeDecodeError):
+            raise RunError(told(path, error)) from error
+        if not isinstance(error, RunError):
+            raise RunError(f"{path} cannot be written: {error.strerror or error}.") from error
+        raise
+
+
+@contextmanager
+def sound(path: Path) -> Iterator[None]:
+    """What a damaged file, or one made to do harm, makes of its content is one sentence."""
+    try:
+        yield
+    except DAMAGE as error:
+        reason = str(error).split("\n", 1)[0] or type(error).__name__
+        raise RunError(f"{path} is damaged ({reason[:200]}): {AGAIN}.") from error
+
+
+def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
+    """Return what failed, and what to do, in words."""
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
+    remedy = REMEDIES.get(code & 0xFF, "mend the folder, and go on with --resume")
+    return f"{path}: {error}. What was written before is safe; {remedy}."
