@@ -11,9 +11,10 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.bench import accuracy as suite
-from livepde.bench import peers as other
 from livepde.bench import scoring
 from livepde.bench.offline import Trajectory, fit
+from livepde.bench.peers import table
+from livepde.bench.peers.augmented import Augmented
 from livepde.bench.problems import PROBLEMS, Data, Problem, Process
 
 TIMES = np.linspace(0.0, 1.0, 21)
@@ -123,15 +124,15 @@ def test_a_contender_that_fails_is_a_row(data):
 
 
 def test_a_peer_that_is_not_installed_is_a_row(monkeypatch):
-    absent = other.Peer(("no_such_package",), lambda data: None)
-    monkeypatch.setitem(other.PEERS, "absent", absent)
-    score = other.run_row(ROD, 0.01, 0, "absent")
+    absent = table.Peer(("no_such_package",), lambda data: None)
+    monkeypatch.setitem(table.PEERS, "absent", absent)
+    score = table.run_row(ROD, 0.01, 0, "absent")
     assert score is not None
     assert score.note == "not installed: no_such_package"
 
 
 def test_peers_are_given_our_forward_model(data):
-    augmented = other.Augmented(data)
+    augmented = Augmented(data)
     a = np.log(data.process.q_true[0] / 0.3) * 3.0
     x = np.concatenate([augmented.start, a])
     for at in range(1, len(TIMES)):
@@ -144,22 +145,22 @@ def test_promises_about_peers_are_checked():
         return [scoring.Score(error=error, step=step)]
 
     found = {
-        ("rod", 0.01, other.MINE): scores(0.1, 2.0),
+        ("rod", 0.01, table.MINE): scores(0.1, 2.0),
         ("rod", 0.01, "DAPPER: EnKF, 50 members"): scores(0.08, 38.0),
         ("rod", 0.01, "do-mpc: moving horizon"): [scoring.Score(note="not installed: do_mpc")],
     }
-    error, work = other._checks(found)
+    error, work = table._checks(found)
     assert (error.value, error.ok) == (pytest.approx(1.25), False)
     assert (work.value, work.bound, work.ok) == (19.0, 20.0, False)
 
 
 @pytest.mark.parametrize(
-    "row", [name for name in other.PEERS if "DAPPER" in name or "filterpy" in name]
+    "row", [name for name in table.PEERS if "DAPPER" in name or "filterpy" in name]
 )
 def test_peers_that_are_installed_find_the_parameter(row):
-    if other.PEERS[row].missing:
-        pytest.skip(f"not installed: {other.PEERS[row].missing}")
-    score = other.run_row(ROD, 0.01, 0, row)
+    if table.PEERS[row].missing:
+        pytest.skip(f"not installed: {table.PEERS[row].missing}")
+    score = table.run_row(ROD, 0.01, 0, row)
     assert score is not None
     assert score.error < 0.2
 
