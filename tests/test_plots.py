@@ -17,6 +17,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import plots
+from livepde.plots.style import shades_of
 
 DAY = 86400.0
 
@@ -250,7 +251,7 @@ def test_refusals(draw: Any, message: str) -> None:
 
 
 def test_colours_differ_in_lightness_too() -> None:
-    shades = [to_hex(colour) for colour in plots._shades(6)]
+    shades = [to_hex(colour) for colour in shades_of(6)]
     lightness = [sum(int(shade[k : k + 2], 16) for k in (1, 3, 5)) for shade in shades]
     assert lightness == sorted(lightness)
     assert len(set(plots.PALETTE)) == len(plots.PALETTE)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from livepde import plots
 from livepde.errors import ConfigurationError
 from livepde.fem import FieldBlock, FunctionSpace, cells
 from livepde.laws import Belief, Status
@@ -272,6 +271,8 @@ class Result:
 
     def plot(self, **options: Any) -> Any:
         """Draw the run and return the figure; needs the extra `plots`."""
+        from livepde import plots
+
         return plots.overview(self.to_xarray(), **options)
 
 

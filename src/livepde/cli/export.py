@@ -76,21 +76,21 @@ def export(
 def _moment(text: str, data: Dataset) -> float:
     """Return a time of the command line in the run's unit."""
     from livepde.cases.units import convert
-    from livepde.runs.export import instants
-    from livepde.runs.summary import SECONDS
+    from livepde.runs.dates import dated
 
     unit = str(data["time"].attrs.get("units", ""))
     try:
         return float(text)
     except ValueError:
         pass
-    zero = instants(data, [0.0])
     try:
         date = datetime.fromisoformat(text)
     except ValueError:
         return convert(text, unit, "--at")
-    if zero is None:
+    dates = dated(data)
+    if dates is None:
         raise ConfigurationError(f"--at: got the date {text}, but the run's times have no date.")
     if date.tzinfo is not None:
         date = date.astimezone(UTC).replace(tzinfo=None)
-    return float((date - zero[0]).total_seconds()) / SECONDS[unit]
+    origin, second = dates
+    return (date - origin).total_seconds() / second

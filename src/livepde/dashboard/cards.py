@@ -15,15 +15,14 @@ import numpy as np
 import xarray as xr
 from dash import html
 
-from livepde.dashboard.figures import groups
 from livepde.dashboard.times import at_time, when_axis
 from livepde.dashboard.view import Seen
 from livepde.diagnostics.identifiability import Known
-from livepde.plots import interval_95, labelled
+from livepde.plots.dataset import groups, interval_95, labelled, scalars
 from livepde.records import STATUS_CODES
 from livepde.runs import unexplained
 from livepde.runs.directory import bound_text
-from livepde.runs.summary import digits, scalars, scored
+from livepde.runs.summary import digits, scored
 
 __all__ = ["cards", "chip", "facts", "pretty", "summary", "tables", "verdict"]
 

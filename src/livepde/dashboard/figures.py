@@ -12,22 +12,14 @@ import xarray as xr
 from livepde.dashboard.canvas import MARKS, band, empty, over_time, show, text, unit_label
 from livepde.dashboard.times import TimeAxis, at_time
 from livepde.linalg import Array
-from livepde.plots import GREY, PALETTE, interval_95, scored_from
-from livepde.runs.summary import scalars, shown
+from livepde.plots import GREY, PALETTE
+from livepde.plots.dataset import MOST_LINES, interval_95, scalars, scored_from
+from livepde.runs.summary import shown
 
-__all__ = ["correlation", "groups", "open_shares", "ratio", "residuals", "told", "unknowns"]
+__all__ = ["correlation", "open_shares", "ratio", "residuals", "told", "unknowns"]
 
 MOST_POINTS = 2000  # of a line
-MOST_LINES = 7  # in one panel; more sensors are drawn as one line with their range
 SURE, FLAT = 0.1, 0.9  # shares of the prior deviation: pinned, told hardly anything
-
-
-def groups(data: xr.Dataset) -> dict[str, list[str]]:
-    """Return unknown -> labels of its numbers: one, or one for each region."""
-    found: dict[str, list[str]] = {}
-    for label in scalars(data):
-        found.setdefault(label.partition("[")[0], []).append(label)
-    return found
 
 
 def _bounded(data: xr.Dataset) -> xr.Dataset:

@@ -14,9 +14,7 @@ import xarray as xr
 
 from livepde.dashboard.fields import drawn_by, field_profile
 from livepde.dashboard.figures import (
-    MOST_LINES,
     correlation,
-    groups,
     open_shares,
     ratio,
     residuals,
@@ -24,6 +22,7 @@ from livepde.dashboard.figures import (
     unknowns,
 )
 from livepde.dashboard.times import at_time, when_axis
+from livepde.plots.dataset import MOST_LINES, groups
 
 __all__ = ["SECTIONS", "Panel", "panels"]
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from livepde.plots import time_scale
-from livepde.runs.summary import SECONDS
+from livepde.runs.dates import dated
 
 __all__ = ["TimeAxis", "at_time", "when_axis"]
 
@@ -50,12 +50,12 @@ class TimeAxis:
 
 def when_axis(data: xr.Dataset) -> TimeAxis:
     """Return how the times of a dataset are shown."""
-    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
-    times = data["time"].values
-    near = bool((np.abs(times) * SECONDS.get(unit, 1.0) < FAR).all())
-    if origin is not None and unit in SECONDS and near:
-        start = datetime.fromisoformat(str(origin)).replace(tzinfo=UTC).timestamp()
-        return TimeAxis(1000.0 * SECONDS[unit], 1000.0 * start, dates=True)
+    dates = dated(data)
+    if dates is not None:
+        origin, second = dates
+        if bool((np.abs(data["time"].values) * second < FAR).all()):
+            start = origin.replace(tzinfo=UTC).timestamp()
+            return TimeAxis(1000.0 * second, 1000.0 * start, dates=True)
     factor, name = time_scale(data)
     return TimeAxis(1.0 / factor, unit=name)
 

@@ -9,7 +9,9 @@ import numpy as np
 import xarray as xr
 
 from livepde.diagnostics.identifiability import FLAT
-from livepde.runs.summary import digits, jumps, scalars, scored, when
+from livepde.plots.dataset import scalars
+from livepde.runs.dates import when
+from livepde.runs.summary import digits, jumps, scored
 
 __all__ = ["doubts", "unexplained"]
 

@@ -21,10 +21,10 @@ import pandas as pd
 import xarray as xr
 
 from livepde.errors import ConfigurationError, RunError
-from livepde.plots import interval_95
+from livepde.plots.dataset import interval_95, scalars
 from livepde.records import STATUS_CODES
+from livepde.runs.dates import dated
 from livepde.runs.directory import Run, plain, write_dataset
-from livepde.runs.summary import SECONDS, scalars
 
 __all__ = [
     "AT_ONE_TIME",
@@ -140,11 +140,12 @@ def _registry() -> Any:
 
 def instants(data: xr.Dataset, times: Any) -> Any:
     """Return times of a run as dates (a pandas index); None if it has none."""
-    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
-    if origin is None or unit not in SECONDS:
+    dates = dated(data)
+    if dates is None:
         return None
-    seconds = np.asarray(times, dtype=float) * SECONDS[unit]
-    return pd.Timestamp(str(origin)) + pd.to_timedelta(seconds, unit="s")
+    origin, second = dates
+    seconds = np.asarray(times, dtype=float) * second
+    return pd.Timestamp(origin) + pd.to_timedelta(seconds, unit="s")
 
 
 def cf(

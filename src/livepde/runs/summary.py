@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from livepde.diagnostics.identifiability import TRADED, Known
-from livepde.plots import interval_95
+from livepde.plots.dataset import interval_95, scalars
+from livepde.runs.dates import when
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
@@ -30,7 +30,6 @@ __all__ = [
 ]
 
 MOST_ROWS = 40
-SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0}
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
 JUMP = "jump"  # what the law notes of each sample
 CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
@@ -99,11 +98,6 @@ def _rmse(errors: np.ndarray[Any, Any]) -> float:
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
 
 
-def scalars(data: xr.Dataset) -> list[str]:
-    """Return the labels of the scalar unknowns."""
-    return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
-
-
 @dataclass(frozen=True)
 class Jump:
     """An alarm of `Jumps`.
@@ -138,15 +132,6 @@ def jumps(data: xr.Dataset) -> list[Jump]:
                 moved[label] = float(values[before]), float(values[end]), float(std[end])
         found.append(Jump(float(data["time"].values[k]), moved))
     return found
-
-
-def when(data: xr.Dataset, t: float) -> str:
-    """Return a time of a run as text: a date if it has one."""
-    unit, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
-    if origin is None or unit not in SECONDS:
-        return f"t = {t:.6g} {unit}".rstrip()
-    date = datetime.fromisoformat(str(origin)) + timedelta(seconds=t * SECONDS[unit])
-    return date.isoformat(sep=" ", timespec="seconds")
 
 
 def _interval(data: xr.Dataset, label: str) -> str:

@@ -1,0 +1,238 @@
+"""Figures of one kind each: profiles of a field, histories, ensembles, closed loops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from livepde.errors import ConfigurationError
+from livepde.plots.dataset import NORMAL_95, interval_95, labelled, time_scale
+from livepde.plots.style import GREY, PALETTE, empty, finish, panel, shades_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["ensemble", "history", "loops", "profiles"]
+
+MARKERS = "osD^vP*X"
+
+
+def _snapshots(data: xr.Dataset, times: Sequence[float] | int) -> list[int]:
+    """Return indices of the snapshots nearest to the times, or of some, most of them early.
+
+    An estimate changes most at the start, so the spread is quadratic.
+    """
+    available = data["snapshot"].values
+    if not len(available):
+        raise ConfigurationError("the dataset holds no snapshots: run with at least one sample.")
+    if isinstance(times, int):
+        spread = np.linspace(0, 1, min(times, len(available))) ** 2 * (len(available) - 1)
+        return [int(k) for k in np.unique(spread.round())]
+    return [int(np.abs(available - t).argmin()) for t in times]
+
+
+def profiles(
+    data: xr.Dataset,
+    name: str,
+    *,
+    times: Sequence[float] | int = 6,
+    exact: ArrayLike | None = None,
+    observed: tuple[float, float] | None = None,
+    markers: bool = True,
+    legend: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a field on an interval at several times; the last one with its 95 % band.
+
+    Parameters
+    ----------
+    data
+        A run's dataset, one-dimensional in space.
+    name
+        Field to draw: a parameter or the state.
+    times
+        Times to draw (the nearest snapshots), or how many.
+    exact
+        Exact values at the vertices, drawn as plain lines: shape (vertices,), or (times, vertices)
+        for one line each.
+    observed
+        Interval omega that is observed, shaded.
+    markers
+        Mark the vertices, as the paper does.
+    legend
+        Put a legend beside the panel.
+
+    Raises
+    ------
+    ConfigurationError
+        No such field, more than one space dimension, or Matplotlib is not installed.
+    """
+    if name not in data or data[name].dims != ("snapshot", "vertex"):
+        fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
+        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
+    if "y" in data.coords:
+        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
+    ax = panel(ax)
+    chosen = _snapshots(data, times)
+    factor, unit = time_scale(data)
+    x = data["x"].values
+    if observed is not None:
+        ax.axvspan(*observed, color=GREY, alpha=0.12, linewidth=0, label="observed")
+    truth = None if exact is None else np.asarray(exact, dtype=float)
+    shades = shades_of(len(chosen))
+    for order, (k, colour) in enumerate(zip(chosen, shades, strict=True)):
+        values = data[name].values[k]
+        label = f"t = {data['snapshot'].values[k] / factor:.4g} {unit}".rstrip()
+        style = {"marker": MARKERS[order % len(MARKERS)], "markersize": 3.5} if markers else {}
+        if truth is not None and truth.ndim == 2:
+            ax.plot(x, truth[order], color=colour, linewidth=1.0, label="_exact")
+        ax.plot(
+            x,
+            values,
+            color=colour,
+            linewidth=0.7 if markers else 1.4,
+            linestyle="--" if truth is not None and truth.ndim == 2 else "-",
+            label=label,
+            **style,  # type: ignore[arg-type]
+        )
+    if f"{name}_std" in data:
+        low, high = (end[chosen[-1]] for end in interval_95(data, name))
+        ax.fill_between(x, low, high, color=shades[-1], alpha=0.25, linewidth=0, label="95 %")
+    if truth is not None and truth.ndim == 1:
+        ax.plot(x, truth, color="black", linewidth=2.0, zorder=1.5, label="exact")
+    elif truth is not None:
+        ax.plot([], [], color=GREY, linewidth=1.0, label="exact")
+    ax.set_xlabel(labelled("x", str(data["x"].attrs.get("units", ""))))
+    ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+    ax.margins(x=0.02)
+    return finish(ax, legend=legend, outside=True)
+
+
+def history(
+    series: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    *,
+    ylabel: str = "",
+    xlabel: str = "t",
+    log: bool = True,
+    levels: Mapping[str, float] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw numbers over time, such as the error of several runs.
+
+    Parameters
+    ----------
+    series
+        Label -> (times, values).
+    levels
+        Label -> constant to compare with, drawn dashed.
+    log
+        Logarithmic scale of the values.
+    """
+    ax = panel(ax)
+    for k, (label, (t, values)) in enumerate(series.items()):
+        ax.plot(np.asarray(t), np.asarray(values), color=PALETTE[k % len(PALETTE)], label=label)
+    for label, level in (levels or {}).items():
+        ax.axhline(level, color=GREY, linestyle="--", linewidth=1.0, label=label)
+    if log:
+        ax.set_yscale("log")
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    return finish(ax, outside=True)
+
+
+def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "") -> Figure:
+    """Draw closed loops: a column for each run, a row for each quantity, with common axes.
+
+    Parameters
+    ----------
+    runs
+        Name -> dataset with the quantities over `time`, and where there are such, what each should
+        be (`_reference`), its limits (`_low`, `_high`), what it is (`_truth`), its deviation
+        (`_std`). With the attribute `held` values are held from sample to sample.
+    rows
+        Names of the quantities.
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+    """
+    drawn = empty(len(rows), len(runs), title)
+    drawn.set_size_inches(3.2 * len(runs), 2.2 * len(rows))
+    grid = drawn.subplots(len(rows), len(runs), squeeze=False, sharex=True, sharey="row")
+    for column, (label, data) in enumerate(runs.items()):
+        factor, clock = time_scale(data)
+        t = data["time"].values / factor
+        for row, name in enumerate(rows):
+            ax, values = grid[row][column], data[name].values
+            for end, style in (("reference", "--"), ("truth", "-"), ("low", ":"), ("high", ":")):
+                if f"{name}_{end}" in data:
+                    limit = end in ("low", "high")
+                    said = ax.get_legend_handles_labels()[1]
+                    meaning = "limit" if limit else end
+                    ax.plot(
+                        t,
+                        data[f"{name}_{end}"].values,
+                        style,
+                        color=PALETTE[1] if limit else PALETTE[-1],
+                        linewidth=1.0,
+                        label="" if meaning in said else meaning,
+                    )
+            if f"{name}_std" in data:
+                half = NORMAL_95 * data[f"{name}_std"].values
+                ax.fill_between(t, values - half, values + half, color=PALETTE[0], alpha=0.25)
+            drawstyle: Any = "steps-post" if "held" in data[name].attrs else "default"
+            ax.plot(t, values, color=PALETTE[0], linewidth=1.2, drawstyle=drawstyle)
+            if row == 0:
+                ax.set_title(label, fontsize="medium")
+            if column == 0:
+                ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+            if row == len(rows) - 1:
+                ax.set_xlabel(labelled("t", clock))
+            finish(ax, legend=column == 0)
+    return drawn
+
+
+def ensemble(
+    times: ArrayLike,
+    values: ArrayLike,
+    *,
+    ylabel: str = "",
+    xlabel: str = "t",
+    levels: Mapping[str, float] | None = None,
+    legend: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw several runs over time: each one thin, their mean thick with its least value marked.
+
+    Parameters
+    ----------
+    times
+        Shape (times,).
+    values
+        Positive numbers, shape (runs, times); the scale is logarithmic.
+    levels
+        Label -> constant to compare with, drawn dashed.
+    legend
+        Put a legend beside the panel.
+    """
+    ax = panel(ax)
+    t, rows = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
+    mean = rows.mean(axis=0)
+    least = int(mean.argmin())
+    for k, row in enumerate(rows):
+        label = "each run" if k == 0 else "_run"
+        ax.plot(t, row, color=PALETTE[5], linewidth=0.6, alpha=0.7, label=label)
+    ax.plot(t, mean, color=PALETTE[0], linewidth=1.8, label="mean")
+    ax.plot(t[least], mean[least], "o", color=PALETTE[1], zorder=3, label="least")
+    for label, level in (levels or {}).items():
+        ax.axhline(level, color=GREY, linestyle="--", linewidth=1.0, label=label)
+    ax.set_yscale("log")
+    ax.set_xlabel(xlabel)
+    ax.set_ylabel(ylabel)
+    return finish(ax, legend=legend, outside=True)

@@ -1,0 +1,79 @@
+"""What a figure of a run's dataset shows: unknowns, intervals, units; without Matplotlib."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from livepde.linalg import Array
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "MOST_LINES",
+    "NORMAL_95",
+    "groups",
+    "interval_95",
+    "labelled",
+    "scalars",
+    "scored_from",
+    "time_scale",
+]
+
+NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
+MOST_LINES = 7  # in one panel; more sensors are drawn as one line with their range
+CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))  # span from which, factor, unit
+
+
+def scalars(data: xr.Dataset) -> list[str]:
+    """Return the labels of the scalar unknowns."""
+    return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
+
+
+def groups(data: xr.Dataset) -> dict[str, list[str]]:
+    """Return unknown -> labels of its numbers: one, or one for each region."""
+    found: dict[str, list[str]] = {}
+    for label in scalars(data):
+        found.setdefault(label.partition("[")[0], []).append(label)
+    return found
+
+
+def interval_95(data: xr.Dataset, name: str) -> tuple[Array, Array]:
+    """Return the ends of the 95 % interval of a variable that has a deviation.
+
+    Those of the dataset, which are mapped through a transform and lie within bounds; where it has
+    none, the value and 1.96 deviations.
+    """
+    if f"{name}_low" in data:
+        return data[f"{name}_low"].values, data[f"{name}_high"].values
+    value, half = data[name].values, NORMAL_95 * data[f"{name}_std"].values
+    return value - half, value + half
+
+
+def labelled(name: str, unit: str) -> str:
+    """Return the label of an axis."""
+    for plain, pretty in (("degC", "°C"), ("**", "^"), ("^2", "²"), ("^3", "³")):
+        unit = unit.replace(plain, pretty)
+    return f"{name} [{unit}]" if unit and unit != "1" else name
+
+
+def time_scale(data: xr.Dataset) -> tuple[float, str]:
+    """Return factor and unit in which times are shown: a month in seconds tells nobody anything."""
+    unit = str(data["time"].attrs.get("units", ""))
+    if unit in ("s", "second", "seconds") and data.sizes["time"]:
+        span = float(data["time"][-1] - data["time"][0])
+        for least, factor, name in CLOCKS:
+            if span >= least:
+                return factor, name
+    return 1.0, unit
+
+
+def scored_from(data: xr.Dataset) -> int:
+    """Return the first sample that was assimilated: what comes before is not scored."""
+    start = data.attrs.get("assimilate_from")
+    if start is None:
+        return 0
+    first = int(np.searchsorted(data["time"].values, float(start)))
+    return first if first < data.sizes["time"] else 0

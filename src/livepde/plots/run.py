@@ -1,0 +1,233 @@
+"""A whole run in one figure: unknowns, fields, innovations, withheld channels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from livepde.errors import ConfigurationError
+from livepde.linalg import Array
+from livepde.plots.curves import profiles
+from livepde.plots.dataset import MOST_LINES, groups, interval_95, labelled, scored_from, time_scale
+from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["overview"]
+
+
+def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int = 5) -> Figure:
+    """Draw a run: unknowns, fields, innovations and withheld channels, one panel each.
+
+    Parameters
+    ----------
+    data
+        As `Result.to_xarray()` gives it.
+    title
+        Above all panels.
+    times
+        Times at which fields are drawn, or how many (one space dimension; maps show the last).
+
+    Raises
+    ------
+    ConfigurationError
+        The dataset is empty, or Matplotlib is not installed.
+    """
+    figure_class()
+    if not data.sizes.get("time"):
+        raise ConfigurationError("the run holds no samples yet, so there is nothing to draw.")
+    panels: list[Any] = []
+    for name, labels in groups(data).items():
+        panels.append(lambda ax, name=name, labels=labels: _scalar_panel(data, name, labels, ax))
+    state = [name for name in str(data.attrs.get("state", "")).split() if name in data]
+    for name in [*str(data.attrs.get("fields", "")).split(), *state]:
+        panels += _field_panels(data, name, times)
+    for variable, dimension, what in (
+        ("innovation", "sensor", "innovation"),
+        ("withheld_error", "withheld", "error of withheld channels"),
+    ):
+        if variable in data and data.sizes.get(dimension):
+            panels.append(
+                lambda ax, v=variable, d=dimension, w=what: _residual_panel(data, v, d, w, ax)
+            )
+    columns = 1 if len(panels) == 1 else 2
+    rows = math.ceil(len(panels) / columns)
+    drawn = empty(rows, columns, title)
+    grid = drawn.add_gridspec(rows, columns)
+    for k, panel in enumerate(panels):
+        alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
+        panel(drawn.add_subplot(grid[k // columns, slice(None) if alone else k % columns]))
+    return drawn
+
+
+def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
+    """Draw one unknown over time with its 95 % band; its regions together."""
+    factor, clock = time_scale(data)
+    t = data["time"].values / factor
+    unit = str(data[labels[0]].attrs.get("units", ""))
+    # The prior's band would flatten everything that follows.
+    late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
+    reach: list[Array] = []
+    for k, label in enumerate(labels):
+        value = data[label].values
+        low, high = interval_95(data, label)
+        colour = PALETTE[k % len(PALETTE)]
+        short = label[len(name) :].strip("[]") or name
+        known = bool(np.isfinite(low[-1]))
+        end = f"{short} = {value[-1]:.4g}"
+        if f"{label}_low" in data:
+            end += f", {low[-1]:.3g} to {high[-1]:.3g}" if known else ""
+        elif known:
+            end += f" ± {high[-1] - value[-1]:.2g}"
+        ax.plot(t, value, color=colour, label=end)
+        reach.append(value)
+        if known:
+            ax.fill_between(t, low, high, color=colour, alpha=0.2, linewidth=0)
+            reach += [low[late], high[late]]
+    finite = np.concatenate(reach)
+    finite = finite[np.isfinite(finite)]
+    if len(finite) and finite.max() > finite.min():
+        margin = 0.06 * (finite.max() - finite.min())
+        ax.set_ylim(finite.min() - margin, finite.max() + margin)
+    _mark_failures(data, ax)
+    _mark_jumps(data, ax)
+    ax.set_xlabel(labelled("t", clock))
+    ax.set_ylabel(labelled(name, unit))
+    ax.set_title(f"{name}: estimate and 95 % band" if len(reach) > len(labels) else name)
+    return finish(ax)
+
+
+def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
+    """Mark samples whose step failed."""
+    failed = data["time"].values[data["status"].values != 0] / time_scale(data)[0]
+    if len(failed):
+        ax.plot(
+            failed,
+            np.full(len(failed), 0.02),
+            "|",
+            color=PALETTE[1],
+            transform=ax.get_xaxis_transform(),
+            label=f"{len(failed)} failed steps",
+        )
+
+
+def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
+    """Draw a line at each alarm of the test for jumps."""
+    if "jump" not in data or data["jump"].dims != ("time",):
+        return
+    times = data["time"].values[data["jump"].values > 0.0] / time_scale(data)[0]
+    for k, t in enumerate(times):
+        label = f"jump at {t:.4g}" if len(times) == 1 else f"{len(times)} jumps"
+        if k:
+            label = "_jump"
+        ax.axvline(t, label=label, color=PALETTE[1], linestyle="--", linewidth=1.0)
+
+
+def _field_panels(data: xr.Dataset, name: str, times: Sequence[float] | int) -> list[Any]:
+    """Return what draws a field: profiles, maps, or its range over time in three dimensions."""
+    if "y" not in data.coords:
+
+        def profile(ax: Axes) -> Axes:
+            profiles(data, name, times=times, markers=False, ax=ax).set_title(f"{name} over time")
+            return ax
+
+        return [profile]
+    if "z" in data.coords:
+        return [lambda ax: _range_panel(data, name, ax)]
+    names = [name, *([f"{name}_std"] if f"{name}_std" in data else [])]
+    return [lambda ax, n=n: _map_panel(data, n, ax) for n in names]
+
+
+def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
+    """Draw the last snapshot of a field on a plane domain."""
+    from matplotlib.tri import Triangulation
+
+    x, y = data["x"].values, data["y"].values
+    if "triangle" in data:  # vertices of each cell, (cell, 3): a domain with holes or corners
+        triangles = Triangulation(x, y, data["triangle"].values)
+    else:
+        triangles = Triangulation(x, y)
+    factor, unit = time_scale(data)
+    spread = name.endswith("_std")
+    drawn = ax.tripcolor(
+        triangles,
+        data[name].values[-1],
+        shading="gouraud",
+        cmap="cividis" if spread else "viridis",
+    )
+    what = labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
+    ax.figure.colorbar(drawn, ax=ax, label=f"standard deviation of {what}" if spread else what)
+    when = f"t = {data['snapshot'].values[-1] / factor:.4g} {unit}".rstrip()
+    whose = f"{'deviation of ' if spread else ''}{name.removesuffix('_std')}"
+    ax.set_title(f"{whose} at {when}")
+    ax.set_aspect("equal")
+    ax.margins(0.0)
+    ax.set_xlabel("x")
+    ax.set_ylabel("y")
+    return ax
+
+
+def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
+    """Draw smallest, median and largest value of a field in space over time."""
+    factor, unit = time_scale(data)
+    t, values = data["snapshot"].values / factor, data[name].values
+    ax.fill_between(
+        t, values.min(axis=1), values.max(axis=1), color=PALETTE[0], alpha=0.2, label="range"
+    )
+    ax.plot(t, np.median(values, axis=1), color=PALETTE[0], label="median")
+    ax.set_xlabel(labelled("t", unit))
+    ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
+    ax.set_title(f"{name} in space")
+    return finish(ax)
+
+
+def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, ax: Axes) -> Axes:
+    """Draw measured minus expected of each channel, with its root mean square error."""
+    factor, clock = time_scale(data)
+    t = data["time"].values / factor
+    errors = data[variable].transpose("time", dimension).values
+    names = [str(name) for name in data[dimension].values]
+    first = scored_from(data)
+    ax.axhline(0.0, color="black", linewidth=0.8)
+    if first:
+        ax.axvline(t[first], color=GREY, linestyle=":", label="assimilated from here")
+    _mark_jumps(data, ax)
+    if len(names) <= MOST_LINES:
+        for k, name in enumerate(names):
+            label = f"{name}: RMSE {_rms(errors[first:, k]):.3g}"
+            colour = PALETTE[k % len(PALETTE)]
+            marker, width = ("None", 0.6) if len(t) > 100 else (".", 0.9)
+            ax.plot(
+                t,
+                errors[:, k],
+                color=colour,
+                linewidth=width,
+                marker=marker,
+                alpha=0.8,
+                label=label,
+            )
+    else:
+        some = np.isfinite(errors).any(axis=1)
+        t, seen = t[some], errors[some]
+        label = f"range of {len(names)} channels"
+        low, high = np.nanmin(seen, axis=1), np.nanmax(seen, axis=1)
+        ax.fill_between(t, low, high, color=PALETTE[0], alpha=0.25, linewidth=0, label=label)
+        root = np.sqrt(np.nanmean(seen**2, axis=1))
+        ax.plot(
+            t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors[first:]):.3g}"
+        )
+    ax.set_xlabel(labelled("t", clock))
+    ax.set_ylabel(labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
+    ax.set_title(what)
+    return finish(ax)
+
+
+def _rms(errors: Array) -> float:
+    finite = errors[np.isfinite(errors)]
+    return float(np.sqrt((finite**2).mean())) if len(finite) else math.nan

@@ -1,0 +1,91 @@
+"""Empty figures, colours and the finish of a panel: all figures look alike."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from livepde.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "GREY",
+    "PALETTE",
+    "empty",
+    "figure",
+    "figure_class",
+    "finish",
+    "panel",
+    "shades_of",
+]
+
+# Okabe and Ito (2008): told apart with every common kind of colour blindness. Yellow is left out:
+# it cannot be seen on white.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+GREY = "#7f7f7f"
+MOST_POINTS = 20_000  # for which a free place for the legend is looked for
+PANEL = (5.4, 3.4)  # inches
+
+
+def figure_class() -> type[Figure]:
+    """Return Matplotlib's class of figures; raises `ConfigurationError` without Matplotlib."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigurationError(
+            "Figures need Matplotlib, which is not installed: pip install 'livepde[plots]'."
+        ) from None
+    return Figure
+
+
+def figure(rows: int = 1, columns: int = 1, title: str = "") -> tuple[Figure, list[Axes]]:
+    """Return an empty figure and its panels, row by row.
+
+    Raises
+    ------
+    ConfigurationError
+        Matplotlib is not installed.
+    """
+    drawn = empty(rows, columns, title)
+    return drawn, list(drawn.subplots(rows, columns, squeeze=False).ravel())
+
+
+def empty(rows: int, columns: int, title: str) -> Figure:
+    """Return a figure of the size of so many panels, and without any."""
+    size = (PANEL[0] * columns, PANEL[1] * rows)
+    drawn = figure_class()(figsize=size, layout="constrained")
+    if title:
+        drawn.suptitle(title)
+    return drawn
+
+
+def panel(ax: Axes | None) -> Axes:
+    """Return where to draw: what is given, or the panel of a new figure."""
+    return figure()[1][0] if ax is None else ax
+
+
+def finish(ax: Axes, *, legend: bool = True, outside: bool = False) -> Axes:
+    """Add grid and legend to a panel that is drawn."""
+    ax.grid(True, alpha=0.3, linewidth=0.6)
+    ax.spines[["top", "right"]].set_visible(False)
+    if legend and ax.get_legend_handles_labels()[0]:
+        if outside:
+            ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False)
+        else:
+            # "best" compares with every point drawn: too slow on long runs.
+            points = sum(np.size(line.get_xdata()) for line in ax.lines)
+            place: Any = "best" if points <= MOST_POINTS else "upper right"
+            ax.legend(loc=place, fontsize="small", framealpha=0.85, edgecolor="none")
+    return ax
+
+
+def shades_of(count: int) -> list[Any]:
+    """Return colours for a sequence in time, early to late: viridis without its yellow."""
+    import matplotlib as mpl
+
+    shades: list[Any] = list(mpl.colormaps["viridis"](np.linspace(0.0, 0.88, max(count, 2))))
+    return shades[:count]
