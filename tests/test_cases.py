@@ -125,7 +125,7 @@ def test_template_is_not_written_over(tmp_path):
     assert not (tmp_path / "case.toml").exists()
     (tmp_path / "file").write_text("")
     with pytest.raises(lp.RunError, match="cannot be written"):
-        write_template(tmp_path / "file")
+        write_template(tmp_path / "file" / "below")
 
 
 def test_units_of_columns(rod, tmp_path):

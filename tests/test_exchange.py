@@ -24,7 +24,13 @@ from livepde.cases import load
 from livepde.cases.template import write_template
 from livepde.cases.units import in_si
 from livepde.cli import app
-from livepde.exchange import OnlineRegressor, compare_fmu, export_fmu, river_regressor
+from livepde.exchange import (
+    OnlineRegressor,
+    compare_fmu,
+    export_fmu,
+    river_regressor,
+    verify,
+)
 from livepde.exchange.component import Component
 from livepde.exchange.process import REFUSED, WAITING, of_code
 from livepde.exchange.recipe import recipe_of
@@ -106,6 +112,19 @@ def test_the_unit_compares_with_its_case(rod, unit):
     assert found.samples == 181
     assert set(found.differences) == {*OUTPUTS, "T_30_model", "estimate_time"}
     assert found.largest <= 1e-10
+
+
+def test_the_comparison_shows_how_far_it_is(rod, unit, monkeypatch):
+    bars = {}
+
+    def watched(rows, total, what):
+        for bars[what], row in enumerate(rows, start=1):
+            assert total == 181
+            yield row
+
+    monkeypatch.setattr(verify, "watched", watched)
+    assert compare_fmu(unit, load(rod), progress=True).samples == 181
+    assert bars == {"in Python": 181, "in the unit": 181}
 
 
 def test_a_unit_of_another_case_is_found_out(rod, tmp_path):

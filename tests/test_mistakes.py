@@ -61,6 +61,7 @@ MISTAKES = {
     "no unit": (case('"5e-5 m^2/s"', '"5e-5"'), RUN),
     "a decimal comma in the case": (case('at = "10 cm"', 'at = "10,5 cm"'), RUN),
     "no quotes": (case('time = "time_s"', "time = time_s"), RUN),
+    "left open": (case('prior = "5e-5 m^2/s"', 'prior = "? m^2/s"'), RUN),
     "the prior": (case('prior = "5e-5 m^2/s"', 'prior = "50 m^2/s"'), RUN),
     "a place": (case('at = "10 cm"', "at = 10"), RUN),
     "no noise": (case('at = "10 cm", noise = "0.05 K"', 'at = "10 cm"'), RUN),

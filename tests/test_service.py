@@ -18,6 +18,7 @@ from commands import bad, call, start, stopped, until
 import livepde as lp
 from livepde import cases, runs
 from livepde.cases.live import Wiring
+from livepde.cases.sources import source_of
 from livepde.runs import JOURNAL, Journal
 from livepde.runs.feeds import Paced, Samples
 from livepde.streams.sources import Rows
@@ -120,6 +121,26 @@ def test_it_follows_a_file_stops_gracefully_and_goes_on(here):
         assert np.array_equal(found[name], expected[name])
     assert found.attrs["origin"] == "2026-11-21 00:00:00"
     assert len(runs.open("live").record["resumed"]) == 1
+
+
+def test_another_file_is_followed_as_the_one_it_stands_for(here):
+    process = start(case(), "--data", "other.csv", "--out", "live")
+    Path("other.csv").write_text(HEADER + table(*(row(k) for k in range(3))))
+    until(lambda: estimates("live") == 3, process)
+    with Path("other.csv").open("a") as file:
+        file.write(table(*(row(k) for k in range(3, 5))))
+    until(lambda: estimates("live") == 5, process)
+    stopped(process)
+    taken = ("--data", "other.csv", "--set", "data.follow=false", "--out", "batch")
+    assert call("run", "case.toml", *taken)[0] == 0
+    expected = runs.open("batch").dataset
+    assert np.array_equal(runs.open("live").dataset["alpha"], expected["alpha"])
+
+
+@pytest.mark.parametrize("name", [None, "other.csv"])
+def test_a_file_that_is_not_there_yet_is_named(here, caplog, name):
+    source_of(cases.load(case()).frame, name, "").close()
+    assert f"there is no file '{name or 'rows.csv'}' yet: waits for it" in caplog.text
 
 
 def test_what_a_process_sends_does_not_end_a_run(here):

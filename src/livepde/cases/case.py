@@ -372,6 +372,12 @@ class Case:
         """Whether the case's own source goes on: a file that grows, a broker, a server."""
         return self.frame.spec.data.live
 
+    def goes_on(self, data: str | None) -> bool:
+        """Whether a source goes on: the case's own, or a file instead of one that is followed."""
+        if data is None:
+            return self.live
+        return self.frame.spec.data.follow and data != "-" and not data.endswith(".parquet")
+
     def begin(self, first: Sample, origin: datetime | None = None) -> Prepared:
         """Return an identifier for a process of which the first sample has come.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,9 @@ from livepde.cases.schema import (
 )
 from livepde.errors import CaseError
 
-__all__ = ["did_you_mean", "read_spec", "read_text", "read_toml"]
+__all__ = ["BLANK", "did_you_mean", "read_spec", "read_text", "read_toml"]
 
+BLANK = "?"  # how a value begins that is still to be filled in
 LONGEST = 1_000_000  # bytes of a case file
 DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no case
 SHOWN = 60  # characters of a line that is shown
@@ -121,10 +122,21 @@ def _line(text: str, reason: str) -> str:
 
 def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
     """Return the checked content of a case's document; raises `CaseError`."""
+    if blanks := list(_blanks(raw)):
+        raise CaseError(f"{where}: still to be filled in, where it says '?': {', '.join(blanks)}.")
     try:
         return CaseSpec.model_validate(raw)
     except ValidationError as error:
         raise CaseError(f"{where}: {_sentence(error, raw)}") from None
+
+
+def _blanks(value: Any, key: str = "") -> Iterator[str]:
+    """Yield the keys whose values `livepde init --data` has left open: '?', '? m'."""
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _blanks(item, f"{key}.{name}" if key else name)
+    elif isinstance(value, str) and value.split(" ")[0] == BLANK:
+        yield key
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 from livepde.cases.read import did_you_mean
 from livepde.errors import CaseError
 
-__all__ = ["apply", "parse", "to_toml"]
+__all__ = ["apply", "parse", "to_toml", "toml_line"]
 
 NAMED = ("unknowns", "channels")  # tables whose members are the case's own
 BARE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
@@ -111,12 +111,21 @@ def to_toml(document: Mapping[str, Any]) -> str:
     x = [1.0, 2.0]
     """
     plain = {key: value for key, value in document.items() if not isinstance(value, dict)}
-    lines = [f"{_key(key)} = {_value(value)}" for key, value in plain.items()]
+    lines = [toml_line(key, value) for key, value in plain.items()]
     for name, table in document.items():
         if name not in plain:
             lines += ["", f"[{_key(name)}]"]
-            lines += [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
+            lines += [toml_line(key, value) for key, value in table.items()]
     return "\n".join(lines) + "\n"
+
+
+def toml_line(key: str, value: Any) -> str:
+    """Return a key and its value as a line of TOML.
+
+    >>> toml_line("T 1", {"role": "sensor", "at": 0.5})
+    '"T 1" = { role = "sensor", at = 0.5 }'
+    """
+    return f"{_key(key)} = {_value(value)}"
 
 
 def _key(name: str) -> str:
@@ -141,7 +150,7 @@ def _value(value: Any) -> str:
         case float():
             return repr(value) if math.isfinite(value) else str(value)
         case Mapping():
-            items = (f"{_key(key)} = {_value(item)}" for key, item in value.items())
+            items = (toml_line(key, item) for key, item in value.items())
             return "{ " + ", ".join(items) + " }" if value else "{}"
         case list():
             return "[" + ", ".join(_value(item) for item in value) + "]"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Iterable
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Data", "limits_of", "policy_of", "publishers_of", "source_of", "source_text"]
 
+LOG = logging.getLogger("livepde.run")
 LEAP = "30 d"  # a process that was away for longer needs a second row that says so
 
 Data: TypeAlias = str | Iterable[str] | Source | None  # a file, lines of JSON, or the case's own
@@ -49,12 +51,13 @@ def source_of(frame: Frame, data: Data, position: str) -> Source:
             password=_password(frame, spec.opcua.password_env, "data.opcua"),
         )
     path = Path(data) if data is not None else data_file(frame)
-    follow = spec.follow and data is None
+    if spec.follow and not path.exists():
+        LOG.warning("there is no file '%s' yet: waits for it", path)
     return Follow(
         path,
         separator=spec.separator,
         encoding=spec.encoding,
-        follow=follow,
+        follow=spec.follow,
         position=position,
     )
 

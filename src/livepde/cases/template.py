@@ -1,4 +1,4 @@
-"""The case that `livepde init` writes: a rod, heated and cooled at one end, made up on the spot."""
+"""The case that `livepde init` writes: for a rod, made up on the spot, or for a table."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from livepde.cases.from_table import parts_of
 from livepde.errors import RunError
 from livepde.fem import Channel, Scalar, interval
 from livepde.models import heat
@@ -20,71 +21,98 @@ CASE = """\
 #   livepde check {case}     what is in here, and what its sensors can tell
 #   livepde run {case}       identify; writes a run directory
 # Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
-# With data of your own: say so in "data", "channels" and the prior, and drop "expect" at the end.
-title = "A metal rod, heated and cooled at its left end"
+{first}
+{title}
 equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
                                # or your own as "file.py:function" (run it with --allow-code)
 initial = "interpolate"        # from the first sample; or a number such as "20 degC"
 
 [mesh]
-from = 0
-to = "40 cm"
+from = {start}
+to = {stop}
 cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
 
 [data]
-file = "{data}"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
-time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
-time_unit = "s"
+{data}
 # dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
 # as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
 # start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
 
 [unknowns.alpha]               # names are those of the equation
-prior = "5e-5 m^2/s"           # what you would have said without data ...
-std = "3e-5 m^2/s"             # ... and how far off that may be
-bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
+{prior}
 # by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
 # as a field: field = true, length = "10 cm"   (and no bounds)
 
 [channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
-T_left = {{ role = "boundary", column = "T_left", at = "left" }}
-T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "{noise} K" }}
-T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
-T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "{noise} K" }}
-T_right = {{ role = "boundary", column = "T_right", at = "right" }}
+{channels}
 
 [law]
-kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
-replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
-                               # kind = "auto" finds out, and needs no noise either
+{law}
 
 [steps]
 scheme = "alexander2"          # second order; or "implicit-euler"
-dt_max = "20 s"                # longer intervals between samples are divided
-
+dt_max = {step}                # longer intervals between samples are divided
+{last}"""
+ROD = {
+    "first": "# With data of your own: 'livepde init DIR --data FILE.csv' fills in what they tell.",
+    "title": 'title = "A metal rod, heated and cooled at its left end"',
+    "start": "0",
+    "stop": '"40 cm"',
+    "data": """\
+file = "rod.csv"               # beside this file; ${LIVEPDE_DATA} may stand in it
+time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
+time_unit = "s\"""",
+    "prior": """\
+prior = "5e-5 m^2/s"           # what you would have said without data ...
+std = "3e-5 m^2/s"             # ... and how far off that may be
+bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]""",
+    "channels": f"""\
+T_left = {{ role = "boundary", column = "T_left", at = "left" }}
+T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "{NOISE} K" }}
+T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
+T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "{NOISE} K" }}
+T_right = {{ role = "boundary", column = "T_right", at = "right" }}""",
+    "law": """\
+kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
+replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
+                               # kind = "auto" finds out, and needs no noise either""",
+    "step": '"20 s"',
+    "last": f"""
 [expect]                       # of these very data: drop it, or say what you expect of yours
-alpha = [9e-5, 1.05e-4]        # the rod's data were made with {alpha:g} m^2/s
-rmse = "<= 0.15"           # its noise is {noise} K; the rest is learning
-"""
+alpha = [9e-5, 1.05e-4]        # the rod's data were made with {TRUE_ALPHA:g} m^2/s
+rmse = "<= 0.15"           # its noise is {NOISE} K; the rest is learning
+""",
+}
 
 
-def write_template(folder: Path) -> tuple[Path, Path]:
-    """Write a commented case and its data into a folder, and return both paths.
+def write_template(folder: Path, table: Path | None = None) -> tuple[Path, Path]:
+    """Write a commented case into a folder, and return the paths of case and data.
+
+    Parameters
+    ----------
+    table
+        A CSV file of measurements that the case is for; it stays where it is. Else data are made
+        up and written beside the case.
 
     Raises
     ------
     RunError
-        One of the files is there already, or the folder cannot be written.
+        A file that would be written is there already, or the folder is none or cannot be written.
+    DataError
+        The table cannot be used as it is.
     """
-    case, data = folder / "case.toml", folder / "rod.csv"
-    for path in (case, data):
+    case, data = folder / "case.toml", table or folder / "rod.csv"
+    if folder.is_file():
+        raise RunError(f"{folder} is a file: 'livepde init DIR --data {folder}' takes a table.")
+    for path in (case, data)[: 1 if table else 2]:
         if path.exists():
             raise RunError(f"{path} is there already: choose another folder, nothing was written.")
-    text = CASE.format(case=case, data=data.name, noise=NOISE, alpha=TRUE_ALPHA)
+    parts = ROD if table is None else parts_of(table, folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        data.write_text(_measurements(), encoding="utf-8")
-        case.write_text(text, encoding="utf-8")
+        if table is None:
+            data.write_text(_measurements(), encoding="utf-8")
+        case.write_text(CASE.format(case=case, **parts), encoding="utf-8")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error
     return case, data

@@ -20,16 +20,30 @@ __all__ = ["equations", "init"]
 
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="Your own table, with a header: what it tells is filled in.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
-    """Write a commented case to start from, with made-up data that it runs on.
+    """Write a commented case to start from, with made-up data that it runs on, or for your own.
 
     Example:  livepde init mycase
+    Your own: livepde init mycase --data measured.csv
     """
     from livepde.cases.template import write_template
 
-    case, data = write_template(folder)
+    case, table = write_template(folder, data)
     console = terminal()
-    console.print(f"Wrote {case} and {data}. Next:", soft_wrap=True)
+    if data is None:
+        console.print(f"Wrote {case} and {table}. Next:", soft_wrap=True)
+    else:
+        console.print(
+            f"Wrote {case} for {data}: fill in what it says '?' for. Next:", soft_wrap=True
+        )
     console.print(f"  livepde check {case}\n  livepde run {case}", soft_wrap=True)
 
 

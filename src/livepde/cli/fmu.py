@@ -50,8 +50,8 @@ def fmu(
         bool,
         typer.Option(
             "--verify",
-            help="Run the unit (by FMPy) on the data of the case, beside the identifier in Python, "
-            "and compare all outputs.",
+            help="Run the unit (by FMPy) on the data of the case, then the identifier in Python, "
+            "and compare all outputs: takes as long as two runs of the case.",
         ),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
@@ -92,7 +92,7 @@ def _compared(path: Path, case: Case) -> tuple[list[Table], list[Check]]:
     from livepde.exchange import compare_fmu
     from livepde.runs import Check, Table
 
-    found = compare_fmu(path, case)
+    found = compare_fmu(path, case, progress=True)
     rows = [[name, value] for name, value in found.differences.items()]
     title = f"Unit and identifier after each of {found.samples} samples"
     table = Table(title, ["output", "largest relative difference"], rows)

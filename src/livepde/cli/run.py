@@ -62,7 +62,7 @@ def run(
         str | None,
         typer.Option(
             help="Other data than the case names: a .csv, .jsonl or .parquet file, or - for JSON "
-            "lines from standard input.",
+            "lines from standard input. With data.follow it is followed as the case's own file.",
             show_default=False,
         ),
     ] = None,
@@ -141,8 +141,8 @@ def run(
 
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
-    goes_on = source is sys.stdin or (loaded.live and data is None)
-    live = realtime or (loaded.live and data is None)
+    own = loaded.goes_on(data)
+    goes_on, live = own or source is sys.stdin, own or realtime
     only = {
         "--speed": speed is not None,
         "--listen": listen,
@@ -159,8 +159,8 @@ def run(
     with ExitStack() as stack:
         if live:
             configure(log.value)
-            own = math.inf if goes_on else 1.0
-            pace = own if speed is None else speed
+            usual = math.inf if goes_on else 1.0
+            pace = usual if speed is None else speed
             how = Beside(source, pace, listen, watch, token, estimates)
             writer, taken = beside(loaded, how, folder, write, stack)
         else:

@@ -15,7 +15,9 @@ import numpy as np
 from livepde.cases import Case
 from livepde.errors import ConfigurationError, RunError
 from livepde.exchange.process import Process, of_case
+from livepde.identifier import Identifier
 from livepde.linalg import Array
+from livepde.progress import watched
 from livepde.records import STATUS_CODES
 from livepde.samples import Sample
 
@@ -44,8 +46,13 @@ class Comparison:
         return float(np.max(list(self.differences.values())))
 
 
-def compare_fmu(unit: str | Path, case: Case) -> Comparison:
-    """Give all samples of a case to its unit, by FMPy, and to an identifier.
+def compare_fmu(unit: str | Path, case: Case, *, progress: bool = False) -> Comparison:
+    """Give all samples of a case to its unit, by FMPy, and to an identifier: two runs of the case.
+
+    Parameters
+    ----------
+    progress
+        Show how far each of both is, if standard error is a terminal.
 
     Raises
     ------
@@ -63,12 +70,12 @@ def compare_fmu(unit: str | Path, case: Case) -> Comparison:
     process = of_case(case, prepared.origin)
     samples = list(prepared.stream)
     names = [*(item.name for item in process.outputs()), "status"]
-    rows = []
-    for sample in samples:
-        estimate = prepared.identifier.step(sample.t, sample.z)
-        shown = process.shown(prepared.identifier, estimate)
-        rows.append([*shown, float(STATUS_CODES.index(estimate.status.code))])
-    expected, found = np.array(rows), np.array(list(_driven(unit, process, samples)))
+
+    def taken(rows: Iterator[list[float]], what: str) -> Array:
+        return np.array(list(watched(rows, len(samples), what) if progress else rows))
+
+    expected = taken(_stepped(prepared.identifier, process, samples), "in Python")
+    found = taken(_driven(unit, process, samples), "in the unit")
     return Comparison(len(samples), dict(zip(names, _apart(expected, found), strict=True)))
 
 
@@ -79,6 +86,15 @@ def _apart(expected: Array, found: Array) -> list[float]:
     size = np.where(np.isnan(expected), 0.0, np.abs(expected)).max(axis=0)
     relative: list[float] = (apart / np.where(size > 0.0, size, 1.0)).tolist()
     return relative
+
+
+def _stepped(
+    identifier: Identifier, process: Process, samples: list[Sample]
+) -> Iterator[list[float]]:
+    """Yield what the outputs have to be after each sample."""
+    for sample in samples:
+        estimate = identifier.step(sample.t, sample.z)
+        yield [*process.shown(identifier, estimate), STATUS_CODES.index(estimate.status.code)]
 
 
 def _driven(unit: str | Path, process: Process, samples: list[Sample]) -> Iterator[list[float]]:

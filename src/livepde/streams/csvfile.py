@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,34 @@ from livepde.streams.clock import (
 from livepde.streams.names import check_columns, no_file
 from livepde.streams.table import Column, Table, cell_number, to_table
 
-__all__ = ["UTF_8", "read_csv", "too_wide"]
+__all__ = ["UTF_8", "Written", "how_written", "read_csv", "too_wide"]
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
 SEPARATORS = (",", ";", "\t")
 LOOK = 100_000  # characters that are looked at to say how a file is written
 BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .ods, .xls
+
+
+@dataclass(frozen=True)
+class Written:
+    """How a CSV file seems to be written, and how it begins.
+
+    Attributes
+    ----------
+    separator, decimal, encoding
+        As `read_csv`, `Column` and `Clock` take them.
+    time_format
+        Of its dates, if they are not in ISO format; else empty.
+    header, rows
+        Cells of the header, and of the first rows.
+    """
+
+    separator: str
+    decimal: str
+    encoding: str
+    time_format: str
+    header: list[str]
+    rows: list[list[str]]
 
 
 def read_csv(
@@ -128,22 +151,63 @@ def _check_separator(
         )
 
 
+def how_written(path: str | Path, encoding: str = "") -> Written:
+    """Return how a CSV file seems to be written, by its first rows.
+
+    Parameters
+    ----------
+    encoding
+        How its text is written, if that is known.
+
+    Raises
+    ------
+    DataError
+        No such file, or a workbook.
+    """
+    path = Path(path)
+    try:
+        _check_text(path)
+        encoding = encoding or _likely(path.read_bytes(), UTF_8)
+        with path.open(newline="", encoding=encoding, errors="replace") as file:
+            text = file.read(LOOK)
+    except FileNotFoundError:
+        raise no_file(path) from None
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}.") from error
+    whole = text if len(text) < LOOK else text.rpartition("\n")[0]
+    lines = [line for line in whole.splitlines() if line.strip()]
+    separator = max(SEPARATORS, key=lines[0].count) if lines else SEPARATORS[0]
+    found = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    header, *rows = [*found] or [[]]
+    cells = [cell for row in rows for cell in row]
+    decimal = "," if any(map(has_decimal_comma, cells)) else "."
+    texts = (c for c in cells if number_of(c, decimal) is None and Clock("").stamp(c) is None)
+    formats = map(guessed_format, dict.fromkeys(texts))
+    time_format = next((form for form in formats if "%d" in form), "")
+    return Written(separator, decimal, encoding, time_format, header, rows)
+
+
+def _likely(content: bytes, encoding: str) -> str:
+    """Return an encoding in which a text can be read, the given one if it can."""
+    try:
+        content.decode(encoding)
+        return encoding
+    except UnicodeError:
+        wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        return "utf-16" if wide else "cp1252" if encoding == UTF_8 else "utf-8"
+
+
 def _as_written(path: Path, separator: str, encoding: str, clock: Clock, known: str) -> str:
-    """Return what to say of how a file is written: what is known, and how two lines of it look."""
-    with path.open(encoding=encoding, errors="replace") as file:
-        header, row, *_ = [*file.read(LOOK).splitlines(), "", ""]
+    """Return what to say of how a file is written: what is known, and what else it lacks."""
+    seems = how_written(path, encoding)
     said = [known]
-    other = max(SEPARATORS, key=header.count)
-    if separator not in header and other in header:
-        separator = other
-        said.append(f"separator = {separator!r}")
-    cells = row.split(separator)
-    if clock.decimal == "." and any(map(has_decimal_comma, cells)):
+    others = "separator" not in known and len(seems.header) > 1
+    if others and seems.separator != separator and separator not in "".join(seems.header):
+        said.append(f"separator = {seems.separator!r}")
+    if clock.decimal == "." and seems.decimal == ",":
         said.append("decimal = ','")
-    texts = (c for c in cells if number_of(c, ",") is None and clock.stamp(c) is None)
-    formats = list(filter(None, map(guessed_format, texts)))
-    if formats and not clock.format:
-        said.append(f"time_format = {formats[0]!r}")
+    if seems.time_format and not clock.format:
+        said.append(f"time_format = {seems.time_format!r}")
     return " and ".join(filter(None, (", ".join(said[:-1]), said[-1])))
 
 
@@ -181,8 +245,7 @@ def _not_text(path: Path, separator: str, encoding: str, clock: Clock) -> DataEr
         content.decode(encoding)
     except UnicodeDecodeError as error:
         row, byte = content.count(b"\n", 0, error.start) + 1, f"byte 0x{content[error.start]:02x} "
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    likely = "utf-16" if wide else "cp1252" if encoding == UTF_8 else "utf-8"
+    likely = _likely(content, encoding)
     said = _as_written(path, separator, likely, clock, f"encoding = {likely!r}")
     return DataError(
         f"{path} is not text in {encoding.removesuffix('-sig').upper()} ({byte}in row {row}): say "

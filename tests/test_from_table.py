@@ -1,0 +1,164 @@
+"""`livepde init --data`: what a table tells is filled in, what it does not tell is named."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import livepde as lp
+from livepde import cases
+from livepde.cases.template import write_template
+from livepde.cli import app
+
+GERMAN = """\
+Zeit;Tiefe 5 cm [°C];Fühler (0,2 m);Bemerkung
+01.04.2025 12:00;20,5;19;
+01.04.2025 12:10;21,5;19,1;Regen
+01.04.2025 12:30;;19,2;
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def begun(text: str, encoding: str = "utf-8") -> dict:
+    """Return the document of the case for a table."""
+    Path("my.csv").write_bytes(text.encode(encoding))
+    case, _ = write_template(Path("mine"), Path("my.csv"))
+    return tomllib.loads(case.read_text())
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+def test_a_table_of_a_german_excel(here, encoding):
+    found = begun(GERMAN, encoding)
+    how = {} if encoding.startswith("utf-8") else {"encoding": encoding}
+    assert found["data"] == {
+        "file": "../my.csv",
+        "time": "Zeit",
+        "time_format": "%d.%m.%Y %H:%M",
+        "separator": ";",
+        "decimal": ",",
+        **how,
+    }
+    assert found["channels"] == {
+        "Tiefe_5_cm": {
+            "role": "sensor",
+            "column": "Tiefe 5 cm [°C]",
+            "at": "5 cm",
+            "unit": "°C",
+        },
+        "Fühler": {"role": "sensor", "column": "Fühler (0,2 m)", "at": "0.2 m"},
+    }
+    assert found["steps"]["dt_max"] == "900 s"
+    text = Path("mine/case.toml").read_text()
+    assert (
+        "# 3 rows from 2025-04-01 12:00:00 to 2025-04-01 12:30:00 UTC, 900 s apart (median)" in text
+    )
+    assert "# without numbers: Bemerkung" in text
+    assert "20.5 to 21.5, place as its name says, 1 missing" in text
+
+
+@pytest.mark.parametrize(
+    ("header", "time", "unit", "step"),
+    [
+        ("time_min,T_0.05,T_b", "time_min", "min", "10 min"),
+        ("t [h],T_0.05,T_b", "t [h]", "h", "10 h"),
+        ("index,T_0.05,T_b", "index", "?", "? s"),
+    ],
+)
+def test_numbers_as_times(here, header, time, unit, step):
+    found = begun(f"{header}\n0,20,20\n10,21,\n20,20,21\n")
+    assert found["data"] == {"file": "../my.csv", "time": time, "time_unit": unit}
+    assert found["steps"]["dt_max"] == step
+    assert found["channels"]["T_0_05"]["at"] == "? m"
+    assert 'at "0.05 m"?' in Path("mine/case.toml").read_text()
+
+
+def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
+    assert begun("n,time_s,T\n0,0,20\n1,10,20\n")["data"]["time"] == "time_s"
+    Path("mine/case.toml").unlink()
+    assert begun("n,when,T\n0,2025-04-01,20\n1,2025-04-02,20\n")["data"]["time"] == "when"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("0,20,20\n10,21,20\n", "has no header: begin it with a line of names"),
+        ("2025-04-01 12:00,20\n2025-04-01 13:00,21\n", "has no header"),
+        ("T\n20\n21\n", "has one column, 'T'; expected times and measurements"),
+        ("time_s,T_1\n", "holds no rows beside its header."),
+        ("", "holds no rows beside its header."),
+        ("time,T_1\ns,K\n0,20\n", "row 2: holds no numbers; the header is one line"),
+        ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column holds times: expected dates, or numbers"),
+        ("time_s,note\n0,a\n1,b\n", "beside the times, 'time_s', no column holds numbers"),
+        ("day,at,T\n2025-04-01,12:00,20\n2025-04-01,12:10,20\n", "join them in one column"),
+        ("time_s,T\n0,20\n20,20\n10,20\n", "row 4, column 'time_s': the time is earlier"),
+        ("time_s,T\n0,20\n20,ERR\n40,20\n", "row 3, column 'T': got 'ERR'"),
+        ("time_s,T,T\n0,20,20\n20,20,20\n", "two columns are called 'T'"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_one_sentence(here, text, told):
+    with pytest.raises(lp.DataError, match=re.escape(told)) as error:
+        begun(text)
+    assert str(error.value).startswith("my.csv")
+    assert not Path("mine").exists()
+
+
+def test_only_tables_with_a_header(here):
+    Path("my.jsonl").write_text('{"time": 0}')
+    with pytest.raises(lp.DataError, match=r"my\.jsonl: a case is begun from a CSV file"):
+        write_template(Path("mine"), Path("my.jsonl"))
+    with pytest.raises(lp.DataError, match=r"there is no file 'my\.csv'"):
+        write_template(Path("mine"), Path("my.csv"))
+
+
+def test_a_table_is_no_folder(here):
+    Path("my.csv").write_text("time_s,T\n0,20\n")
+    with pytest.raises(lp.RunError, match=r"my\.csv is a file: 'livepde init DIR --data my\.csv'"):
+        write_template(Path("my.csv"))
+
+
+def test_a_day_and_a_month_that_may_be_swapped_are_asked_for(here):
+    begun("time,T\n03/02/2026 08:00,20\n03/02/2026 08:10,20\n")
+    assert "the day first, or the month?" in Path("mine/case.toml").read_text()
+
+
+def test_from_a_table_to_estimates(here):
+    rod, _ = write_template(Path("rod"))
+    runner = CliRunner()
+    done = runner.invoke(app, ["init", "mine", "--data", "rod/rod.csv"])
+    assert done.exit_code == 0
+    assert "Wrote mine/case.toml for rod/rod.csv: fill in" in done.stdout
+    case = Path("mine/case.toml")
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(case)
+    named = "mesh.from, mesh.to, unknowns.alpha.prior, unknowns.alpha.std, channels.T_left.at, "
+    assert str(error.value) == (
+        f"mine/case.toml: still to be filled in, where it says '?': {named}channels.T_10.at, "
+        "channels.T_20.at, channels.T_30.at, channels.T_right.at."
+    )
+    places = {f"channels.T_{k}.at": f"{k} cm" for k in (10, 20, 30)}
+    ends = {
+        f"channels.T_{end}.{key}": value
+        for end in ("left", "right")
+        for key, value in (("role", "boundary"), ("at", end))
+    }
+    mesh = {"mesh.from": 0, "mesh.to": "40 cm"}
+    prior = {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
+    filled = cases.load(case, settings={**places, **ends, **mesh, **prior})
+    prepared = filled.prepare()
+    assert len(prepared.stream) == 181
+    expected = cases.load(rod).prepare()
+    assert np.array_equal(prepared.stream.t, expected.stream.t)
+    result = prepared.identifier.run(prepared.stream)
+    value, std = result.last.parameters["alpha"]
+    assert abs(value - 9.7e-5) < 4 * std < 2e-6
+    assert runner.invoke(app, ["init", "mine", "--data", "rod/rod.csv"]).exception is not None
