@@ -150,7 +150,8 @@ class Model:
         self.form_M = self._form("M", _product(x) if M is None else M, pair)
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
-        self.form_A = compose(self._form("A", A, triple, "u", dA, "q"), self.latent)
+        self.physical_A = self._form("A", A, triple, "u", dA, "q")
+        self.form_A = compose(self.physical_A, self.latent)
         sources = f if isinstance(f, Sequence) else [f]
         integrands = [_as_integrand(item, x) for item in sources]
         self.form_F = self._form("f", integrands, {"v": x})

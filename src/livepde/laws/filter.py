@@ -65,6 +65,11 @@ class Point:
     age: float = 0.0
     kept: Kept = field(default_factory=Kept.none)
 
+    @cached_property
+    def deviates(self) -> bool:
+        """True if the estimate is not the reference."""
+        return bool(self.du.any() or self.da.any())
+
     def along(self, shift: Array) -> Array:
         """Return by how much the state is expected to move with a shift of a, shape (n,)."""
         if not shift.any():
@@ -232,11 +237,6 @@ class Filter:
         back = block_diag(*(motion.backward(h) for motion in self.motions))
         return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
 
-    def directions(self, point: Point) -> Array:
-        """Return the columns of the factor and da in latent coefficients, shape (m, r + 1)."""
-        directions: Array = self.Phi @ np.column_stack([point.C, point.da])
-        return directions
-
     def latent(self, point: Point) -> Array:
         """Return the estimated latent parameter, not yet bounded."""
         q: Array = point.q + self.Phi @ point.da
@@ -245,7 +245,7 @@ class Filter:
     def predict(self, point: Point, moment: Moment) -> Array:
         """Return what the sensors are expected to show, linear about the reference."""
         predicted = self.problem.predict(point.u, point.q, moment)
-        if not (point.du.any() or point.da.any()):
+        if not point.deviates:
             return predicted
         return predicted + self._seen(point, point.du[:, None], point.da[:, None], moment)[:, 0]
 
@@ -274,12 +274,12 @@ class Filter:
     def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
         """Return the filter at the end of an interval, substeps, and why it failed or None."""
         end = self.moved(point, interval.t1 - interval.t0)
-        deviates = bool(end.du.any() or end.da.any())
+        deviates = end.deviates
         kept, tolerance = point.kept, ESTIMATE if deviates else GAIN
 
         def directions(at: Point) -> Array:
-            along: Array = self.directions(at) if deviates else self.Phi @ at.C
-            return along
+            C = np.column_stack([at.C, at.da]) if deviates else at.C
+            return self.problem.model.latent.tangent(at.q, self.Phi @ C)
 
         at_end = directions(end)
 
