@@ -267,8 +267,7 @@ class Filter:
 
     def bounded(self, q: Array) -> Array:
         """Return the latent parameter within its bounds."""
-        lower, upper = self.problem.model.latent.bounds
-        return np.clip(q, lower, upper)
+        return self.problem.model.latent.clipped(q)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
@@ -323,9 +322,9 @@ class Filter:
             count = int(present.sum() - used.sum())
             point = replace(point, refused=refused)
             e = np.where(used, e, np.nan)
-        point = replace(point, consistency=point.consistency.add(e))
+        consistency = point.consistency.add(e)
         if not used.any():
-            return point, count
+            return replace(point, consistency=consistency), count
         d /= noise
         if not used.all():
             Y, d, noise = Y[used], d[used], noise[used]
@@ -335,7 +334,13 @@ class Filter:
         spread += float(np.log(noise).sum())
         evidence = point.evidence - 0.5 * float(d @ d - half @ half) - spread
         new = replace(
-            point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U, evidence=evidence
+            point,
+            da=point.da + C @ half,
+            du=point.du + U @ half,
+            C=C,
+            U=U,
+            consistency=consistency,
+            evidence=evidence,
         )
         if self.adaptive:
             # What the update leaves of the sample, and what is left of its variance.
@@ -372,7 +377,7 @@ class Filter:
         """
         estimate = self.latent(point)
         within = self.bounded(estimate)
-        if np.array_equal(within, estimate):
+        if within is estimate or np.array_equal(within, estimate):
             zero = np.zeros(len(point.da))
             return replace(point, u=point.u + point.du, q=estimate, du=0.0 * point.du, da=zero)
         shift = self.reduced(within - point.q)

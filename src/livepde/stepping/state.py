@@ -339,5 +339,3 @@ class _Equation:
 
     def factor(self, y: Array, sweep: bool) -> Factor:
         return self.stage._factorise(self.stage._data(y, self.q, self.h, self.moment))
-
-
