@@ -18,6 +18,7 @@ from livepde.fem import (
     FieldBlock,
     Form,
     FunctionSpace,
+    Inputs,
     Integrand,
     Latent,
     Moment,
@@ -28,6 +29,7 @@ from livepde.fem import (
     compose,
     dot,
     grad,
+    reads,
 )
 from livepde.linalg import Array
 from livepde.operators import DualOperator
@@ -150,10 +152,12 @@ class Model:
         self.form_M = self._form("M", _product(x) if M is None else M, pair)
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
-        self.form_A = compose(self._form("A", A, triple, "u", dA, "q"), self.latent)
+        self.physical_A = self._form("A", A, triple, "u", dA, "q")
+        self.form_A = compose(self.physical_A, self.latent)
         sources = f if isinstance(f, Sequence) else [f]
         integrands = [_as_integrand(item, x) for item in sources]
         self.form_F = self._form("f", integrands, {"v": x})
+        self._source: tuple[Mapping[str, float], Array] | None = None  # of the last inputs
         self.form_initial: Form | Composed | None = None
         if initial is not None:
             pair = {"q": q, "v": x}
@@ -326,13 +330,13 @@ class Model:
 
     def F(self, moment: Moment = START) -> Array:
         """Return the source in X*, shape (n,)."""
-        if self.form_F.constant:
-            return self._constant_source
-        return self.form_F.vector("v", moment)
-
-    @cached_property
-    def _constant_source(self) -> Array:
-        return self.form_F.vector("v")
+        uses, kept = self.form_F.uses, self._source
+        if "t" not in uses and kept is not None and (not uses or kept[0] is moment.inputs):
+            return kept[1]
+        source = self.form_F.vector("v", moment)
+        if not uses or isinstance(moment.inputs, Inputs):  # which never change
+            self._source = (moment.inputs, source)
+        return source
 
     @cached_property
     def homogeneous(self) -> bool:
@@ -426,6 +430,7 @@ def _as_density(source: Source, state: FunctionSpace) -> Integrand:
 def _single_density(source: Any, block: FieldBlock) -> Integrand:
     product = _pointwise(block)
     if callable(source):
-        return lambda v, x: product(source(x, x.t), v)
+        timed = reads(source, 1) or "t" in source.__code__.co_names  # as x.t, on some branch
+        return lambda v, x: product(source(x, x.t if timed else 0.0), v)
     level = float(source)
     return lambda v, x: level * v

@@ -32,6 +32,7 @@ from livepde.fem.meshes import (
     smooth,
 )
 from livepde.fem.place import START, Inputs, Moment, Place
+from livepde.fem.reading import reads
 from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace, Named
@@ -83,6 +84,7 @@ __all__ = [
     "positive",
     "quadratic",
     "read_mesh",
+    "reads",
     "rectangle",
     "smooth",
     "trace",

@@ -22,9 +22,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from dis import get_instructions
 from functools import cached_property
-from types import FunctionType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -35,6 +33,7 @@ from livepde.fem.elementwise import ElementProducts, ElementTensor
 from livepde.fem.fields import Integrand, On
 from livepde.fem.measure import Measure
 from livepde.fem.place import START, Inputs, Moment, Place
+from livepde.fem.reading import reads
 from livepde.fem.scatter import Scatter, scatter
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern, PatternOperator
@@ -249,14 +248,7 @@ class Form(FormMatrices):
         """Return false if a function never uses its nonlinear argument, whatever its branches."""
         if self.nonlinear is None:
             return False
-        position = list(self.spaces).index(self.nonlinear)
-        if not isinstance(integrand, FunctionType) or integrand.__code__.co_argcount <= position:
-            return True
-        code = integrand.__code__
-        name = code.co_varnames[position]
-        used = [item.argval for item in get_instructions(code) if item.opname.count("FAST")]
-        named = [name in item if isinstance(item, tuple) else item == name for item in used]
-        return any(named) or name in code.co_cellvars
+        return reads(integrand, list(self.spaces).index(self.nonlinear))
 
     @property
     def steady(self) -> bool:

@@ -41,7 +41,7 @@ class LatentPart:
     block: Any
     part: slice
 
-    @property
+    @cached_property
     def transform(self) -> Transform:
         """T of this unknown."""
         transform: Transform = self.unknown.map
@@ -100,17 +100,20 @@ class Latent:
         ]
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
 
+    def visible(self, each: Array) -> Array:
+        """Return V applied to rows that belong to latent coefficients, (dim,) or (dim, k)."""
+        return each if self.dim == self.space.dim else self.V @ each  # the same but for harmonics
+
     def _each(self, a: Array, function: str) -> Array:
         pieces = [getattr(p.transform, function)(a[p.part]) for p in self.parts.values()]
-        return np.concatenate(pieces)
+        return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def value(self, a: Array) -> Array:
         """Return the coefficients of q, shape (m,), for latent ones of shape (dim,)."""
         if self.plain:
             return a
         with np.errstate(over="ignore"):
-            value: Array = self.V @ self._each(a, "value")
-        return value
+            return self.visible(self._each(a, "value"))
 
     def slopes(self, a: Array) -> Array:
         """Return T' of each latent coefficient, shape (dim,)."""
@@ -126,14 +129,16 @@ class Latent:
         """Return dq/da applied to columns of shape (dim, k): shape (m, k)."""
         if self.plain:
             return directions
-        product: Array = self.V @ (self.slopes(a)[:, None] * directions)
-        return product
+        return self.visible(self.slopes(a)[:, None] * directions)
 
     def deviation(self, a: Array, std: Array) -> Array:
         """Return deviations of q, shape (m,), for those of independent latent ones, (dim,)."""
         if self.plain:
             return std
-        deviation: Array = np.sqrt(self.V**2 @ (self.slopes(a) * std) ** 2)
+        each = self.slopes(a) * std
+        if self.dim == self.space.dim:
+            return each
+        deviation: Array = np.sqrt(self.V**2 @ each**2)
         return deviation
 
     def inverse(self, q: Array) -> Array:

@@ -16,7 +16,7 @@ from livepde.fem.blocks import FieldBlock, Local, block_of
 from livepde.fem.fields import Unknown
 from livepde.fem.measure import Measure
 from livepde.fem.place import Moment
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, compact
 
 __all__ = ["FunctionSpace", "LocalSpace", "Named"]
 
@@ -79,9 +79,8 @@ class LocalSpace:
         return sp.csr_array((self.phi[c, i, e, p], (rows, self.dofs[i, e])), shape=shape)
 
     @cached_property
-    def evaluation_transposed(self) -> sp.csr_array:
-        """Transpose of `evaluation`."""
-        return sp.csr_array(self.evaluation.T)
+    def _evaluation_transposed(self) -> sp.csr_array | Array:
+        return compact(sp.csr_array(self.evaluation.T))
 
     def values(self, coefficients: Array) -> Array:
         """Return the components of a function, shape (components, elements, points)."""
@@ -98,8 +97,9 @@ class LocalSpace:
     def tested(self, density: Array, weights: Array) -> Array:
         """Return the integrals of a density, shape (components, E, P), against all functions."""
         if self.kept:
-            weighted = np.broadcast_to(density * weights, (self.components, *self.shape))
-            whole: Array = self.evaluation_transposed @ weighted.ravel()
+            weighted = np.empty((self.components, *self.shape))
+            np.multiply(density, weights, out=weighted)
+            whole: Array = self._evaluation_transposed @ weighted.ravel()
             return whole
         local = np.zeros(self.dofs.shape)
         for (k,), part in _parts(density, (self.components,)):

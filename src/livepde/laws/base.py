@@ -82,17 +82,13 @@ class Problem:
         latent = self.model.latent
         if latent.plain:
             return belief
-        q_factor, prior_factor = (
-            None if factor is None else latent.tangent(belief.q, factor)
-            for factor in (belief.q_factor, belief.prior_factor)
-        )
-        rest = None if belief.rest is None else latent.deviation(belief.q, belief.rest)
+        q, C, prior, rest = belief.q, belief.q_factor, belief.prior_factor, belief.rest
         return replace(
             belief,
-            q=latent.value(belief.q),
-            q_factor=q_factor,
-            prior_factor=prior_factor,
-            rest=rest,
+            q=latent.value(q),
+            q_factor=None if C is None else latent.tangent(q, C),
+            prior_factor=None if prior is None else latent.tangent(q, prior),
+            rest=None if rest is None or not rest.any() else latent.deviation(q, rest),
         )
 
 

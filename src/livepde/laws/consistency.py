@@ -60,24 +60,28 @@ class Consistency:
     def add(self, e: Array) -> Consistency:
         """Return the value after one more vector of normalised innovations."""
         seen = np.isfinite(e)
-        count = int(np.count_nonzero(seen))
-        known = np.where(seen, e, 0.0)
-        # Before its first value a sensor has no product, and later none where it is missing.
         both = seen & np.isfinite(self.last)
-        before = np.where(both, self.last, 0.0)
-        slow = self.slow + np.where(seen, (known - self.slow) / SLOW, 0.0)
+        count, pairs = int(np.count_nonzero(seen)), int(np.count_nonzero(both))
+
+        def where_seen(new: Array, else_: Array | float) -> Array:
+            return new if count == len(e) else np.where(seen, new, else_)
+
+        known = where_seen(e, 0.0)
+        # Before its first value a sensor has no product, and later none where it is missing.
+        before = self.last if pairs == len(e) else np.where(both, self.last, 0.0)
+        slow = where_seen(self.slow + (known - self.slow) / SLOW, self.slow)
         kept = (1.0 - 1.0 / SLOW) ** 2 * self.slow_variance + 1.0 / SLOW**2
-        slow_variance = np.where(seen, kept, self.slow_variance)
+        slow_variance = where_seen(kept, self.slow_variance)
         fade = 1.0 - 1.0 / WINDOW
         return Consistency(
             fade * self.count + count,
             fade**2 * self.weight + count,
             fade * self.square + float(known @ known),
-            fade * self.pairs + int(np.count_nonzero(both)),
+            fade * self.pairs + pairs,
             fade * self.product + float(known @ before),
             fade * self.slow_expected + float(slow_variance @ seen),
             fade * self.slow_square + float((slow * slow) @ seen),
-            np.where(seen, e, self.last),
+            where_seen(e, self.last),
             e,
             slow,
             slow_variance,

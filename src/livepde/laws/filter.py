@@ -65,6 +65,11 @@ class Point:
     age: float = 0.0
     kept: Kept = field(default_factory=Kept.none)
 
+    @cached_property
+    def deviates(self) -> bool:
+        """True if the estimate is not the reference."""
+        return bool(self.du.any() or self.da.any())
+
     def along(self, shift: Array) -> Array:
         """Return by how much the state is expected to move with a shift of a, shape (n,)."""
         if not shift.any():
@@ -232,11 +237,6 @@ class Filter:
         back = block_diag(*(motion.backward(h) for motion in self.motions))
         return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
 
-    def directions(self, point: Point) -> Array:
-        """Return the columns of the factor and da in latent coefficients, shape (m, r + 1)."""
-        directions: Array = self.Phi @ np.column_stack([point.C, point.da])
-        return directions
-
     def latent(self, point: Point) -> Array:
         """Return the estimated latent parameter, not yet bounded."""
         q: Array = point.q + self.Phi @ point.da
@@ -245,7 +245,7 @@ class Filter:
     def predict(self, point: Point, moment: Moment) -> Array:
         """Return what the sensors are expected to show, linear about the reference."""
         predicted = self.problem.predict(point.u, point.q, moment)
-        if not (point.du.any() or point.da.any()):
+        if not point.deviates:
             return predicted
         return predicted + self._seen(point, point.du[:, None], point.da[:, None], moment)[:, 0]
 
@@ -267,19 +267,18 @@ class Filter:
 
     def bounded(self, q: Array) -> Array:
         """Return the latent parameter within its bounds."""
-        lower, upper = self.problem.model.latent.bounds
-        return np.clip(q, lower, upper)
+        return self.problem.model.latent.clipped(q)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
         """Return the filter at the end of an interval, substeps, and why it failed or None."""
         end = self.moved(point, interval.t1 - interval.t0)
-        deviates = bool(end.du.any() or end.da.any())
+        deviates = end.deviates
         kept, tolerance = point.kept, ESTIMATE if deviates else GAIN
 
         def directions(at: Point) -> Array:
-            along: Array = self.directions(at) if deviates else self.Phi @ at.C
-            return along
+            C = np.column_stack([at.C, at.da]) if deviates else at.C
+            return self.problem.model.latent.tangent(at.q, self.Phi @ C)
 
         at_end = directions(end)
 
@@ -323,9 +322,9 @@ class Filter:
             count = int(present.sum() - used.sum())
             point = replace(point, refused=refused)
             e = np.where(used, e, np.nan)
-        point = replace(point, consistency=point.consistency.add(e))
+        consistency = point.consistency.add(e)
         if not used.any():
-            return point, count
+            return replace(point, consistency=consistency), count
         d /= noise
         if not used.all():
             Y, d, noise = Y[used], d[used], noise[used]
@@ -335,7 +334,13 @@ class Filter:
         spread += float(np.log(noise).sum())
         evidence = point.evidence - 0.5 * float(d @ d - half @ half) - spread
         new = replace(
-            point, da=point.da + C @ half, du=point.du + U @ half, C=C, U=U, evidence=evidence
+            point,
+            da=point.da + C @ half,
+            du=point.du + U @ half,
+            C=C,
+            U=U,
+            consistency=consistency,
+            evidence=evidence,
         )
         if self.adaptive:
             # What the update leaves of the sample, and what is left of its variance.
@@ -372,7 +377,7 @@ class Filter:
         """
         estimate = self.latent(point)
         within = self.bounded(estimate)
-        if np.array_equal(within, estimate):
+        if within is estimate or np.array_equal(within, estimate):
             zero = np.zeros(len(point.da))
             return replace(point, u=point.u + point.du, q=estimate, du=0.0 * point.du, da=zero)
         shift = self.reduced(within - point.q)

@@ -61,6 +61,10 @@ class Guards:
             if value < least:
                 raise LawError(f"Guards: {name} must be at least {least}; got {value}.")
 
+    def within_reach(self, change: Array) -> bool:
+        """Return whether a sample moves the unknowns by so little, in prior deviations (k,)."""
+        return bool(np.abs(change).max(initial=0.0) <= self.reach)
+
 
 @dataclass(frozen=True, eq=False)
 class Scale:

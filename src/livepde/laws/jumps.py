@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
 
 from livepde.errors import LawError
 from livepde.laws.consistency import Consistency
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 
 __all__ = ["Jumps", "Watch"]
 
@@ -75,6 +76,11 @@ class Jumps:
         if self.settle < 0:
             raise LawError(f"Jumps: settle must be at least 0; got {self.settle}.")
 
+    @cached_property
+    def _lengths(self) -> IntArray:
+        """Numbers of samples that are looked at, less one."""
+        return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
+
     def start(self) -> Watch:
         """Return the value before any innovation."""
         return Watch(np.zeros(self.window), np.zeros(self.window), 0)
@@ -94,7 +100,7 @@ class Jumps:
         new = watch.add(e)
         if not new.counts[0]:
             return new, False
-        lengths = 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
+        lengths = self._lengths
         sums, freedom = np.cumsum(new.squares)[lengths], np.cumsum(new.counts)[lengths]
         chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums / usual.scatter**2)
         if float(chance.min()) * len(lengths) >= self.probability:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,9 +43,12 @@ class Samples:
             samples = samples._append(interval.t0, nothing, interval.inputs0, channels)
         return samples._append(interval.t1, interval.z1, interval.inputs1, channels)
 
-    def _append(self, t: float, z: Array, inputs: object, channels: tuple[str, ...]) -> Samples:
-        row = np.array([inputs[c] for c in channels])  # type: ignore[index]
-        return Samples(np.append(self.t, t), np.vstack([self.z, z]), np.vstack([self.inputs, row]))
+    def _append(
+        self, t: float, z: Array, inputs: Mapping[str, float], channels: tuple[str, ...]
+    ) -> Samples:
+        row = np.array([[inputs[c] for c in channels]])
+        both = ((self.t, [t]), (self.z, z[None]), (self.inputs, row))
+        return Samples(*(np.concatenate(pair) for pair in both))
 
     def since(self, first: int) -> Samples:
         """Return the samples from one on, which is the start of them."""

@@ -300,8 +300,10 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         if self.replay is None:
             if (guards := self.guards) is not None:
                 point, notes = self._iterated(work, guards, state, interval, point)
-                report = replace(report, notes={**report.notes, **_consistent(point), **notes})
-            return self._remember(work, replace(state, now=work.recentred(point)), interval), report
+                if notes:
+                    notes = {**report.notes, **_consistent(point), **notes}
+                    report = replace(report, notes=notes)
+            return self._remember(work, state, work.recentred(point), interval), report
         state = self._store(work, state, point, interval)
         if state.assimilated >= state.due:
             for _ in range(self.replay.iterations):
@@ -316,20 +318,20 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
                     break
         if len(state.samples.t) > self.replay.window:
             state = self.renewed(work.recentred(state.now), state)
-        return self._remember(work, state, interval), report
+        return self._remember(work, state, state.now, interval), report
 
     def _remember(
-        self, work: Filter, state: SensitivityState, interval: Interval
+        self, work: Filter, state: SensitivityState, now: Point, interval: Interval
     ) -> SensitivityState:
-        """Return a state whose past holds the sample."""
+        """Return a state that stands at a filter, and whose past holds the sample."""
         if self.guards is None and self.jumps is None:
-            return state
+            return replace(state, now=now)
         length = max(
             self.guards.past if self.guards is not None else 0,
             self.jumps.window if self.jumps is not None else 0,
         )
-        past = state.past.add(state.now, interval, work.problem.channels, length)
-        return replace(state, past=past)
+        past = state.past.add(now, interval, work.problem.channels, length)
+        return replace(state, now=now, past=past)
 
     def renewed(self, start: Point, state: SensitivityState) -> SensitivityState:
         """Return a state whose window begins at a filter, with no samples yet."""
@@ -358,14 +360,16 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
 
         Too far is cured by a replay of this one sample from where the interval began.
         """
+        if guards.within_reach(point.da - state.now.da):  # cheaper to see than how far it is
+            return point, {}
         level = state.now.level
         for temper in range(guards.temperings + 1):
             tempered = {"tempered": 1.0} if temper else {}
             begin = replace(state.now, level=level.times(TEMPER**temper), kept=point.kept)
             if temper:
                 point, _ = self._filter(work, begin, interval)
-            if np.abs(point.da - begin.da).max(initial=0.0) <= guards.reach:  # cheaper to see
-                return _levelled(point, level, temper), tempered
+                if guards.within_reach(point.da - begin.da):
+                    return _levelled(point, level, temper), tempered
             window = self._store(work, self.renewed(begin, state), point, interval)
             if not self._far(work, window):
                 return _levelled(point, level, temper), tempered

@@ -16,6 +16,8 @@ from livepde.linalg.types import Array, IntArray
 
 __all__ = ["BandedSolver"]
 
+MANY = 1000  # unknowns up to which copies of the triangles take longer than they save
+
 
 @dataclass(frozen=True, eq=False)
 class BandedFactor:
@@ -45,8 +47,8 @@ class BandedFactor:
 
     @cached_property
     def _triangles(self) -> tuple[Array, Array] | None:
-        """L and U in band storage if no rows were exchanged: they are solved with faster."""
-        if not np.array_equal(self.pivots, np.arange(len(self.pivots))):
+        """L and U in band storage, if no rows were exchanged and they are solved with faster."""
+        if len(self.pivots) < MANY or not np.array_equal(self.pivots, np.arange(len(self.pivots))):
             return None
         diagonal = self.lower + self.upper
         return np.asfortranarray(self.lu[diagonal:]), np.asfortranarray(

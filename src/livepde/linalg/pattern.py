@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -55,6 +56,16 @@ class Pattern:
         return len(self.indices)
 
     @property
+    def small(self) -> bool:
+        """True if a dense matrix multiplies faster than a sparse one."""
+        return self.shape[0] * self.shape[1] <= DENSE
+
+    @cached_property
+    def places(self) -> IntArray:
+        """Where in a dense matrix each structural non-zero stands, counted along the rows."""
+        return self.rows.astype(np.intp) * self.shape[1] + self.indices
+
+    @property
     def rows(self) -> IntArray:
         """Row index of each structural non-zero, shape (nnz,)."""
         return np.repeat(np.arange(self.shape[0], dtype=np.int32), np.diff(self.indptr))
@@ -74,6 +85,14 @@ class Pattern:
     def matrix(self, data: Array) -> sp.csr_array:
         """Return the CSR matrix with these values; `data` and the structure are shared."""
         return sp.csr_array((data, self.indices, self.indptr), shape=self.shape, copy=False)
+
+    def compact(self, data: Array) -> sp.csr_array | Array:
+        """Return the matrix as what multiplies fastest by a vector: a small one is dense."""
+        if not self.small:
+            return self.matrix(data)
+        dense = np.zeros(self.shape)
+        dense.put(self.places, data)
+        return dense
 
     def transposed(self, data: Array) -> sp.csc_array:
         """Return the transpose of `matrix(data)` as CSC, sharing `data`."""
@@ -95,11 +114,10 @@ class PatternOperator:
     """Products with a matrix whose data change: nothing is built again, a small one is dense."""
 
     def __init__(self, pattern: Pattern) -> None:
-        rows, cols = pattern.shape
         self._places: IntArray | None = None
-        if rows * cols <= DENSE:
-            self._places = pattern.rows.astype(np.intp) * cols + pattern.indices
-            self._dense = np.zeros((rows, cols))
+        if pattern.small:
+            self._places = pattern.places
+            self._dense = np.zeros(pattern.shape)
             return
         empty = np.zeros(pattern.nnz)
         self._matrix, self._transposed = pattern.matrix(empty), pattern.transposed(empty)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import Advance, Interval, advance
 from livepde.stepping.newton import TINY, Near, Newton, Parts, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
-from livepde.stepping.state import ForwardStage, Kept, simulate
+from livepde.stepping.simulation import simulate
+from livepde.stepping.state import ForwardStage
 
 __all__ = [
     "TINY",

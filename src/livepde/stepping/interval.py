@@ -45,6 +45,8 @@ class Interval:
         """Return time and inputs at t."""
         if t == self.t1:
             return self.end
+        if self.inputs0 is self.inputs1:
+            return Moment(t, self.end.inputs)
         s = self._weight(t)
         mixed = {k: (1 - s) * self.inputs0[k] + s * v for k, v in self.inputs1.items()}
         return Moment(t, Inputs(mixed))
@@ -117,7 +119,9 @@ class Advance:
 
     def over(self, interval: Interval) -> Interval:
         """Return an interval with its inputs as they are taken."""
-        return replace(interval, inputs0=interval.inputs1) if self.hold else interval
+        if not self.hold or interval.inputs0 is interval.inputs1:
+            return interval
+        return replace(interval, inputs0=interval.inputs1)
 
     def count(self, interval: Interval) -> int:
         """Return the number of even substeps of an interval."""

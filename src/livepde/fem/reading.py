@@ -1,0 +1,20 @@
+"""Which of its arguments a function reads, by its code: whatever branches it has."""
+
+from __future__ import annotations
+
+from dis import get_instructions
+from types import FunctionType
+from typing import Any
+
+__all__ = ["reads"]
+
+
+def reads(function: Any, position: int) -> bool:
+    """Return false if a function never uses the argument at a position; true if it may."""
+    if not isinstance(function, FunctionType) or function.__code__.co_argcount <= position:
+        return True
+    code = function.__code__
+    name = code.co_varnames[position]
+    used = [item.argval for item in get_instructions(code) if item.opname.count("FAST")]
+    named = [name in item if isinstance(item, tuple) else item == name for item in used]
+    return any(named) or name in code.co_cellvars

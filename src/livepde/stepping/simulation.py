@@ -1,0 +1,58 @@
+"""The forward model with a known parameter, from time to time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from livepde.fem import Moment
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.stepping.interval import Advance, Interval, advance
+from livepde.stepping.state import ForwardStage
+
+__all__ = ["simulate"]
+
+
+def simulate(
+    model: Model,
+    q: Array,
+    u0: Any,
+    times: Sequence[float],
+    control: Advance,
+    inputs: Callable[[float], Any] | None = None,
+) -> Iterator[tuple[float, Array]]:
+    """Yield (t, u) of the forward model at the given times, the first being the initial time.
+
+    Parameters
+    ----------
+    q
+        Coefficients of the parameter, shape (m,).
+    u0
+        Initial state: a number, a function of x, or coefficients.
+    inputs
+        t -> mapping of input channels.
+
+    Raises
+    ------
+    StepFailed
+        A step failed even when halved as often as `control` allows.
+    """
+    values = inputs or (lambda t: {})
+    forward = ForwardStage(model)
+    none = np.zeros(0)
+    u = model.initial(u0, Moment(times[0], values(times[0])))
+    yield times[0], u
+    for t0, t1 in pairwise(times):
+        interval = Interval(t0, t1, values(t0), values(t1), none, none)
+
+        def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:
+            return forward.solve(c, q, h, interval.at(t))
+
+        u, _, failure = advance(control, stage, u, interval)
+        if failure is not None:
+            raise failure
+        yield t1, u
