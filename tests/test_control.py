@@ -37,8 +37,7 @@ def rod(cells: int = 20, **options: Any) -> lp.Model:
         state=lp.Field(mesh, ElementLineP1()),
         parameter={"k": lp.Scalar(20.0, std=10.0, transform="log", bounds=(0.0, np.inf))},
         M=lambda u, v, x: 3.6e6 * u * v,
-        inputs=["heater", "room"],
-        **given,
+        **{"inputs": ["heater", "room"], **given},
     )
 
 
@@ -205,6 +204,8 @@ def test_names_that_do_not_exist_are_told():
         reduced().error(h=-1.0)
     with pytest.raises(lp.ConfigurationError, match="q names 'c'"):
         ct.Kalman(reduced(), PERIOD, drive={}, q={"c": 1.0})
+    with pytest.raises(lp.ConfigurationError, match=r"controls='heater'.*give a list"):
+        ct.reduce(rod(), OUTPUTS, "heater")
     with pytest.raises(lp.ConfigurationError, match="before names 'valve'"):
         ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"valve": 1.0})
     with pytest.raises(lp.ConfigurationError, match="controls=\\['valve'\\]; the channels"):
@@ -220,11 +221,43 @@ def test_names_that_do_not_exist_are_told():
         ({"inputs": {"heater": 1.0}}, "least < largest"),
         ({"price": {"heater": np.nan}}, "price\\['heater'\\] must be a number"),
         ({"penalty": -1.0}, "penalty must be at least 0"),
+        ({"track": {"tip": "much"}}, "track\\['tip'\\] must be a positive number"),
+        ({"track": ["tip"]}, "track must be a mapping"),
+        ({"inputs": {"heater": (None, 1.0)}}, "least < largest"),
     ],
 )
 def test_goals_that_make_no_sense_are_told(changes, says):
     with pytest.raises(lp.ConfigurationError, match=says):
         replace(GOAL, **changes)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"modes": 2.5}, "modes must be a whole number"),
+        ({"rates": (-1.0,)}, "rates must be positive"),
+        ({"u": np.nan}, "u is not finite"),
+        ({"inputs": {"room": np.nan}}, r"inputs\['room'\] must be a finite number"),
+    ],
+)
+def test_numbers_of_a_reduction_that_make_no_sense_are_told(options, says):
+    with pytest.raises(lp.ConfigurationError, match=says):
+        ct.reduce(rod(), OUTPUTS, ["heater"], **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"q": {"k": -1.0}}, r"q\['k'\] must be a number from 0 to inf"),
+        ({"period": 0.0}, "period must be a positive number"),
+        ({"drive": {"heater": np.nan}}, "deviation of 'heater' must be a number"),
+        ({"offset": {"heater": -1.0}}, "deviation of 'heater' must be a number"),
+        ({"x": [1.0]}, "x has shape"),
+    ],
+)
+def test_numbers_of_the_filter_that_make_no_sense_are_told(options, says):
+    with pytest.raises(lp.ConfigurationError, match=says):
+        ct.Kalman(reduced(modes=1), **{"period": PERIOD, "drive": {}, **options})
 
 
 # --- filter --------------------------------------------------------------------------------------
@@ -374,6 +407,41 @@ def test_the_target_meets_the_reference_or_stays_within_the_range():
         assert tip == pytest.approx(reference) if reference < 100.0 else v[0] == 1.0
 
 
+def test_a_control_does_the_work_of_another_that_is_at_its_end():
+    """The best steady state within the ranges, found by trying all of them."""
+    sources = [
+        lambda x, t: 2000.0 * x.inputs["room"],
+        lp.On("left", lambda x, t: 60e3 * x.inputs["heater"]),
+        lp.On("right", lambda x, t: 60e3 * x.inputs["second"]),
+    ]
+    model = rod(f=sources, inputs=["heater", "second", "room"])
+    small = ct.reduce(model, OUTPUTS, ["heater", "second"], sensors=SENSORS, u=ROOM)
+    goal = ct.Goal(
+        track={"tip": 1.0, "face": 1.0},
+        move={"heater": 1.0, "second": 1.0},
+        inputs={"heater": (0.0, 1.0), "second": (0.0, 0.04)},
+    )
+    step, wanted = small.matrices(np.array([20.0]), PERIOD), np.array([50.0, 50.0])
+    x, v = ct.LQ(small, goal, PERIOD).target(step, wanted, np.array([ROOM]))
+
+    def missed(v: Any) -> float:
+        c = np.array([*v, ROOM])
+        steady = np.linalg.solve(np.eye(small.size) - step.A, step.B @ c + step.f)
+        return float(np.sum((small.outputs(steady, c) - 50.0) ** 2))
+
+    tried = [(a, b) for a in np.linspace(0.0, 1.0, 201) for b in np.linspace(0.0, 0.04, 5)]
+    assert missed(v) <= min(missed(pair) for pair in tried)
+    assert v[1] == 0.04
+    assert 0.0 < v[0] < 1.0
+    np.testing.assert_allclose(step(x, np.array([*v, ROOM])), x, rtol=1e-6)
+
+
+def test_prices_alone_are_not_for_the_linear_quadratic_controller():
+    priced = replace(GOAL, track={}, price={"heater": 1.0})
+    with pytest.raises(lp.ConfigurationError, match="no positive weight"):
+        ct.LQ(reduced(modes=1), priced, PERIOD)
+
+
 @needs_mpc
 def test_the_predictive_controller_is_optimal_where_nothing_binds():
     model = reduced(modes=2)
@@ -500,6 +568,21 @@ def test_an_estimate_is_trusted_only_where_all_tests_pass(changes, says):
     assert bool(doubt) == bool(says)
 
 
+def test_what_may_be_negative_is_measured_by_its_prior():
+    """A source of 0.01, known to 0.1, is known, where it might have been 1."""
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot")}),
+        {"s": lp.Scalar(0.0, std=1.0)},
+        A=lambda q, u, v, x: -q.s * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    small = ct.reduce(model, lp.Points({"middle": 0.5}), ["hot"])
+    for std, doubt in ((0.1, ""), (0.4, "s = 0.01 is known to 0.4 only")):
+        estimate = told(q=np.array([0.01]), q_std=np.array([std]))
+        assert ct.Trust().doubt(estimate, small) == doubt
+
+
 @pytest.mark.parametrize(
     "levels", [{"spread": np.nan}, {"misfit": 0.0}, {"patience": 0}, {"patience": 1.5}]
 )
@@ -581,6 +664,68 @@ def test_what_is_not_a_number_is_missing():
         loop.step(2 * PERIOD, [ROOM] * 2, {"room": np.inf}, reference={"tip": 45.0})
 
 
+def test_inputs_may_stand_among_the_measurements():
+    """As for an identifier; those that are given apart go first."""
+    ends = []
+    for z, given in (
+        ([21.0, 20.0], {"room": 5.0}),
+        ({"T_5": 21.0, "T_10": 20.0, "room": 5.0}, None),
+        ({"T_5": 21.0, "T_10": 20.0, "room": 9.0}, {"room": 5.0}),
+    ):
+        for estimator in (identifier(), ct.Kalman(reduced(), PERIOD, drive={"heater": 0.1})):
+            loop = ct.Loop(estimator, ct.LQ(reduced(), GOAL, PERIOD))
+            loop.step(0.0, [ROOM] * 2, {"room": ROOM}, reference={"tip": 45.0})
+            ends.append(loop.step(PERIOD, z, given, reference={"tip": 45.0}).outputs)
+    assert ends[0] == ends[2] == ends[4]
+    assert ends[1] == ends[3] == ends[5]
+
+
+class Own:
+    """A controller of a user's own: it returns, or raises, what it is told."""
+
+    model, goal, period, horizon = reduced(modes=1), GOAL, PERIOD, 1
+
+    def __init__(self, answer: Any) -> None:
+        self.answer = answer
+
+    def start(self) -> Any:
+        return np.zeros(0)
+
+    def decide(self, known: ct.Known, plan: ct.Plan, before: Any, memory: Any) -> ct.Decision:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return ct.Decision(np.array(self.answer), "ok", memory)
+
+
+@pytest.mark.parametrize(
+    ("answer", "applied", "set_to", "says"),
+    [
+        ([0.4], 0.3, 0.4, "ok"),
+        ([np.nan], 0.3, 0.3, "the inputs were held"),
+        ([np.nan], 7.0, 1.0, "the inputs were held"),
+        ([7.0], 0.3, 1.0, "beyond its range"),
+    ],
+)
+def test_a_loop_lets_through_what_actuators_can_do(answer, applied, set_to, says):
+    loop = ct.Loop(identifier(), Own(answer))
+    given = {"room": ROOM, "heater": applied}
+    action = loop.step(0.0, [ROOM] * 2, given, reference={"tip": 45.0})
+    assert action.inputs == {"heater": set_to}
+    assert says in action.status
+
+
+def test_a_controller_that_raises_leaves_a_loop_that_goes_on():
+    loop = ct.Loop(identifier(), Own(ZeroDivisionError("bang")))
+    with pytest.raises(ZeroDivisionError, match="bang"):
+        loop.step(0.0, [ROOM] * 2, {"room": ROOM, "heater": 0.3}, reference={"tip": 45.0})
+    loop.controller.answer = [np.nan]
+    action = loop.step(PERIOD, [ROOM] * 2, reference={"tip": 45.0})
+    assert action.inputs == {"heater": 0.3}
+    loop.controller.answer = [0.1, 0.2]
+    with pytest.raises(lp.ConfigurationError, match=r"Own.decide returned inputs of shape \(2,\)"):
+        loop.step(2 * PERIOD, [ROOM] * 2, reference={"tip": 45.0})
+
+
 def test_a_sample_that_is_refused_changes_nothing():
     loops = [ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD)) for _ in range(2)]
     for loop in loops:
@@ -621,7 +766,15 @@ def test_a_limit_that_the_goal_does_not_have_is_not_dropped():
         loop.step(0.0, **step, limits={"face": (10.0, 75.0)})
     with pytest.raises(lp.SampleError, match=r"must be \(least, largest\)"):
         loop.step(0.0, **step, limits={"face": 75.0})
+    for ends in ((-np.inf, "hot"), (-np.inf, np.nan)):
+        with pytest.raises(lp.SampleError, match=r"limits\['face'\]"):
+            loop.step(0.0, **step, limits={"face": ends})
     loop.step(0.0, **step, limits={"face": (-np.inf, np.inf)})
+    held = replace(GOAL, limits={"face": (10.0, 75.0)})
+    with pytest.raises(lp.SampleError, match="the least value is above the largest"):
+        ct.Loop(identifier(), ct.LQ(reduced(), held, PERIOD)).step(
+            0.0, **step, limits={"face": (80.0, 70.0)}
+        )
 
 
 def test_references_and_forecasts_are_checked():
@@ -633,6 +786,15 @@ def test_references_and_forecasts_are_checked():
         loop.step(0.0, z, {"room": ROOM})
     with pytest.raises(lp.SampleError, match="forecast names 'heater'"):
         loop.step(0.0, z, {"room": ROOM}, reference={"tip": 1.0}, forecast={"heater": 1.0})
+    for given in ("hot", np.inf, [], None, [[45.0]]):
+        with pytest.raises(lp.SampleError, match=r"reference\['tip'\]"):
+            loop.step(0.0, z, {"room": ROOM}, reference={"tip": given})
+    with pytest.raises(lp.SampleError, match="reference must be a mapping"):
+        loop.step(0.0, z, {"room": ROOM}, reference=45.0)
+    with pytest.raises(lp.SampleError, match=r"forecast\['room'\]"):
+        loop.step(0.0, z, {"room": ROOM}, reference={"tip": 1.0}, forecast={"room": np.inf})
+    with pytest.raises(lp.ConfigurationError, match=r"before\['heater'\] must be a number"):
+        ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"heater": np.inf})
     with pytest.raises(lp.SampleError, match="unknown input 'wind'"):
         loop.step(0.0, z, {"wind": ROOM}, reference={"tip": 45.0})
     with pytest.raises(lp.ConfigurationError, match="hold=True"):

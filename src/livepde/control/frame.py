@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,7 +14,7 @@ from livepde.control.linear import Linear, Linearisation
 from livepde.errors import ModelError
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.observation import Observation, Observed
+from livepde.observation import Observed
 from livepde.result import unknown_of
 
 __all__ = ["Frame", "likely"]
@@ -32,7 +32,7 @@ class Frame:
     model
         The full model.
     outputs, sensors
-        Observations of what is controlled, and of what is measured.
+        What is controlled, and what is measured, bound to the full model.
     V, test
         Basis, shape (n, r), and V^T M, shape (r, n).
     u, q, inputs
@@ -40,8 +40,8 @@ class Frame:
     """
 
     model: Model
-    outputs: Observation
-    sensors: Observation
+    outputs: Observed
+    sensors: Observed
     V: Array
     test: Array
     u: Array
@@ -53,20 +53,15 @@ class Frame:
         """Which coefficients of the parameter are unknown numbers."""
         return list(self.model.parameter_space.labels.values())
 
-    @cached_property
-    def observed_sensors(self) -> Observed:
-        """The sensors, bound to the full model."""
-        return self.observed(self.sensors)
+    @property
+    def moves(self) -> bool:
+        """Whether the systems depend on where they are taken, beside the unknown numbers."""
+        return bool(self.model.parameter_space.fields) or not self.model.affine
 
     @cached_property
     def linearisation(self) -> Linearisation:
         """The linear systems of the full model."""
         return Linearisation(self.model, self.u, self.inputs)
-
-    def observed(self, observation: Observation) -> Observed:
-        """Return an observation bound to the full model."""
-        model = self.model
-        return observation.bind(model.state_space, model.X, model.parameter_space)
 
     @cached_property
     def boundary(self) -> tuple[Array, Array]:
@@ -86,7 +81,7 @@ class Frame:
             self,
             u=self.u if u is None else u,
             q=self.q if q is None else q,
-            inputs=self.inputs if inputs is None else inputs,
+            inputs={**self.inputs, **(inputs or {})},
         )
 
     def values(self) -> list[Array]:
@@ -114,7 +109,6 @@ class Frame:
             (self.q[row] * slope for row, slope in zip(self.rows, slopes, strict=True)),
             np.zeros_like(systems[0]),
         )
-        self._check_linear(values, systems)
         return np.array([constant, *slopes])
 
     def _projected(self, system: Linear) -> Array:
@@ -125,7 +119,10 @@ class Frame:
         driven = self.V.T @ (np.column_stack([system.E, system.f]) - system.K @ fixed)
         return np.column_stack([K, driven + K @ (self.test @ fixed)])
 
-    def _check_linear(self, values: Sequence[Array], systems: Sequence[Array]) -> None:
+    def check(self) -> None:
+        """Raise `ModelError` where the model is not linear in its unknown numbers."""
+        values = self.values()
+        systems = [self._projected(self.linearisation.at(q)) for q in values]
         both = self.q + 0.5 * sum((q - self.q for q in values[1:]), np.zeros_like(self.q))
         expected = systems[0] + 0.5 * sum(
             (system - systems[0] for system in systems[1:]), np.zeros_like(systems[0])
@@ -138,9 +135,9 @@ class Frame:
                 "(transform='log') is no hindrance."
             )
 
-    def output(self, observation: Observation) -> Output:
+    def output(self, observed: Observed) -> Output:
         """Return what an observation shows of the coordinates."""
-        observed, moment = self.observed(observation), self.linearisation.moment
+        moment = self.linearisation.moment
         W, known = self.boundary
         y = observed.predict(self.u, self.q, moment)
         H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())

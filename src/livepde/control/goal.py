@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from numbers import Real
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,6 +18,14 @@ from livepde.linalg import Array
 __all__ = ["Controller", "Decision", "Goal", "Plan", "check"]
 
 FREE = (-np.inf, np.inf)
+
+
+def _real(value: Any) -> bool:
+    return isinstance(value, Real)
+
+
+def _finite(value: Any) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 @dataclass(frozen=True)
@@ -51,22 +61,29 @@ class Goal:
     penalty: float | None = None
 
     def __post_init__(self) -> None:
+        for what in ("track", "move", "inputs", "limits", "price"):
+            if not isinstance(getattr(self, what), Mapping):
+                raise ConfigurationError(
+                    f"Goal: {what} must be a mapping from names to numbers; got "
+                    f"{getattr(self, what)!r}."
+                )
         for what, weights, least in (("track", self.track, 0.0), ("move", self.move, 1e-300)):
             for name, weight in weights.items():
-                if not (np.isfinite(weight) and weight >= least):
+                if not (_finite(weight) and weight >= least):
                     raise ConfigurationError(
-                        f"Goal: {what}['{name}'] must be a positive number; got {weight}."
+                        f"Goal: {what}['{name}'] must be a positive number; got {weight!r}."
                     )
         for what, ranges in (("inputs", self.inputs), ("limits", self.limits)):
             for name, ends in ranges.items():
-                if np.shape(ends) != (2,) or not ends[0] < ends[1]:
+                two = np.shape(ends) == (2,) and all(_real(end) for end in ends)
+                if not two or not ends[0] < ends[1]:
                     raise ConfigurationError(
                         f"Goal: {what}['{name}'] must be (least, largest) with least < largest; "
                         f"got {ends}."
                     )
         for name, price in self.price.items():
-            if not np.isfinite(price):
-                raise ConfigurationError(f"Goal: price['{name}'] must be a number; got {price}.")
+            if not (_finite(price)):
+                raise ConfigurationError(f"Goal: price['{name}'] must be a number; got {price!r}.")
         if not (np.isfinite(self.beyond) and self.beyond >= 0.0):
             raise ConfigurationError(f"Goal: penalty must be at least 0; got {self.penalty}.")
 

@@ -65,6 +65,13 @@ class Kalman:
                 raise ConfigurationError(
                     f"Kalman: there is no channel '{name}'; the model has {list(model.channels)}."
                 )
+            size = {**drive, **(offset or {})}[name]
+            if not (np.isfinite(size) and size >= 0.0):
+                raise ConfigurationError(
+                    f"Kalman: the deviation of '{name}' must be a number, at least 0; got {size}."
+                )
+        if not (np.isfinite(period) and period > 0.0):
+            raise ConfigurationError(f"Kalman: period must be a positive number; got {period}.")
         self.model = model
         self.period = period
         self.drive = np.array([float(drive.get(name, 0.0)) for name in model.channels])
@@ -74,6 +81,10 @@ class Kalman:
         self._t = np.nan
         self.set(q or {})
         x = model.start if x is None else np.asarray(x, dtype=float)
+        if x.shape != (model.size,):
+            raise ConfigurationError(
+                f"Kalman: x has shape {x.shape}; the reduced model needs ({model.size},)."
+            )
         self._x = np.concatenate([x, np.zeros(len(self._moving))])
         self._P = self._usual[2]
 
@@ -118,7 +129,7 @@ class Kalman:
             if unknown:
                 raise SampleError(f"unknown sensor '{unknown[0]}'; there are {list(sensors)}.")
             z = [number(z.get(name), f"sensor '{name}'") for name in sensors]
-        seen = readings(z, self.model.frame.observed_sensors)
+        seen = readings(z, self.model.frame.sensors)
         if not np.isnan(self._t):
             h = t - self._t
             if not h > 0.0:

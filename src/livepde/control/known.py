@@ -7,6 +7,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from livepde.control.reduced import ReducedModel
 from livepde.linalg import Array
 
 __all__ = ["Known", "Source"]
@@ -27,6 +28,10 @@ class Known:
     offset
         What is added to each channel by something that nobody measures, shape (channels,); None:
         nothing. It acts on the state.
+    model
+        The reduced model about the estimate, where it depends on where it is taken: unknown fields,
+        models that are not affine in u. None: that of the controller. Its basis and its outputs are
+        those of the controller's.
     source, why
         "estimate", or "fallback" and why the estimate is not trusted.
     """
@@ -37,6 +42,7 @@ class Known:
     source: Source = "estimate"
     why: str = ""
     offset: Array | None = None
+    model: ReducedModel | None = None
 
     @property
     def std(self) -> Array:

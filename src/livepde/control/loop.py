@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from livepde import checkpoint
 from livepde.control.estimators import Estimator, Learned
-from livepde.control.goal import Controller, Plan
+from livepde.control.goal import Controller, Decision, Plan
 from livepde.control.kalman import Kalman
 from livepde.control.known import Known
 from livepde.control.trust import Trust
@@ -20,7 +20,7 @@ from livepde.errors import ConfigurationError, RunError, SampleError
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.result import Estimate
-from livepde.samples import number
+from livepde.samples import number, numbers
 
 __all__ = ["Action", "Loop"]
 
@@ -122,6 +122,8 @@ class Loop:
                 raise ConfigurationError(
                     f"Loop: before names '{name}'; the controls are {list(model.controls)}."
                 )
+            if not np.isfinite(value):
+                raise ConfigurationError(f"Loop: before['{name}'] must be a number; got {value}.")
             start[model.controls.index(name)] = float(value)
         self._before: Array = start
         self._memory: Array = controller.start()
@@ -142,7 +144,7 @@ class Loop:
         Parameters
         ----------
         t, z
-            As for `Identifier.step`: measurements of the sensors.
+            As for `Identifier.step`: measurements of the sensors; by name with inputs among them.
         inputs
             Measured disturbances; and what a control really applied since the sample before, where
             that is not what was asked for. NaN is missing: a disturbance holds its last value, a
@@ -162,6 +164,9 @@ class Loop:
             where the goal has none.
         """
         controller, model = self.controller, self.controller.model
+        if isinstance(z, Mapping):
+            inputs = {name: z[name] for name in model.channels if name in z} | dict(inputs or {})
+            z = {k: v for k, v in z.items() if k not in model.channels or k in model.sensors.names}
         given = {name: number(v, f"input '{name}'") for name, v in (inputs or {}).items()}
         unknown = [name for name in given if name not in model.channels]
         if unknown:
@@ -179,9 +184,9 @@ class Loop:
         channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
         plan = self._plan(reference or {}, forecast or {}, now, limits or {})
         known = self.estimator.step(t, z, channels)
-        decision = controller.decide(known, plan, applied, self._memory)
+        self._before, self._disturbances = applied, now  # should the controller raise
+        decision = self._possible(controller.decide(known, plan, applied, self._memory), applied)
         self._before, self._memory = decision.inputs, decision.memory
-        self._disturbances = now
         y = model.outputs(known.x, model.values(channels))
         return Action(
             t,
@@ -192,6 +197,22 @@ class Loop:
             getattr(self.estimator, "estimate", None),
         )
 
+    def _possible(self, decision: Decision, applied: Array) -> Decision:
+        """Return a decision that the actuators can follow, whatever the controller says."""
+        model, found = self.controller.model, np.asarray(decision.inputs, dtype=float)
+        if found.shape != applied.shape:
+            raise ConfigurationError(
+                f"{type(self.controller).__name__}.decide returned inputs of shape {found.shape}; "
+                f"the controls are {list(model.controls)}: return {applied.shape}."
+            )
+        finite, status = np.isfinite(found), decision.status
+        if not finite.all():
+            found, status = applied, "an input that is not finite: the inputs were held"
+        inside = np.clip(found, *self.controller.goal.range(model))
+        if status == "ok" and not np.array_equal(inside, found):
+            status = "an input beyond its range: it was set to the end of it"
+        return Decision(inside, status, decision.memory)
+
     def _plan(
         self,
         reference: Future,
@@ -201,7 +222,7 @@ class Loop:
     ) -> Plan:
         """Return what is known of the future, checked."""
         goal, model, count = self.controller.goal, self.controller.model, self.controller.horizon
-        for name, ends in dict[str, Any](limits).items():
+        for name, ends in _mapping(limits, "limits").items():
             if not isinstance(ends, tuple | list) or len(ends) != 2:
                 raise SampleError(f"limits['{name}'] must be (least, largest); got {ends!r}.")
         found = []
@@ -217,6 +238,10 @@ class Loop:
                     "Goal.limits, so that the controller is built with it."
                 )
             found.append(values)
+        crossed = (found[0] > found[1]).any(axis=0)
+        if crossed.any():
+            name = list(goal.limits)[int(np.flatnonzero(crossed)[0])]
+            raise SampleError(f"limits['{name}']: the least value is above the largest one.")
         return Plan(
             _ahead(reference, tuple(goal.track), None, count, "reference"),
             _ahead(forecast, model.disturbances, now, count, "forecast"),
@@ -254,19 +279,29 @@ class Loop:
         self._disturbances = leaves["disturbances"]
 
 
+def _mapping(given: Any, what: str) -> Mapping[str, Any]:
+    if not isinstance(given, Mapping):
+        raise SampleError(f"{what} must be a mapping from names to values; got {given!r}.")
+    return given
+
+
 def _ahead(
     given: Future, names: tuple[str, ...], default: Array | None, horizon: int, what: str
 ) -> Array:
-    """Return values over the horizon, shape (horizon, names)."""
-    for name in given:
+    """Return values over the horizon, shape (horizon, names); only limits may be infinite."""
+    for name in _mapping(given, what):
         if name not in names:
             raise SampleError(f"{what} names '{name}'; there are {list(names)}.")
     columns = []
     for k, name in enumerate(names):
         if name in given:
-            values = np.atleast_1d(np.asarray(given[name], dtype=float))
-            if values.ndim > 1 or not len(values) or np.isnan(values).any():
-                raise SampleError(f"{what}['{name}'] must be a number, or one for each period.")
+            values = np.atleast_1d(numbers(given[name], f"{what}['{name}']"))
+            wrong = np.isnan(values) if what == "limits" else ~np.isfinite(values)
+            if values.ndim > 1 or not len(values) or wrong.any():
+                raise SampleError(
+                    f"{what}['{name}'] must be a number, or one for each period; got "
+                    f"{given[name]!r}."
+                )
         elif default is None:
             raise SampleError(f"{what}: '{name}' has none; give a number, or one for each period.")
         else:

@@ -11,6 +11,7 @@ from livepde.control.affine import Discrete
 from livepde.control.goal import Decision, Goal, Plan, check
 from livepde.control.known import Known
 from livepde.control.reduced import ReducedModel
+from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
 __all__ = ["LQ"]
@@ -43,6 +44,10 @@ class LQ:
 
     def __post_init__(self) -> None:
         check(self)
+        if not sum(self.goal.track.values()) > 0.0:
+            raise ConfigurationError(
+                "LQ: Goal.track has no positive weight; give one, or take MPC, which knows prices."
+            )
 
     def start(self) -> Array:
         """Return the memory before the first sample: unknown numbers and their gain, NaN as yet."""
@@ -51,16 +56,21 @@ class LQ:
 
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
         """Return what to set from now on; as for `Controller`."""
-        model, low, high = self.model, *self.goal.range(self.model)
+        low, high = self.goal.range(self.model)
+        model = known.model or self.model
         step = model.matrices(known.q, self.period).with_offset(known.offset)
         try:
             x, v = self.target(step, plan.reference[0], plan.disturbances[0])
             m, kept = len(known.q), np.isfinite(memory).all()
-            if not (kept and np.array_equal(memory[:m], known.q)):
-                memory = np.concatenate([known.q, self.gain(step).ravel()])
+            if known.model is not None:  # another one at each sample: its gain is not kept
+                gain = self.gain(step)
+            elif kept and np.array_equal(memory[:m], known.q):
+                gain = memory[m:].reshape(len(before), -1)
+            else:
+                gain = self.gain(step)
+                memory = np.concatenate([known.q, gain.ravel()])
         except np.linalg.LinAlgError as error:
             return Decision(before, f"no gain ({error}): the inputs were held", memory)
-        gain = memory[m:].reshape(len(before), -1)
         wanted = before - gain @ np.concatenate([known.x - x, before - v])
         if not np.isfinite(wanted).all():
             return Decision(before, "no finite state or target: the inputs were held", memory)
@@ -103,5 +113,12 @@ class LQ:
         pair = one + along @ np.linalg.lstsq(root[:, None] * (C @ along), missed, rcond=None)[0]
         v = np.clip(pair[r:], low, high)
         if not np.array_equal(v, pair[r:]):
+            if len(v) > 1:  # where one of them is at its end, the others may do its work
+                from scipy.optimize import lsq_linear
+
+                move = along @ np.linalg.pinv(along[r:])  # of the pair, with v
+                effect = root[:, None] * (C @ move)
+                rest = missed + effect @ one[r:]
+                v = np.clip(lsq_linear(effect, rest, (low, high), method="bvls").x, low, high)
             pair = pair + along @ np.linalg.lstsq(along[r:], v - pair[r:], rcond=None)[0]
         return np.asarray(pair[:r]), v

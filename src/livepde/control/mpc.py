@@ -157,7 +157,7 @@ class MPC:
 
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
         """Return what to set from now on; as for `Controller`."""
-        mpc, model = self.problem, self.model
+        mpc, model = self.problem, known.model or self.model
         found = known.scenarios(self.kappa, (self.scenarios - 1) // 2)
         found = np.array([model.shifted(known.q, one - known.q) for one in found])
         q = np.vstack([found, np.tile(known.q, (self.scenarios - len(found), 1))])

@@ -86,6 +86,13 @@ class ReducedModel:
             frame=frame,
         )
 
+    def __repr__(self) -> str:
+        return (
+            f"ReducedModel({self.size} coordinates, unknowns={list(self.unknowns)}, "
+            f"controls={list(self.controls)}, disturbances={list(self.disturbances)}, "
+            f"outputs={list(self.outputs.names)}, sensors={list(self.sensors.names)})"
+        )
+
     @property
     def size(self) -> int:
         """Number of coordinates r."""
@@ -102,6 +109,11 @@ class ReducedModel:
 
     def values(self, inputs: Mapping[str, float]) -> Array:
         """Return the channels as an array, shape (channels,)."""
+        missing = [name for name in self.channels if name not in inputs]
+        if missing:
+            raise ConfigurationError(
+                f"The channels {missing} have no value; give one for each of {list(self.channels)}."
+            )
         return np.array([float(inputs[name]) for name in self.channels])
 
     def system(self, q: Array) -> tuple[Array, Array, Array]:
@@ -157,7 +169,13 @@ class ReducedModel:
                 raise ConfigurationError(
                     f"q names '{label}'; the unknown numbers are {list(self.unknowns)}."
                 )
-            numbers[self.unknowns.index(label)] = value
+            k = self.unknowns.index(label)
+            if not (np.isfinite(value) and self.lower[k] <= value <= self.upper[k]):
+                raise ConfigurationError(
+                    f"q['{label}'] must be a number from {self.lower[k]:g} to {self.upper[k]:g}; "
+                    f"got {value}."
+                )
+            numbers[k] = value
         return numbers
 
     def shifted(self, q: Array, shift: Array) -> Array:
@@ -175,7 +193,7 @@ class ReducedModel:
         Of sensors that are not linear in the state, or see unknown numbers, at x and q.
         """
         frame, c = self.frame, self.values(inputs)
-        observed = frame.observed_sensors
+        observed = frame.sensors
         if type(observed) is Observed and observed.linear:
             return self.sensors(x, c), self.sensors.C
         full, moment = frame.q.copy(), Moment(0.0, Inputs(inputs))
@@ -192,16 +210,29 @@ class ReducedModel:
     ) -> ReducedModel:
         """Return the same on the same basis, linearised about another state.
 
-        For a model that is not affine in u, or has unknown fields.
+        For a model that is not affine in u, or has unknown fields. A loop does it by itself.
 
         Parameters
         ----------
         u, q
             Coefficients of state and parameter, shapes (n,) and (m,); default as before.
         inputs
-            Value of each channel; default as before.
+            Channel -> value; the others as before.
+
+        Raises
+        ------
+        ConfigurationError
+            Another shape, or a channel that the model does not have.
         """
-        return ReducedModel.of(self.frame.moved(u, q, inputs), self.controls)
+        frame = self.frame
+        for what, given, mine in (("u", u, frame.u), ("q", q, frame.q)):
+            if given is not None and np.shape(given) != mine.shape:
+                raise ConfigurationError(
+                    f"about: {what} has shape {np.shape(given)}; the model has {len(mine)} "
+                    f"coefficients, so it needs {mine.shape}."
+                )
+        _known("about", inputs, self.channels)
+        return ReducedModel.of(frame.moved(u, q, inputs), self.controls)
 
     def error(
         self, q: Mapping[str, float] | None = None, *, h: float, samples: int = 100
@@ -228,7 +259,6 @@ class ReducedModel:
         step = self.matrices(numbers, h)
         size, missed = np.zeros((2, len(self.outputs.names)))
         model, times = frame.model, (h * np.arange(samples + 1)).tolist()
-        observed = frame.observed(frame.outputs)
         for control in self.controls:
             inputs = dict(frame.inputs) | {control: frame.inputs[control] + 1.0}
             u0 = model.impose(frame.u, Moment(0.0, Inputs(inputs)))
@@ -244,13 +274,26 @@ class ReducedModel:
             for t, u in states:
                 if t > 0.0:
                     x = step(x, c)
-                exact = observed.predict(u, full, Moment(t, Inputs(inputs)))
+                exact = frame.outputs.predict(u, full, Moment(t, Inputs(inputs)))
                 rows.append((exact, self.outputs(x, c)))
             exact, found = np.array(rows).transpose(1, 0, 2)
             size = np.maximum(size, np.abs(exact - exact[0]).max(axis=0))
             missed = np.maximum(missed, np.abs(found - exact).max(axis=0))
         worst = missed / np.where(size > 0.0, size, 1.0)
         return dict(zip(self.outputs.names, worst.tolist(), strict=True))
+
+
+def _known(what: str, inputs: Mapping[str, float] | None, channels: Sequence[str]) -> None:
+    """Refuse inputs that are no channels, or no numbers."""
+    for name, value in (inputs or {}).items():
+        if name not in channels:
+            raise ConfigurationError(
+                f"{what}: inputs names '{name}'; the channels are {list(channels)}."
+            )
+        if not np.isfinite(value):
+            raise ConfigurationError(
+                f"{what}: inputs['{name}'] must be a finite number; got {value}."
+            )
 
 
 def _end(unknown: Any, side: int) -> float:
@@ -305,25 +348,28 @@ def reduce(
         A control that is no channel of the model.
     """
     unknown = [name for name in controls if name not in model.channels]
-    if unknown or not controls or len(set(controls)) < len(controls):
+    if isinstance(controls, str) or unknown or not 0 < len(controls) == len(set(controls)):
         raise ConfigurationError(
-            f"reduce: controls={list(controls)}; the channels of the model are "
-            f"{list(model.channels)}: name one or more of them, each once."
+            f"reduce: controls={controls!r}; the channels of the model are "
+            f"{list(model.channels)}: give a list of one or more of them, each once."
         )
-    for name in inputs or {}:
-        if name not in model.channels:
-            raise ConfigurationError(
-                f"reduce: inputs names '{name}'; the channels are {list(model.channels)}."
-            )
-    if modes < 0:
-        raise ConfigurationError(f"reduce: modes must be at least 0; got {modes}.")
+    _known("reduce", inputs, model.channels)
+    if modes != int(modes) or modes < 0:
+        raise ConfigurationError(f"reduce: modes must be a whole number, at least 0; got {modes}.")
+    for rate in rates:
+        if not (np.isfinite(rate) and rate > 0.0):
+            raise ConfigurationError(f"reduce: rates must be positive numbers; got {rate}.")
     given = dict.fromkeys(model.channels, 0.0) | dict(inputs or {})
     physical = model.latent.value(model.initial_parameter(q))
     start = model.initial(0.0 if u is None else u, Moment(0.0, Inputs(given)))
+    if not np.isfinite(start).all():
+        raise ConfigurationError("reduce: u is not finite; give the state where it is linearised.")
+    spaces = (model.state_space, model.X, model.parameter_space)
+    seen = outputs.bind(*spaces)
     frame = Frame(
         model,
-        outputs,
-        outputs if sensors is None else sensors,
+        seen,
+        seen if sensors is None else sensors.bind(*spaces),
         np.zeros((model.X.dim, 0)),
         np.zeros((0, model.X.dim)),
         start,
@@ -342,4 +388,6 @@ def reduce(
     systems = [linearisation.at(value) for value in values]
     free = np.flatnonzero(model.X.free)
     V = basis(model.mass, free, systems, np.column_stack([W, known]), modes, rates)
-    return ReducedModel.of(replace(frame, V=V, test=V.T @ model.mass), tuple(controls))
+    frame = replace(frame, V=V, test=V.T @ model.mass)
+    frame.check()
+    return ReducedModel.of(frame, tuple(controls))

@@ -25,7 +25,8 @@ class Trust:
     - The step of the identifier was taken (status ok).
     - The model explains the data: the mean square of the normalised innovations is at most
       `misfit`.
-    - Each unknown number is known: its standard deviation is at most `spread` of its value.
+    - Each unknown number is known: its standard deviation is at most `spread` of its value; of one
+      that may be negative, of the prior's deviation where that is larger.
     - Each lies inside of its bounds, not at one.
 
     Parameters
@@ -66,10 +67,11 @@ class Trust:
         if estimate.q_std is None:
             return "the law has no covariance: take SensitivityLaw"
         q, std = model.numbers(estimate.q), model.numbers(estimate.q_std)
-        for label, value, deviation, low, high in zip(
-            model.unknowns, q, std, model.lower, model.upper, strict=True
+        size = np.where(model.lower < 0.0, np.maximum(np.abs(q), model.std), np.abs(q))
+        for label, value, deviation, scale, low, high in zip(
+            model.unknowns, q, std, size, model.lower, model.upper, strict=True
         ):
-            if not np.isfinite(value) or not deviation <= self.spread * abs(value):
+            if not np.isfinite(value) or not deviation <= self.spread * scale:
                 return f"{label} = {value:.4g} is known to {deviation:.2g} only"
             if not low < value < high:
                 return f"{label} = {value:.4g} lies at its bound"

@@ -225,9 +225,9 @@ def _sparse(matrix: Array) -> Any:
 def _reading(model: ReducedModel, x: Any, c: Any) -> Any:
     """Return what the sensors show, as a CasADi expression."""
     casadi = packages()[1]
-    seen, sensors = model.sensors, model.frame.sensors
+    seen, sensors = model.sensors, model.frame.sensors.observation
     if not isinstance(sensors, Transformed):
         return casadi.DM(seen.C) @ x + casadi.DM(seen.D) @ c + casadi.DM(seen.d)
-    # Its base is linear: on the basis, without boundary values.
-    base = model.frame.observed(sensors.base)
-    return sensors.function(casadi.DM(np.asarray(base.G @ model.frame.V)) @ x)
+    # What it transforms is linear: on the basis, without boundary values.
+    linear = np.asarray(model.frame.sensors.G @ model.frame.V)
+    return sensors.function(casadi.DM(linear) @ x)

@@ -71,7 +71,7 @@ class Run:
                 np.full(len(times), v) for v in (low, high)
             )
         space = model.frame.model.parameter_space
-        units = dict.fromkeys(model.outputs.names, model.frame.outputs.unit)
+        units = dict.fromkeys(model.outputs.names, model.frame.outputs.observation.unit)
         units |= {label: unknown_of(space, label).unit for label in model.unknowns}
         data = {
             name: (
