@@ -126,6 +126,11 @@ def test_a_table_is_no_folder(here):
         write_template(Path("my.csv"))
 
 
+def test_what_loggers_write_for_no_value_is_missing(here):
+    begun("time_s,T\n0,20\n10,---\n20,#NV\n30,--\n")
+    assert "20 to 20, 3 missing" in Path("mine/case.toml").read_text()
+
+
 def test_a_day_and_a_month_that_may_be_swapped_are_asked_for(here):
     begun("time,T\n03/02/2026 08:00,20\n03/02/2026 08:10,20\n")
     assert "the day first, or the month?" in Path("mine/case.toml").read_text()
@@ -143,7 +148,7 @@ def test_from_a_table_to_estimates(here):
     named = "mesh.from, mesh.to, unknowns.alpha.prior, unknowns.alpha.std, channels.T_left.at, "
     assert str(error.value) == (
         f"mine/case.toml: still to be filled in, where it says '?': {named}channels.T_10.at, "
-        "channels.T_20.at, channels.T_30.at, channels.T_right.at."
+        "channels.T_20.at, channels.T_30.at, channels.T_right.at, law.noise."
     )
     places = {f"channels.T_{k}.at": f"{k} cm" for k in (10, 20, 30)}
     ends = {
@@ -153,7 +158,8 @@ def test_from_a_table_to_estimates(here):
     }
     mesh = {"mesh.from": 0, "mesh.to": "40 cm"}
     prior = {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
-    filled = cases.load(case, settings={**places, **ends, **mesh, **prior})
+    noise = {"law.noise": "0.05 K"}
+    filled = cases.load(case, settings={**places, **ends, **mesh, **prior, **noise})
     prepared = filled.prepare()
     assert len(prepared.stream) == 181
     expected = cases.load(rod).prepare()

@@ -128,6 +128,12 @@ def test_a_mistake_is_one_sentence_with_its_remedy(mistake, home, monkeypatch, c
     assert contents(home) == before
 
 
+def test_data_in_any_encoding_are_no_case(home, monkeypatch, capsys):
+    data("T_20", "Fühler", "cp1252")()
+    expected = (2, "", f"Error: {messages()['data as a case']}\n")
+    assert livepde(("check", str(DATA)), monkeypatch, capsys) == expected
+
+
 @pytest.mark.parametrize("command", [("watch", "old"), (*RUN, "--realtime", "--watch", "8050")])
 def test_a_missing_package_is_said_before_a_run_begins(command, home, monkeypatch, capsys):
     RunWriter.create(Path("old"), version="", command=[], title="")

@@ -42,9 +42,9 @@ transform = "log"              # keeps it positive"""
 CHANNELS = """\
 # Delete what is no temperature. One at an end of the mesh is given: role = "boundary", at = "left"
 # or "right"; through an end without one no heat flows. One of role = "withheld" is only scored."""
-LAW = """\
-kind = "auto"                  # finds the noise of the sensors, and whether unknowns move
-# noise = "0.1 K"              # of a single value: with it 'livepde check' tells more"""
+NOISE = f"""\
+noise = "{BLANK} K"                  # of a single value: its standard deviation
+"""
 
 
 def parts_of(table: Path, folder: Path) -> dict[str, str]:
@@ -92,7 +92,7 @@ def parts_of(table: Path, folder: Path) -> dict[str, str]:
         "data": "\n".join(data),
         "prior": PRIOR,
         "channels": "\n".join([CHANNELS, *channels]),
-        "law": LAW,
+        "noise": NOISE,
         "step": f'"{step}"',
         "last": "",
     }

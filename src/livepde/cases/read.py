@@ -72,6 +72,10 @@ TABLES: dict[str, type[BaseModel]] = {
 
 def read_text(path: Path) -> str:
     """Return the text of a case file."""
+    if path.suffix in DATA:
+        raise CaseError(
+            f"{path}: is data, not a case: 'livepde init DIR --data {path}' begins one."
+        )
     try:
         with path.open("rb") as file:
             content = file.read(LONGEST + 1)
@@ -101,8 +105,6 @@ def _nearest(folder: Path, name: str) -> str:
 
 def read_toml(text: str, where: str) -> dict[str, Any]:
     """Return the document of a case file; raises `CaseError`."""
-    if where.endswith(DATA):
-        raise CaseError(f"{where}: is data, not a case: 'livepde run CASE --data {where}'.")
     try:
         return tomllib.loads(text)
     except RecursionError as error:

@@ -47,7 +47,9 @@ cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells 
 {channels}
 
 [law]
-{law}
+{noise}kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
+replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
+                               # kind = "auto" finds out, and needs no noise either
 
 [steps]
 scheme = "alexander2"          # second order; or "implicit-euler"
@@ -72,10 +74,7 @@ T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "{NOISE} K" }}
 T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
 T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "{NOISE} K" }}
 T_right = {{ role = "boundary", column = "T_right", at = "right" }}""",
-    "law": """\
-kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
-replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
-                               # kind = "auto" finds out, and needs no noise either""",
+    "noise": "",
     "step": '"20 s"',
     "last": f"""
 [expect]                       # of these very data: drop it, or say what you expect of yours

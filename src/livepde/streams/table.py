@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
-MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "#n/a"})
+MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
 
 
 @dataclass(frozen=True)
