@@ -47,6 +47,7 @@ KEPT_EVENTS = 10_000
 TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
 LOG_SIZE = 16 * 2**20  # bytes of the write-ahead log that are kept when it was longer
 LONGEST = 2000  # characters of the message of an event
+MOMENT = 0.5  # seconds for which who only asks whether a journal is written may hold its lock
 
 SCHEMA = (
     "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
@@ -559,9 +560,10 @@ def _reader(path: Path) -> sqlite3.Connection:
     connection = _connect(path, "mode=ro")
     try:
         connection.execute("SELECT 1 FROM sqlite_schema").close()
-    except sqlite3.OperationalError:
+    except sqlite3.OperationalError as error:
         log = log_of(path)
-        if log.exists() and log.stat().st_size:
+        busy = error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+        if busy or (log.exists() and log.stat().st_size):
             raise
         # A folder in which nothing can be made, and nobody writes.
         connection.close()
@@ -618,7 +620,7 @@ def _lock_of(path: Path) -> FileLock:
 def _locked(path: Path) -> FileLock:
     lock = _lock_of(path)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=MOMENT)
     except Timeout:
         raise RunError(
             f"{path.parent} is being written by another process: stop it, or choose another folder."
