@@ -108,7 +108,7 @@ class Wiring:
         sinks
             Where estimates go beside the journal and what the case names; closed with this.
         stopping
-            Ends the waiting.
+            Ends the waiting, and the run.
 
         Returns
         -------
@@ -120,6 +120,7 @@ class Wiring:
         DataError
             The source ended before.
         """
+        stopping = stopping or threading.Event()
         sinks = [*sinks, *publishers_of(self.case.frame)]
         for sink in sinks:
             self._stack.callback(sink.close)
@@ -129,7 +130,7 @@ class Wiring:
             first = self._journal.first
             self.prepared = self.case.begin(Sample(first.t, first.values), self._start)
         else:
-            found = self._begun(stopping or threading.Event(), irregular)
+            found = self._begun(stopping, irregular)
             if found is None:
                 return None
             self.prepared, waiting = found
@@ -147,6 +148,7 @@ class Wiring:
             silence=silence,
             begun=waiting,
             irregular=irregular.values(),
+            stopping=stopping,
         )
         again = live.resume()
         if len(live.result):

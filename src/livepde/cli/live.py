@@ -89,10 +89,10 @@ def beside(
         except DataError as error:
             writer.finish(status="failed", notes=[str(error)])
             raise
-    if live is None or wiring.prepared is None:
-        return writer, None
-    health.live = live
-    return writer, (wiring.prepared, conduct(live, patient=True))
+        if live is None or wiring.prepared is None:
+            return writer, None
+        health.live = live
+        return writer, (wiring.prepared, conduct(live, patient=True))
 
 
 class _Health:

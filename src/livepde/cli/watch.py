@@ -54,10 +54,10 @@ def watch(
 
     runs.open(folder)  # what is no run is said before all else
     server = serve(folder, Address.read(address, PORT, token))
-    if attached:  # to a run that may be killed without a word
-        Thread(target=_end_with_input, args=(server,), daemon=True).start()
-    terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)", soft_wrap=True)
     try:
+        if attached:  # to a run that may be killed without a word
+            Thread(target=_end_with_input, args=(server,), daemon=True).start()
+        terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)", soft_wrap=True)
         server.wait()
     except KeyboardInterrupt:
         server.close()

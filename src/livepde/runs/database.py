@@ -26,6 +26,7 @@ __all__ = [
 ]
 
 LOG_SIZE = 16 * 2**20  # bytes of the write-ahead log that are kept when it was longer
+MOMENT = 0.5  # seconds for which who only asks whether a journal is written may hold its lock
 # What a file of somebody else may make of reading it.
 DAMAGE = (
     ArithmeticError,
@@ -69,9 +70,10 @@ def reader(path: Path) -> sqlite3.Connection:
     connection = _connect(path, "mode=ro")
     try:
         connection.execute("SELECT 1 FROM sqlite_schema").close()
-    except sqlite3.OperationalError:
+    except sqlite3.OperationalError as error:
         log = log_of(path)
-        if log.exists() and log.stat().st_size:
+        busy = error.sqlite_errorcode & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+        if busy or (log.exists() and log.stat().st_size):
             raise
         # A folder in which nothing can be made, and nobody writes.
         connection.close()
@@ -114,7 +116,7 @@ def in_use(path: Path) -> bool:
     """Return whether a process holds a journal to write it."""
     lock = _lock_of(path)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=MOMENT)
     except (Timeout, OSError):
         return True
     lock.release()
@@ -129,7 +131,7 @@ def locked(path: Path) -> FileLock:
     """Become the one writer of a file, or say that there is one."""
     lock = _lock_of(path)
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(timeout=MOMENT)
     except Timeout:
         raise RunError(
             f"{path.parent} is being written by another process: stop it, or choose another folder."

@@ -120,6 +120,8 @@ class Live:
         an event.
     begun, irregular
         Samples that the feed has brought already, and what was worth counting until then.
+    stopping
+        Ends the run when it is set; it may be set already.
     clock
         Seconds that pass.
     """
@@ -138,6 +140,7 @@ class Live:
         strict: bool = False,
         begun: Iterable[Ready] = (),
         irregular: Iterable[Remark] = (),
+        stopping: threading.Event | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
@@ -149,7 +152,7 @@ class Live:
         self.silence = silence
         self.strict = strict
         self.silent = False
-        self.stopping = threading.Event()
+        self.stopping = stopping or threading.Event()
         self.busy = False  # a step is taken
         self._clock = clock
         self._heard = clock()

@@ -9,6 +9,7 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Any
@@ -123,9 +124,12 @@ class Server:
         self._server.timeout = TIMEOUT
         self._server.max_request_header_size = LONGEST_HEADER
         self._server.max_request_body_size = LONGEST_BODY
+        prepared: Future[None] = Future()
+        # What a daemon starts is one: no thread that serves keeps a program from its end.
+        self._thread = threading.Thread(target=self._serve, args=(place, prepared), daemon=True)
+        self._thread.start()
         try:
-            socket.create_server(place).close()  # cheroot leaves a socket open if it cannot listen
-            self._server.prepare()
+            prepared.result()
         except OSError as error:
             reason = error.strerror or error
             raise RunError(
@@ -136,8 +140,16 @@ class Server:
         plain = f"http://{host}:{self.port}/"
         self.url = f"{plain}?token={address.token}" if address.token else plain
         self.shown = self.url if address.made else plain
-        self._thread = threading.Thread(target=self._server.serve, daemon=True)
-        self._thread.start()
+
+    def _serve(self, place: tuple[str, int], prepared: Future[None]) -> None:
+        try:
+            socket.create_server(place).close()  # cheroot leaves a socket open if it cannot listen
+            self._server.prepare()
+        except Exception as error:  # noqa: BLE001  it is raised where the server is made
+            prepared.set_exception(error)
+            return
+        prepared.set_result(None)
+        self._server.serve()
 
     def wait(self) -> None:
         """Serve until it is closed."""
