@@ -13,7 +13,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.cases import load
 from livepde.cases.template import write_template
-from livepde.laws.bank import GUESSED, PATIENCE, _guess
+from livepde.laws.guess import GUESSED, PATIENCE, first_guess
 from livepde.stepping import ForwardStage
 
 POINTS = [0.25, 0.5, 0.75]
@@ -165,15 +165,15 @@ def test_a_jump_is_learned():
 def test_guesses_of_the_noise():
     rng = np.random.default_rng(0)
     z = np.array([1.0, 5.0]) + np.array([0.1, 2.0]) * rng.standard_normal((200, 2))
-    np.testing.assert_allclose(_guess(z), [0.1, 2.0], rtol=0.2)
-    assert _guess(z[:GUESSED]) is None
+    np.testing.assert_allclose(first_guess(z), [0.1, 2.0], rtol=0.2)
+    assert first_guess(z[:GUESSED]) is None
     z[:, 1] = 3.0
-    assert _guess(z[: PATIENCE - 1]) is None
-    dead = _guess(z)
+    assert first_guess(z[: PATIENCE - 1]) is None
+    dead = first_guess(z)
     assert dead is not None
     assert dead[1] == dead[0]
     z[:, 0] = np.nan
-    assert _guess(z) is None
+    assert first_guess(z) is None
 
 
 # --- what does not matter ------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livepde.laws.bank import AutoLaw
+from livepde.laws.auto import AutoLaw
 from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.laws.bounds import (
     Constants,
