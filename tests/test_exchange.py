@@ -209,6 +209,53 @@ def test_a_unit_begins_anew_after_a_reset(unit):
         assert [taken(instance, t, z) for t, z in history(4)] == before
 
 
+def test_with_a_period_short_steps_are_not_taken_for_measurements(unit):
+    """A master with steps of 6 s, say, while there is a sample every 20 s."""
+    with running(unit, 0.0) as instance:
+        assert instance.get(["sample_period"]) == [0.0]
+        instance.set(["sample_period"], [20.0])
+        shown = {}
+        for k in range(14):
+            instance.set(INPUTS, [20.0 + k, 20.0 + 0.1 * k, 20.0, 20.0])
+            instance.step(6.0 * k, 6.0)
+            shown[6.0 * k] = instance.get([*OUTPUTS, "estimate_time"])
+            if k == 5:
+                kept = instance.fmu.getFMUState()
+        assert [found[-1] for found in shown.values()] == [0.0] * 4 + [24.0] * 3 + [42.0] * 3 + [
+            60.0
+        ] * 4
+        instance.fmu.setFMUState(kept)
+        instance.set(["sample_period"], [20.0])
+        instance.step(36.0, 6.0)
+        assert instance.get([*OUTPUTS, "estimate_time"]) == shown[36.0]
+        instance.fmu.freeFMUState(kept)
+    with running(unit, 0.0) as other:
+        for t in (0.0, 24.0, 42.0, 60.0):
+            k = round(t / 6.0)
+            found = taken(other, t, [20.0 + k, 20.0 + 0.1 * k, 20.0, 20.0])
+            assert found == shown[t][:-1]
+
+
+def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "import livepde as lp\n"
+        "from livepde.models import heat\n"
+        "def build():\n"
+        "    alpha = lp.Scalar(5e-5, std=3e-5)\n"
+        "    model = heat(lp.interval(0.0, 0.4, 8), alpha, {'left': lp.Channel('hot')})\n"
+        "    return lp.Identifier(model, lp.Points({'T': 0.1}, noise=0.1), lp.SensitivityLaw())\n"
+    )
+    unit = export_fmu(f"{tmp_path / 'own.py'}:build", tmp_path / "own.fmu")
+    with running(unit, 0.0) as instance:
+        for t in (0.0, 1.0):
+            instance.step(t, 1.0)
+            assert instance.get(["status"]) == [WAITING]
+            assert "'hot' has no value" in instance.messages[-1]
+        instance.set(["hot", "T"], [20.0, 20.0])
+        instance.step(2.0, 1.0)
+        assert instance.get(["status", "estimate_time"]) == [0.0, 2.0]
+
+
 def test_what_cannot_be_used_is_a_status_and_a_message(unit):
     (_, z), *others = history(6)
     with running(unit, 0.0) as instance:

@@ -16,6 +16,8 @@ from livepde.samples import Sample
 
 __all__ = ["Component"]
 
+SAME = 1e-9  # of a period: a difference of times that is rounding
+
 
 class Component:
     """Takes one sample at each communication point; what cannot be used is a status.
@@ -29,6 +31,8 @@ class Component:
     ----------
     inputs
         The channels as they are now, NaN: missing.
+    period
+        Seconds between samples: the first step in each period takes one. 0: every step.
     outputs, status
         What goes out, in the order of `Process.outputs`, and how the last step went.
     """
@@ -38,11 +42,17 @@ class Component:
         self.inputs = [math.nan] * len(process.inputs)
         self.outputs = process.unknown()
         self.status = WAITING
+        self.period = 0.0
+        self._next = -math.inf
         self._first = np.zeros(0)
         self._identifier: Identifier | None = None
 
     def take(self, seconds: float) -> str:
         """Take what the inputs hold as the sample of a time; return what is to be told, or ''."""
+        if self.period > 0.0:
+            if seconds < self._next:
+                return ""
+            self._next = self.period * (math.floor(seconds / self.period + SAME) + 1.0 - SAME)
         process, t = self.process, seconds * self.process.second
         try:
             z = {
@@ -56,6 +66,8 @@ class Component:
                 self._identifier = self._begun(np.array([t, *z.values()]))
             estimate = self._identifier.step(t, z)
         except LivepdeError as error:
+            if math.isnan(self.outputs[0]):  # the first one: the next may begin
+                self._identifier = None
             self.status = WAITING if self._identifier is None else REFUSED
             return f"t = {seconds:g} s: {error}"
         self.status = STATUS_CODES.index(estimate.status.code)
@@ -65,6 +77,7 @@ class Component:
     def dump(self) -> bytes:
         """Return all that evolves, from which `restore` goes on with the same numbers."""
         leaves = {"inputs": self.inputs, "outputs": self.outputs, "status": self.status}
+        leaves |= {"period": self.period, "next": self._next}
         if self._identifier is not None:
             leaves["first"] = self._first
             leaves["identifier"] = np.frombuffer(self._identifier.dump(), dtype=np.uint8)
@@ -76,6 +89,7 @@ class Component:
         _, leaves = checkpoint.unpacked(content, where)
         self.inputs, self.outputs = leaves["inputs"].tolist(), leaves["outputs"].tolist()
         self.status = int(leaves["status"])
+        self.period, self._next = float(leaves["period"]), float(leaves["next"])
         if "identifier" not in leaves:
             self._identifier = None
             return

@@ -24,6 +24,7 @@ from livepde.streams import Column
 from livepde.streams.table import channel_value
 
 __all__ = [
+    "PERIOD",
     "REFUSED",
     "STATUS",
     "WAITING",
@@ -35,6 +36,7 @@ __all__ = [
     "of_code",
 ]
 
+PERIOD = "sample_period"  # the parameter of a unit
 REFUSED, WAITING = -2, -1  # beside the indices of `STATUS_CODES`
 LARGEST = 1000  # vertices of a field that become outputs, one for each
 STEPS = {"degC": "K", "degF": "degR"}  # units of differences on scales with a zero of their own
@@ -158,7 +160,7 @@ class Process:
             text = f"The model's value of {port.name}."
             found.append(Output(f"{port.name}_model", port.unit, text))
         names = [port.name for port in self.inputs] + [item.name for item in found]
-        names += ["status", "time"]
+        names += ["status", "time", PERIOD]
         for name in names:
             if names.count(name) > 1:
                 raise ConfigurationError(

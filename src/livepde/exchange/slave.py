@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element, SubElement
 from livepde import __version__
 from livepde.cases.units import in_si
 from livepde.exchange.component import Component
-from livepde.exchange.process import STATUS, Output, Process
+from livepde.exchange.process import PERIOD, STATUS, Output, Process
 from livepde.exchange.recipe import opened
 
 __all__ = ["FOLDER", "IdentifierSlave"]
@@ -80,6 +80,9 @@ class IdentifierSlave:
         for k, item in enumerate(process.outputs()):
             add(real, item, causality.output, partial(self._output, k))
         add(whole, Output("status", "", STATUS), causality.output, self._status)
+        item = Output(PERIOD, "s", "Time between samples; 0: every step takes one.")
+        about = {"setter": self._set_period, "variability": variability.fixed}
+        add(real, item, causality.parameter, self._period, **about)
 
     def _put(self, k: int, value: float) -> None:
         self.component.inputs[k] = value
@@ -89,6 +92,12 @@ class IdentifierSlave:
 
     def _output(self, k: int) -> float:
         return self.component.outputs[k]
+
+    def _set_period(self, value: float) -> None:
+        self.component.period = value
+
+    def _period(self) -> float:
+        return self.component.period
 
     def _status(self) -> int:
         return self.component.status
