@@ -117,6 +117,18 @@ def test_template_runs_and_finds_the_truth(rod):
     assert not row.hardly
 
 
+def test_sensors_that_one_cell_does_not_tell_apart_are_named(rod):
+    def noted(cells: int, places: tuple[str, str, str]) -> bool:
+        at = {f"channels.T_{k}.at": x for k, x in zip((10, 20, 30), places, strict=True)}
+        notes = cases.load(rod(), settings={**at, "mesh.cells": cells}).notes
+        return any("(T_10, T_20, T_30) lie in one cell of the mesh" in note for note in notes)
+
+    assert noted(1, ("10 cm", "20 cm", "30 cm"))
+    assert noted(40, ("10.2 cm", "10.5 cm", "10.8 cm"))
+    assert not noted(40, ("10.5 cm", "10.5 cm", "10.5 cm"))
+    assert not noted(40, ("10 cm", "10.5 cm", "11.5 cm"))
+
+
 def test_template_is_not_written_over(tmp_path):
     write_template(tmp_path)
     (tmp_path / "case.toml").unlink()
