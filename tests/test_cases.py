@@ -405,7 +405,28 @@ def test_own_module(rod):
     path = rod(('equation = "heat"  ', 'equation = "livepde.models.diffusion:HEAT"  '))
     assert cases.load(path, allow_code=True).frame.equation.name == "heat"
     path = rod(("livepde.models.diffusion:HEAT", "missing.py:build"))
-    with pytest.raises(lp.CaseError, match=r"loading 'missing\.py' failed"):
+    with pytest.raises(lp.CaseError, match=r"there is no file '.*missing\.py'"):
+        cases.load(path, allow_code=True)
+    path.with_name("broken.py").write_text("import missing_module")
+    path = rod(("missing.py:build", "broken.py:build"))
+    with pytest.raises(lp.CaseError, match=r"loading 'broken\.py' failed with ModuleNotFound"):
+        cases.load(path, allow_code=True)
+
+
+def test_code_where_the_user_is_and_not_the_case(rod, monkeypatch):
+    path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
+    monkeypatch.chdir(path.parents[1])
+    Path("mine.py").write_text("")
+    with pytest.raises(lp.CaseError, match=r"beside the case; did you mean '\.\./mine\.py'\?"):
+        cases.load(path, allow_code=True)
+
+
+def test_a_unit_where_a_function_has_none(rod):
+    path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
+    path.with_name("mine.py").write_text("def rod(mesh, unknowns, dirichlet):\n    pass\n")
+    with pytest.raises(
+        lp.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* say unknowns\.alpha\.unit"
+    ):
         cases.load(path, allow_code=True)
 
 

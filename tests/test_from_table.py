@@ -177,6 +177,7 @@ def test_an_equation_belongs_to_a_table(here):
     for arguments, told in (
         (["--equation", "heat"], "--equation belongs to a table of your own: add --data"),
         (["--data", "my.csv", "--equation", "heet"], "no equation 'heet'; did you mean 'heat'?"),
+        (["--data", "my.csv", "--equation", "own.py:rod"], "write 'own.py:rod' into the case."),
     ):
         error = runner.invoke(app, ["init", "mine", *arguments]).exception
         assert isinstance(error, lp.ConfigurationError)

@@ -84,7 +84,7 @@ def parts_of(table: Path, folder: Path, equation: Equation) -> dict[str, str]:
         "start": _open(equation.length_unit),
         "stop": _open(equation.length_unit),
         "data": "\n".join(data),
-        "unknowns": "\n".join(_unknowns(equation)),
+        "unknowns": "\n\n".join(_unknowns(equation)),
         "channels": "\n".join(
             [CHANNELS.format(state=state.text), *_channels(equation, names, samples)]
         ),
@@ -106,7 +106,7 @@ def _open(unit: str) -> str:
 
 def _told(line: str, text: str) -> str:
     """Return a line with a comment, in the column of those of the template."""
-    return f"{line:<30} # {text}"
+    return f"{line:<29}  # {text}"
 
 
 def _equation(equation: Equation) -> Iterator[str]:
@@ -121,12 +121,16 @@ def _equation(equation: Equation) -> Iterator[str]:
 def _unknowns(equation: Equation) -> Iterator[str]:
     """Yield the tables of the unknowns that have to be there."""
     for name, variable in equation.unknowns.items():
-        if not variable.optional:
-            yield _told(f"[unknowns.{name}]", variable.text)
-            prior = _open(variable.unit)
-            yield _told(f"prior = {prior}", "what you would have said without data ...")
-            yield _told(f"std = {prior}", "... and how far off that may be")
-            yield _told('transform = "log"', "it is positive; if it need not be, drop this line")
+        if variable.optional:
+            continue
+        prior = _open(variable.unit)
+        lines = {
+            f"[unknowns.{name}]": variable.text,
+            f"prior = {prior}": "what you would have said without data ...",
+            f"std = {prior}": "... and how far off that may be",
+            'transform = "log"': "it is positive; if it need not be, drop this line",
+        }
+        yield "\n".join(_told(line, text) for line, text in lines.items())
 
 
 def _kinds(table: Path, written: Written) -> dict[str, str]:

@@ -48,6 +48,11 @@ def init(
 
     if equation is not None and data is None:
         raise ConfigurationError("--equation belongs to a table of your own: add --data FILE.csv.")
+    if equation is not None and ":" in equation:
+        raise ConfigurationError(
+            f"--equation takes a ready-made one: begin with any, and write '{equation}' into the "
+            "case."
+        )
     found = named(equation or "heat", EQUATIONS, "equation")
     case, table = write_template(folder, data, found)
     console = terminal()
