@@ -117,6 +117,18 @@ def test_template_runs_and_finds_the_truth(rod):
     assert not row.hardly
 
 
+def test_sensors_that_one_cell_does_not_tell_apart_are_named(rod):
+    def noted(cells: int, places: tuple[str, str, str]) -> bool:
+        at = {f"channels.T_{k}.at": x for k, x in zip((10, 20, 30), places, strict=True)}
+        notes = cases.load(rod(), settings={**at, "mesh.cells": cells}).notes
+        return any("(T_10, T_20, T_30) lie in one cell of the mesh" in note for note in notes)
+
+    assert noted(1, ("10 cm", "20 cm", "30 cm"))
+    assert noted(40, ("10.2 cm", "10.5 cm", "10.8 cm"))
+    assert not noted(40, ("10.5 cm", "10.5 cm", "10.5 cm"))
+    assert not noted(40, ("10 cm", "10.5 cm", "11.5 cm"))
+
+
 def test_template_is_not_written_over(tmp_path):
     write_template(tmp_path)
     (tmp_path / "case.toml").unlink()
@@ -393,7 +405,28 @@ def test_own_module(rod):
     path = rod(('equation = "heat"  ', 'equation = "livepde.models.diffusion:HEAT"  '))
     assert cases.load(path, allow_code=True).frame.equation.name == "heat"
     path = rod(("livepde.models.diffusion:HEAT", "missing.py:build"))
-    with pytest.raises(lp.CaseError, match=r"loading 'missing\.py' failed"):
+    with pytest.raises(lp.CaseError, match=r"there is no file '.*missing\.py'"):
+        cases.load(path, allow_code=True)
+    path.with_name("broken.py").write_text("import missing_module")
+    path = rod(("missing.py:build", "broken.py:build"))
+    with pytest.raises(lp.CaseError, match=r"loading 'broken\.py' failed with ModuleNotFound"):
+        cases.load(path, allow_code=True)
+
+
+def test_code_where_the_user_is_and_not_the_case(rod, monkeypatch):
+    path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
+    monkeypatch.chdir(path.parents[1])
+    Path("mine.py").write_text("")
+    with pytest.raises(lp.CaseError, match=r"beside the case; did you mean '\.\./mine\.py'\?"):
+        cases.load(path, allow_code=True)
+
+
+def test_a_unit_where_a_function_has_none(rod):
+    path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
+    path.with_name("mine.py").write_text("def rod(mesh, unknowns, dirichlet):\n    pass\n")
+    with pytest.raises(
+        lp.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* say unknowns\.alpha\.unit"
+    ):
         cases.load(path, allow_code=True)
 
 

@@ -507,7 +507,7 @@ def test_bad_input_is_one_sentence(rod, tmp_path, monkeypatch):
         (rod, {"target": "a.fmu", "fmi": 1}, lp.ConfigurationError, "expected 2 .FMI 2.0. or 3"),
         ("nix.toml", {}, lp.CaseError, "no such case file"),
         ("own.py:nix", {}, lp.CaseError, "has no function 'nix'"),
-        ("nix.py:build", {}, lp.CaseError, "loading 'nix.py' failed"),
+        ("nix.py:build", {}, lp.CaseError, "there is no file 'nix.py'"),
         ("own.py:fails", {}, lp.ConfigurationError, "failed with ValueError: no rod today"),
         ("own.py:other", {}, lp.ConfigurationError, r"returned int; expected \(\) -> livepde"),
     ]:

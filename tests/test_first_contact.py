@@ -30,6 +30,21 @@ EDITS = {  # line of the template -> line for data of his own: dates, another co
 }
 
 
+OPEN = {  # what his table does not tell: the ends, the places, a unit, the prior, the noise
+    'from = "?': "from = 0",
+    'to = "?': 'to = "40 cm"',
+    'prior = "?': 'prior = "5e-5 m^2/s"',
+    'std = "?': 'std = "3e-5 m^2/s"',
+    'column = "T_left"': 'left = { role = "boundary", column = "T_left", at = "left" }',
+    'column = "probe': 'probe = { role = "sensor", column = "probe near furnace", at = "10 cm", '
+    'unit = "degF" }',
+    'column = "T_20"': 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }',
+    'column = "T_30"': 'T_30 = { role = "sensor", column = "T_30", at = "30 cm" }',
+    'column = "T_right"': 'right = { role = "boundary", column = "T_right", at = "right" }',
+    'noise = "?': f'noise = "{NOISE} K"',
+}
+
+
 class Shell:
     """A shell in which the new environment is active."""
 
@@ -158,3 +173,15 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     refused = shell("livepde", "run", "mine/case.toml", "--out", "runs/mine")
     assert refused.returncode == 2
     assert "runs/mine already holds a run" in refused.stderr
+
+    # For the same table he might have begun with a case of its own, and found the same.
+    assert "fill in what it says '?' for" in shell.ok(
+        "livepde", "init", "own", "--data", "mine/rod.csv"
+    )
+    refused = shell("livepde", "check", "own/case.toml")
+    assert refused.returncode == 2
+    assert "still to be filled in, where it says '?': mesh.from, mesh.to" in refused.stderr
+    edit(home / "own" / "case.toml", OPEN)
+    shell.ok("livepde", "run", "own/case.toml")
+    again = json.loads(shell.ok("livepde", "report", "runs/own", "--json"))["measures"]
+    assert abs(again["alpha"] - estimate) < std

@@ -14,6 +14,7 @@ import livepde as lp
 from livepde import cases
 from livepde.cases.template import write_template
 from livepde.cli import app
+from livepde.models import EQUATIONS
 
 GERMAN = """\
 Zeit;Tiefe 5 cm [°C];Fühler (0,2 m);Bemerkung
@@ -29,10 +30,10 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def begun(text: str, encoding: str = "utf-8") -> dict:
+def begun(text: str, encoding: str = "utf-8", equation: str = "heat") -> dict:
     """Return the document of the case for a table."""
     Path("my.csv").write_bytes(text.encode(encoding))
-    case, _ = write_template(Path("mine"), Path("my.csv"))
+    case, _ = write_template(Path("mine"), Path("my.csv"), EQUATIONS[equation])
     return tomllib.loads(case.read_text())
 
 
@@ -63,7 +64,7 @@ def test_a_table_of_a_german_excel(here, encoding):
         "# 3 rows from 2025-04-01 12:00:00 to 2025-04-01 12:30:00 UTC, 900 s apart (median)" in text
     )
     assert "# without numbers: Bemerkung" in text
-    assert "20.5 to 21.5, place as its name says, 1 missing" in text
+    assert "20.5 to 21.5, 1 missing, place as its name says" in text
 
 
 @pytest.mark.parametrize(
@@ -71,6 +72,7 @@ def test_a_table_of_a_german_excel(here, encoding):
     [
         ("time_min,T_0.05,T_b", "time_min", "min", "10 min"),
         ("t [h],T_0.05,T_b", "t [h]", "h", "10 h"),
+        ("minutes,T_0.05,T_b", "minutes", "minutes", "10 minutes"),
         ("index,T_0.05,T_b", "index", "?", "? s"),
     ],
 )
@@ -79,7 +81,7 @@ def test_numbers_as_times(here, header, time, unit, step):
     assert found["data"] == {"file": "../my.csv", "time": time, "time_unit": unit}
     assert found["steps"]["dt_max"] == step
     assert found["channels"]["T_0_05"]["at"] == "? m"
-    assert 'at "0.05 m"?' in Path("mine/case.toml").read_text()
+    assert 'at = "0.05 m"?' in Path("mine/case.toml").read_text()
 
 
 def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
@@ -134,6 +136,53 @@ def test_what_loggers_write_for_no_value_is_missing(here):
 def test_a_day_and_a_month_that_may_be_swapped_are_asked_for(here):
     begun("time,T\n03/02/2026 08:00,20\n03/02/2026 08:10,20\n")
     assert "the day first, or the month?" in Path("mine/case.toml").read_text()
+
+
+def test_inputs_and_units_of_another_equation(here):
+    table = "time (min),Q [m3/h],near 8 m,far 25 m [ft],level [NN]\n0,43,0,0,1\n1,43,1,0,1\n"
+    found = begun(table, equation="pumping_test")
+    assert found["channels"] == {
+        "Q": {"role": "input", "column": "Q [m3/h]", "unit": "m^3/h"},
+        "near_8_m": {"role": "sensor", "column": "near 8 m", "at": "8 m"},
+        "far_25_m": {"role": "sensor", "column": "far 25 m [ft]", "at": "25 m", "unit": "ft"},
+        "level": {"role": "sensor", "column": "level [NN]", "at": "? m", "unit": "? NN"},
+    }
+    assert found["options"] == {"b": "? m"}
+    assert found["unknowns"]["Ss"] == {"prior": "? 1/m", "std": "? 1/m", "transform": "log"}
+    Path("mine/case.toml").unlink()
+    found = begun("time (min),near 8 m\n0,0\n1,1\n", equation="pumping_test")
+    assert found["channels"]["Q"] == {"role": "input", "column": "?"}
+
+
+@pytest.mark.parametrize("name", EQUATIONS)
+def test_a_case_of_every_equation_has_what_it_needs(here, name):
+    found, equation = begun("time,a\n0,1\n10,2\n20,2\n", equation=name), EQUATIONS[name]
+
+    def needed(known):
+        return {key for key, item in known.items() if not item.optional}
+
+    assert found["equation"] == name
+    assert set(found["unknowns"]) == needed(equation.unknowns)
+    assert set(found["channels"]) == {"a", *needed(equation.inputs)}
+    assert set(found.get("options", ())) == {
+        key for key, option in equation.options.items() if option.default is None
+    }
+    with pytest.raises(lp.CaseError, match=r"still to be filled in, .* mesh\.from, mesh\.to,"):
+        cases.load("mine/case.toml")
+
+
+def test_an_equation_belongs_to_a_table(here):
+    Path("my.csv").write_text("time_s,T\n0,20\n")
+    runner = CliRunner()
+    for arguments, told in (
+        (["--equation", "heat"], "--equation belongs to a table of your own: add --data"),
+        (["--data", "my.csv", "--equation", "heet"], "no equation 'heet'; did you mean 'heat'?"),
+        (["--data", "my.csv", "--equation", "own.py:rod"], "write 'own.py:rod' into the case."),
+    ):
+        error = runner.invoke(app, ["init", "mine", *arguments]).exception
+        assert isinstance(error, lp.ConfigurationError)
+        assert told in str(error)
+    assert not Path("mine").exists()
 
 
 def test_from_a_table_to_estimates(here):

@@ -81,6 +81,7 @@ MISTAKES = {
     "data as a case": (nothing, ("run", "mine/rod.csv")),
     "a run again": (lambda: taken("old"), (*RUN, "--out", "old")),
     "a run elsewhere": (lambda: taken("runs/mine"), ("report", "mine")),
+    "a case as a run": (lambda: taken("runs/mine"), ("report", "mine/case.toml")),
     "a page for a file": (nothing, (*RUN, "--watch", "8050")),
     "code": (case('equation = "heat"', 'equation = "own.py:model"'), RUN),
 }
@@ -132,6 +133,13 @@ def test_data_in_any_encoding_are_no_case(home, monkeypatch, capsys):
     data("T_20", "Fühler", "cp1252")()
     expected = (2, "", f"Error: {messages()['data as a case']}\n")
     assert livepde(("check", str(DATA)), monkeypatch, capsys) == expected
+
+
+def test_a_file_of_a_run_leads_to_the_run(home, monkeypatch, capsys):
+    taken("runs/mine")
+    code, _, told = livepde(("report", "runs/mine/run.json"), monkeypatch, capsys)
+    assert code == 2
+    assert told.endswith("run.json holds no run (it is a file); did you mean 'runs/mine'?\n")
 
 
 @pytest.mark.parametrize("command", [("watch", "old"), (*RUN, "--realtime", "--watch", "8050")])

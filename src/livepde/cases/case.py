@@ -21,7 +21,7 @@ from livepde.cases.laws import law_of
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import VariantSpec
-from livepde.cases.sensors import columns_of, initial_of, observation_of
+from livepde.cases.sensors import columns_of, initial_of, observation_of, sensor_notes
 from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
@@ -311,7 +311,7 @@ class Case:
     @property
     def notes(self) -> list[str]:
         """What is allowed and yet deserves a word."""
-        found = process_notes(self.frame, self.mesh)
+        found = process_notes(self.frame, self.mesh) + sensor_notes(self.frame, self.mesh)
         if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
             found.append(
                 "The gradient law is made for observed subdomains and averages; a few noisy point "

@@ -5,12 +5,14 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from livepde.cases.read import did_you_mean
 from livepde.errors import CaseError, LivepdeError
+from livepde.streams.names import no_file
 
 __all__ = ["check_options", "load_code"]
 
@@ -61,11 +63,21 @@ def check_options(function: Any, given: Iterable[str], where: str) -> None:
             )
 
 
+def _no_code(path: Path, source: str, folder: Path) -> str:
+    """Return a sentence about code that is not beside the case, but perhaps where the user is."""
+    if Path(source).is_file():
+        there = Path(os.path.relpath(source, folder)).as_posix()
+        return f"there is no file '{path}', beside the case; did you mean '{there}'?"
+    return str(no_file(path))
+
+
 def _module(source: str, folder: Path, where: str) -> Any:
     try:
         if not source.endswith(".py"):
             return importlib.import_module(source)
         path = folder / source
+        if not path.is_file():
+            raise CaseError(f"{where}: {_no_code(path, source, folder)}")
         loader = importlib.util.spec_from_file_location(path.stem, path)
         if loader is None or loader.loader is None:
             raise ImportError(f"{path} is not a Python file")

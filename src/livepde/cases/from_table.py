@@ -18,7 +18,7 @@ from livepde.cases.settings import toml_line
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, SampleError
 from livepde.linalg import Array
-from livepde.models import EQUATIONS
+from livepde.models import Equation
 from livepde.streams import Clock, Column, Table, read_csv
 from livepde.streams.clock import number_of
 from livepde.streams.csvfile import UTF_8, Written, how_written
@@ -26,29 +26,21 @@ from livepde.streams.table import JSON_LINES, MISSING
 
 __all__ = ["parts_of"]
 
-HEAT = EQUATIONS["heat"]
 UNIT = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
-TAIL = re.compile(r"_([A-Za-z]+)$")  # time_s
+TIME = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 PLACE = re.compile(r"(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z])")  # T_5cm, depth 0.05 m
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?")
 EITHER = re.compile(r"%[dm][/-]%[dm][/-]")  # day and month: a table does not always tell which
 FIRST = """\
 # '?' stands for what the table does not tell: fill it in; 'livepde check' names what is left."""
-PRIOR = f"""\
-prior = "{BLANK} m^2/s"              # copper 1e-4, steel 1e-5, stone and ice 1e-6, soil 5e-7
-std = "{BLANK} m^2/s"                # how far off that may be
-transform = "log"              # keeps it positive"""
 CHANNELS = """\
-# Delete what is no temperature. One at an end of the mesh is given: role = "boundary", at = "left"
-# or "right"; through an end without one no heat flows. One of role = "withheld" is only scored."""
-NOISE = f"""\
-noise = "{BLANK} K"                  # of a single value: its standard deviation
-"""
+# Drop what is no {state}. A value given at an end: role = "boundary", at = "left" or
+# "right"; through an end without one nothing flows. One of role = "withheld" is only scored."""
 
 
-def parts_of(table: Path, folder: Path) -> dict[str, str]:
-    """Return the parts of a case in `folder` that a CSV file tells; others are left open.
+def parts_of(table: Path, folder: Path, equation: Equation) -> dict[str, str]:
+    """Return the parts of a case in `folder` that equation and CSV file tell; others are open.
 
     Raises
     ------
@@ -70,10 +62,10 @@ def parts_of(table: Path, folder: Path) -> dict[str, str]:
         separator=written.separator,
         encoding=written.encoding,
     )
-    unit = "s" if samples.origin else _unit(time, HEAT.time_unit, UNIT, TAIL) or BLANK
-    steps = np.diff(samples.t)
-    step = f"{np.median(steps):g} {unit}" if len(steps) and unit != BLANK else f"{BLANK} s"
     file = table if table.is_absolute() else Path(os.path.relpath(table, folder))
+    unit = equation.time_unit
+    if unit:
+        unit = "s" if samples.origin else _unit(time, unit, UNIT, TIME) or BLANK
     data = [
         toml_line("file", file.as_posix()),
         toml_line("time", time),
@@ -81,21 +73,64 @@ def parts_of(table: Path, folder: Path) -> dict[str, str]:
     ]
     if unused := [name for name in kinds if name not in (time, *names)]:
         data.append(f"# without numbers: {', '.join(unused)}")
-    channels = (
-        _channel(name, column) for name, column in zip(names, samples.values.T, strict=True)
-    )
+    steps = np.diff(samples.t)
+    step = BLANK if unit == BLANK or not len(steps) else f"{np.median(steps):g}"
+    state = equation.state
+    noise = f"noise = {_open(state.unit.replace('degC', 'K'))}"
     return {
         "first": FIRST,
         "title": toml_line("title", table.stem),
-        "start": f'"{BLANK} m"',
-        "stop": f'"{BLANK} m"',
+        "equation": "\n".join(_equation(equation)),
+        "start": _open(equation.length_unit),
+        "stop": _open(equation.length_unit),
         "data": "\n".join(data),
-        "prior": PRIOR,
-        "channels": "\n".join([CHANNELS, *channels]),
-        "noise": NOISE,
-        "step": f'"{step}"',
+        "unknowns": "\n\n".join(_unknowns(equation)),
+        "channels": "\n".join(
+            [CHANNELS.format(state=state.text), *_channels(equation, names, samples)]
+        ),
+        "noise": f"{_told(noise, 'of a single value: its standard deviation')}\n",
+        "step": "dt_max = " + _quantity(step, unit if unit != BLANK else equation.time_unit),
         "last": "",
     }
+
+
+def _quantity(number: str, unit: str) -> str:
+    """Return a number with a unit as TOML."""
+    return f'"{number} {unit}"' if unit else number if number != BLANK else f'"{BLANK}"'
+
+
+def _open(unit: str) -> str:
+    """Return what stands for a quantity that is to be filled in."""
+    return _quantity(BLANK, unit)
+
+
+def _told(line: str, text: str) -> str:
+    """Return a line with a comment, in the column of those of the template."""
+    return f"{line:<29}  # {text}"
+
+
+def _equation(equation: Equation) -> Iterator[str]:
+    """Yield the line of the equation, and of the options that it needs."""
+    yield _told(toml_line("equation", equation.name), equation.formula)
+    yield f"# 'livepde equations {equation.name}' tells what it knows; 'livepde equations': others"
+    for name, option in equation.options.items():
+        if option.default is None:
+            yield _told(f"options.{name} = {_open(option.unit)}", option.text)
+
+
+def _unknowns(equation: Equation) -> Iterator[str]:
+    """Yield the tables of the unknowns that have to be there."""
+    for name, variable in equation.unknowns.items():
+        if variable.optional:
+            continue
+        prior = _open(variable.unit)
+        lines = {
+            f"[unknowns.{name}]": variable.text,
+            f"prior = {prior}": "what you would have said without data ...",
+            f"std = {prior}": "... and how far off that may be",
+            'transform = "log"': "it is positive; if it need not be, drop this line",
+        }
+        yield "\n".join(_told(line, text) for line, text in lines.items())
 
 
 def _kinds(table: Path, written: Written) -> dict[str, str]:
@@ -144,7 +179,7 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> str:
             f"{table}: the day is in '{dates[0]}' and the time in '{hours[0]}': join them in one "
             "column, as 2025-04-01 12:00."
         )
-    timed = [name for name in numbers if _unit(name, HEAT.time_unit, UNIT, TAIL)]
+    timed = [name for name in numbers if _unit(name, "s", UNIT, TIME)]
     rising = [name for name in numbers if _rises(name, written)]
     found = [*dates, *(name for name in timed if name in rising), *rising, *timed]
     if not found:
@@ -164,13 +199,15 @@ def _rises(name: str, written: Written) -> bool:
 def _written(written: Written, samples: Table, unit: str) -> Iterator[str]:
     """Yield the lines of [data] that say how the file is written, and what is in it."""
     if samples.origin is None:
-        yield toml_line("time_unit", unit)
+        if unit:
+            yield toml_line("time_unit", unit)
         begin, end = (f"{t:g}" for t in samples.t[[0, -1]])
     else:
         begin, end = (f"{samples.origin + timedelta(seconds=t)}" for t in samples.t[[0, -1]])
     if written.time_format and samples.origin:
-        remark = "    # the day first, or the month?" if EITHER.search(written.time_format) else ""
-        yield toml_line("time_format", written.time_format) + remark
+        line = toml_line("time_format", written.time_format)
+        swapped = EITHER.search(written.time_format)
+        yield _told(line, "the day first, or the month?") if swapped else line
     if written.separator != ",":
         yield toml_line("separator", written.separator)
     if written.decimal != ".":
@@ -180,35 +217,50 @@ def _written(written: Written, samples: Table, unit: str) -> Iterator[str]:
     told = f"# {len(samples)} rows from {begin} to {end}{' UTC' if samples.origin else ''}"
     steps = np.diff(samples.t)
     if len(steps):
-        told += f", {np.median(steps):g} {unit} apart".replace(f" {BLANK}", "")
+        told += f", {np.median(steps):g} {unit.replace(BLANK, '')}".rstrip() + " apart"
     if len(steps) and steps.max() > 1.01 * steps.min():
         told += f" (median), {steps.min():g} to {steps.max():g}"
     yield told
 
 
-def _channel(name: str, values: Array) -> str:
-    """Return the line of a channel: its place and unit, if the name of its column has them."""
-    given: dict[str, str] = {"role": "sensor", "column": name, "at": f"{BLANK} m"}
-    unit = _unit(name, HEAT.state.unit, UNIT)
-    if unit and unit != HEAT.state.unit:
-        given["unit"] = unit
-    place, present = PLACE.search(name), values[np.isfinite(values)]
+def _channels(equation: Equation, names: list[str], samples: Table) -> Iterator[str]:
+    """Yield the lines of the channels, those of inputs that no column is named after at the end."""
+    inputs = {name: item for name, item in equation.inputs.items() if not item.optional}
+    for name, values in zip(names, samples.values.T, strict=True):
+        key = re.sub(r"\W+", "_", UNIT.sub("", name)).strip("_") or name
+        told, variable = [_range(values)], inputs.pop(key, None)
+        given = {"role": "input" if variable else "sensor", "column": name}
+        if variable is None:
+            variable = equation.state
+            place, fraction = PLACE.search(name), FRACTION.search(name)
+            given["at"] = _open(equation.length_unit).strip('"')
+            if place is not None and equation.length_unit:
+                given["at"] = f"{place[1].replace(',', '.')} {place[2]}"
+                told.append("place as its name says")
+            elif fraction is not None:
+                told.append(f'at = "{fraction[0]} {equation.length_unit}"?')
+        stated = UNIT.search(name)
+        if stated and not PLACE.fullmatch(stated[1].strip()):
+            unit = _unit(name, variable.unit, UNIT) or f"{BLANK} {stated[1]}"
+            given |= {"unit": unit} if unit != variable.unit else {}
+        yield _told(toml_line(key, given), ", ".join(told))
+    for key, variable in inputs.items():
+        yield _told(toml_line(key, {"role": "input", "column": BLANK}), variable.text)
+
+
+def _range(values: Array) -> str:
+    """Return in words what a column holds."""
+    present = values[np.isfinite(values)]
+    missing = len(values) - len(present)
     told = f"{present.min():.4g} to {present.max():.4g}"
-    if place is not None:
-        given["at"] = f"{place[1].replace(',', '.')} {place[2]}"
-        told += ", place as its name says"
-    elif (fraction := FRACTION.search(name)) is not None:
-        told += f', at "{fraction[0]} m"?'
-    if missing := len(values) - len(present):
-        told += f", {missing} missing"
-    key = re.sub(r"\W+", "_", UNIT.sub("", name)).strip("_") or name
-    return f"{toml_line(key, given)}  # {told}"
+    return f"{told}, {missing} missing" if missing else told
 
 
 def _unit(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
     """Return the unit in the name of a column; empty if none can be converted to `unit`."""
     for given in filter(None, (pattern.search(name) for pattern in patterns)):
-        with suppress(CaseError):
-            conversion(given[1], unit, name)
-            return given[1]
+        for text in (given[1], re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])):  # m3/h, m^3/h
+            with suppress(CaseError):
+                conversion(text, unit, name)
+                return text
     return ""

@@ -158,6 +158,10 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
 
     def value(given: float | str, item: str) -> float:
         if isinstance(given, str):
+            if not unit and ":" in frame.spec.equation:
+                text = f"got '{given}'; '{frame.spec.equation}' has no units of its own: "
+                text += f"say {key}.unit, too, or write numbers."
+                raise frame.error(f"{key}.{item}", text)
             return frame.convert(given, unit, f"{key}.{item}")
         return rule.factor * given + rule.offset
 

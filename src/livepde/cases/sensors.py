@@ -29,7 +29,7 @@ from livepde.observation import (
 )
 from livepde.streams import Column
 
-__all__ = ["columns_of", "initial_of", "noise_of", "observation_of"]
+__all__ = ["columns_of", "initial_of", "noise_of", "observation_of", "sensor_notes"]
 
 
 def columns_of(frame: Frame) -> dict[str, Column]:
@@ -209,6 +209,20 @@ def _inside_mesh(frame: Frame, mesh: Any, at: Any, key: str) -> Any:
             )
     inside = [float(np.clip(x, a, b)) for x, a, b in zip(point, low, high, strict=True)]
     return inside[0] if len(inside) == 1 else inside
+
+
+def sensor_notes(frame: Frame, mesh: Any) -> list[str]:
+    """Return what is allowed of places of sensors and yet deserves a word."""
+    channels = frame.roles("sensor", "withheld")
+    if len(mesh.p) != 1 or any(item.at is None for item in channels.values()):
+        return []
+    at = {float(_position(frame, mesh, name, item)) for name, item in channels.items()}
+    if len(at) == 1 or len(set(np.searchsorted(np.sort(mesh.p[0]), list(at)).tolist())) > 1:
+        return []
+    return [
+        f"All sensors ({', '.join(channels)}) lie in one cell of the mesh, which hardly tells them "
+        "apart: more mesh.cells, or mesh.spacing = 'geometric' for smaller ones at the left end."
+    ]
 
 
 def noise_of(frame: Frame, role: str) -> dict[str, float] | None:

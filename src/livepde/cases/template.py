@@ -9,7 +9,7 @@ import numpy as np
 from livepde.cases.from_table import parts_of
 from livepde.errors import RunError
 from livepde.fem import Channel, Scalar, interval
-from livepde.models import heat
+from livepde.models import EQUATIONS, Equation, heat
 from livepde.stepping import Advance, Alexander2, simulate
 
 __all__ = ["write_template"]
@@ -23,8 +23,7 @@ CASE = """\
 # Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
 {first}
 {title}
-equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
-                               # or your own as "file.py:function" (run it with --allow-code)
+{equation}
 initial = "interpolate"        # from the first sample; or a number such as "20 degC"
 
 [mesh]
@@ -38,8 +37,7 @@ cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells 
 # as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
 # start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
 
-[unknowns.alpha]               # names are those of the equation
-{prior}
+{unknowns}
 # by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
 # as a field: field = true, length = "10 cm"   (and no bounds)
 
@@ -53,18 +51,22 @@ replay = true                  # constant unknowns; for drifting ones drift = "0
 
 [steps]
 scheme = "alexander2"          # second order; or "implicit-euler"
-dt_max = {step}                # longer intervals between samples are divided
+{step:<30} # longer intervals between samples are divided
 {last}"""
 ROD = {
     "first": "# With data of your own: 'livepde init DIR --data FILE.csv' fills in what they tell.",
     "title": 'title = "A metal rod, heated and cooled at its left end"',
+    "equation": """\
+equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
+                               # or your own as "file.py:function" (run it with --allow-code)""",
     "start": "0",
     "stop": '"40 cm"',
     "data": """\
 file = "rod.csv"               # beside this file; ${LIVEPDE_DATA} may stand in it
 time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
 time_unit = "s\"""",
-    "prior": """\
+    "unknowns": """\
+[unknowns.alpha]               # names are those of the equation
 prior = "5e-5 m^2/s"           # what you would have said without data ...
 std = "3e-5 m^2/s"             # ... and how far off that may be
 bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]""",
@@ -75,7 +77,7 @@ T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
 T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "{NOISE} K" }}
 T_right = {{ role = "boundary", column = "T_right", at = "right" }}""",
     "noise": "",
-    "step": '"20 s"',
+    "step": 'dt_max = "20 s"',
     "last": f"""
 [expect]                       # of these very data: drop it, or say what you expect of yours
 alpha = [9e-5, 1.05e-4]        # the rod's data were made with {TRUE_ALPHA:g} m^2/s
@@ -84,7 +86,9 @@ rmse = "<= 0.15"           # its noise is {NOISE} K; the rest is learning
 }
 
 
-def write_template(folder: Path, table: Path | None = None) -> tuple[Path, Path]:
+def write_template(
+    folder: Path, table: Path | None = None, equation: Equation = EQUATIONS["heat"]
+) -> tuple[Path, Path]:
     """Write a commented case into a folder, and return the paths of case and data.
 
     Parameters
@@ -92,6 +96,8 @@ def write_template(folder: Path, table: Path | None = None) -> tuple[Path, Path]
     table
         A CSV file of measurements that the case is for; it stays where it is. Else data are made
         up and written beside the case.
+    equation
+        Of the case for that table.
 
     Raises
     ------
@@ -106,7 +112,7 @@ def write_template(folder: Path, table: Path | None = None) -> tuple[Path, Path]
     for path in (case, data)[: 1 if table else 2]:
         if path.exists():
             raise RunError(f"{path} is there already: choose another folder, nothing was written.")
-    parts = ROD if table is None else parts_of(table, folder)
+    parts = ROD if table is None else parts_of(table, folder, equation)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if table is None:

@@ -14,6 +14,7 @@ from livepde.cli.printing import (
     print_table,
     terminal,
 )
+from livepde.errors import ConfigurationError
 
 __all__ = ["equations", "init"]
 
@@ -28,15 +29,32 @@ def init(
             show_default=False,
         ),
     ] = None,
+    equation: Annotated[
+        str | None,
+        typer.Option(
+            help="With --data: one of those that 'livepde equations' shows. Default: heat.",
+            autocompletion=names_in("livepde.models:EQUATIONS"),
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Write a commented case to start from, with made-up data that it runs on, or for your own.
 
     Example:  livepde init mycase
-    Your own: livepde init mycase --data measured.csv
+    Your own: livepde init mycase --data measured.csv --equation groundwater
     """
     from livepde.cases.template import write_template
+    from livepde.models import EQUATIONS
 
-    case, table = write_template(folder, data)
+    if equation is not None and data is None:
+        raise ConfigurationError("--equation belongs to a table of your own: add --data FILE.csv.")
+    if equation is not None and ":" in equation:
+        raise ConfigurationError(
+            f"--equation takes a ready-made one: begin with any, and write '{equation}' into the "
+            "case."
+        )
+    found = named(equation or "heat", EQUATIONS, "equation")
+    case, table = write_template(folder, data, found)
     console = terminal()
     if data is None:
         console.print(f"Wrote {case} and {table}. Next:", soft_wrap=True)

@@ -83,6 +83,8 @@ def _only_begun(path: Path, case: str) -> bool:
 
 def _nearest(folder: Path) -> str:
     """Return where the run may be that is not in this folder: below it, or in runs/."""
+    if folder.is_file():  # a case, or a file of a run
+        folder = folder.parent
     near = difflib.get_close_matches(folder.name, _runs_in(folder.parent), n=1)
     likely = [folder.parent / name for name in near]
     for place in (folder, folder / RUNS, folder.parent / RUNS):
@@ -363,8 +365,9 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         if len(text) > LONGEST:
             raise RunError(f"{folder / RECORD} is longer than {LONGEST} bytes.")
         record = json.loads(text)
-    except FileNotFoundError:
-        raise RunError(f"{folder} holds no run (no {RECORD}); {_nearest(folder)}") from None
+    except (FileNotFoundError, NotADirectoryError):
+        why = f"no {RECORD}" if folder.is_dir() or not folder.exists() else "it is a file"
+        raise RunError(f"{folder} holds no run ({why}); {_nearest(folder)}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:
