@@ -553,7 +553,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
     path, seen = tmp_path / NAME, 0
     for _ in range(3):
         child = subprocess.Popen([sys.executable, "-c", WRITER, tmp_path, Path(__file__).parent])
-        goal = seen + 150
+        goal = seen + 50
         while child.poll() is None and seen < goal:
             if path.exists():
                 with Journal.open(path) as kept:
@@ -565,7 +565,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
         child.wait()
         with Journal.open(path) as kept:
             assert len(list(kept)) >= seen
-    assert seen >= 450
+    assert seen >= 150
 
 
 def test_an_open_reader_does_not_let_the_log_grow(tmp_path):
