@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from urllib.parse import urlsplit
 
 import pytest
-
-PATIENCE = 90.0  # seconds until a browser must have shown something
+from patience import PATIENCE
 
 
 @contextmanager

@@ -6,12 +6,15 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+from patience import PATIENCE
 from typer.testing import CliRunner
 
 from livepde import cli
-from livepde.errors import LivepdeError
+from livepde.errors import LivepdeError, RunError
+from livepde.runs import JOURNAL, Journal
 
 
 def call(*arguments: str, stdin: str | None = None) -> tuple[int, str]:
@@ -33,7 +36,7 @@ def shell(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
     """Run the command in a process of its own."""
     code = "import sys; from livepde.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, **options)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, **options)
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
@@ -41,8 +44,8 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def until(what, process: subprocess.Popen[str], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
+def until(what, process: subprocess.Popen[str]) -> None:
+    end = time.monotonic() + PATIENCE
     while not what():
         if process.poll() is not None or time.monotonic() > end:
             process.kill()
@@ -50,9 +53,21 @@ def until(what, process: subprocess.Popen[str], seconds: float = 60.0) -> None:
         time.sleep(0.02)
 
 
+def estimates(folder: str | Path) -> int:
+    """Return how many samples a run has estimated."""
+    path = Path(folder) / JOURNAL
+    if not path.exists():
+        return 0
+    try:
+        with Journal.open(path) as journal:
+            return len(journal)
+    except RunError:  # it is being made
+        return 0
+
+
 def stopped(process: subprocess.Popen[str], how: signal.Signals = signal.SIGTERM) -> str:
     process.send_signal(how)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors
     return output

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import os
 import signal
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from broker import MOSQUITTO, Server
 
 PROJECT = Path(__file__).resolve().parents[1]
+
+if find_spec("hypothesis"):
+    from hypothesis import HealthCheck, settings
+
+    # The same examples each time, on a slow machine too; --hypothesis-profile default: others.
+    slow = [HealthCheck.too_slow]
+    settings.register_profile("same", derandomize=True, deadline=None, suppress_health_check=slow)
+    settings.load_profile("same")
 
 
 @pytest.fixture(scope="session")
@@ -31,7 +40,7 @@ def server(tmp_path):
     folder.mkdir()
     running = Server(folder)
     yield running
-    running.stop()
+    running.close()
 
 
 @pytest.fixture

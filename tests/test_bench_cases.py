@@ -48,6 +48,7 @@ def project(tmp_path, monkeypatch):
     case, _ = write_template(tmp_path / "cases")
     case = case.rename(case.with_name("rod.toml"))
     text = case.read_text().replace('file = "rod.csv"', 'reader = "own.py:read"')
+    text = text.replace("replay = true", "replay = false")  # takes most of the time
     case.write_text(text + VARIANTS.replace('data.reader = "own.py:read", ', ""))
     body = READER.replace("FOLDER", repr(str(case.parent)))
     (case.parent / "own.py").write_text(body)
@@ -82,7 +83,7 @@ def test_a_case_with_variants_and_one_that_fails(project, tmp_path):
     assert rows["rod"]["samples"] == 181
     assert rows["rod: thin"]["samples"] == 61
     assert rows["rod: five seeds"]["reference"] == "0.0001"
-    assert float(rows["rod"]["time"]) > 1
+    assert float(rows["rod"]["time"]) > 0
     assert float(rows["rod"]["prior"]) > float(rows["rod"]["RMSE"])
     assert "has no function 'raed'" in found["notes"][0]
     page = (tmp_path / "page" / "gallery.md").read_text()

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
-from commands import bad, call, shell
+from commands import bad, call, estimates, shell, until
+from patience import PATIENCE
 from typer.testing import CliRunner
 
 import livepde
@@ -284,13 +285,9 @@ def test_ctrl_c_keeps_what_there_is(rod, here):
     process.stdin.write(lines(8))
     process.stdin.flush()
     record = here / "out" / "run.json"
-    for _ in range(300):
-        if record.exists():
-            break
-        signal.sigtimedwait([], 0.05)
-    signal.sigtimedwait([], 1.0)  # the samples are taken; now it waits for more
+    until(lambda: estimates(here / "out") == 8, process)  # now it waits for more
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130, errors
     assert "Traceback" not in errors
     assert json.loads(record.read_text())["status"] == "interrupted"

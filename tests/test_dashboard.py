@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -18,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from browser import PATIENCE, chromium, count, text, wait
+from browser import chromium, count, text, wait
+from patience import PATIENCE
 from skfem import MeshHex, MeshTri
 from typer.testing import CliRunner
 
@@ -323,17 +325,29 @@ def test_watch_needs_a_run(tmp_path):
     assert "holds no run" in str(result.exception)
 
 
+def test_ctrl_c_while_it_says_where_ends_it(tmp_path, monkeypatch):
+    begun(tmp_path, identifier()).close()
+    before = {*threading.enumerate()}
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys.modules["livepde.cli.watch"], "terminal", interrupted)
+    assert CliRunner().invoke(cli.app, ["watch", str(tmp_path), "--address", "0"]).exit_code == 0
+    assert {*threading.enumerate()} == before  # threads that serve would keep it from its end
+
+
 def test_watch_says_where_and_ends_with_ctrl_c(tmp_path, ctrl_c):
     begun(tmp_path, identifier()).close()
     command = [sys.executable, "-m", "livepde", "watch", str(tmp_path), "--address", "0"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
         try:
             url = child.stdout.readline().split()[1]
-            with urllib.request.urlopen(url, timeout=30) as answer:
+            with urllib.request.urlopen(url, timeout=PATIENCE) as answer:
                 assert "A rod" in answer.read().decode()
                 assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
             child.send_signal(signal.SIGINT)
-            assert child.wait(60) == 0
+            assert child.wait(PATIENCE) == 0
         finally:
             child.kill()
 
@@ -427,8 +441,7 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
             wait(page, back)
             seen = count(page)
             wait(page, lambda p: count(p) > seen + 5)  # the run goes on, the page stays there
-            assert "looking back" in text(page, "#shown")
-            assert back(page)
+            wait(page, lambda p: "looking back" in text(p, "#shown") and back(p))
 
             page.find_element(By.ID, "newest").click()
             wait(page, lambda p: text(p, "#shown").startswith("newest"))
@@ -457,8 +470,9 @@ def test_text_from_files_is_shown_as_text(tmp_path):
         assert text(page, "h1") == HOSTILE
         wait(page, lambda p: HOSTILE in text(p, "#tables-sensors td"))
         assert page.title == f"{HOSTILE} – livepde"
-        wide = page.execute_script("return document.documentElement.scrollWidth")
-        assert wide <= page.execute_script("return window.innerWidth")  # fits a phone
+        # When all is drawn it fits a phone.
+        fits = "return document.documentElement.scrollWidth <= window.innerWidth"
+        wait(page, lambda p: p.execute_script(fits))
 
 
 def rewrite_layout(path: Path, **changes) -> None:
@@ -482,7 +496,7 @@ def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
         address = url.partition("?")[0]
         for path in ("", "_dash-layout", "assets/page.css"):
             with pytest.raises(urllib.error.HTTPError, match="403"):
-                urllib.request.urlopen(address + path, timeout=30)
+                urllib.request.urlopen(address + path, timeout=PATIENCE)
         page.get(url)
         panel = "figure.panel canvas"
         wait(page, lambda p: len(p.find_elements("css selector", panel)) >= 3)
@@ -497,7 +511,7 @@ def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
 def test_every_visitor_has_a_page_that_needs_nothing_from_elsewhere(tmp_path):
     """What the page names in its text, beside what it has asked for above."""
     begun(tmp_path, identifier()).close()
-    with served(tmp_path) as url, urllib.request.urlopen(url, timeout=30) as answer:
+    with served(tmp_path) as url, urllib.request.urlopen(url, timeout=PATIENCE) as answer:
         shown = answer.read().decode()
     assert "https://" not in shown
     assert os.fspath(tmp_path) not in shown

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE
 from typer.testing import CliRunner
 
 from livepde.cli.program import app
@@ -50,10 +51,10 @@ def test_the_unit_is_one(tmp_path):
     unit = tmp_path / "livepde@rod.service"
     unit.write_text(UNIT.read_text().replace("/opt/livepde/bin/livepde", str(program)))
     command = [str(ANALYZE), "verify", "--man=no", "--recursive-errors=no", str(unit)]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (found.returncode, found.stderr) == (0, "")
     unit.write_text(unit.read_text().replace("ProtectClock=yes", "ProtectClock=maybe"))
-    found = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert "Failed to parse boolean value, ignoring: maybe" in found.stderr
 
 
@@ -72,7 +73,7 @@ def test_the_health_check_asks_the_run():
             env={**os.environ, "LIVEPDE_TOKEN": token},
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
             check=False,
         )
 

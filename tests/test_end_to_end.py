@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import queue
 import re
-import socket
+import subprocess
+import threading
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from browser import chromium, count, text, wait
 from commands import start, stopped, until
+from patience import PATIENCE
 
 from livepde import cases, runs
 from livepde.runs import drive
@@ -19,10 +22,16 @@ CASE = Path(__file__).parents[1] / "cases" / "soil_uniform.toml"
 SAMPLES = 240  # ten days
 
 
-def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
+def address(process: subprocess.Popen[str]) -> str:
+    """Return where the page of a run is, as soon as it is told."""
+    told: queue.Queue[str] = queue.Queue()
+
+    def read() -> None:
+        line = next(line for line in process.stderr if "Open" in line)
+        told.put(line.split()[1])
+
+    threading.Thread(target=read, daemon=True).start()
+    return told.get(timeout=PATIENCE)
 
 
 def publish(port: int, rows: list[dict[str, object]]) -> None:
@@ -33,7 +42,7 @@ def publish(port: int, rows: list[dict[str, object]]) -> None:
     client.connect("127.0.0.1", port)
     client.loop_start()
     for row in rows:
-        client.publish("soil/rows", json.dumps(row), qos=1).wait_for_publish(30)
+        client.publish("soil/rows", json.dumps(row), qos=1).wait_for_publish(PATIENCE)
     client.disconnect()
     client.loop_stop()
 
@@ -47,13 +56,11 @@ def test_soil_from_a_broker_to_a_browser(tmp_path, monkeypatch, data_dir, server
     text_of = CASE.read_text()
     own = f'mqtt = {{ port = {server.port}, rows = ["soil/rows"] }}'
     Path("soil.toml").write_text(re.sub(r"file = .*", own, text_of, count=1))
-    port = free_port()
-    process = start("soil.toml", "--out", "run", "--watch", str(port))
+    process = start("soil.toml", "--out", "run", "--watch", "0")
     until(lambda: Path("run/run.json").exists(), process)
     with chromium() as page:
         publish(server.port, rows[: SAMPLES // 2])
-        until(lambda: "Open" in process.stderr.readline(), process)
-        page.get(f"http://127.0.0.1:{port}/")
+        page.get(address(process))
         wait(page, lambda page: count(page) == SAMPLES // 2)
         assert text(page, "#title") == "Soil, April 2025: uniform diffusivity"
         wait(page, lambda page: "alpha" in text(page, "#cards"))

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 import livepde as lp
 from livepde.models import heat
@@ -56,7 +57,7 @@ class Shell:
 
     def __call__(self, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         command = [str(self._path / program), *arguments]
-        return subprocess.run(command, capture_output=True, timeout=300, **self._how)
+        return subprocess.run(command, capture_output=True, timeout=PATIENCE, **self._how)
 
     def ok(self, program: str, *arguments: str) -> str:
         """Return what a command prints that has to succeed."""
@@ -74,7 +75,7 @@ def shell(tmp_path_factory) -> Shell:
     """A fresh virtual environment with the wheel of this checkout and what the live page needs."""
     folder = tmp_path_factory.mktemp("new")
     environment = folder / "venv"
-    subprocess.run([sys.executable, "-m", "venv", environment], check=True, timeout=120)
+    subprocess.run([sys.executable, "-m", "venv", environment], check=True, timeout=PATIENCE)
     shell = Shell(environment, folder)
     if shell("pip", "download", "-q", "--no-deps", "-d", "index", "hatchling").returncode:
         pytest.skip("pip reaches no package index: a new user could not install anything")
@@ -151,11 +152,11 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     page = shell.start("livepde", "watch", "runs/mine", "--address", "127.0.0.1:0")
     try:
         (address,) = re.findall(r"http://127\.0\.0\.1:\d+/", page.stdout.readline())
-        with urllib.request.urlopen(address, timeout=30) as answer:
+        with urllib.request.urlopen(address, timeout=PATIENCE) as answer:
             assert "A metal rod, heated and cooled at its left end" in answer.read().decode()
     finally:
         page.send_signal(signal.SIGINT)
-        page.communicate(timeout=30)
+        page.communicate(timeout=PATIENCE)
     assert page.returncode == 0
 
     # The report has the numbers again, for people and for programs.

@@ -5,11 +5,9 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 import signal
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from contextlib import suppress
@@ -20,6 +18,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from live_rod import CLOCK, COLUMNS, OPENED, identifier, journal, live, rows, same, write
+from patience import PATIENCE
 
 import livepde as lp
 from livepde.runs.feeds import Samples
@@ -77,11 +76,25 @@ def test_samples_in_order_go_on_after_the_last_one(tmp_path):
 
 
 CHILD = """
-import sys
+import signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from live_rod import live
-run = live(Path(sys.argv[1]))
+
+class Fuse:
+    left = int(sys.argv[3])
+    def put(self, estimate):
+        self.left -= 1
+        if self.left <= 0:
+            self.put = lambda estimate: None
+            self.burn()
+    def burn(self):
+        signal.setitimer(signal.ITIMER_PROF, float(sys.argv[4]))  # nobody hears it: it kills
+
+fuse = Fuse()
+if not fuse.left:
+    fuse.burn()
+run = live(Path(sys.argv[1]), sinks=[fuse])
 run.resume()
 run.run()
 run.journal.close()
@@ -97,22 +110,15 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     undisturbed.run()
     here = str(Path(__file__).parent)
     rng, kills = np.random.default_rng(1), 0
-    for _ in range(20):
-        child = subprocess.Popen([sys.executable, "-c", CHILD, str(killed), here])
-        path = killed / "journal.sqlite"
-        seen = path.stat().st_size if path.exists() else 0
-        while child.poll() is None and (not path.exists() or path.stat().st_size == seen):
-            time.sleep(0.01)
-        time.sleep(float(rng.uniform(0.0, 0.3)))
-        if child.poll() is None:
-            os.kill(child.pid, signal.SIGKILL)
-            kills += 1
-        if child.wait() == 0:
-            break
+    for samples in (0, 60, 0, 200, 40, 100):
+        fuse = str(samples), f"{rng.uniform(0.001, 0.012)}"  # and seconds of a processor
+        child = subprocess.run([sys.executable, "-c", CHILD, str(killed), here, *fuse], check=False)
+        assert child.returncode in (0, -signal.SIGPROF)
+        kills += child.returncode != 0
     rest = live(killed)
     rest.resume()
     rest.run()
-    assert kills >= 2
+    assert kills >= 4
     same(rest.journal, undisturbed.journal)
     assert rest.journal.accepted == 700
 
@@ -380,7 +386,9 @@ def test_silence_is_noticed(tmp_path):
 
 def test_health_and_metrics(tmp_path):
     def ask(path):
-        with urllib.request.urlopen(f"http://127.0.0.1:{monitor.port}{path}", timeout=10) as answer:
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{monitor.port}{path}", timeout=PATIENCE
+        ) as answer:
             return answer.read().decode()
 
     metrics = Metrics(["a", "b"])

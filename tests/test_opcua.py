@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import socket
 import threading
 import time
 from datetime import UTC, datetime
 
 import pytest
 from live_rod import live
+from patience import PATIENCE
+from ports import kept_port
 
 import livepde as lp
 from livepde.streams.opcua import OpcuaSource
-from livepde.streams.sources import Rows
+from livepde.streams.sources import Row, Rows, drained
 
 pytest.importorskip("asyncua")
 COLUMNS = {"ns=2;s=a": "a", "ns=2;s=b": "b", "ns=2;s=left": "left"}
@@ -24,9 +25,8 @@ class Server:
     """A server with three values, in a thread of its own."""
 
     def __init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.url = f"opc.tcp://127.0.0.1:{free.getsockname()[1]}/plant"
+        self.kept, port = kept_port()
+        self.url = f"opc.tcp://127.0.0.1:{port}/plant"
         self.loop = asyncio.new_event_loop()
         self.thread = threading.Thread(target=self.loop.run_forever, daemon=True)
         self.thread.start()
@@ -34,7 +34,7 @@ class Server:
         self.start()
 
     def _do(self, work):
-        return asyncio.run_coroutine_threadsafe(work, self.loop).result(30)
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result(PATIENCE)
 
     def start(self) -> None:
         self._do(self._start())
@@ -76,25 +76,44 @@ class Server:
             self._do(self.server.stop())
         self.running = False
 
+    async def _rest(self) -> None:
+        """End what asyncua leaves behind."""
+        tasks = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
     def close(self) -> None:
         self.stop()
+        self._do(self._rest())
         self.loop.call_soon_threadsafe(self.loop.stop)
-        self.thread.join(10)
+        self.thread.join(PATIENCE)
         self.loop.close()
+        self.kept.close()
 
 
-@pytest.fixture
-def server():
+@pytest.fixture(scope="module")
+def plant():
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
     running = Server()
     yield running
     running.close()
 
 
+@pytest.fixture
+def server(plant):
+    """The server of all tests, as it was at first: to make one takes seconds."""
+    if not plant.running:
+        plant.start()
+    for name in plant.nodes:
+        plant.write(name, 0.0)
+    return plant
+
+
 def listen(source, wanted) -> list:
     """Return what comes until a row is as wanted."""
     rows = []
-    until = time.monotonic() + 60.0
+    until = time.monotonic() + PATIENCE
     while time.monotonic() < until:
         rows += source.poll(0.2)
         if any(wanted(row) for row in rows):
@@ -135,7 +154,7 @@ def test_a_server_that_was_away_is_heard_again(server, caplog):
     server.write("a", 1.0)
     listen(heard, lambda row: row.values.get("a") == 1.0)
     server.stop()
-    until = time.monotonic() + 60.0
+    until = time.monotonic() + PATIENCE
     while "is lost" not in caplog.text and time.monotonic() < until:
         time.sleep(0.1)
     server.start()
@@ -151,9 +170,28 @@ def test_a_connection_that_breaks_down_ends_the_run(server):
     heard = source(server)
     listen(heard, lambda row: "left" in row.values)
     heard._loop.call_soon_threadsafe(heard._stop.set)  # as if its thread had failed
-    heard._thread.join(30)
+    heard._thread.join(PATIENCE)
     while not heard._rows.empty():
         heard.poll(0.0)
+    with pytest.raises(lp.DataError, match="has broken down"):
+        heard.poll(0.0)
+
+
+def test_the_last_rows_of_a_connection_that_breaks_down_are_taken(server, monkeypatch):
+    """A row that comes between the last look and the end of the thread is not lost."""
+    heard = source(server)
+    listen(heard, lambda row: "left" in row.values)
+    row = Row({"t": "2026-01-01T00:00:00+00:00", "a": 1.0})
+
+    def breaks_down(rows, wait):
+        found = drained(rows, wait)
+        if heard._thread.is_alive():
+            heard.close()
+            heard._rows.put(row)
+        return found
+
+    monkeypatch.setattr("livepde.streams.opcua.drained", breaks_down)
+    assert row in [*heard.poll(0.0), *heard.poll(0.0)]
     with pytest.raises(lp.DataError, match="has broken down"):
         heard.poll(0.0)
 
@@ -165,28 +203,30 @@ def test_a_thread_may_outlive_its_loop(server, monkeypatch):
 
     def lingers(self):
         work(self)
-        leave.wait(30.0)
+        leave.wait(PATIENCE)
 
     monkeypatch.setattr(OpcuaSource, "_work", lingers)
     heard = source(server)
     heard._loop.call_soon_threadsafe(heard._stop.set)
     while not heard._loop.is_closed():
         time.sleep(0.01)
-    threading.Timer(0.2, leave.set).start()
+    join = heard._thread.join
+    monkeypatch.setattr(heard._thread, "join", lambda wait: [leave.set(), join(PATIENCE)])
     assert heard._thread.is_alive()
     heard.close()
     assert not heard._thread.is_alive()
 
 
 def test_a_run_takes_them(server, tmp_path):
-    heard = source(server)
+    heard, rows = source(server), []
     listen(heard, lambda row: "left" in row.values)
     for k in range(6):
         moment = datetime(2026, 1, 1, 0, 0, k, tzinfo=UTC)
-        for name, value in (("left", 1.0), ("a", 0.7), ("b", 0.4)):
-            server.write(name, value + 0.01 * k, moment=moment)
-        time.sleep(0.2)  # the server looks at its values from time to time
-    rows = listen(heard, lambda row: row.values.get("b") == 0.45)
+        values = {"left": 1.0 + 0.01 * k, "a": 0.7 + 0.01 * k, "b": 0.4 + 0.01 * k}
+        for name, value in values.items():
+            server.write(name, value, moment=moment)
+        # The server sends each node's values together: two moments at once would be out of order.
+        rows += listen(heard, lambda row, b=values["b"]: row.values.get("b") == b)
     heard.close()
     run = live(tmp_path, Rows([row.values for row in rows]))
     run.feed.intake.origin = None

@@ -8,6 +8,7 @@ import json
 import logging
 import pickle
 import socket
+import threading
 import tomllib
 import urllib.error
 import urllib.request
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_rod import identifier, live, rows
+from patience import PATIENCE
 from typer.testing import CliRunner
 
 import livepde as lp
@@ -271,7 +273,7 @@ def serving():
 
 def ask(server, path="/", **headers) -> tuple[int, str, http.client.HTTPMessage]:
     """Return code, content and headers of an answer."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.putrequest("GET", path, skip_host="Host" in headers)
     for name, value in headers.items():
         connection.putheader(name, value)
@@ -323,7 +325,9 @@ def test_elsewhere_a_token_is_made(serving):
     assert one.token not in repr(one)
     server = serving(host="0.0.0.0")
     assert ask(server)[0] == 403
-    with urllib.request.urlopen(server.url.replace("0.0.0.0", "127.0.0.1"), timeout=30) as answer:
+    with urllib.request.urlopen(
+        server.url.replace("0.0.0.0", "127.0.0.1"), timeout=PATIENCE
+    ) as answer:
         assert answer.status == 200
     assert server.shown == server.url  # nobody else can say it
 
@@ -373,13 +377,22 @@ def test_requests_that_are_too_long_are_refused(serving):
     server = serving()
     assert ask(server, "/" + "x" * 20_000)[0] == 414
     assert ask(server, Long="x" * 20_000)[0] == 413
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.putrequest("POST", "/")
     connection.putheader("Content-Length", str(LONGEST_BODY + 1))
     connection.endheaders()
     assert connection.getresponse().status == 413
     connection.close()
     assert ask(server)[0] == 200
+
+
+def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
+    before = {*threading.enumerate()}
+    server = serving()
+    assert ask(server)[0] == 200
+    begun = {*threading.enumerate()} - before
+    assert len(begun) > THREADS
+    assert all(thread.daemon for thread in begun)
 
 
 def test_slow_visitors_do_not_keep_others_out(serving):
@@ -389,7 +402,7 @@ def test_slow_visitors_do_not_keep_others_out(serving):
         one.sendall(b"GET / HTTP/1.1\r\nHo")
     assert ask(server)[0] == 200
     for one in slow:
-        one.settimeout(60)
+        one.settimeout(PATIENCE)
         assert b"408" in one.recv(1000)  # they have had their time
         one.close()
 

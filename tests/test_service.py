@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import bad, call, start, stopped, until
+from commands import bad, call, estimates, start, stopped, until
 
 import livepde as lp
 from livepde import cases, runs
 from livepde.cases.live import Wiring
 from livepde.cases.sources import source_of
+from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal
 from livepde.runs.feeds import Paced, Samples
 from livepde.streams.sources import Rows
@@ -83,17 +84,6 @@ def here(tmp_path, monkeypatch):
 def case(data='file = "rows.csv"\nfollow = true', intake="", habit="") -> str:
     Path("case.toml").write_text(CASE.format(data=data, intake=intake, habit=habit))
     return "case.toml"
-
-
-def estimates(folder: str) -> int:
-    path = Path(folder) / JOURNAL
-    if not path.exists():
-        return 0
-    try:
-        with Journal.open(path) as journal:
-            return len(journal)
-    except lp.RunError:  # it is being made
-        return 0
 
 
 def test_it_follows_a_file_stops_gracefully_and_goes_on(here):
@@ -304,6 +294,35 @@ def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
         assert str(cases.load(text).prepare().origin) == origin
         with Wiring(cases.load(text)) as wiring:
             assert wiring.live().journal.layout.attrs["origin"] == origin
+
+
+@pytest.mark.parametrize("moment", ["the case begins", "the loop has not begun"])
+def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
+    begin = cases.Case.begin
+
+    def begins(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return begin(*arguments)
+
+    class Health(beside._Health):
+        def __setattr__(self, name, value):
+            if name == "live" and value is not None:
+                signal.raise_signal(signal.SIGINT)
+            super().__setattr__(name, value)
+
+    if moment == "the case begins":
+        monkeypatch.setattr(cases.Case, "begin", begins)
+    else:
+        monkeypatch.setattr(beside, "_Health", Health)
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(5))))
+    arguments = ["run", case('file = "rows.csv"'), "--realtime", "--speed", "inf", "--out", "live"]
+    assert call(*arguments)[0] == 0
+    assert runs.open("live").status == "interrupted"
+    assert estimates("live") == 0
+    monkeypatch.undo()
+    monkeypatch.chdir(here)
+    assert call(*arguments, "--resume")[0] == 0
+    assert estimates("live") == 5
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from live_rod import live, rows
+from patience import PATIENCE
 
 from livepde.runs.logs import configure
 from livepde.runs.sinks import JsonLinesSink
@@ -71,7 +72,7 @@ run.journal.close()
 def child(folder: Path, output) -> str:
     command = [sys.executable, "-c", CHILD, str(folder), str(Path(__file__).parent)]
     ended = subprocess.run(
-        command, stdout=output, stderr=subprocess.PIPE, text=True, timeout=120, check=False
+        command, stdout=output, stderr=subprocess.PIPE, text=True, timeout=PATIENCE, check=False
     )
     assert ended.returncode == 0, ended.stderr
     return ended.stderr

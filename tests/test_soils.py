@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -11,11 +12,11 @@ from livepde.bench.cases import jobs_of, run_job
 CASES = Path(__file__).parents[1] / "cases"
 
 
-@pytest.fixture
-def run(data_dir, monkeypatch):
-    """Return the numbers of a case or of one of its variants."""
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
+@pytest.fixture(scope="module")
+def run(data_dir):
+    """Return the numbers of a case or of one of its variants; each is run once."""
 
+    @cache
     def numbers(name, variant=""):
         (job,) = [job for job in jobs_of(CASES / f"{name}.toml") if job.variant == variant]
         found = run_job(job)
@@ -23,7 +24,9 @@ def run(data_dir, monkeypatch):
         assert found.numbers["failed_steps"] == 0
         return found.numbers
 
-    return numbers
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIVEPDE_DATA", str(data_dir))
+        yield numbers
 
 
 @pytest.mark.parametrize("month", ["", "June"])

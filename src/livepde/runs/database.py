@@ -116,7 +116,7 @@ def in_use(path: Path) -> bool:
     """Return whether a process holds a journal to write it."""
     lock = _lock_of(path)
     try:
-        lock.acquire(timeout=MOMENT)
+        lock.acquire(timeout=0)
     except (Timeout, OSError):
         return True
     lock.release()

@@ -38,7 +38,7 @@ def kills_of_topics(plan: Plan) -> Outcome:
     with TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
         broker = Mosquitto(folder)
-        stack.callback(broker.stop)
+        stack.callback(broker.close)
 
         def plant(here: Path, rows: Sequence[Row], seed: int) -> Topic:
             return stack.enter_context(closing(Topic(broker, rows, here.name)))

@@ -102,9 +102,10 @@ class Mosquitto:
                 "there is no MQTT broker: install mosquitto (Debian's package of that name), or "
                 "leave it out with --only file --only malformed."
             )
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = int(free.getsockname()[1])
+        self._kept = socket.socket()  # keeps the port for the broker, also while it is away
+        self._kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._kept.bind(("127.0.0.1", 0))
+        self.port = int(self._kept.getsockname()[1])
         folder = parent / "broker"
         folder.mkdir()
         config = folder / "mosquitto.conf"
@@ -133,6 +134,11 @@ class Mosquitto:
         """Stop it; what it keeps is on disk."""
         self._process.terminate()
         self._process.wait()
+
+    def close(self) -> None:
+        """Stop it for good."""
+        self.stop()
+        self._kept.close()
 
 
 def wait(what: Callable[[], bool], why: str, patience: float = PATIENCE) -> None:

@@ -122,7 +122,7 @@ def hearing(rows: Sequence[Row]) -> Iterator[tuple[Mosquitto, Topic, Run]]:
         folder = Path(name) / "mqtt"
         folder.mkdir()
         broker = Mosquitto(Path(name))
-        stack.callback(broker.stop)
+        stack.callback(broker.close)
         topic = stack.enter_context(closing(Topic(broker, rows, "rod")))
         run = stack.enter_context(closing(Run(folder, topic.source)))
         run.start()
