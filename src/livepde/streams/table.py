@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
+STREAM = "standard input"
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
 
 
@@ -262,14 +263,12 @@ class JsonLines:
         *,
         every: int = 1,
         missing: Iterable[float] = (),
-        where: str = "standard input",
     ) -> None:
         self._lines = lines
         self._columns = columns
         self._clock = clock
         self._every = every
         self._missing = tuple(float(number) for number in missing)
-        self._where = where
         self.origin: datetime | None = None
 
     def __iter__(self) -> Iterator[Sample]:
@@ -278,10 +277,10 @@ class JsonLines:
         for number, line in enumerate(self._lines, start=1):
             if not line.strip():
                 continue
-            where = f"{self._where}, line {number}"
+            where = f"{STREAM}, line {number}"
             row = _object(line, where)
             t, dates = row_time(row, clock, where, dates)
-            low, high = clock.bounds(dates, self._where)
+            low, high = clock.bounds(dates, STREAM)
             if t > high:
                 return
             if t < low:
