@@ -42,10 +42,12 @@ STEP = 0.05  # between two samples
 BEFORE = (200, 300)  # samples before the jump
 AFTER = 300  # samples after it
 CALM = 3000  # samples of a run without a jump
+CALM_RUNS = 3  # of each process
 SOON = 30  # samples within which a jump has to be flagged
 SELDOM = 1.0  # false alarms in 10 000 samples, at most
 FOUND = JUMP / 3  # relative error after the jump, at most
 WATCHED = 300  # samples of a run whose model is in question
+TWINS = 10  # data sets for each wrong model
 
 POINTS = (0.25, 0.5, 0.75)
 MESH = interval(0.0, 1.0, 20, regions={"left half": lambda x: x[0] < 0.5})
@@ -366,25 +368,21 @@ def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
 # --- all of it -----------------------------------------------------------------------------------
 
 
-def alarms(seeds: int = 5, calm: int = 3, twins: int = 10, *, progress: bool = False) -> Outcome:
+def alarms(seeds: int = 5, *, progress: bool = False) -> Outcome:
     """Run everything.
 
     Parameters
     ----------
     seeds
         Jumps up, and as many down, of each process.
-    calm
-        Runs without a jump of each process.
-    twins
-        Data sets for each wrong model.
     """
     jumped = [
         (name, seed, sign * JUMP) for name in PROCESSES for seed in range(seeds) for sign in (1, -1)
     ]
     todo: list[Any] = [
         *jumped,
-        *((name, seed, 0.0) for name in PROCESSES for seed in range(calm)),
-        *((name, seed) for name in SUSPECTS for seed in range(twins)),
+        *((name, seed, 0.0) for name in PROCESSES for seed in range(CALM_RUNS)),
+        *((name, seed) for name in SUSPECTS for seed in range(TWINS)),
         *CASES,
     ]
     jumps: dict[str, list[Told]] = {name: [] for name in PROCESSES}

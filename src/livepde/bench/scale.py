@@ -260,15 +260,15 @@ def scale(
     return Outcome(tables=[table, *counted.tables], checks=[*checks, *counted.checks], notes=[note])
 
 
-def million(size: int = HUGE, steps: int = MILLION) -> Outcome:
+def million() -> Outcome:
     """Identify a field of a square in a process of its own, from samples in a file."""
     gain = GAINS[-1]
     with TemporaryDirectory() as folder:
         path = f"{folder}/samples.npy"
-        _alone(f"record({size}, {steps}, {path!r})")
-        need = Need(**_alone(f"asdict(identify({size}, {gain}, {path!r}))"))
-    cost = _cost(size, 2, gain)
-    name = f"{cost.nodes} nodes, {steps} steps"
+        _alone(f"record({HUGE}, {MILLION}, {path!r})")
+        need = Need(**_alone(f"asdict(identify({HUGE}, {gain}, {path!r}))"))
+    cost = _cost(HUGE, 2, gain)
+    name = f"{cost.nodes} nodes, {MILLION} steps"
     checks = [
         Check(f"{name}: relative error of q (q = 0: 1)", need.error, ACCURACY, "<="),
         Check(f"{name}: kB for each coefficient of the state", need.memory, MEMORY, "<="),

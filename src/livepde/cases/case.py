@@ -69,12 +69,12 @@ class Prepared:
         """The identifier, before the first sample."""
         return self.identifier_with(self.case.law)
 
-    def identifier_with(self, law: AnyLaw) -> Identifier:
-        """Return an identifier for the same case with another law."""
+    def identifier_with(self, law: AnyLaw, sensors: Observation | None = None) -> Identifier:
+        """Return an identifier for the same case with another law, and with other sensors."""
         case = self.case
         return Identifier(
             case.model,
-            case.observation,
+            case.observation if sensors is None else sensors,
             law,
             u0=self.u0,
             t0=float(self.first.t),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping
-from datetime import UTC, datetime, tzinfo
+from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -18,6 +18,7 @@ from livepde.cases.schema import CaseSpec
 from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
+from livepde.streams.clock import since_1970
 from livepde.streams.names import no_file
 from livepde.streams.table import JSON_LINES
 
@@ -186,4 +187,4 @@ def assimilation_start(frame: Frame, clock: Clock, origin: datetime | None) -> f
     if stamp is None:
         text = f"got '{value}'; expected a date as 2025-04-01 12:00."
         raise frame.error("data.assimilate_from", text)
-    return (stamp - origin.replace(tzinfo=UTC).timestamp()) * clock.second
+    return (stamp - since_1970(origin)) * clock.second

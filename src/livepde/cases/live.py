@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 from livepde.cases.case import Case, Prepared
@@ -19,6 +19,7 @@ from livepde.identifier import Sample
 from livepde.runs.feeds import Feed, Gathered, Paced, Samples
 from livepde.runs.journal import Journal
 from livepde.runs.live import LOOK, Live, Sink
+from livepde.streams.clock import since_1970
 from livepde.streams.intake import Intake, Ready, Remark, gather
 
 __all__ = ["Wiring"]
@@ -230,4 +231,4 @@ def _seconds(origin: str | None) -> float:
     """Return the seconds since 1970 of an origin as a layout has it; 0 if times are numbers."""
     if origin is None:
         return 0.0
-    return datetime.fromisoformat(origin).replace(tzinfo=UTC).timestamp()
+    return since_1970(datetime.fromisoformat(origin))

@@ -179,18 +179,7 @@ def _previewed(
     prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample], sensors: Observation
 ) -> Iterator[Belief]:
     """Yield what a filter believes that is linear about the prior, after each measurement."""
-    case = prepared.case
-    identifier = Identifier(
-        case.model,
-        sensors,
-        law,
-        u0=prepared.u0,
-        t0=float(prepared.first.t),
-        withheld=case.withheld,
-        scheme=case.scheme,
-        dt_max=case.dt_max,
-        assimilate_from=prepared.assimilate_from,
-    )
+    identifier = prepared.identifier_with(law, sensors)
     own = [name for name in identifier.observed.names if name != NEW]
     count = 0
     for sample in samples:

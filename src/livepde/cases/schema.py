@@ -1,16 +1,11 @@
-"""What a case file may say, as pydantic models; what it means is in `build`."""
+"""What a case file may say, as pydantic models: a class for each table."""
 
 from __future__ import annotations
 
-import codecs
-import re
-from datetime import date, datetime
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
     NonNegativeInt,
@@ -20,8 +15,19 @@ from pydantic import (
     model_validator,
 )
 
+from livepde.cases.values import (
+    Box,
+    Encoding,
+    Expected,
+    Identifier,
+    Instant,
+    Name,
+    Pair,
+    Point,
+    Quantity,
+    TimeFormat,
+)
 from livepde.laws import Guards, Jumps, Replay
-from livepde.runs.outcome import Bound, Sense
 from livepde.streams.csvfile import UTF_8
 
 __all__ = [
@@ -39,71 +45,6 @@ __all__ = [
     "UnknownSpec",
     "VariantSpec",
 ]
-
-
-def _quantity(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        message = 'expected a number, or text with a unit as "20 h"'
-        raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
-    return value if isinstance(value, str) else float(value)
-
-
-def _bound(value: Any) -> Any:
-    """[low, high], "<= number" or ">= number" -> (sense, bound)."""
-    if isinstance(value, list) and len(value) == 2:
-        low, high = value
-        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
-            return "in", (float(low), float(high))
-    if isinstance(value, str):
-        match = re.fullmatch(r"\s*(<=|>=)\s*([-+0-9.eE]+)\s*", value)
-        if match:
-            try:
-                return match[1], float(match[2])
-            except ValueError:
-                pass
-    raise ValueError('expected [low, high], "<= number" or ">= number"')
-
-
-def _encoding(value: str) -> str:
-    try:
-        codecs.lookup(value)
-    except LookupError:
-        raise ValueError("expected the name of an encoding, as 'utf-8', 'cp1252'") from None
-    return value
-
-
-def _time_format(value: str) -> str:
-    moment = datetime(2001, 2, 3, 4)
-    try:
-        if datetime.strptime(moment.strftime(value), value).date() == moment.date():
-            return value
-    except ValueError:
-        pass
-    raise ValueError("expected year, month, day and time, as '%d.%m.%Y %H:%M'")
-
-
-def _flat(value: Any) -> Any:
-    """{"k": {"error": x}} -> {"k.error": x}: TOML reads k.error = x as a table."""
-    if not isinstance(value, dict):
-        return value
-    found: dict[str, Any] = {}
-    for name, item in value.items():
-        inner = _flat(item)
-        if isinstance(inner, dict):
-            found |= {f"{name}.{key}": one for key, one in inner.items()}
-        else:
-            found[name] = item
-    return found
-
-
-Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
-Pair: TypeAlias = tuple[Quantity, Quantity]
-Point: TypeAlias = Quantity | tuple[Quantity, ...]
-Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
-Instant: TypeAlias = date | datetime | float | str
-Encoding: TypeAlias = Annotated[str, AfterValidator(_encoding)]
-Name: TypeAlias = Annotated[str, Field(min_length=1)]
-Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 
 
 class Spec(BaseModel):
@@ -199,7 +140,7 @@ class DataSpec(Spec):
     options: dict[Identifier, Any] = Field(default_factory=dict)
     time: Name = "time"
     time_unit: str | None = None
-    time_format: Annotated[str, AfterValidator(_time_format)] = ""
+    time_format: TimeFormat = ""
     zone: Name = "UTC"
     start: Instant | None = None
     stop: Instant | None = None
@@ -446,11 +387,6 @@ class OutputSpec(Spec):
         if self.thin > 1 and self.retain is None:
             raise ValueError("thin belongs to retain = the time for which all is kept")
         return self
-
-
-Expected: TypeAlias = Annotated[
-    dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_bound)]], BeforeValidator(_flat)
-]
 
 
 class VariantSpec(Spec):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -21,6 +22,11 @@ from livepde.cli.printing import (
     show,
     terminal,
 )
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from livepde.runs import Outcome, RunWriter
 
 __all__ = ["demo", "reproduce"]
 
@@ -51,6 +57,13 @@ def demo(out: OutOption = None) -> None:
     )
     outcome = experiment.run(None, progress=True)
     show(console, outcome.tables, outcome.checks, outcome.notes)
+    for name in _finish(writer, outcome, console):
+        console.print(f"Figure: {folder / name}.png", soft_wrap=True)
+    console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+
+
+def _finish(writer: RunWriter, outcome: Outcome, console: Console) -> Iterable[str]:
+    """Write what an experiment gave; return the names of its figures, if any can be drawn."""
     figures = outcome.figures if can_draw(console) else {}
     writer.finish(
         status="finished",
@@ -60,9 +73,7 @@ def demo(out: OutOption = None) -> None:
         notes=outcome.notes,
         figures=figures,
     )
-    for name in figures:
-        console.print(f"Figure: {folder / name}.png", soft_wrap=True)
-    console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+    return figures
 
 
 def reproduce(
@@ -107,12 +118,5 @@ def reproduce(
         )
     outcome = experiment.run(truth, progress=not as_json)
     if writer is not None:
-        writer.finish(
-            status="finished",
-            dataset=outcome.dataset,
-            shown=outcome.tables,
-            checks=outcome.checks,
-            notes=outcome.notes,
-            figures=outcome.figures if can_draw(terminal(err=True)) else {},
-        )
+        _finish(writer, outcome, terminal(err=True))
     report_outcome(outcome, command, as_json)

@@ -83,9 +83,8 @@ class MPC:
         """Return the memory before the first sample: where the optimisation begins."""
         return np.zeros(int(self.problem.opt_x_num.master.shape[0]))
 
-    @cached_property
-    def problem(self) -> Any:
-        """do-mpc's object, without a state: all that changes is set at each sample."""
+    def _process(self) -> Any:
+        """Return the model in do-mpc's words: cost, and how far it is beyond each limit."""
         do_mpc, casadi = packages()
         model, goal, r = self.model, self.goal, self.model.size
         process = do_mpc.model.Model("discrete")
@@ -122,6 +121,13 @@ class MPC:
             process.set_expression(f"low_{name}", ends["low"][k] - value)
             process.set_expression(f"high_{name}", value - ends["high"][k])
         process.setup()
+        return process
+
+    @cached_property
+    def problem(self) -> Any:
+        """do-mpc's object, without a state: all that changes is set at each sample."""
+        do_mpc, casadi = packages()
+        model, goal, process = self.model, self.goal, self._process()
         mpc = do_mpc.controller.MPC(process)
         mpc.settings.n_horizon = self.horizon
         mpc.settings.n_robust = 1 if self.scenarios > 1 else 0

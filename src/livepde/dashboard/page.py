@@ -49,7 +49,9 @@ def page(path: Path) -> dash.Dash:
         meta_tags=[{"name": "viewport", "content": "width=device-width, initial-scale=1"}],
     )
     app.layout = _skeleton
-    _connect(app, view)
+    _look(app, view)
+    _steer(app, view)
+    _draw(app, view)
     _harden(app)
     return app
 
@@ -83,45 +85,50 @@ def _skeleton() -> Any:
             ),
             html.Ul(id="verdict", **_aria(label="Is anything wrong?")),
             html.Div(id="cards", **_aria(label="Estimates")),
-            html.Div(
-                [
-                    html.Label("Look back", htmlFor="slider", id="slider-label"),
-                    dcc.Slider(
-                        id="slider",
-                        min=0,
-                        max=1,
-                        value=1,
-                        marks=None,
-                        updatemode="drag",
-                        allow_direct_input=False,
-                        disabled=True,
-                    ),
-                    html.Output(id="shown"),
-                    html.Button("Newest", id="newest", n_clicks=0),
-                    html.Div(
-                        [
-                            html.Label("Cuts", htmlFor="cut"),
-                            dcc.Slider(
-                                id="cut",
-                                min=0.05,
-                                max=0.95,
-                                step=0.05,
-                                value=0.5,
-                                marks=None,
-                                allow_direct_input=False,
-                            ),
-                        ],
-                        id="cutbar",
-                        hidden=True,
-                    ),
-                ],
-                id="timebar",
-                role="group",
-                **_aria(label="Look back: arrow keys move, End follows the newest"),
-            ),
+            _timebar(),
             *sections,
             html.Footer(f"livepde {__version__}"),
         ]
+    )
+
+
+def _timebar() -> Any:
+    """Return what looks back, and moves the cuts through solids."""
+    return html.Div(
+        [
+            html.Label("Look back", htmlFor="slider", id="slider-label"),
+            dcc.Slider(
+                id="slider",
+                min=0,
+                max=1,
+                value=1,
+                marks=None,
+                updatemode="drag",
+                allow_direct_input=False,
+                disabled=True,
+            ),
+            html.Output(id="shown"),
+            html.Button("Newest", id="newest", n_clicks=0),
+            html.Div(
+                [
+                    html.Label("Cuts", htmlFor="cut"),
+                    dcc.Slider(
+                        id="cut",
+                        min=0.05,
+                        max=0.95,
+                        step=0.05,
+                        value=0.5,
+                        marks=None,
+                        allow_direct_input=False,
+                    ),
+                ],
+                id="cutbar",
+                hidden=True,
+            ),
+        ],
+        id="timebar",
+        role="group",
+        **_aria(label="Look back: arrow keys move, End follows the newest"),
     )
 
 
@@ -130,8 +137,8 @@ def _aria(**values: str) -> Any:
     return {f"aria-{name}": value for name, value in values.items()}
 
 
-def _connect(app: dash.Dash, view: View) -> None:
-    """Let the page look at the run, and draw when there is news or another time is asked for."""
+def _look(app: dash.Dash, view: View) -> None:
+    """Let the page look at the run from time to time."""
 
     @app.callback(
         Output("news", "data"),
@@ -157,6 +164,10 @@ def _connect(app: dash.Dash, view: View) -> None:
             cards.summary(seen),
             cards.facts(seen),
         )
+
+
+def _steer(app: dash.Dash, view: View) -> None:
+    """Let it follow the newest estimate, or stay at the time that is asked for."""
 
     @app.callback(
         Output("at", "data"),
@@ -186,6 +197,10 @@ def _connect(app: dash.Dash, view: View) -> None:
         moment = high if at is None else at
         said = f"{'newest' if at is None else 'looking back'}: {when_axis(data).text(moment)}"
         return at, low, high, step, moment, not high > low, said
+
+
+def _draw(app: dash.Dash, view: View) -> None:
+    """Let it say and draw what there is at that time."""
 
     @app.callback(
         Output("verdict", "children"),

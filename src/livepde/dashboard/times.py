@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import xarray as xr
 
 from livepde.plots import time_scale
 from livepde.runs.dates import dated
+from livepde.streams.clock import since_1970
 
 __all__ = ["TimeAxis", "at_time", "when_axis"]
 
@@ -54,8 +54,7 @@ def when_axis(data: xr.Dataset) -> TimeAxis:
     if dates is not None:
         origin, second = dates
         if bool((np.abs(data["time"].values) * second < FAR).all()):
-            start = origin.replace(tzinfo=UTC).timestamp()
-            return TimeAxis(1000.0 * second, 1000.0 * start, dates=True)
+            return TimeAxis(1000.0 * second, 1000.0 * since_1970(origin), dates=True)
     factor, name = time_scale(data)
     return TimeAxis(1.0 / factor, unit=name)
 

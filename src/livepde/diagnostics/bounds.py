@@ -30,6 +30,12 @@ __all__ = ["Errors", "TwinTracker", "bounds", "conditions"]
 
 Data = Literal["exact", "noisy", "smoothed"]
 ROUNDING = 1e-9  # of an inequality between norms, relative
+# Section -> the paper's labels of a bound on mu, of a stronger one, and of a bound on nu.
+CONDITIONS: dict[Data, tuple[str, str, str]] = {
+    "exact": ("cond:mu_1", "cond:mu02", "cond:nu"),
+    "noisy": ("ass:mu_nu, mu", "ass:mu_noisy", "ass:mu_nu, nu"),
+    "smoothed": ("ass:mu_nu_smooth, mu", "cond:mu_smooth_2", "ass:mu_nu_smooth, nu"),
+}
 UNUSED = "The hypothesis of the proposition does not hold along the run; see the conditions."
 
 
@@ -200,6 +206,26 @@ def _integral(errors: Sequence[Errors], get: Callable[[Errors], float]) -> float
     return float(np.trapezoid(_values(errors, get), times))
 
 
+def _asked(
+    data: Data, c: Constants, sigma: float
+) -> tuple[Callable[[Errors, float], float], Callable[[Errors], float]]:
+    """Return the least theta, for a constant c_1, and the least nu that a section asks for."""
+
+    def theta(item: Errors, c1: float) -> float:
+        if data == "exact":
+            return theta_exact(c, item.p.V, item.r, c1)
+        if data == "noisy":
+            return theta_noisy(c, item.e, item.p.V, item.r, item.d, sigma, c1)
+        return theta_smoothed(c, item.p.V, item.r_alpha, item.d.V, item.rate, c1)
+
+    def nu(item: Errors) -> float:
+        if data == "exact":
+            return nu_exact(c, item.e, item.p)
+        return nu_noisy(c, item.e, item.p, item.d.V)
+
+    return theta, nu
+
+
 def conditions(
     errors: Sequence[Errors],
     c: Constants,
@@ -232,24 +258,8 @@ def conditions(
     n = len(errors)
     if not n:
         raise ConfigurationError("conditions: the tracker has not seen any estimate.")
-
-    def asked_theta(item: Errors, c1: float) -> float:
-        if data == "exact":
-            return theta_exact(c, item.p.V, item.r, c1)
-        if data == "noisy":
-            return theta_noisy(c, item.e, item.p.V, item.r, item.d, sigma, c1)
-        return theta_smoothed(c, item.p.V, item.r_alpha, item.d.V, item.rate, c1)
-
-    def asked_nu(item: Errors) -> float:
-        if data == "exact":
-            return nu_exact(c, item.e, item.p)
-        return nu_noisy(c, item.e, item.p, item.d.V)
-
-    first, second, third = {
-        "exact": ("cond:mu_1", "cond:mu02", "cond:nu"),
-        "noisy": ("ass:mu_nu, mu", "ass:mu_noisy", "ass:mu_nu, nu"),
-        "smoothed": ("ass:mu_nu_smooth, mu", "cond:mu_smooth_2", "ass:mu_nu_smooth, nu"),
-    }[data]
+    first, second, third = CONDITIONS[data]
+    asked_theta, asked_nu = _asked(data, c, sigma)
 
     def line(name: str, holds: Any, remedy: str) -> CheckLine:
         return CheckLine.at_least(f"{name} (share of samples)", np.mean(holds), 1.0, remedy)

@@ -288,7 +288,7 @@ def row(kind: str, level: float, runs: Ensemble) -> list[Any]:
 
 
 def paper_noise(
-    levels: Sequence[float] = LEVELS, seeds: Sequence[int] = SEEDS, progress: bool = False
+    seeds: Sequence[int] = SEEDS, progress: bool = False
 ) -> tuple[Runs, Table, dict[float, float]]:
     """Run the second figure on the paper's example.
 
@@ -303,11 +303,11 @@ def paper_noise(
     runs: Runs = {
         (name, level * v.share): ensemble(case, v.law, v.noise, level * v.share, seeds, progress)
         for name, v in PAPER.items()
-        for level in levels
+        for level in LEVELS
     }
     norm = float(np.sqrt(_squares(case.twin.q[None], case.twin.model.parameter_mass)[0]))
     alone = {}
-    for level in levels:
+    for level in LEVELS:
         found = ensemble(nothing, NOISY, "band", level, seeds, progress)
         alone[level] = float(found.size[:, -1].mean()) / norm
     title = "Second figure, the paper's example: partial data, gain 100, means of"
@@ -315,7 +315,6 @@ def paper_noise(
 
 
 def excited_noise(
-    levels: Sequence[float] = LEVELS,
     seeds: Sequence[int] = SEEDS,
     progress: bool = False,
     kinds: Sequence[Kind] = ("nodal", "band"),
@@ -325,7 +324,7 @@ def excited_noise(
     runs: Runs = {}
     for kind in kinds:
         numbers = seeds[:1] if kind == "nodal" else seeds
-        for level in levels:
+        for level in LEVELS:
             runs[f"{kind}, mu = 1", level] = ensemble(case, EXCITED, kind, level, numbers, progress)
     title = "Second figure, the excited twin: full data, gain 40, means of"
     return runs, _table(f"{title} {len(seeds)} seeds (nodal: one)", runs)

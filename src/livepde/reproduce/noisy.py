@@ -33,7 +33,7 @@ from livepde.reproduce.experiment import Experiment
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.streams import LocalPolynomial, RelativeNoise, Twin
 
-__all__ = ["SEED_EXCITED_NOISE", "NoisyRun", "WhiteNoise", "noisy_excited", "noisy_run"]
+__all__ = ["SEED_EXCITED_NOISE", "NoisyRun", "WhiteNoise", "noisy_run"]
 
 Kind = Literal["white", "nodal"]
 
@@ -166,11 +166,6 @@ class _Noisy:
         for t, z in zip(self.twin.times, self.twin.exact_data, strict=True):
             std = self.noise.std(z, self.twin.weights)
             yield Sample(float(t), z + std * rng.standard_normal(len(z)))
-
-
-def noisy_excited(level: float, seed: int = 0, smoothing: bool = True) -> float:
-    """Return the relative L2 error of q at t = 60 with the settings of this file."""
-    return noisy_run(level, seed, smoothing).error
 
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:

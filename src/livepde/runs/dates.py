@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from typing import Any
 
+import numpy as np
 import xarray as xr
 
-__all__ = ["SECONDS", "dated", "when"]
+__all__ = ["SECONDS", "dated", "instants", "when"]
 
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0}
 
@@ -26,3 +28,15 @@ def when(data: xr.Dataset, t: float) -> str:
         return f"t = {t:.6g} {data['time'].attrs.get('units', '')}".rstrip()
     origin, second = dates
     return (origin + timedelta(seconds=t * second)).isoformat(sep=" ", timespec="seconds")
+
+
+def instants(data: xr.Dataset, times: Any) -> Any:
+    """Return times of a run as dates (a pandas index); None if it has none."""
+    dates = dated(data)
+    if dates is None:
+        return None
+    import pandas as pd
+
+    origin, second = dates
+    seconds = np.asarray(times, dtype=float) * second
+    return pd.Timestamp(origin) + pd.to_timedelta(seconds, unit="s")

@@ -6,14 +6,10 @@ units that UDUNITS reads, times with their date, what belongs to what; and UGRID
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from tokenize import TokenError
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,276 +17,20 @@ import pandas as pd
 import xarray as xr
 
 from livepde.errors import ConfigurationError, RunError
-from livepde.plots.dataset import interval_95, scalars
 from livepde.records import STATUS_CODES
-from livepde.runs.dates import dated
-from livepde.runs.directory import Run, plain, write_dataset
+from livepde.runs.conventions import (
+    DIFFERENCES,
+    bounded,
+    cf,
+    free_names,
+    kinds_of,
+    oriented,
+    udunits,
+)
+from livepde.runs.dates import instants
+from livepde.runs.directory import Run, write_dataset
 
-__all__ = [
-    "AT_ONE_TIME",
-    "FORMATS",
-    "NEEDS",
-    "cf",
-    "export",
-    "instants",
-    "into_place",
-    "need",
-    "refuse_file",
-    "udunits",
-]
-
-CONVENTIONS = "CF-1.11"
-BESIDE = {  # end of a name -> what such a variable says of the one without it
-    "_std": "standard deviation of {}",
-    "_low": "lower end of the 95 % interval of {}",
-    "_high": "upper end of the 95 % interval of {}",
-    "_left": "share of the prior deviation of {} that is left",
-    "_modes": "number of modes of {} that the data have told of",
-}
-LONG_NAMES = {
-    "snapshot": "time of the fields",
-    "x": "x of the vertices",
-    "y": "y of the vertices",
-    "z": "z of the vertices",
-    "sensor": "assimilated channel",
-    "withheld": "withheld channel",
-    "innovation": "measured minus expected, one step ahead",
-    "withheld_error": "measured minus expected of withheld channels, one step ahead",
-    "status": "how the step went",
-    "correlation": "correlation of the last estimates",
-}
-DIFFERENCES = ("innovation", "withheld_error")
-# CF: an axis Z is vertical, and must say whether it grows up or down, which a mesh does not know.
-AXES = {"time": "T", "snapshot": "T", "x": "X", "y": "Y"}
-CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
-SYMBOLS = {  # of pint -> of UDUNITS, where they differ
-    "°C": "degC",
-    "°F": "degF",
-    "Δ°C": "K",
-    "Δ°F": "degR",
-    "Ω": "ohm",
-    "a": "year",
-    "deg": "degree",
-}
-SCALES = ("degC", "degF")  # their zero is not zero
-NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of cell.
-
-    Attributes
-    ----------
-    dimension, role
-        Of the mesh, and what UGRID calls such a cell.
-    edges
-        Corners to which the edges lead from the first one, in an order that turns right-handed.
-    turned
-        The corners of a cell that turns the other way, in the right order.
-    """
-
-    dimension: int
-    role: str
-    edges: tuple[int, ...]
-    turned: tuple[int, ...]
-
-
-KINDS = {
-    "triangle": Kind(2, "face", (1, 2), (0, 2, 1)),
-    "quad": Kind(2, "face", (1, 3), (0, 3, 2, 1)),
-    "tetra": Kind(3, "volume", (1, 2, 3), (0, 2, 1, 3)),
-    "hexahedron": Kind(3, "volume", (1, 3, 4), (4, 5, 6, 7, 0, 1, 2, 3)),
-}
-
-
-# --- names and units -----------------------------------------------------------------------------
-
-
-@cache
-def udunits(unit: str) -> str | None:
-    """Return a unit as UDUNITS writes it; None for one that it has not, such as a root.
-
-    >>> udunits("m^2/s"), udunits("J/(m^3 K)"), udunits("degC"), udunits("")
-    ('m2 s-1', 'J m-3 K-1', 'degC', '1')
-    """
-    from pint.util import to_units_container
-
-    try:
-        found = to_units_container(_registry().parse_units(unit))
-    except NOT_A_UNIT:
-        return None
-    parts = {name: float(str(power)) for name, power in found.items()}
-    if not all(power.is_integer() for power in parts.values()):
-        return None
-    words = []
-    for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
-        symbol = _registry().get_symbol(name)
-        symbol = SYMBOLS.get(symbol, symbol.replace("µ", "u"))
-        words.append(symbol if power == 1 else f"{symbol}{int(power)}")
-    return " ".join(words) or "1"
-
-
-@cache
-def _registry() -> Any:
-    import pint
-
-    return pint.UnitRegistry()
-
-
-def instants(data: xr.Dataset, times: Any) -> Any:
-    """Return times of a run as dates (a pandas index); None if it has none."""
-    dates = dated(data)
-    if dates is None:
-        return None
-    origin, second = dates
-    seconds = np.asarray(times, dtype=float) * second
-    return pd.Timestamp(origin) + pd.to_timedelta(seconds, unit="s")
-
-
-def cf(
-    data: xr.Dataset, *, title: str = "", source: str = "livepde", history: str = ""
-) -> xr.Dataset:
-    """Return a run's dataset with names, units and relations after the CF conventions.
-
-    Parameters
-    ----------
-    data
-        As `Result.to_xarray` gives it.
-    title, source, history
-        Global attributes; a title that the dataset has comes first.
-
-    Returns
-    -------
-    Dataset
-        `time` and `snapshot` count from a date where the run has one, so that xarray opens them as
-        dates; units are as UDUNITS reads them; names consist of letters, digits and underscores,
-        and `long_name` holds what they stand for; deviations and ends of intervals are
-        `ancillary_variables`; a mesh in two or three dimensions follows UGRID. Of standard names
-        only those of the times: the others are of sea and air.
-    """
-    found = _bounded(data)
-    names = _names(str(name) for name in found.variables)
-    clock, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
-    times = [found[name] for name in ("time", "snapshot") if name in found]
-    for time in times:
-        time.attrs |= {"units": clock} | ({"standard_name": "time"} if clock else {})
-    for name in names:
-        _describe(found, name)
-        beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
-        if beside:
-            found[name].attrs["ancillary_variables"] = " ".join(beside)
-    if origin is not None and clock in CLOCKS:
-        since = {"units": f"{CLOCKS[clock]} since {origin}", "calendar": "standard"}
-        for time in times:
-            time.attrs |= since | {"units_metadata": "leap_seconds: none"}
-    found.attrs = {key: plain(value) for key, value in data.attrs.items()}
-    lists = {key: str(data.attrs.get(key, "")).split() for key in ("fields", "state")}
-    for key, some in {"scalars": scalars(data), **lists}.items():
-        found.attrs[key] = " ".join(names[name] for name in some if name in names)
-    found.attrs |= {"Conventions": CONVENTIONS, "source": source, "history": history}
-    found.attrs["title"] = str(data.attrs.get("title", "")) or title
-    found = found.rename({old: new for old, new in names.items() if old != new})
-    for kind in _kinds(found):
-        _add_topology(found, kind)
-    return found
-
-
-def _bounded(data: xr.Dataset) -> xr.Dataset:
-    """Return a copy with the ends of the 95 % interval of every number beside its deviation."""
-    found = {}
-    for name, variable in data.data_vars.items():
-        found[name] = variable.copy(deep=False)
-        label = str(name).removesuffix("_std")
-        if label != name and label in scalars(data) and f"{label}_low" not in data:
-            unit = {"units": variable.attrs.get("units", "")}
-            for end, values in zip(("_low", "_high"), interval_95(data, label), strict=True):
-                found[f"{label}{end}"] = xr.DataArray(values, dims="time", attrs=unit)
-    return xr.Dataset(found, data.coords, data.attrs)
-
-
-def _names(wanted: Iterable[str]) -> dict[str, str]:
-    """Return name -> one of letters, digits and underscores that no other has."""
-    found: dict[str, str] = {}
-    for name in wanted:
-        stem = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
-        stem = stem if stem[:1].isalpha() else f"v{stem}"
-        free, number = stem, 2
-        while free in found.values():
-            free, number = f"{stem}_{number}", number + 1
-        found[name] = free
-    return found
-
-
-def _describe(data: xr.Dataset, name: str) -> None:
-    """Say what a variable is, and in which unit."""
-    variable = data[name]
-    attrs = variable.attrs
-    attrs.setdefault("long_name", LONG_NAMES.get(name, name))
-    for end, text in BESIDE.items():
-        base = name.removesuffix(end)
-        if base != name and base in data:
-            attrs["long_name"] = text.format(base)
-            attrs.setdefault("units", "")
-    if name in AXES:
-        attrs["axis"] = AXES[name]
-    if name in data.coords:
-        variable.encoding["_FillValue"] = None  # a coordinate is never missing
-    if "units" in attrs:
-        own = str(attrs.pop("units"))
-        unit = udunits(own)
-        attrs |= {"comment": f"unit: {own}"} if unit is None else {"units": unit}
-        if unit in SCALES:
-            apart = name.endswith("_std") or name in DIFFERENCES
-            attrs["units_metadata"] = f"temperature: {'difference' if apart else 'on_scale'}"
-    if "flag_values" in attrs:
-        attrs["flag_values"] = np.array(attrs["flag_values"], dtype=variable.dtype)
-
-
-def _kinds(data: xr.Dataset) -> list[str]:
-    return [kind for kind in KINDS if kind in data and data[kind].dims == ("cell", "corner")]
-
-
-def _oriented(data: xr.Dataset, kind: str) -> Any:
-    """Return the corners of each cell so that all turn the same way: others count on that."""
-    corners = np.array(data[kind].values)
-    about = KINDS[kind]
-    axes = "xyz"[: about.dimension]
-    points = np.column_stack([data[axis].values for axis in axes])
-    edges = [points[corners[:, k]] - points[corners[:, 0]] for k in about.edges]
-    wrong = np.linalg.det(np.stack(edges, axis=1)) < 0.0
-    corners[wrong] = corners[wrong][:, about.turned]
-    return corners
-
-
-def _add_topology(data: xr.Dataset, kind: str) -> None:
-    """Say how vertices and cells are a mesh, after UGRID."""
-    dimension, cell = KINDS[kind].dimension, KINDS[kind].role
-    name = "mesh"
-    while name in data:
-        name += "_"
-    corners = f"{cell}_node_connectivity"
-    axes = [axis for axis in "xyz" if axis in data.coords]
-    data[kind].values = _oriented(data, kind)
-    data[kind].attrs |= {"cf_role": corners, "start_index": np.int32(0)}
-    data[kind].attrs["long_name"] = f"vertices of each {kind}"
-    for variable in data.data_vars.values():
-        if variable.dims[-1:] == ("vertex",):
-            variable.attrs |= {"mesh": name, "location": "node"}
-    about = {
-        "cf_role": "mesh_topology",
-        "long_name": "mesh",
-        "topology_dimension": np.int32(dimension),
-        "node_coordinates": " ".join(axes),
-        corners: kind,
-    }
-    if dimension == 2:
-        about["face_dimension"] = "cell"
-    data[name] = ((), np.int32(0), about)
-    data.attrs["Conventions"] = f"{CONVENTIONS} UGRID-1.0"
-
-
-# --- files ---------------------------------------------------------------------------------------
+__all__ = ["AT_ONE_TIME", "FORMATS", "NEEDS", "cf", "export", "into_place", "need", "refuse_file"]
 
 
 def export(run: Run, target: Path, *, at: float | None = None, force: bool = False) -> None:
@@ -401,7 +141,7 @@ def _zarr(run: Run, path: Path, at: float | None) -> None:
 
 def _csv(run: Run, path: Path, at: float | None) -> None:
     """Write what is over time, one row for each sample; units stand in the header."""
-    data = _bounded(run.dataset)
+    data = bounded(run.dataset)
     times = data["time"].values
     columns: dict[str, Any] = {}
     dates = instants(data, times)
@@ -461,14 +201,16 @@ def _mesh(data: xr.Dataset) -> tuple[Any, list[tuple[str, Any]]]:
     """Return points, shape (vertices, 3), and cells; those of an interval join its neighbours."""
     count = data.sizes["vertex"]
     axes = [data[axis].values if axis in data.coords else np.zeros(count) for axis in "xyz"]
-    cells = [(kind, _oriented(data, kind)) for kind in _kinds(data)]
+    cells = [(kind, oriented(data, kind)) for kind in kinds_of(data)]
     order = np.arange(count, dtype=np.int32)
     return np.column_stack(axes), cells or [("line", np.column_stack([order[:-1], order[1:]]))]
 
 
 def _fields(data: xr.Dataset, k: int) -> dict[str, Any]:
     """Return the values at the vertices of one snapshot."""
-    names = _names(str(n) for n, v in data.data_vars.items() if v.dims == ("snapshot", "vertex"))
+    names = free_names(
+        str(n) for n, v in data.data_vars.items() if v.dims == ("snapshot", "vertex")
+    )
     return {free: data[name].values[k] for name, free in names.items()}
 
 

@@ -22,7 +22,9 @@ __all__ = [
     "guessed_format",
     "has_decimal_comma",
     "number_of",
+    "origin_at",
     "read_times",
+    "since_1970",
 ]
 
 Instant: TypeAlias = float | str | date | datetime
@@ -159,6 +161,16 @@ def guessed_format(text: str) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it says which comes first, day or month: so do we
         return guess_datetime_format(text.strip(), dayfirst="." in text[:5]) or ""
+
+
+def origin_at(stamp: float) -> datetime:
+    """Return the date of seconds since 1970 as origins are kept: in UTC, without a zone."""
+    return datetime.fromtimestamp(stamp, UTC).replace(tzinfo=None)
+
+
+def since_1970(origin: datetime) -> float:
+    """Return the seconds since 1970 of what `origin_at` returned."""
+    return origin.replace(tzinfo=UTC).timestamp()
 
 
 def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Any, Literal
 
 from livepde.errors import DataError, SampleError
-from livepde.streams.clock import Clock
+from livepde.streams.clock import Clock, origin_at, since_1970
 from livepde.streams.table import Column, channel_value, row_time
 
 __all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark", "gather"]
@@ -206,7 +206,7 @@ class Intake:
         """The date of t = 0, if times are dates."""
         if self.origin is None or not self._dates:
             return None
-        return datetime.fromtimestamp(self.origin, UTC).replace(tzinfo=None)
+        return origin_at(self.origin)
 
     @property
     def waiting(self) -> list[Any]:
@@ -353,6 +353,6 @@ class Intake:
 def _microseconds(stamp: float) -> float:
     """Return seconds since 1970 as a date has them, so that a date gives the same again."""
     try:
-        return datetime.fromtimestamp(stamp, UTC).timestamp()
+        return since_1970(origin_at(stamp))
     except (ValueError, OverflowError, OSError):
         raise SampleError("the first time is no date in UTC; its year must be 1 to 9999") from None

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,15 @@ import numpy as np
 from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.identifier import Sample
 from livepde.linalg import Array
-from livepde.streams.clock import COMMA, NO_POINT, Clock, has_decimal_comma, number_of, read_times
+from livepde.streams.clock import (
+    COMMA,
+    NO_POINT,
+    Clock,
+    has_decimal_comma,
+    number_of,
+    origin_at,
+    read_times,
+)
 from livepde.streams.names import check_columns, hint, no_file
 
 __all__ = [
@@ -32,6 +40,7 @@ __all__ = [
 ]
 
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
+STREAM = "standard input"
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
 
 
@@ -245,7 +254,7 @@ def to_table(
         raise DataError(f"{source}: no sample has all channels that it needs.")
     t, values, origin = times[use][kept], values[kept], None
     if dates:
-        origin = datetime.fromtimestamp(float(t[0]) / clock.second, UTC).replace(tzinfo=None)
+        origin = origin_at(float(t[0]) / clock.second)
         t = t - t[0]
     told = {key: number for key, number in remarks.items() if number}
     return Table(t, values, tuple(columns), origin, told)
@@ -262,14 +271,12 @@ class JsonLines:
         *,
         every: int = 1,
         missing: Iterable[float] = (),
-        where: str = "standard input",
     ) -> None:
         self._lines = lines
         self._columns = columns
         self._clock = clock
         self._every = every
         self._missing = tuple(float(number) for number in missing)
-        self._where = where
         self.origin: datetime | None = None
 
     def __iter__(self) -> Iterator[Sample]:
@@ -278,10 +285,10 @@ class JsonLines:
         for number, line in enumerate(self._lines, start=1):
             if not line.strip():
                 continue
-            where = f"{self._where}, line {number}"
+            where = f"{STREAM}, line {number}"
             row = _object(line, where)
             t, dates = row_time(row, clock, where, dates)
-            low, high = clock.bounds(dates, self._where)
+            low, high = clock.bounds(dates, STREAM)
             if t > high:
                 return
             if t < low:
@@ -295,8 +302,7 @@ class JsonLines:
             if zero is None:
                 zero = t if dates else 0.0
                 if dates:
-                    stamp = datetime.fromtimestamp(t / clock.second, UTC)
-                    self.origin = stamp.replace(tzinfo=None)
+                    self.origin = origin_at(t / clock.second)
             values = {
                 channel: channel_value(column, row, self._missing, where)
                 for channel, column in self._columns.items()

@@ -84,10 +84,8 @@ class Run:
         unit = model.frame.model.time_unit
         return xr.Dataset(data, coords={"time": ("time", self.t, {"units": unit})})
 
-    def cost(
-        self, problem: Problem, since: float = -np.inf, until: float = np.inf, *, paid: bool = True
-    ) -> float:
-        """Return the cost of the goal over samples with since < t <= until.
+    def cost(self, problem: Problem, since: float = -np.inf, *, paid: bool = True) -> float:
+        """Return the cost of the goal over the samples after a time.
 
         Parameters
         ----------
@@ -102,8 +100,7 @@ class Run:
         moved = change @ np.array([goal.move[name] for name in model.controls])
         moved += self.inputs @ np.array([goal.price.get(name, 0.0) for name in model.controls])
         beyond = (goal.beyond if paid else 0.0) * self.beyond(problem).sum(axis=1)
-        counted = (self.t > since) & (self.t <= until)
-        return float((missed + moved + beyond)[counted].sum())
+        return float((missed + moved + beyond)[self.t > since].sum())
 
     def beyond(self, problem: Problem) -> Array:
         """Return by how much each limited output was beyond its limits, (samples, limited)."""

@@ -132,7 +132,6 @@ def peers(
     seeds: int = 1,
     *,
     levels: Sequence[float] = (LEVEL,),
-    rows: Sequence[str] = (*OURS, *PEERS),
     progress: bool = False,
 ) -> Outcome:
     """Run our sensitivity law and the peers on the same data, each row in a fresh process.
@@ -145,8 +144,6 @@ def peers(
         Data sets for each noise level.
     levels
         Noise levels.
-    rows
-        Names of `PEERS`, and of rows of `accuracy`.
     progress
         Show a bar on standard error.
     """
@@ -156,7 +153,7 @@ def peers(
         for name in names
         for level in PROBLEMS[name].chosen(levels)
         for seed in range(seeds)
-        for row in rows
+        for row in (*OURS, *PEERS)
     ]
     found: Found = {}
     with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
