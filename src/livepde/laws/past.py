@@ -46,9 +46,9 @@ class Samples:
     def _append(
         self, t: float, z: Array, inputs: Mapping[str, float], channels: tuple[str, ...]
     ) -> Samples:
-        row = np.array([[inputs[c] for c in channels]])
-        both = ((self.t, [t]), (self.z, z[None]), (self.inputs, row))
-        return Samples(*(np.concatenate(pair) for pair in both))
+        each = ([t], [z], [[inputs[c] for c in channels]])
+        kept = (self.t, self.z, self.inputs)
+        return Samples(*(np.concatenate(pair) for pair in zip(kept, each, strict=True)))
 
     def since(self, first: int) -> Samples:
         """Return the samples from one on, which is the start of them."""
