@@ -46,9 +46,12 @@ class Samples:
     def _append(
         self, t: float, z: Array, inputs: Mapping[str, float], channels: tuple[str, ...]
     ) -> Samples:
-        each = ([t], [z], [[inputs[c] for c in channels]])
-        kept = (self.t, self.z, self.inputs)
-        return Samples(*(np.concatenate(pair) for pair in zip(kept, each, strict=True)))
+        row = [[inputs[c] for c in channels]]
+        return Samples(
+            np.concatenate((self.t, [t])),
+            np.concatenate((self.z, [z])),
+            np.concatenate((self.inputs, row)),
+        )
 
     def since(self, first: int) -> Samples:
         """Return the samples from one on, which is the start of them."""
