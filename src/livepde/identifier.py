@@ -6,7 +6,6 @@ import copy
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -23,18 +22,18 @@ from livepde.errors import (
 )
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
+from livepde.intake import Intake
 from livepde.laws import AnyLaw, Belief, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
-from livepde.samples import Sample, number, numbers, plan, readings
+from livepde.samples import Sample, number, numbers
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
 
 FORMAT = 2  # of the checkpoint
-NOTHING = np.zeros(0)  # withheld sensors without a value
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -98,7 +97,7 @@ class Identifier:
         control = Advance(scheme or ImplicitEuler(), dt_max, hold=hold)
         self.problem = Problem(model, self.observed, control)
         self.assimilate_from = assimilate_from
-        self._check_names()
+        self._intake = Intake(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
         if u0 is not None and model.form_initial is not None:
@@ -138,15 +137,6 @@ class Identifier:
         other._state, other._z = copy.deepcopy((self._state, self._z), memo)
         return other
 
-    def _check_names(self) -> None:
-        hidden = self.withheld.names if self.withheld else ()
-        both = [name for name in hidden if name in self.observed.names]
-        if both:
-            raise ConfigurationError(
-                f"channels {both} are both assimilated and withheld: give the sensors names of "
-                'their own, as in Points({"T_30": 0.3}).'
-            )
-
     def _begin(self, inputs: Inputs) -> None:
         self._state = self._start(inputs)
         self._inputs = inputs
@@ -170,25 +160,20 @@ class Identifier:
         """Time of the last accepted sample."""
         return self._t
 
-    @cached_property
+    @property
     def channels(self) -> tuple[str, ...]:
         """Every channel a sample may name."""
-        withheld = self.withheld.names if self.withheld else ()
-        return tuple(dict.fromkeys([*self.observed.names, *withheld, *self.inputs]))
+        return self._intake.channels
 
-    @cached_property
+    @property
     def inputs(self) -> tuple[str, ...]:
         """Channels that the model and the sensors read."""
-        withheld = self.withheld.observation.inputs if self.withheld else ()
-        return tuple(dict.fromkeys([*self.problem.channels, *withheld]))
+        return self._intake.inputs
 
-    @cached_property
+    @property
     def optional_inputs(self) -> frozenset[str]:
         """Inputs that may be missing: positions of moving sensors."""
-        sensors = [item.observation for item in (self.observed, self.withheld) if item is not None]
-        needed = {name for item in sensors for name in set(item.inputs) - item.optional}
-        found = frozenset().union(*(item.optional for item in sensors))
-        return found - needed - set(self.model.channels)
+        return self._intake.optional
 
     def step(
         self,
@@ -214,8 +199,8 @@ class Identifier:
         t = number(t, "time t")
         if math.isnan(t):
             raise SampleError("time t is NaN; give the time of the sample.")
-        measured, withheld, named = self._parse(z, inputs or {})
-        values, held = self._filled(named, self._inputs)
+        measured, withheld, named = self._intake.parse(z, inputs or {})
+        values, held = self._intake.filled(named, self._inputs)
         first = self._samples == 0
         self._reachable(t)
         if t < self._t or (t == self._t and not first):
@@ -337,7 +322,7 @@ class Identifier:
                 f"{t.tolist()}."
             )
         self._reachable(float(t[-1]))
-        planned = self._planned(inputs or {}, t)
+        planned = self._intake.planned(inputs or {}, t.tolist(), self._t, self._inputs)
         state, before = self._state, self._inputs
         if state is None:
             state, before = self._start(planned[0]), planned[0]
@@ -349,7 +334,7 @@ class Identifier:
                 [(self._t, before, self._z), *ends]
             )
         ]
-        sensors = [item for item in (self.observed, self.withheld) if item is not None]
+        sensors = self._intake.sensors
         return ahead(self.law, self._work, self.problem, sensors, state, intervals)
 
     def run(
@@ -394,68 +379,6 @@ class Identifier:
                 f"{self.problem.control.dt_max:g} after t = {self._t:g}: check its time, or take a "
                 "longer dt_max."
             )
-
-    def _parse(
-        self, z: ArrayLike | Mapping[str, float], inputs: Mapping[str, float]
-    ) -> tuple[Array, Array, dict[str, float]]:
-        """Return assimilated values, withheld values, and inputs, all checked."""
-        hidden = self.withheld.names if self.withheld else ()
-        if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
-            unknown = [name for name in (*z, *inputs) if name not in self.channels]
-            if unknown:
-                raise SampleError(
-                    f"unknown channel '{unknown[0]}'; this identifier has {list(self.channels)}."
-                )
-            values = {name: number(value, f"channel '{name}'") for name, value in z.items()}
-            measured = np.array([values.get(name, np.nan) for name in self.observed.names])
-            withheld = np.array([values.get(name, np.nan) for name in hidden])
-            named = {name: values[name] for name in self.inputs if name in values}
-        else:
-            measured = readings(z, self.observed)
-            withheld, named = np.full(len(hidden), np.nan) if hidden else NOTHING, {}
-        return measured, withheld, named | self._named(inputs)
-
-    def _named(self, inputs: Mapping[str, float]) -> dict[str, float]:
-        """Return inputs, checked."""
-        named = {}
-        for name, value in inputs.items():
-            if name not in self.inputs:
-                raise SampleError(
-                    f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
-                )
-            named[name] = number(value, f"input '{name}'")
-        return named
-
-    def _planned(self, inputs: Mapping[str, ArrayLike], times: Array) -> list[Inputs]:
-        """Return all inputs at each of some times to come."""
-        plans = {name: plan(name, values, len(times)) for name, values in inputs.items()}
-        known, planned = self._inputs, []
-        for k, t in enumerate(times):
-            named = self._named({name: float(values[k]) for name, values in plans.items()})
-            if t == self._t:  # the last sample itself: where sensors are that move is known
-                named = {**known, **{name: v for name, v in named.items() if not np.isnan(v)}}
-            known, _ = self._filled(named, known)
-            planned.append(known)
-        return planned
-
-    def _filled(self, named: Mapping[str, float], known: Inputs) -> tuple[Inputs, tuple[str, ...]]:
-        """Return all inputs; a missing one holds its last known value."""
-        if not self.inputs:
-            return known, ()
-        values, held, last = {}, [], dict(known)
-        for name in self.inputs:
-            value = named.get(name, np.nan)
-            if np.isnan(value) and name not in self.optional_inputs:
-                if name not in last:
-                    needed = [c for c in self.inputs if c not in self.optional_inputs]
-                    raise MissingInputError(
-                        f"input '{name}' has no value in the first sample, nor before; start where "
-                        f"all of {needed} have one."
-                    )
-                value = last[name]
-                held.append(name)
-            values[name] = value
-        return Inputs(values), tuple(held)
 
     def _fingerprint(self) -> dict[str, Any]:
         return {

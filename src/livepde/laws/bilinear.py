@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.laws.whole import Whole, WholeEquation
-from livepde.linalg import Array, Pattern, compact
+from livepde.linalg import Array, Pattern
 
 if TYPE_CHECKING:
     from livepde.laws.coupled import CoupledStage
@@ -33,11 +33,10 @@ class BilinearEquation(WholeEquation):
         u, q = y[:n], y[n:]
         self.r = r = self.stage.split.project(u) - self.u_alpha
         self.w = w = u if self.stage.gains.at_estimate else u - r
-        out: Array = way.linear @ np.concatenate((w, (y - self.c) / self.h, y))
-        observed = way.observed @ r
-        self.Mr, self.mass_r = observed[:n], observed[n:]
+        made: Array = way.products @ np.concatenate((w, (y - self.c) / self.h, y, r))
+        out, self.Mr, self.mass_r = made[: len(y)], made[-2 * n : -n], made[-n:]
         A = way.operator
-        A.set(way.coupling @ w)
+        A.set(made[len(y) : -2 * n])
         out[:n] += A.apply(q) + self.pull() - self._known
         out[n:] -= A.apply_transposed(r)
         if self.metric is not None:
@@ -55,18 +54,15 @@ class BilinearEquation(WholeEquation):
 
 
 class Bilinear(Whole):
-    """A residual is five products with sparse matrices of fixed structure.
+    """A residual is one product with a sparse matrix, and one each with A(w) and its transpose.
 
     Attributes
     ----------
-    coupling, operator
-        w -> data of A(w) on the free coefficients, and the operator that takes them.
+    products, operator
+        (w, (y - c)/h, y, r) -> the linear part of the residual, the data of A(w) on the free
+        coefficients, R^T M_op r, and R^T M r; and the operator that takes the data of A(w).
     lagged, jacobian
         w, and (w, q, r) -> data of the part of the stage's Jacobian that changes.
-    linear
-        (w, (y - c)/h, y) -> the linear part of the residual.
-    observed
-        r -> R^T M_op r above R^T M r.
     offset
         B(0) on the free coefficients.
     """
@@ -81,7 +77,7 @@ class Bilinear(Whole):
         free, free_q = sp.diags_array(model.X.free), sp.diags_array(stage.free_q)
         pattern = model.form_A.pattern("v", "q")
         kept = model.X.free[pattern.rows] * stage.free_q[pattern.indices]
-        self.coupling = sp.csr_array(sp.diags_array(kept) @ vq)
+        coupling = sp.csr_array(sp.diags_array(kept) @ vq)
         self.operator = pattern.operator()
         self.lagged = sp.csr_array(sp.hstack([maps["A"] @ vq, maps["Au"] @ vu]))
         self.jacobian = sp.csr_array(sp.hstack([self.lagged, maps["Aq"] @ qu]))
@@ -91,14 +87,16 @@ class Bilinear(Whole):
         gram = sp.csr_array(free_q @ stage.gram / g.gain)
         wide = sp.csr_array((n, m))
         rows = [
-            [free @ B, free @ model.mass, wide, g.nu * free @ stage.PNP, wide],
-            [wide.T, wide.T, gram, wide.T, g.sigma * gram],
+            [free @ B, free @ model.mass, wide, g.nu * free @ stage.PNP, wide, None],
+            [wide.T, wide.T, gram, wide.T, g.sigma * gram, None],
+            [coupling, None, None, None, None, None],
+            [None, None, None, None, None, stage.RM],
+            [None, None, None, None, None, stage.RT @ model.mass],
         ]
-        linear = sp.csr_array(sp.block_array(rows))
-        linear.eliminate_zeros()
-        linear.sum_duplicates()
-        self.linear = Pattern.of(linear).matrix(linear.data)  # with short indices
-        self.observed = compact(sp.csr_array(sp.vstack([stage.RM, stage.RT @ model.mass])))
+        products = sp.csr_array(sp.block_array(rows))
+        products.eliminate_zeros()
+        products.sum_duplicates()
+        self.products = Pattern.of(products).matrix(products.data)  # with short indices
 
     @classmethod
     def of(cls, stage: CoupledStage) -> Bilinear | None:

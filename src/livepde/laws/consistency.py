@@ -98,7 +98,7 @@ class Consistency:
         if not self.pairs or not self.square:
             return 0.0
         value = self.product / self.pairs / self.ratio
-        return float(np.clip(value, -LARGEST_CORRELATION, LARGEST_CORRELATION))
+        return min(max(value, -LARGEST_CORRELATION), LARGEST_CORRELATION)
 
     @property
     def persistence(self) -> float:

@@ -46,9 +46,12 @@ class Samples:
     def _append(
         self, t: float, z: Array, inputs: Mapping[str, float], channels: tuple[str, ...]
     ) -> Samples:
-        row = np.array([[inputs[c] for c in channels]])
-        both = ((self.t, [t]), (self.z, z[None]), (self.inputs, row))
-        return Samples(*(np.concatenate(pair) for pair in both))
+        row = [[inputs[c] for c in channels]]
+        return Samples(
+            np.concatenate((self.t, [t])),
+            np.concatenate((self.z, [z])),
+            np.concatenate((self.inputs, row)),
+        )
 
     def since(self, first: int) -> Samples:
         """Return the samples from one on, which is the start of them."""

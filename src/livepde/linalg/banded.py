@@ -16,7 +16,7 @@ from livepde.linalg.types import Array, IntArray
 
 __all__ = ["BandedSolver"]
 
-MANY = 1000  # unknowns up to which copies of the triangles take longer than they save
+FEW = 300  # entries of a triangle up to which copying it takes longer than it saves
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,9 @@ class BandedFactor:
     @cached_property
     def _triangles(self) -> tuple[Array, Array] | None:
         """L and U in band storage, if no rows were exchanged and they are solved with faster."""
-        if len(self.pivots) < MANY or not np.array_equal(self.pivots, np.arange(len(self.pivots))):
+        if self.lower * len(self.pivots) < FEW or not np.array_equal(
+            self.pivots, np.arange(len(self.pivots))
+        ):
             return None
         diagonal = self.lower + self.upper
         return np.asfortranarray(self.lu[diagonal:]), np.asfortranarray(

@@ -1,0 +1,158 @@
+"""What a sample brings to an identifier: its channels, their values, and what holds in a gap."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from livepde.errors import ConfigurationError, MissingInputError, SampleError
+from livepde.fem import Inputs
+from livepde.linalg import Array
+from livepde.observation import Observed
+from livepde.samples import number, plan, readings
+
+__all__ = ["Intake"]
+
+NOTHING = np.zeros(0)  # withheld sensors without a value
+
+
+@dataclass(frozen=True, eq=False)
+class Intake:
+    """Names of all channels, and samples as checked arrays.
+
+    Parameters
+    ----------
+    forced
+        Channels that the model reads.
+    observed, withheld
+        Sensors that are assimilated, and those that are only scored.
+
+    Raises
+    ------
+    ConfigurationError
+        A sensor is both.
+    """
+
+    forced: tuple[str, ...]
+    observed: Observed
+    withheld: Observed | None
+
+    def __post_init__(self) -> None:
+        both = [name for name in self.hidden if name in self.observed.names]
+        if both:
+            raise ConfigurationError(
+                f"channels {both} are both assimilated and withheld: give the sensors names of "
+                'their own, as in Points({"T_30": 0.3}).'
+            )
+
+    @cached_property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the withheld sensors."""
+        return self.withheld.names if self.withheld else ()
+
+    @cached_property
+    def sensors(self) -> list[Observed]:
+        """The observations there are."""
+        return [item for item in (self.observed, self.withheld) if item is not None]
+
+    @cached_property
+    def channels(self) -> tuple[str, ...]:
+        """Every channel a sample may name."""
+        return tuple(dict.fromkeys([*self.observed.names, *self.hidden, *self.inputs]))
+
+    @cached_property
+    def inputs(self) -> tuple[str, ...]:
+        """Channels that the model and the sensors read."""
+        read = [name for item in self.sensors for name in item.observation.inputs]
+        return tuple(dict.fromkeys([*self.forced, *read]))
+
+    @cached_property
+    def optional(self) -> frozenset[str]:
+        """Inputs that may be missing: positions of moving sensors."""
+        sensors = [item.observation for item in self.sensors]
+        needed = {name for item in sensors for name in set(item.inputs) - item.optional}
+        found = frozenset().union(*(item.optional for item in sensors))
+        return found - needed - set(self.forced)
+
+    def parse(
+        self, z: ArrayLike | Mapping[str, float], inputs: Mapping[str, float]
+    ) -> tuple[Array, Array, dict[str, float]]:
+        """Return assimilated values, withheld values, and inputs, all checked."""
+        hidden = self.hidden
+        if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
+            unknown = [name for name in (*z, *inputs) if name not in self.channels]
+            if unknown:
+                raise SampleError(
+                    f"unknown channel '{unknown[0]}'; this identifier has {list(self.channels)}."
+                )
+            values = {name: number(value, f"channel '{name}'") for name, value in z.items()}
+            measured = np.array([values.get(name, np.nan) for name in self.observed.names])
+            withheld = np.array([values.get(name, np.nan) for name in hidden])
+            named = {name: values[name] for name in self.inputs if name in values}
+        else:
+            measured = readings(z, self.observed)
+            withheld, named = np.full(len(hidden), np.nan) if hidden else NOTHING, {}
+        return measured, withheld, named | self._named(inputs)
+
+    def _named(self, inputs: Mapping[str, float]) -> dict[str, float]:
+        """Return inputs, checked."""
+        named = {}
+        for name, value in inputs.items():
+            if name not in self.inputs:
+                raise SampleError(
+                    f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
+                )
+            named[name] = number(value, f"input '{name}'")
+        return named
+
+    def filled(self, named: Mapping[str, float], known: Inputs) -> tuple[Inputs, tuple[str, ...]]:
+        """Return all inputs, and which of them hold their last known value as they are missing.
+
+        Raises
+        ------
+        MissingInputError
+            An input has no value yet.
+        """
+        if not self.inputs:
+            return known, ()
+        values, held = {}, []
+        for name in self.inputs:
+            value = named.get(name, np.nan)
+            if math.isnan(value) and name not in self.optional:
+                if name not in set(known):
+                    needed = [c for c in self.inputs if c not in self.optional]
+                    raise MissingInputError(
+                        f"input '{name}' has no value in the first sample, nor before; start where "
+                        f"all of {needed} have one."
+                    )
+                value = known[name]
+                held.append(name)
+            values[name] = value
+        return Inputs(values), tuple(held)
+
+    def planned(
+        self, inputs: Mapping[str, ArrayLike], times: Iterable[float], t: float, known: Inputs
+    ) -> list[Inputs]:
+        """Return all inputs at each of some times to come.
+
+        Parameters
+        ----------
+        inputs
+            Channel -> its value, or one for each time.
+        t, known
+            Of the last sample.
+        """
+        times, planned, last = list(times), [], known
+        plans = {name: plan(name, values, len(times)) for name, values in inputs.items()}
+        for k, when in enumerate(times):
+            named = self._named({name: float(values[k]) for name, values in plans.items()})
+            if when == t:  # the last sample itself: where sensors are that move is known
+                named = {**last, **{name: v for name, v in named.items() if not np.isnan(v)}}
+            last, _ = self.filled(named, last)
+            planned.append(last)
+        return planned
