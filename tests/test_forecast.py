@@ -194,6 +194,13 @@ def test_a_forecast_too_far_away_says_so():
         identifier.forecast(1e6)
 
 
+def test_a_sensor_that_does_not_exist_is_told():
+    model = heat(line(10), lp.Scalar(0.1, std=0.05))
+    found = lp.Identifier(model, SENSORS, lp.GradientLaw()).forecast(1.0)
+    with pytest.raises(lp.SampleError, match="no sensor is called 'T_99'; there are"):
+        found["T_99"]
+
+
 def test_a_step_that_fails_is_the_status_of_the_forecast():
     model = lp.Model(
         lp.Field(line(10), ElementLineP1()),

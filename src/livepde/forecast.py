@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from livepde.errors import SampleError
 from livepde.fem import Moment
 from livepde.laws import AnyLaw, Belief, Problem, Status
 from livepde.linalg import Array
@@ -43,7 +44,11 @@ class Forecast:
     status: Status
 
     def __getitem__(self, name: str) -> Array:
-        """Return what one sensor will show, shape (times,)."""
+        """Return what one sensor will show, shape (times,); `SampleError` if there is none."""
+        if name not in self.names:
+            raise SampleError(
+                f"forecast: no sensor is called '{name}'; there are {list(self.names)}."
+            )
         column: Array = self.z[:, self.names.index(name)]
         return column
 

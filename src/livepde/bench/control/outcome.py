@@ -158,14 +158,14 @@ PROBLEMS: Mapping[str, Contest] = {
     ),
     "wall": Contest(
         wall,
-        [Setting(24, 1.0, 1.0), Setting(48, 1.0, 10.0)],
+        both(Setting(24, 1.0, 1.0), Setting(48, 1.0, 10.0)),
         ["air", "heater", "k[masonry]", "k[insulation]"],
         linear=False,
         shown=1,  # the first one has nearly the wall that is believed in
     ),
     "battery": Contest(
         battery,
-        [Setting(16, 1.0, 1.0), Setting(30, 1.0, 1.0)],
+        both(Setting(16, 1.0, 1.0), Setting(30, 1.0, 1.0)),
         ["mean", "surface", "I", "D"],
         linear=False,
     ),
