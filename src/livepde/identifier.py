@@ -28,7 +28,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
-from livepde.samples import Sample, number, numbers, plan, readings
+from livepde.samples import Sample, labelled, number, numbers, plan, readings, sample_of
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
@@ -379,7 +379,7 @@ class Identifier:
         """
         result = Result(self.model, self.observed, self.withheld, fields_every)
         for item in _watched(stream, progress, total):
-            sample = item if isinstance(item, Sample) else Sample(*item)
+            sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
             result.add(estimate)
             if on_estimate is not None:
@@ -400,6 +400,7 @@ class Identifier:
     ) -> tuple[Array, Array, dict[str, float]]:
         """Return assimilated values, withheld values, and inputs, all checked."""
         hidden = self.withheld.names if self.withheld else ()
+        z = z if isinstance(z, np.ndarray) else labelled(z)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             unknown = [name for name in (*z, *inputs) if name not in self.channels]
             if unknown:
