@@ -301,3 +301,40 @@ def test_substeps_are_those_made_by_hand():
         found = by_hand.step(0.1 * k, z)
     np.testing.assert_allclose(estimate.u, found.u, atol=1e-6)
     np.testing.assert_allclose(estimate.q, found.q, atol=1e-6)
+
+
+def test_rows_of_a_pandas_table_count_by_name():
+    import pandas as pd
+
+    rows = [sample(0.1), sample(0.2, a=0.4, b=0.1), sample(0.3, b=0.7)]
+    table = pd.DataFrame([values for _, values in rows], index=[t for t, _ in rows])
+    expected = identifier().run(rows).last
+    swapped = table[["b", "heat", "a", "T_end", "c"]]
+    found = identifier().run(swapped.iterrows()).last
+    assert np.array_equal(found.u, expected.u)
+    by_step = identifier()
+    for t, row in swapped.iterrows():
+        last = by_step.step(t, row)
+    assert np.array_equal(last.u, expected.u)
+
+
+@pytest.mark.parametrize("kind", ["columns", "tuples", "records"])
+def test_a_stream_that_gives_no_samples(kind):
+    import pandas as pd
+
+    table = pd.DataFrame([{"t": t, **values} for t, values in (sample(0.1), sample(0.2))])
+    streams = {"columns": table, "tuples": table.itertuples(), "records": table.to_dict("records")}
+    with pytest.raises(lp.SampleError, match=r"a stream gives \(t, z\).* by \.iterrows\(\)"):
+        identifier().run(streams[kind])
+
+
+def test_numbers_where_something_else_is_expected():
+    mesh = lp.interval(0.0, 1.0, 4)
+    with pytest.raises(lp.SpaceError, match=r"got 0\.5 as an unknown; expected Scalar"):
+        lp.Model(lp.Field(mesh, ElementLineP1()), {"k": 0.5}, A=lambda q, u, v, x: q.k * u * v)
+    with pytest.raises(lp.SpaceError, match=r"cells >= 1, whole"):
+        lp.interval(0.0, 1.0, 2.5)
+    with pytest.raises(lp.SpaceError, match="got 'interpolate'; expected a number, or a function"):
+        identifier(u0="interpolate")
+    with pytest.raises(lp.ObservationError, match=r"noise: got \{'a': 0\.1\}; expected one number"):
+        lp.Identifier(rod(), lp.Points({"a": 0.3}, noise={"a": 0.1}), lp.SensitivityLaw())

@@ -163,9 +163,14 @@ def gradient() -> None:
     case("replay = true", "")()
 
 
-@pytest.mark.parametrize(
-    ("mistake", "prepare"), [("nothing to learn", rest), ("the law", gradient)]
-)
+NOTED = {
+    "nothing to learn": rest,
+    "the law": gradient,
+    "a coarse mesh": case("cells = 40  ", "cells = 1  "),
+}
+
+
+@pytest.mark.parametrize(("mistake", "prepare"), NOTED.items())
 def test_what_is_no_mistake_gets_a_note(mistake, prepare, home, monkeypatch, capsys):
     prepare()
     code, out, _ = livepde(RUN, monkeypatch, capsys)
@@ -180,4 +185,4 @@ def test_check_tells_of_data_that_tell_nothing(home, monkeypatch, capsys):
 
 
 def test_the_page_has_these_mistakes_and_no_others():
-    assert set(messages()) == {*MISTAKES, "no Dash", "nothing to learn", "the law"}
+    assert set(messages()) == {*MISTAKES, *NOTED, "no Dash"}

@@ -28,7 +28,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
-from livepde.samples import Sample, number, numbers
+from livepde.samples import Sample, number, numbers, sample_of
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
@@ -364,7 +364,7 @@ class Identifier:
         """
         result = Result(self.model, self.observed, self.withheld, fields_every)
         for item in _watched(stream, progress, total):
-            sample = item if isinstance(item, Sample) else Sample(*item)
+            sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
             result.add(estimate)
             if on_estimate is not None:

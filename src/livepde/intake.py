@@ -14,7 +14,7 @@ from livepde.errors import ConfigurationError, MissingInputError, SampleError
 from livepde.fem import Inputs
 from livepde.linalg import Array
 from livepde.observation import Observed
-from livepde.samples import number, plan, readings
+from livepde.samples import labelled, number, plan, readings
 
 __all__ = ["Intake"]
 
@@ -84,6 +84,7 @@ class Intake:
     ) -> tuple[Array, Array, dict[str, float]]:
         """Return assimilated values, withheld values, and inputs, all checked."""
         hidden = self.hidden
+        z = z if isinstance(z, np.ndarray) else labelled(z)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             unknown = [name for name in (*z, *inputs) if name not in self.channels]
             if unknown:

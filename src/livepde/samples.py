@@ -14,7 +14,7 @@ from livepde.errors import SampleError
 from livepde.linalg import Array
 from livepde.observation import Observed
 
-__all__ = ["Sample", "number", "numbers", "plan", "readings"]
+__all__ = ["Sample", "labelled", "number", "numbers", "plan", "readings", "sample_of"]
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,25 @@ class Sample:
     t: float
     z: ArrayLike | Mapping[str, float]
     inputs: Mapping[str, float] | None = None
+
+
+def sample_of(item: Any) -> Sample:
+    """Return an item of a stream as a sample: it is one, (t, z), or (t, z, inputs)."""
+    if isinstance(item, Sample):
+        return item
+    if isinstance(item, tuple | list) and len(item) in (2, 3):
+        return Sample(*item)
+    raise SampleError(
+        f"a stream gives (t, z), (t, z, inputs) or livepde.Sample; got {item!r:.60}; a pandas "
+        "table whose index are the times and whose columns are channels gives them by .iterrows()."
+    )
+
+
+def labelled(z: Any) -> Any:
+    """Return a row of a pandas table as a mapping: its names count, not its order."""
+    if hasattr(z, "to_dict") and all(isinstance(name, str) for name in z.keys()):  # noqa: SIM118
+        return z.to_dict()
+    return z
 
 
 def number(value: Any, what: str) -> float:

@@ -14,10 +14,11 @@ from livepde import checkpoint
 from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.identifier import Identifier, Sample
+from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, Law, Problem, Report
 from livepde.linalg import Array
 from livepde.result import Estimate
+from livepde.samples import Sample, sample_of
 from livepde.stepping import Interval, Scheme, Stage, StepFailed
 
 __all__ = ["check_law"]
@@ -67,7 +68,7 @@ def check_law(
     >>> report.ok
     True
     """
-    items = [item if isinstance(item, Sample) else Sample(*item) for item in samples]
+    items = [sample_of(item) for item in samples]
     if len(items) < 4:
         raise LawError(f"check_law: needs at least four samples; got {len(items)}.")
 

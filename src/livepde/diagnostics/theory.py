@@ -23,13 +23,14 @@ from livepde.diagnostics.stopping import (
 )
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
-from livepde.identifier import Identifier, Sample
+from livepde.identifier import Identifier
 from livepde.laws.bounds import Constants, Norms
 from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.result import Estimate
+from livepde.samples import Sample, sample_of
 from livepde.streams import Twin
 
 __all__ = ["OnlineTracker", "Sheet", "TheoryReport", "theory_report"]
@@ -295,7 +296,7 @@ def theory_report(
     ConfigurationError
         The stream holds fewer than two samples.
     """
-    items = [item if isinstance(item, Sample) else Sample(*item) for item in samples]
+    items = [sample_of(item) for item in samples]
     if len(items) < 2:
         raise ConfigurationError(f"theory: needs at least two samples; got {len(items)}.")
     if window is None:

@@ -305,7 +305,11 @@ class FieldBlock(Block):
     def interpolate(self, value: Any) -> Array:
         """Return coefficients of a number, or the L2 projection of a function of x."""
         if not callable(value):
-            level = float(value)
+            try:
+                level = float(value)
+            except (TypeError, ValueError):
+                text = f"got {value!r}; expected a number, or a function of x."
+                raise SpaceError(text) from None
             if level == 0.0 or self.nodal:
                 return np.full(self.size, level)
             value = lambda x: np.full(np.shape(x[0]), level)  # noqa: E731
@@ -527,4 +531,9 @@ def block_of(unknown: Unknown) -> Block:
     """Return the block of an unknown."""
     if isinstance(unknown, Field):
         return FieldBlock(unknown)
+    if not isinstance(unknown, Scalars | Scalar | Piecewise):
+        raise SpaceError(
+            f"got {unknown!r} as an unknown; expected Scalar, Piecewise, Scalars or Field, as "
+            "Scalar(0.5, std=0.1)."
+        )
     return NamesBlock(unknown) if isinstance(unknown, Scalars) else ScalarBlock(unknown)

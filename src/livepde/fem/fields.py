@@ -79,12 +79,14 @@ def interval(
     geometric
         Elements grow by a constant ratio, as radial problems want; needs start > 0. Else uniform.
     """
-    if not stop > start or cells < 1:
-        raise SpaceError(f"interval({start}, {stop}, {cells}): needs stop > start and cells >= 1.")
+    if not stop > start or cells < 1 or cells != int(cells):
+        raise SpaceError(
+            f"interval({start}, {stop}, {cells}): needs stop > start and cells >= 1, whole."
+        )
     if geometric and not start > 0:
         raise SpaceError(f"interval({start}, {stop}, geometric=True): needs start > 0.")
     spaced = np.geomspace if geometric else np.linspace
-    mesh = MeshLine(spaced(start, stop, cells + 1))
+    mesh = MeshLine(spaced(start, stop, int(cells) + 1))
     mesh = mesh.with_boundaries(
         {"left": lambda x: np.isclose(x[0], start), "right": lambda x: np.isclose(x[0], stop)}
     )

@@ -232,7 +232,12 @@ class Observed:
         given = self.observation.noise
         if given is None:
             return None
-        noise = np.asarray(given, dtype=float)
+        try:
+            noise = np.asarray(given, dtype=float)
+        except (TypeError, ValueError):
+            raise ObservationError(
+                f"noise: got {given!r}; expected one number, or one for each of {self.names}."
+            ) from None
         if noise.ndim > 1 or (noise.ndim == 1 and noise.shape != (self.size,)):
             raise ObservationError(
                 f"noise: got {noise.size} values for {self.size} sensors; give one, or one each."

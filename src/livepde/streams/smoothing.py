@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ConfigurationError, SampleError
-from livepde.identifier import Sample
 from livepde.linalg import Array
+from livepde.samples import Sample, sample_of
 
 __all__ = ["Exponential", "LocalPolynomial", "Smoothed", "Smoother", "WindowAverage"]
 
@@ -128,7 +128,7 @@ class Smoothed(Iterable[Sample]):
         weights = self.smoother.weights()
         before = -np.inf
         for item in self.stream:
-            sample = item if isinstance(item, Sample) else Sample(*item)
+            sample = sample_of(item)
             t = float(sample.t)
             if not t > before:
                 raise SampleError(
