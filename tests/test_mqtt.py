@@ -30,6 +30,11 @@ pytest.importorskip("paho.mqtt")
 pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 60.0)
+
+
 def source(server: Server, topics=None, **options) -> MqttSource:
     broker = Broker("127.0.0.1", server.port, **options)
     return MqttSource(broker, topics or {"rod": None}, "t")
@@ -96,8 +101,10 @@ def until(run, count: int) -> None:
     run.stopping.clear()
     alarm = threading.Timer(PATIENCE, run.stopping.set)
     alarm.start()
-    run.run()
-    alarm.cancel()
+    try:
+        run.run()
+    finally:
+        alarm.cancel()
 
 
 def test_what_was_not_safe_comes_again(server, tmp_path):
@@ -186,8 +193,8 @@ def test_estimates_wait_for_the_broker_and_the_oldest_give_way(server, tmp_path,
 
 
 def test_a_sink_can_be_closed_while_the_broker_is_away(server, tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 0.5)
     publisher = sink(server)
+    monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 0.5)
     server.stop()
     for estimate in estimates(tmp_path, 40):
         publisher.put(estimate)
@@ -269,7 +276,6 @@ def test_an_acknowledgement_is_never_that_of_another_message(server):
 
 
 def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch):
-    monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 2.0)
     messages = list(rows(60))
     heard = source(server, ahead=5)
     publish(server, messages)
@@ -277,6 +283,7 @@ def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch
     until(run, 60)
     assert len(run.journal) == 60
     assert not run.journal.counts
+    monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 2.0)
     stuck = Gathered(heard, Intake(COLUMNS, Clock("t"), Policy(wait=1e6), origin=0.0))
     publish(server, messages)
     with pytest.raises(lp.DataError, match="messages wait for later ones"):

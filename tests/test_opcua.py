@@ -92,6 +92,11 @@ class Server:
         self.kept.close()
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    monkeypatch.setattr("livepde.streams.opcua.PATIENCE", 60.0)
+
+
 @pytest.fixture(scope="module")
 def plant():
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)

@@ -361,7 +361,7 @@ def test_a_password_comes_from_the_environment(here, monkeypatch):
 
 def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
     wrong = [{"when": k, "left": 20.0, "T_3": 20.0, "T_6": 20.0} for k in range(3)]
-    loaded = cases.load(case(intake='silence = "1 ms"'))
+    loaded = cases.load(case())
     with (
         caplog.at_level("WARNING"),
         Wiring(loaded, Rows(wrong)) as wiring,
@@ -389,7 +389,7 @@ def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
             return []
 
     caplog.clear()
-    with Wiring(loaded, Nothing([])) as wiring:
+    with Wiring(cases.load(case(intake='silence = "1 ms"')), Nothing([])) as wiring:
         assert wiring.live(stopping=Nothing.stopping) is None
         assert wiring.silent
     assert "nothing from the source" in caplog.text
