@@ -142,3 +142,46 @@ def test_a_name_that_is_no_unknown_is_said():
             {"D": lp.Scalar(1.0), "r": lp.Scalar(1.0)},
             A=lambda q, u, v, x: q.d * u * v,
         )
+
+
+def heated(source):
+    """A reaction with a source, and its inputs."""
+    model = reaction(line(), ElementLineP1(), f=source, inputs=("Q",))
+    return model, Inputs({"Q": 3.0})
+
+
+def test_a_source_is_evaluated_again_only_where_it_may_have_changed():
+    counts = {"evaluated": 0}
+
+    def held(x, t):
+        counts["evaluated"] += 1
+        return x.inputs["Q"] + x[0]
+
+    model, first = heated(held)
+    counts["evaluated"] = 0
+    found = [model.F(Moment(t, first)) for t in (0.0, 0.5, 1.0)]
+    assert counts["evaluated"] == 1
+    assert found[0] is found[2]
+    second = Inputs({"Q": 4.0})
+    np.testing.assert_allclose((model.F(Moment(1.0, second)) - found[0]).sum(), 1.0)
+    assert counts["evaluated"] == 2
+    changing = {"Q": 3.0}  # a dictionary may change behind its back
+    np.testing.assert_array_equal(model.F(Moment(1.0, changing)), found[0])
+    changing["Q"] = 4.0
+    np.testing.assert_allclose((model.F(Moment(1.0, changing)) - found[0]).sum(), 1.0)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        lambda x, t: t * x[0],
+        lambda x, t: x.t * x[0],
+        lambda x, t: x.t if x.inputs["Q"] > 2.0 else 0.0,  # not on the branch that is probed
+        lambda x, *rest: rest[0] * x[0],
+    ],
+)
+def test_a_source_that_may_read_the_time_is_evaluated_at_every_time(source):
+    model, inputs = heated(source)
+    early, late = (model.F(Moment(t, inputs)) for t in (1.0, 2.0))
+    np.testing.assert_allclose(late, 2.0 * early)
+    assert early.any()

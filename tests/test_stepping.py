@@ -14,7 +14,17 @@ from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Pattern, analyse
-from livepde.stepping import TINY, ForwardStage, Near, Parts, StepFailed, advance, simulate
+from livepde.stepping import (
+    TINY,
+    ForwardStage,
+    Interval,
+    Kept,
+    Near,
+    Parts,
+    StepFailed,
+    advance,
+    simulate,
+)
 
 SCHEMES = {"euler": lp.ImplicitEuler(), "alexander": lp.Alexander2()}
 
@@ -325,6 +335,49 @@ def test_forward_stage_of_an_affine_model_is_one_factorisation():
     residual = model.mass @ (first - u) / 0.1 + model.B(first) + model.A(first)(q)
     residual = (residual - model.F(Moment(0.1))) * model.X.free
     np.testing.assert_allclose(residual, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("transform", [None, "log"])
+def test_the_matrix_of_a_stage_is_assembled_once_for_each_parameter(transform):
+    calls = []
+
+    class Counted(ForwardStage):
+        def _data_at(self, q, h, moment):
+            calls.append(q)
+            return super()._data_at(q, h, moment)
+
+    unknown = lp.Scalar(2.0, std=1.0, transform=transform)
+    mesh = line(8)
+    model = lp.Model(
+        lp.Field(mesh, ElementLineP1()),
+        unknown,
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: u * v,
+    )
+    forward, q = Counted(model), model.latent.prior
+    c = np.column_stack([mesh.p[0] ** 2, mesh.p[0]])
+    directions, kept = np.ones((1, 1)), Kept.none()
+    assert not forward.solver.price  # the choice of an engine looks at matrices of its own
+    calls.clear()
+    found, _ = forward.advance(c, q, directions, 0.1, Moment(0.1), kept)
+    np.testing.assert_allclose(calls, [[2.0]])  # of the physical parameter
+    forward.advance(found, q, directions, 0.1, Moment(0.2), kept)
+    assert len(calls) == 1
+    # The tangent is the derivative along a change of the physical parameter.
+    step = 1e-6
+    moved = model.latent.inverse(np.array([2.0 + step]))
+    near = ForwardStage(model).solve(c[:, 0] + step * c[:, 1], moved, 0.1, Moment(0.1))
+    np.testing.assert_allclose((near - found[:, 0]) / step, found[:, 1], atol=1e-5)
+
+
+def test_held_inputs_are_held_exactly():
+    held = lp.Advance(lp.Alexander2(), hold=True)
+    between = held.over(
+        Interval(0.0, 1.0, Inputs({"Q": 5.0}), Inputs({"Q": 0.1}), *[np.ones(1)] * 2)
+    )
+    assert between.at(1.0 / 3.0).inputs["Q"] == between.at(1.0).inputs["Q"] == 0.1
+    assert between.at(1.0 / 3.0).inputs is between.at(1.0).inputs
+    assert held.over(between) is between
 
 
 def test_shortcuts_of_affine_models_do_not_change_the_numbers():
