@@ -100,6 +100,7 @@ def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
         ("", "holds no rows beside its header."),
         ("time,T_1\ns,K\n0,20\n", "row 2: holds no numbers; the header is one line"),
         ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column holds times: expected dates, or numbers"),
+        (",T\n2025-04-01,20\n2025-04-02,20\n", "Column 1 has no name: give it one."),
         ("time_s,note\n0,a\n1,b\n", "beside the times, 'time_s', no column holds numbers"),
         ("day,at,T\n2025-04-01,12:00,20\n2025-04-01,12:10,20\n", "join them in one column"),
         ("time_s,T\n0,20\n20,20\n10,20\n", "row 4, column 'time_s': the time is earlier"),
@@ -136,6 +137,15 @@ def test_what_loggers_write_for_no_value_is_missing(here):
 def test_a_day_and_a_month_that_may_be_swapped_are_asked_for(here):
     begun("time,T\n03/02/2026 08:00,20\n03/02/2026 08:10,20\n")
     assert "the day first, or the month?" in Path("mine/case.toml").read_text()
+
+
+def test_names_that_are_alike_without_signs_and_units(here):
+    found = begun("time_s,T 1,T-1,T [K],T [degC],[K],state\n0,1,1,1,1,1,ok\n1,1,1,1,1,1,ok\n")
+    assert set(found["channels"]) == {"T 1", "T-1", "T [K]", "T [degC]", "[K]"}
+
+
+def test_more_words_than_numbers_in_a_row(here):
+    assert begun("time_s,T,a,b,c\n0,20,x,y,z\n1,20,x,y,z\n")["channels"].keys() == {"T"}
 
 
 def test_inputs_and_units_of_another_equation(here):

@@ -145,12 +145,12 @@ def _kinds(table: Path, written: Written) -> dict[str, str]:
 
     if all(_kind(cell, written) in ("number", "date") for cell in header if cell):
         raise SampleError(f"{table}: has no header: begin it with a line of names of its columns.")
-    if sum(map(bool, header)) < 2:
+    if len(header) < 2:
         raise SampleError(
             f"{table}: has one column, '{header[0]}'; expected times and measurements, with a "
             "comma, a semicolon or a tab between them."
         )
-    if kind(rows[0]) == "text":
+    if not any(_kind(cell, written) in ("number", "date") for cell in rows[0]):
         raise SampleError(
             f"{table}, row 2: holds no numbers; the header is one line: delete the second."
         )
@@ -183,9 +183,12 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> str:
     rising = [name for name in numbers if _rises(name, written)]
     found = [*dates, *(name for name in timed if name in rising), *rising, *timed]
     if not found:
+        nameless = ""
+        if "" in written.header:
+            nameless = f" Column {written.header.index('') + 1} has no name: give it one."
         raise SampleError(
             f"{table}: no column holds times: expected dates, or numbers that increase from row to "
-            "row."
+            f"row.{nameless}"
         )
     return found[0]
 
@@ -226,8 +229,9 @@ def _written(written: Written, samples: Table, unit: str) -> Iterator[str]:
 def _channels(equation: Equation, names: list[str], samples: Table) -> Iterator[str]:
     """Yield the lines of the channels, those of inputs that no column is named after at the end."""
     inputs = {name: item for name, item in equation.inputs.items() if not item.optional}
-    for name, values in zip(names, samples.values.T, strict=True):
-        key = re.sub(r"\W+", "_", UNIT.sub("", name)).strip("_") or name
+    keys = [re.sub(r"\W+", "_", UNIT.sub("", name)).strip("_") for name in names]
+    for key, name, values in zip(keys, names, samples.values.T, strict=True):
+        key = key if key and keys.count(key) == 1 else name
         told, variable = [_range(values)], inputs.pop(key, None)
         given = {"role": "input" if variable else "sensor", "column": name}
         if variable is None:
