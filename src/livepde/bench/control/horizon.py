@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -71,6 +70,11 @@ class MovingHorizon:
         The task; its periods are steps of Radau's method, do-mpc's default.
     setting
         Window and weights.
+
+    Attributes
+    ----------
+    mhe
+        do-mpc's object.
     """
 
     def __init__(self, problem: Problem, setting: Setting) -> None:
@@ -84,6 +88,7 @@ class MovingHorizon:
         self._c = np.zeros((count, len(model.channels)))
         self._x = np.zeros((count + 1, model.size))
         self._taken = 0
+        self.mhe = self._built()  # here: a sample is not charged for it
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         """Take a sample, as an `Estimator` does; the first one describes the start."""
@@ -161,9 +166,8 @@ class MovingHorizon:
             found.append(prior * exp(std / prior * p[k]) if positive else prior + std * p[k])
         return found
 
-    @cached_property
-    def mhe(self) -> Any:
-        """do-mpc's object."""
+    def _built(self) -> Any:
+        """Return do-mpc's object."""
         do_mpc, casadi = packages()
         period, setting = self.problem.period, self.setting
         model, scale = self.coordinates.model, self.coordinates.scale
