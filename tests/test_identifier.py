@@ -338,3 +338,20 @@ def test_numbers_where_something_else_is_expected():
         identifier(u0="interpolate")
     with pytest.raises(lp.ObservationError, match=r"noise: got \{'a': 0\.1\}; expected one number"):
         lp.Identifier(rod(), lp.Points({"a": 0.3}, noise={"a": 0.1}), lp.SensitivityLaw())
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ((SENSORS, rod(), lp.SensitivityLaw()), "place of the model stands Points"),
+        ((rod(), lp.SensitivityLaw(), SENSORS), "place of the observation stands Sensitivity"),
+        (
+            (rod(), SENSORS, lp.SensitivityLaw),
+            "place of the law stands .*Law'>: call it",
+        ),
+        ((rod(), SENSORS, "gradient"), "place of the law stands 'gradient'"),
+    ],
+)
+def test_what_is_no_part_of_an_identifier_is_said(parts, words):
+    with pytest.raises(lp.ConfigurationError, match=words):
+        lp.Identifier(*parts)

@@ -23,7 +23,7 @@ from livepde.errors import (
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
 from livepde.intake import Intake
-from livepde.laws import AnyLaw, Belief, Problem, Report, Status
+from livepde.laws import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
@@ -85,6 +85,14 @@ class Identifier:
         assimilate_from: float = -np.inf,
         hold: bool = False,
     ) -> None:
+        given = (model, Model), (observation, Observation), (law, Law)
+        for part, kind in given:
+            if not isinstance(part, kind):
+                remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
+                raise ConfigurationError(
+                    "Identifier(model, observation, law): in the place of the "
+                    f"{kind.__name__.lower()} stands {part!r:.80}{remedy}."
+                )
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
         if not np.isfinite(t0):
