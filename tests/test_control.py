@@ -555,7 +555,10 @@ def told(**changes: Any) -> Any:
     [
         ({}, ""),
         ({"status": lp.Status("singular", "no way")}, "the step failed"),
-        ({"notes": {"innovation_ratio": 9.0}}, "innovations are 3.0 times as large"),
+        (
+            {"notes": {"innovation_ratio": 9.0}},
+            "innovations are 3.0 times as large as expected; look at dt_max",
+        ),
         ({"q_std": np.array([20.0])}, "known to 20 only"),
         ({"q_std": np.array([np.nan])}, "only"),
         ({"q_std": None}, "no covariance"),

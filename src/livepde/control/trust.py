@@ -62,7 +62,7 @@ class Trust:
         if not misfit <= self.misfit:
             return (
                 f"the model does not explain the data: innovations are {math.sqrt(misfit):.1f} "
-                "times as large as expected"
+                "times as large as expected; look at dt_max, the noise, and what it lacks"
             )
         if estimate.q_std is None:
             return "the law has no covariance: take SensitivityLaw"
