@@ -110,7 +110,7 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     undisturbed.run()
     here = str(Path(__file__).parent)
     rng, kills = np.random.default_rng(1), 0
-    for samples in (0, 60, 0, 200, 40, 100):
+    for samples in (0, 150, 0, 200):
         fuse = str(samples), f"{rng.uniform(0.001, 0.012)}"  # and seconds of a processor
         child = subprocess.run([sys.executable, "-c", CHILD, str(killed), here, *fuse], check=False)
         assert child.returncode in (0, -signal.SIGPROF)
@@ -118,7 +118,7 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     rest = live(killed)
     rest.resume()
     rest.run()
-    assert kills >= 4
+    assert kills == 4
     same(rest.journal, undisturbed.journal)
     assert rest.journal.accepted == 700
 
