@@ -278,7 +278,7 @@ class Run:
             told = "".join(f" {note}" for note in self.notes)
             raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.{told}")
         try:
-            return xr.load_dataset(path, engine="scipy")
+            return xr.load_dataset(path, engine="scipy", mmap=False)
         except (OSError, ValueError, TypeError, LookupError, MemoryError) as error:
             raise RunError(f"{path} is damaged: {error}.") from error
 
