@@ -98,6 +98,7 @@ class Model:
         Integrand (u, v, x), linear in v.
     f
         Source density: a number or f(x, t); for several components a mapping of names to those.
+        Like A and B it is evaluated once for each set of inputs if it reads no time.
     M
         Integrand (u, v, x) of the mass term, symmetric positive; default u v, or the sum of these
         products over the components.
