@@ -86,7 +86,7 @@ bench: $(READY)  ## Measure what one step costs
 	@$(BIN)/livepde bench step
 
 lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest versions
-	@$(UV) pip compile --quiet --upgrade --python $(BIN)/python --extra dev --no-header --no-annotate \
+	@$(UV) pip compile --quiet --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
 	  --output-file constraints.txt pyproject.toml
 	@echo "Renewed constraints.txt: read the difference, then run 'make check test versions'."
 
