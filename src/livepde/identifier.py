@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
+from livepde.channels import Channels
 from livepde.errors import (
     ConfigurationError,
     MissingInputError,
@@ -22,7 +23,6 @@ from livepde.errors import (
 )
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
-from livepde.intake import Intake
 from livepde.laws import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.model import Model
@@ -105,7 +105,7 @@ class Identifier:
         control = Advance(scheme or ImplicitEuler(), dt_max, hold=hold)
         self.problem = Problem(model, self.observed, control)
         self.assimilate_from = assimilate_from
-        self._intake = Intake(model.channels, self.observed, self.withheld)
+        self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
         if u0 is not None and model.form_initial is not None:
@@ -171,17 +171,17 @@ class Identifier:
     @property
     def channels(self) -> tuple[str, ...]:
         """Every channel a sample may name."""
-        return self._intake.channels
+        return self._channels.names
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Channels that the model and the sensors read."""
-        return self._intake.inputs
+        return self._channels.inputs
 
     @property
     def optional_inputs(self) -> frozenset[str]:
         """Inputs that may be missing: positions of moving sensors."""
-        return self._intake.optional
+        return self._channels.optional
 
     def step(
         self,
@@ -207,8 +207,8 @@ class Identifier:
         t = number(t, "time t")
         if math.isnan(t):
             raise SampleError("time t is NaN; give the time of the sample.")
-        measured, withheld, named = self._intake.parse(z, inputs or {})
-        values, held = self._intake.filled(named, self._inputs)
+        measured, withheld, named = self._channels.parse(z, inputs or {})
+        values, held = self._channels.filled(named, self._inputs)
         first = self._samples == 0
         self._reachable(t)
         if t < self._t or (t == self._t and not first):
@@ -330,7 +330,7 @@ class Identifier:
                 f"{t.tolist()}."
             )
         self._reachable(float(t[-1]))
-        planned = self._intake.planned(inputs or {}, t.tolist(), self._t, self._inputs)
+        planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._inputs)
         state, before = self._state, self._inputs
         if state is None:
             state, before = self._start(planned[0]), planned[0]
@@ -342,7 +342,7 @@ class Identifier:
                 [(self._t, before, self._z), *ends]
             )
         ]
-        sensors = self._intake.sensors
+        sensors = self._channels.sensors
         return ahead(self.law, self._work, self.problem, sensors, state, intervals)
 
     def run(

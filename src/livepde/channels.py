@@ -1,4 +1,4 @@
-"""What a sample brings to an identifier: its channels, their values, and what holds in a gap."""
+"""The channels of an identifier: what a sample brings by name, and what holds in a gap."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from livepde.linalg import Array
 from livepde.observation import Observed
 from livepde.samples import labelled, number, plan, readings
 
-__all__ = ["Intake"]
+__all__ = ["Channels"]
 
 NOTHING = np.zeros(0)  # withheld sensors without a value
 
 
 @dataclass(frozen=True, eq=False)
-class Intake:
+class Channels:
     """Names of all channels, and samples as checked arrays.
 
     Parameters
@@ -61,7 +61,7 @@ class Intake:
         return [item for item in (self.observed, self.withheld) if item is not None]
 
     @cached_property
-    def channels(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """Every channel a sample may name."""
         return tuple(dict.fromkeys([*self.observed.names, *self.hidden, *self.inputs]))
 
@@ -86,10 +86,10 @@ class Intake:
         hidden = self.hidden
         z = z if isinstance(z, np.ndarray) else labelled(z)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
-            unknown = [name for name in (*z, *inputs) if name not in self.channels]
+            unknown = [name for name in (*z, *inputs) if name not in self.names]
             if unknown:
                 raise SampleError(
-                    f"unknown channel '{unknown[0]}'; this identifier has {list(self.channels)}."
+                    f"unknown channel '{unknown[0]}'; this identifier has {list(self.names)}."
                 )
             values = {name: number(value, f"channel '{name}'") for name, value in z.items()}
             measured = np.array([values.get(name, np.nan) for name in self.observed.names])
