@@ -717,6 +717,38 @@ def test_a_loop_lets_through_what_actuators_can_do(answer, applied, set_to, says
     assert says in action.status
 
 
+def test_a_memory_that_is_not_finite_is_not_kept():
+    seen = []
+
+    class Remembers(Own):
+        def start(self) -> Any:
+            return np.zeros(1)
+
+        def decide(self, known: ct.Known, plan: ct.Plan, before: Any, memory: Any) -> ct.Decision:
+            seen.append(memory.tolist())
+            return ct.Decision(np.array(self.answer), "ok", np.array(self.answer))
+
+    loop = ct.Loop(identifier(), Remembers([0.5]))
+    for k, answer in enumerate([0.5, np.nan, 0.25, 0.25]):
+        loop.controller.answer = [answer]
+        loop.step(k * PERIOD, [ROOM] * 2, {"room": ROOM}, reference={"tip": 45.0})
+    assert seen == [[0.0], [0.5], [0.5], [0.25]]
+
+
+def test_a_row_of_a_pandas_table_counts_by_name_for_all_of_a_loop():
+    import pandas as pd
+
+    loops = [ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD)) for _ in range(2)]
+    named = {"T_10": 23.0, "T_5": 21.0, "room": ROOM}
+    for k in range(3):
+        one, other = (
+            loop.step(k * PERIOD, z, reference={"tip": 45.0})
+            for loop, z in zip(loops, (named, pd.Series(named)), strict=True)
+        )
+    assert one.inputs == other.inputs
+    assert one.known.x.tolist() == other.known.x.tolist()
+
+
 def test_a_controller_that_raises_leaves_a_loop_that_goes_on():
     loop = ct.Loop(identifier(), Own(ZeroDivisionError("bang")))
     with pytest.raises(ZeroDivisionError, match="bang"):

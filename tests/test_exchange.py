@@ -236,6 +236,17 @@ def test_with_a_period_short_steps_are_not_taken_for_measurements(unit):
             assert found == shown[t][:-1]
 
 
+def test_a_step_that_takes_no_sample_does_not_use_up_its_period(unit):
+    with running(unit, 0.0) as instance:
+        instance.set(["sample_period"], [20.0])
+        found = []
+        for k in range(8):
+            instance.set(INPUTS, [20.0 if k % 2 else math.nan] * 4)
+            instance.step(10.0 * k, 10.0)
+            found += instance.get(["estimate_time"])
+    assert found[1:] == [10.0, 20.0, 20.0, 40.0, 40.0, 60.0, 60.0]  # at 0 it could not begin
+
+
 def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
     (tmp_path / "own.py").write_text(
         "import livepde as lp\n"

@@ -144,6 +144,22 @@ def test_names_that_are_alike_without_signs_and_units(here):
     assert set(found["channels"]) == {"T 1", "T-1", "T [K]", "T [degC]", "[K]"}
 
 
+def test_names_whose_numbers_are_no_places(here):
+    names = ["depth -0.5 m", "Q_5 m3/h", "flux_30_m2", "T 0.5 m"]
+    found = begun(f"time_s,{','.join(names)}\n0,1,1,1,1\n1,1,1,1,1\n")["channels"]
+    places = [item["at"] for item in found.values()]
+    assert places == ["? m", "? m", "? m", "0.5 m"]
+
+
+def test_a_case_behind_a_link_finds_its_table(here):
+    (here / "far" / "away").mkdir(parents=True)
+    (here / "link").symlink_to(here / "far" / "away")
+    (here / "table.csv").write_text("time_s,T\n0,1\n1,1\n")
+    write_template(Path("link/mine"), Path("table.csv"), EQUATIONS["heat"])
+    document = tomllib.loads(Path("link/mine/case.toml").read_text())
+    assert (here / "link" / "mine" / document["data"]["file"]).is_file()
+
+
 def test_more_words_than_numbers_in_a_row(here):
     assert begun("time_s,T,a,b,c\n0,20,x,y,z\n1,20,x,y,z\n")["channels"].keys() == {"T"}
 

@@ -318,12 +318,28 @@ def test_rows_of_a_pandas_table_count_by_name():
     assert np.array_equal(last.u, expected.u)
 
 
-@pytest.mark.parametrize("kind", ["columns", "tuples", "records"])
+def test_samples_of_other_tables():
+    import pandas as pd
+
+    twice = pd.Series([1.0, 2.0, 3.0], index=["a", "b", "b"])
+    with pytest.raises(lp.SampleError, match="two values of the sample have the same name"):
+        identifier(withheld=None).step(0.1, twice, {"heat": 1.0, "T_end": 0.0})
+    _, named = sample()
+    expected = identifier().step(0.1, named).u
+    by_names = xr.Dataset({name: ((), value) for name, value in named.items()})
+    assert np.array_equal(identifier().step(0.1, by_names).u, expected)
+    plain, inputs = identifier(withheld=None), {"heat": 1.0, "T_end": 0.5}
+    by_order = identifier(withheld=None).step(0.1, [0.1, 0.2], inputs).u
+    assert np.array_equal(plain.step(0.1, xr.DataArray([0.1, 0.2]), inputs).u, by_order)
+
+
+@pytest.mark.parametrize("kind", ["columns", "tuples", "two channels", "records"])
 def test_a_stream_that_gives_no_samples(kind):
     import pandas as pd
 
     table = pd.DataFrame([{"t": t, **values} for t, values in (sample(0.1), sample(0.2))])
     streams = {"columns": table, "tuples": table.itertuples(), "records": table.to_dict("records")}
+    streams["two channels"] = table[["a", "b"]].itertuples()
     with pytest.raises(lp.SampleError, match=r"a stream gives \(t, z\).* by \.iterrows\(\)"):
         identifier().run(streams[kind])
 

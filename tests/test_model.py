@@ -171,6 +171,11 @@ def test_a_source_is_evaluated_again_only_where_it_may_have_changed():
     np.testing.assert_allclose((model.F(Moment(1.0, changing)) - found[0]).sum(), 1.0)
 
 
+def behind(x):
+    """Read the time in a helper, on a branch that is not probed."""
+    return x.t if x.inputs["Q"] > 2.0 else 0.0
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -178,6 +183,8 @@ def test_a_source_is_evaluated_again_only_where_it_may_have_changed():
         lambda x, t: x.t * x[0],
         lambda x, t: x.t if x.inputs["Q"] > 2.0 else 0.0,  # not on the branch that is probed
         lambda x, *rest: rest[0] * x[0],
+        lambda x, t: behind(x),
+        lambda x, t: sum(x.t * k for k in (1.0, 2.0)) if x.inputs["Q"] > 2.0 else 0.0,
     ],
 )
 def test_a_source_that_may_read_the_time_is_evaluated_at_every_time(source):

@@ -98,7 +98,7 @@ class Model:
         Integrand (u, v, x), linear in v.
     f
         Source density: a number or f(x, t); for several components a mapping of names to those.
-        Like A and B it is evaluated once for each set of inputs if it reads no time.
+        It is evaluated once for each set of inputs if it reads no time.
     M
         Integrand (u, v, x) of the mass term, symmetric positive; default u v, or the sum of these
         products over the components.
@@ -335,6 +335,7 @@ class Model:
         if "t" not in uses and kept is not None and (not uses or kept[0] is moment.inputs):
             return kept[1]
         source = self.form_F.vector("v", moment)
+        uses = self.form_F.uses  # with what this evaluation has read
         if not uses or isinstance(moment.inputs, Inputs):  # which never change
             self._source = (moment.inputs, source)
         return source

@@ -42,7 +42,9 @@ def sample_of(item: Any) -> Sample:
     if isinstance(item, Sample):
         return item
     if isinstance(item, tuple | list) and len(item) in (2, 3):
-        return Sample(*item)
+        *_, last = item
+        if len(item) == 2 or last is None or isinstance(last, Mapping):
+            return Sample(*item)
     raise SampleError(
         f"a stream gives (t, z), (t, z, inputs) or livepde.Sample; got {item!r:.60}; a pandas "
         "table whose index are the times and whose columns are channels gives them by .iterrows()."
@@ -51,9 +53,14 @@ def sample_of(item: Any) -> Sample:
 
 def labelled(z: Any) -> Any:
     """Return a row of a pandas table as a mapping: its names count, not its order."""
-    if hasattr(z, "to_dict") and all(isinstance(name, str) for name in z.keys()):  # noqa: SIM118
-        return z.to_dict()
-    return z
+    if isinstance(z, Mapping) or not (hasattr(z, "to_dict") and hasattr(z, "keys")):
+        return z  # an xarray.Dataset is a mapping already, a DataArray has no names
+    if not all(isinstance(name, str) for name in z.keys()):  # noqa: SIM118
+        return z
+    named: dict[str, Any] = z.to_dict()
+    if len(named) < len(z):
+        raise SampleError("two values of the sample have the same name; rename one.")
+    return named
 
 
 def number(value: Any, what: str) -> float:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from livepde.cases.read import did_you_mean
+from livepde.cases.read import beside, did_you_mean
 from livepde.errors import CaseError, LivepdeError
 from livepde.streams.names import no_file
 
@@ -66,7 +65,7 @@ def check_options(function: Any, given: Iterable[str], where: str) -> None:
 def _no_code(path: Path, source: str, folder: Path) -> str:
     """Return a sentence about code that is not beside the case, but perhaps where the user is."""
     if Path(source).is_file():
-        there = Path(os.path.relpath(source, folder)).as_posix()
+        there = beside(Path(source), folder).as_posix()
         return f"there is no file '{path}', beside the case; did you mean '{there}'?"
     return str(no_file(path))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -13,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from livepde.cases.read import BLANK
+from livepde.cases.read import BLANK, beside
 from livepde.cases.settings import toml_line
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, SampleError
@@ -28,7 +27,8 @@ __all__ = ["parts_of"]
 
 UNIT = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
 TIME = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
-PLACE = re.compile(r"(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z])")  # T_5cm, depth 0.05 m
+# T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
+PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?")
 EITHER = re.compile(r"%[dm][/-]%[dm][/-]")  # day and month: a table does not always tell which
@@ -62,7 +62,7 @@ def parts_of(table: Path, folder: Path, equation: Equation) -> dict[str, str]:
         separator=written.separator,
         encoding=written.encoding,
     )
-    file = table if table.is_absolute() else Path(os.path.relpath(table, folder))
+    file = table if table.is_absolute() else beside(table, folder)
     unit = equation.time_unit
     if unit:
         unit = "s" if samples.origin else _unit(time, unit, UNIT, TIME) or BLANK

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
@@ -31,7 +32,7 @@ from livepde.cases.schema import (
 )
 from livepde.errors import CaseError
 
-__all__ = ["BLANK", "did_you_mean", "read_spec", "read_text", "read_toml"]
+__all__ = ["BLANK", "beside", "did_you_mean", "read_spec", "read_text", "read_toml"]
 
 BLANK = "?"  # how a value begins that is still to be filled in
 LONGEST = 1_000_000  # bytes of a case file
@@ -139,6 +140,14 @@ def _blanks(value: Any, key: str = "") -> Iterator[str]:
             yield from _blanks(item, f"{key}.{name}" if key else name)
     elif isinstance(value, str) and value.split(" ")[0] == BLANK:
         yield key
+
+
+def beside(path: Path, folder: Path) -> Path:
+    """Return where a file is, seen from a folder; whole where it is on another drive."""
+    try:  # '..' of a link leads away from what it links to
+        return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve()))
+    except ValueError:
+        return path.absolute()
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

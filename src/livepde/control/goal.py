@@ -182,7 +182,7 @@ class Controller(Protocol):
         """Number of periods that it looks ahead."""
 
     def start(self) -> Array:
-        """Return the memory before the first sample."""
+        """Return the memory before the first sample, of the shape that it keeps."""
 
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
         """Return what to set from now on.

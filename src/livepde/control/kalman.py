@@ -14,7 +14,7 @@ from livepde.control.known import Known
 from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderError
 from livepde.linalg import Array
-from livepde.samples import number, readings
+from livepde.samples import labelled, number, readings
 
 __all__ = ["Kalman"]
 
@@ -123,7 +123,7 @@ class Kalman:
         TimeOrderError
             t is not later than the sample before.
         """
-        sensors, r = self.model.sensors.names, self.model.size
+        sensors, r, z = self.model.sensors.names, self.model.size, labelled(z)
         if isinstance(z, Mapping):
             unknown = [name for name in z if name not in sensors]
             if unknown:

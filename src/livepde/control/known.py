@@ -30,8 +30,8 @@ class Known:
         nothing. It acts on the state.
     model
         The reduced model about the estimate, where it depends on where it is taken: unknown fields,
-        models that are not affine in u. None: that of the controller. Its basis and its outputs are
-        those of the controller's.
+        models that are not affine in u. None: that of the controller. Its basis is that of the
+        controller's; a controller takes its own outputs.
     source, why
         "estimate", or "fallback" and why the estimate is not trusted.
     """

@@ -20,7 +20,7 @@ from livepde.errors import ConfigurationError, RunError, SampleError
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.result import Estimate
-from livepde.samples import number, numbers
+from livepde.samples import labelled, number, numbers
 
 __all__ = ["Action", "Loop"]
 
@@ -164,6 +164,7 @@ class Loop:
             where the goal has none.
         """
         controller, model = self.controller, self.controller.model
+        z = labelled(z)
         if isinstance(z, Mapping):
             inputs = {name: z[name] for name in model.channels if name in z} | dict(inputs or {})
             z = {k: v for k, v in z.items() if k not in model.channels or k in model.sensors.names}
@@ -211,7 +212,8 @@ class Loop:
         inside = np.clip(found, *self.controller.goal.range(model))
         if status == "ok" and not np.array_equal(inside, found):
             status = "an input beyond its range: it was set to the end of it"
-        return Decision(inside, status, decision.memory)
+        memory = decision.memory if finite.all() else self._memory
+        return Decision(inside, status, memory)
 
     def _plan(
         self,

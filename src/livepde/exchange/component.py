@@ -49,10 +49,8 @@ class Component:
 
     def take(self, seconds: float) -> str:
         """Take what the inputs hold as the sample of a time; return what is to be told, or ''."""
-        if self.period > 0.0:
-            if seconds < self._next:
-                return ""
-            self._next = self.period * (math.floor(seconds / self.period + SAME) + 1.0 - SAME)
+        if self.period > 0.0 and seconds < self._next:
+            return ""
         process, t = self.process, seconds * self.process.second
         try:
             z = {
@@ -65,6 +63,8 @@ class Component:
             if self._identifier is None:
                 self._identifier = self._begun(np.array([t, *z.values()]))
             estimate = self._identifier.step(t, z)
+            if self.period > 0.0:
+                self._next = self.period * (math.floor(seconds / self.period + SAME) + 1.0 - SAME)
         except LivepdeError as error:
             if math.isnan(self.outputs[0]):  # the first one: the next may begin
                 self._identifier = None

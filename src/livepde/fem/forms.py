@@ -326,6 +326,8 @@ class Form(FormMatrices):
                 for key, local in term.spaces.items()
             ]
             density = np.asarray(term.integrand(*jets, place))
+            if not place.used <= self.uses:  # on a branch that the probe did not take
+                self.uses |= place.used
             result += term.spaces[slot].tested(density, term.measure.weights)
         return result
 

@@ -143,7 +143,9 @@ class Server:
 
     def _serve(self, place: tuple[str, int], prepared: Future[None]) -> None:
         try:
-            socket.create_server(place).close()  # cheroot leaves a socket open if it cannot listen
+            family = socket.AF_INET6 if ":" in place[0] else socket.AF_INET
+            # cheroot leaves a socket open if it cannot listen
+            socket.create_server(place, family=family).close()
             self._server.prepare()
         except Exception as error:  # noqa: BLE001  it is raised where the server is made
             prepared.set_exception(error)
