@@ -432,7 +432,7 @@ def _as_density(source: Source, state: FunctionSpace) -> Integrand:
 def _single_density(source: Any, block: FieldBlock) -> Integrand:
     product = _pointwise(block)
     if callable(source):
-        timed = reads(source, 1) or "t" in source.__code__.co_names  # as x.t, on some branch
+        timed = reads(source, 1)  # what it reads of x is seen where the form is evaluated
         return lambda v, x: product(source(x, x.t if timed else 0.0), v)
     level = float(source)
     return lambda v, x: level * v
