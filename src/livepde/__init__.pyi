@@ -87,6 +87,7 @@ from .laws import (
     Belief,
     ConstantDamping,
     Damping,
+    ExcitationGate,
     GradientLaw,
     Guards,
     Jumps,
@@ -97,11 +98,9 @@ from .laws import (
     Report,
     Residual,
     ResidualDamping,
-    Rest,
     SensitivityLaw,
     Status,
-    observed_operator,
-    unobserved_operator,
+    diffusion_operator,
 )
 from .model import Model
 from .observation import (
@@ -193,7 +192,6 @@ __all__ = [
     "Report",
     "Residual",
     "ResidualDamping",
-    "Rest",
     "Result",
     "RunError",
     "Sample",
@@ -239,7 +237,6 @@ __all__ = [
     "models",
     "mul",
     "observation",
-    "observed_operator",
     "parallel",
     "plots",
     "positive",
@@ -255,6 +252,5 @@ __all__ = [
     "streams",
     "trace",
     "transpose",
-    "unobserved_operator",
     "upwind",
 ]

@@ -31,7 +31,7 @@ from livepde.fem import (
     grad,
     reads,
 )
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.operators import DualOperator
 from livepde.spaces import BorderedSpace, HilbertSpace, product
 
@@ -294,12 +294,17 @@ class Model:
         pair = {"u": space, "v": space}
         return Form("inner", integrand, pair, field.mesh, order).matrix("v", "u")
 
-    def bilinear(self, integrand: Integrand | On | Sequence[Integrand | On]) -> sp.csr_array:
-        """Assemble a constant bilinear form (u, v, x) on the state space, shape (n, n)."""
+    def bilinear(
+        self, integrand: Integrand | On | Sequence[Integrand | On], cells: IntArray | None = None
+    ) -> sp.csr_array:
+        """Assemble a constant bilinear form (u, v, x) on the state space, shape (n, n).
+
+        With `cells`, integrated over these elements only.
+        """
         form = self._form("operator", integrand, {"u": self.state_space, "v": self.state_space})
         if not form.constant:
             raise ModelError("an operator such as M_op may not depend on time or inputs.")
-        return form.matrix("v", "u")
+        return (form if cells is None else form.on(cells)).matrix("v", "u")
 
     @cached_property
     def affine(self) -> bool:

@@ -65,6 +65,7 @@ def interval(
     *,
     regions: Mapping[str, Predicate] | None = None,
     geometric: bool = False,
+    through: Sequence[float] = (),
 ) -> MeshLine:
     """Return a mesh of [start, stop] with boundaries "left" and "right".
 
@@ -78,6 +79,9 @@ def interval(
         Named subdomains, each a predicate on the midpoints of the elements.
     geometric
         Elements grow by a constant ratio, as radial problems want; needs start > 0. Else uniform.
+    through
+        Points that the mesh shall have as nodes: the nearest inner node is moved to each, so that
+        a `Subdomain`, a layer or a sensor ends at a node.
     """
     if not stop > start or cells < 1 or cells != int(cells):
         raise SpaceError(
@@ -86,11 +90,25 @@ def interval(
     if geometric and not start > 0:
         raise SpaceError(f"interval({start}, {stop}, geometric=True): needs start > 0.")
     spaced = np.geomspace if geometric else np.linspace
-    mesh = MeshLine(spaced(start, stop, int(cells) + 1))
+    mesh = MeshLine(_moved(spaced(start, stop, int(cells) + 1), through))
     mesh = mesh.with_boundaries(
         {"left": lambda x: np.isclose(x[0], start), "right": lambda x: np.isclose(x[0], stop)}
     )
     return mesh.with_subdomains(dict(regions)) if regions else mesh
+
+
+def _moved(nodes: Array, through: Sequence[float]) -> Array:
+    """Return the nodes with the nearest inner one moved to each of the points."""
+    moved = nodes.copy()
+    nearest = [1 + int(np.abs(nodes[1:-1] - x).argmin()) if len(nodes) > 2 else 0 for x in through]
+    inside = all(nodes[0] < x < nodes[-1] for x in through)
+    if not inside or len(set(nearest)) < len(nearest) or 0 in nearest:
+        raise SpaceError(
+            f"interval: through={list(through)} needs points between {nodes[0]:g} and "
+            f"{nodes[-1]:g}, each with an inner node of its own nearby: take more cells."
+        )
+    moved[nearest] = through
+    return moved
 
 
 def line(nodes: Sequence[float]) -> MeshLine:

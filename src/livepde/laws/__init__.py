@@ -13,12 +13,13 @@ from livepde.laws.bounds import (
     unobserved_damping,
 )
 from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
+from livepde.laws.excitation import ExcitationGate
 from livepde.laws.gradient import GradientLaw
 from livepde.laws.guards import Guards
 from livepde.laws.jumps import Jumps
-from livepde.laws.operators import observed_operator, unobserved_operator
+from livepde.laws.operators import diffusion_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
-from livepde.laws.rest import Rest
+
 from livepde.laws.sensitivity import Replay, SensitivityLaw
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "ConstantDamping",
     "Constants",
     "Damping",
+    "ExcitationGate",
     "ExactBound",
     "GradientLaw",
     "Guards",
@@ -42,11 +44,9 @@ __all__ = [
     "Report",
     "Residual",
     "ResidualDamping",
-    "Rest",
     "SensitivityLaw",
     "SmoothedBound",
     "Status",
-    "observed_operator",
+    "diffusion_operator",
     "unobserved_damping",
-    "unobserved_operator",
 ]

@@ -77,6 +77,13 @@ class Problem:
         """Return what the sensors are expected to show, for state u and latent parameter q."""
         return self.observed.predict(u, self.model.latent.value(q), moment)
 
+    def linear_readings(self, interval: Interval, u: Array) -> Interval:
+        """Return an interval with its inputs as they are taken, and readings as linear sensors'."""
+        interval = self.control.over(interval)
+        z0 = self.observed.linearised(interval.z0, u)
+        z1 = self.observed.linearised(interval.z1, u)
+        return interval if z1 is interval.z1 else replace(interval, z0=z0, z1=z1)
+
     def physical(self, belief: Belief) -> Belief:
         """Return a belief of latent coefficients as one of the physical parameter."""
         latent = self.model.latent

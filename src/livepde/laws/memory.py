@@ -62,13 +62,13 @@ import scipy.sparse as sp
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.gains import PULL, Metric
+from livepde.laws.coupled.forms import StageForms
 from livepde.linalg import Array, Pattern
 from livepde.model import Model
-from livepde.observation import Split
 
 __all__ = ["Learned", "Learning"]
 
+PULL = 10.0  # theta h: r forgets within a step
 PROBES = 8  # random vectors for the trace
 FORGETS = 2.0  # power of time that weighs a sample in the mean of S
 FADES = 1.0  # power of time that weighs a sample in J
@@ -148,11 +148,11 @@ class Learning:
         r = np.zeros(self.model.X.dim)
         return Learned(q0, np.zeros(self.pattern.nnz), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, r, r)
 
-    def coupling(self, split: Split, w: Array, q: Array, moment: Moment) -> sp.csr_array:
-        """Return R^T A(w), on free coefficients, shape (n, m)."""
-        A = self.model.form_A.matrix("v", "q", moment, u=w, q=q)
+    def coupling(self, forms: StageForms, w: Array, q: Array, moment: Moment) -> sp.csr_array:
+        """Return R^T A(w) over omega, on free coefficients, shape (n, m)."""
+        A = forms.A_in.matrix("v", "q", moment, u=w, q=q)
         free, free_q = sp.diags_array(self.model.X.free), sp.diags_array(self.model.Q.free)
-        return sp.csr_array(split.R.T @ (free @ A @ free_q))
+        return sp.csr_array(forms.split.R.T @ (free @ A @ free_q))
 
     def spread(self, learned: Learned, coupling: sp.csr_array, h: float) -> float:
         """Return S for the next step: that of the prior itself before anything is known."""
@@ -166,12 +166,11 @@ class Learning:
         image = np.sqrt(self.weights)[:, None] * (coupling @ moved)
         return h * float((image**2).sum()) / size
 
-    def metric(self, learned: Learned, spread: float, q: Array, h: float) -> Metric:
-        """Return the metric of a step of length h that starts at q."""
+    def shift(self, learned: Learned, spread: float, q: Array, h: float) -> Array:
+        """Return the pull of a prior that has become heavier or lighter, per time, shape (m,)."""
         before = learned.spread if learned.samples else spread
-        shift = (spread - before) * self.model.Q.dual(q - learned.origin) / h
-        information = self.pattern.matrix(learned.information)
-        return Metric(spread, information, learned.information, shift)
+        pull: Array = (spread - before) * self.model.Q.dual(q - learned.origin) / h
+        return pull
 
     def departure(self, learned: Learned, spread: float, q: Array) -> float:
         """Return ||q - q0||_Q^2 over what a right model exceeds with a chance below `CHANCE`."""

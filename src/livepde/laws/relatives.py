@@ -22,10 +22,10 @@ from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Problem, Report
 from livepde.laws.damping import Damping, Residual
-from livepde.laws.gains import Gains
-from livepde.laws.gradient import GradientLaw, GradientState, GradientWork
+from livepde.laws.gradient import GradientLaw, GradientState
+from livepde.laws.gradient_parts import GradientParts, constant_parts
 from livepde.linalg import Array
-from livepde.model import h1_form, mass_form
+from livepde.model import h1_form
 from livepde.stepping import Interval, Newton
 
 __all__ = ["BaumeisterLaw", "KueglerLaw"]
@@ -45,7 +45,7 @@ class _Linear(Damping):
 
 
 @dataclass(frozen=True)
-class _Relative(Law[GradientWork, GradientState]):
+class _Relative(Law[GradientParts, GradientState]):
     """A law on the coupled stage of the gradient law, with a linear pull."""
 
     gain: float = 1.0
@@ -64,28 +64,29 @@ class _Relative(Law[GradientWork, GradientState]):
     def _base(self) -> GradientLaw:
         return GradientLaw(self.gain, _Linear(self.mu), newton=self.newton)
 
-    def _work(self, problem: Problem, pull: Any, *, at_estimate: bool) -> GradientWork:
-        if not problem.observed.linear:
-            raise LawError(
-                f"{type(self).__name__} needs readings z = G u; this observation is not linear "
-                "or sees a parameter directly: use SensitivityLaw."
-            )
-        M_op = problem.model.bilinear(pull)
-        gains = Gains(self.gain, _Linear(self.mu), 0.0, 0.0, M_op, M_op, at_estimate)
-        return GradientWork(problem, gains, self.newton)
+    def _parts(self, problem: Problem, pull: Any, *, at_estimate: bool) -> GradientParts:
+        return constant_parts(
+            problem,
+            self.gain,
+            _Linear(self.mu),
+            self.newton,
+            M_op=pull,
+            N_op=pull,
+            at_estimate=at_estimate,
+        )
 
-    def init(self, work: GradientWork, q0: Array, u0: Array) -> GradientState:
+    def init(self, work: GradientParts, q0: Array, u0: Array) -> GradientState:
         return self._base.init(work, q0, u0)
 
-    def start(self, work: GradientWork, q0: Array, u0: Array, moment: Moment) -> GradientState:
+    def start(self, work: GradientParts, q0: Array, u0: Array, moment: Moment) -> GradientState:
         return self._base.start(work, q0, u0, moment)
 
     def step(
-        self, work: GradientWork, state: GradientState, interval: Interval
+        self, work: GradientParts, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         return self._base.step(work, state, interval)
 
-    def belief(self, work: GradientWork, state: GradientState) -> Belief:
+    def belief(self, work: GradientParts, state: GradientState) -> Belief:
         return self._base.belief(work, state)
 
 
@@ -123,7 +124,7 @@ class BaumeisterLaw(_Relative):
 
     A_0: Any = h1_form
 
-    def prepare(self, problem: Problem) -> GradientWork:
+    def prepare(self, problem: Problem) -> GradientParts:
         X, split = problem.model.X, problem.observed.split()
         free = int(X.free.sum())
         seen = round(float(split.R.diagonal().sum()))  # trace of a projection: its rank
@@ -133,7 +134,7 @@ class BaumeisterLaw(_Relative):
                 "coefficients. Use GradientLaw, which estimates what is not observed, KueglerLaw "
                 "if C is monotone, or observe Full()."
             )
-        return self._work(problem, self.A_0, at_estimate=False)
+        return self._parts(problem, self.A_0, at_estimate=False)
 
 
 @dataclass(frozen=True)
@@ -163,5 +164,5 @@ class KueglerLaw(_Relative):
         The nonlinear iteration.
     """
 
-    def prepare(self, problem: Problem) -> GradientWork:
-        return self._work(problem, mass_form, at_estimate=True)
+    def prepare(self, problem: Problem) -> GradientParts:
+        return self._parts(problem, None, at_estimate=True)

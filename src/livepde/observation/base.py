@@ -132,6 +132,11 @@ class Split:
         Their rows of G, shape (present, n).
     vectors
         A basis of N(G)^perp, shape (n, k); None if `inverse` is one.
+    omega
+        Elements on which the data give the state, of sensors that read it on a subdomain: there the
+        paper's chi_omega is one, and integrals over Omega are split into those over `omega`, with
+        the data, and those over the other elements, with the estimate. None: all elements, where R
+        and P alone split the state.
     """
 
     R: sp.csr_array
@@ -140,6 +145,7 @@ class Split:
     present: Array
     G: sp.csr_array
     vectors: Array | None = None
+    omega: IntArray | None = None
 
     @property
     def basis(self) -> Array:
@@ -399,7 +405,9 @@ class Observed:
         if self.observation.nodal and _is_selection(tangent):
             inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
+            omega = self._observed_elements(tangent.indices)
         else:
+            omega = None
             if (support := len(np.unique(tangent.indices))) * n > LARGEST_PROJECTION:
                 raise ObservationError(
                     f"R, the projection on what these sensors see, has {n} rows with {support} "
@@ -421,7 +429,24 @@ class Observed:
         P = sp.csr_array(sp.eye_array(n) - R)
         R.eliminate_zeros()
         P.eliminate_zeros()
-        return Split(R, P, inverse, present, G, V)
+        return Split(R, P, inverse, present, G, V, omega)
+
+    def _observed_elements(self, observed: IntArray) -> IntArray | None:
+        """Return the elements on which the observed coefficients give the state; None: all.
+
+        Of a state with several components those on which they give every component of which they
+        show anything. Dirichlet coefficients are known.
+        """
+        known = self.X.free == 0.0
+        known[observed] = True
+        inside = np.ones(0, dtype=bool)
+        for name, block in self.state.fields.items():
+            start = self.state.part(name).start
+            own = (observed >= start) & (observed < start + block.size)
+            if own.any():
+                complete = known[start + block.element_dofs].all(axis=0)
+                inside = inside & complete if len(inside) else complete
+        return None if inside.all() and len(inside) else np.flatnonzero(inside)
 
 
 def _is_selection(G: sp.csr_array) -> bool:

@@ -9,19 +9,26 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Predicate
+from livepde.fem.measure import Measure
 from livepde.linalg import IntArray
 from livepde.observation.base import Observation
 
 __all__ = ["Full", "Subdomain"]
 
+INTERIOR = 3  # quadrature order of the points at which omega is asked: all inside of the element
+
 
 @dataclass(frozen=True, eq=False)
 class Subdomain(Observation):
-    """The state on omega, z = u|_omega (obsdiff): its coefficients located in omega.
+    """The state on omega, z = u|_omega (obsdiff), with omega as a union of elements.
 
-    z holds the selected coefficients in their order (for Hermite elements values and slopes).
-    G selects, so R and P are exact projections; the coefficients on the Dirichlet boundary are
-    known and not part of z. `coordinates` of the bound observation tells where each one sits.
+    An element belongs to omega if the predicate holds at its inner quadrature points; z holds the
+    free coefficients of these elements in their order (for Hermite elements values and slopes), so
+    those of the nodes on the closed ends of omega, too. The coefficients on the Dirichlet boundary
+    are known and not part of z.
+
+    An element that omega cuts is left out whole. Give the mesh nodes at the ends of omega where
+    that strip matters: `interval(0, 1, 30, through=(0.3, 0.87))`.
 
     Parameters
     ----------
@@ -31,15 +38,25 @@ class Subdomain(Observation):
 
     omega: Predicate
 
+    def elements(self, state: FieldBlock) -> IntArray:
+        """Return the elements that lie in omega."""
+        inside = np.zeros(state.field.mesh.nelements, dtype=bool)
+        for at, piece in Measure(state.field.mesh, INTERIOR).pieces():
+            x = piece.points
+            found = np.broadcast_to(self.omega(x.reshape(len(x), -1)), x[0].size)
+            inside[at] = found.reshape(x.shape[1:]).all(axis=1)
+        return np.flatnonzero(inside)
+
     def selected(self, state: FieldBlock) -> IntArray:
-        """Return the free coefficients located in omega."""
-        inside = np.broadcast_to(self.omega(state.doflocs), (state.size,)).copy()
+        """Return the free coefficients of the elements that lie in omega."""
+        inside = np.zeros(state.size, dtype=bool)
+        inside[state.element_dofs[:, self.elements(state)]] = True
         inside[state.fixed] = False
         found: IntArray = np.flatnonzero(inside)
         if not len(found):
             raise ObservationError(
-                "Subdomain: no free coefficient of the state lies in omega; check the predicate "
-                "and the unit of its coordinates, or refine the mesh."
+                "Subdomain: no element of the mesh with a free coefficient lies in omega; check "
+                "the predicate and the unit of its coordinates, or refine the mesh."
             )
         return found
 

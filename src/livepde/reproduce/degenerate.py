@@ -27,7 +27,7 @@ from livepde import plots
 from livepde.fem import Field, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
-from livepde.laws.operators import observed_operator, unobserved_operator
+from livepde.laws.operators import diffusion_operator
 from livepde.linalg import Array
 from livepde.observation import Subdomain
 from livepde.progress import watched
@@ -121,8 +121,8 @@ def identify(process: Process, nu: float, what: str = "", progress: bool = False
         gain=process.gain,
         damping=ResidualDamping(process.c1),
         nu=nu,
-        M_op=observed_operator(omega, process.D),
-        N_op=unobserved_operator(omega, process.D),
+        M_op=diffusion_operator(process.D),
+        N_op=diffusion_operator(process.D),
     )
     identifier = Identifier(model, sensors, law, q0=0.0, u0=lambda x: u_true(x, 0.0))
     P = identifier.observed.split().P

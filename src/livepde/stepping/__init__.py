@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.newton import TINY, Near, Newton, Parts, Solution, StepFailed
+from livepde.stepping.newton import TINY, Near, Newton, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.simulation import simulate
 from livepde.stepping.state import ForwardStage
@@ -19,7 +19,6 @@ __all__ = [
     "Kept",
     "Near",
     "Newton",
-    "Parts",
     "Scheme",
     "Solution",
     "Stage",

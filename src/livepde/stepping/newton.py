@@ -1,27 +1,26 @@
-"""The nonlinear iteration of an implicit stage: Newton with a kept factor."""
+"""The nonlinear iteration of an implicit stage: Newton, accepted by the residual."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 
-__all__ = ["TINY", "Near", "Newton", "Parts", "Solution", "StepFailed"]
+__all__ = ["TINY", "Near", "Newton", "Solution", "StageEquation", "StagePoint", "StepFailed"]
 
-ROUNDING = 1e-11  # relative updates below this are the end of what arithmetic can do
-SLOWEST = 0.1  # rate at which a factor of a stage with sweeps is expected to go on
 TINY = 1e-300  # what is zero counts as this large
-STALLED = 10  # sweeps in a row that change everything: let Newton try from the start
+HALVINGS = 8  # of a Newton update that does not reduce the residual
+FACTORS = 3  # made from a prediction before the iteration begins anew from the ordinary start
 
 
 class StepFailed(Exception):
-    """A stage that did not converge; caught by the step control, never seen by users."""
+    """A stage that was not solved; caught by the step control, never seen by users."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -29,340 +28,251 @@ class StepFailed(Exception):
         self.detail = detail
 
 
-class StageEquation(Protocol):
-    """One implicit stage."""
+class StagePoint(Protocol):
+    """A stage evaluated at a point."""
 
-    def residual(self, y: Array) -> Array:
-        """Return the residual at y, shape (n,)."""
+    @property
+    def y(self) -> Array:
+        """The point, shape (n,)."""
         ...
 
-    def factor(self, y: Array, sweep: bool) -> Factor:
-        """Return the factorised Jacobian at the y of the last residual.
+    @property
+    def residual(self) -> Array:
+        """The residual, shape (n,)."""
+        ...
 
-        With `sweep`, of the equation in which nonlinear coefficients are held at y (lagged).
-        """
+    @property
+    def size(self) -> float:
+        """Dual norm of the residual, relative to that of the largest term of the equation."""
+        ...
+
+    @property
+    def resolved(self) -> bool:
+        """False while the residual is too large for a small difference that the equation needs."""
         ...
 
 
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """Parts of y whose errors are measured separately, since they have different units.
-
-    Attributes
-    ----------
-    weights
-        The squared norm of each part is the sum of weights times squares, shape (n, parts).
-    floors
-        Squared norm of each part below which it counts as this large, > 0: a part of nothing but
-        rounding errors has no relative accuracy.
-    """
-
-    weights: Array
-    floors: tuple[float, ...]
-
-    @classmethod
-    def whole(cls, size: int) -> Parts:
-        """Return one part, measured in the Euclidean norm."""
-        return cls(np.ones((size, 1)), (TINY,))
-
-    def squares(self, x: Array) -> list[float]:
-        """Return the squared norm of each part."""
-        return self.products(x, x)
-
-    def products(self, x: Array, y: Array) -> list[float]:
-        """Return the inner product in each part."""
-        products: list[float] = ((x * y) @ self.weights).tolist()
-        return products
-
-    def allowed(self, shares: list[float], missed: list[float], scales: list[float]) -> list[float]:
-        """Return how much of each part may be left, from what was missed of it.
-
-        All but the shares are squares; `scales` are those of y.
-        """
-        return [share**2 * square for share, square in zip(shares, missed, strict=True)]
-
-    def relative(self, change: Array, y: Array) -> float:
-        """Return the size of a change of y, relative to it, in its worst part."""
-        pairs = zip(self.squares(change), self.squares(y), self.floors, strict=True)
-        return math.sqrt(max(square / max(scale, floor) for square, scale, floor in pairs))
+Point = TypeVar("Point", bound=StagePoint)
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """What the iteration found, and how it went.
+class StageEquation(Protocol[Point]):
+    """One implicit stage: pure functions of the iterate."""
 
-    Attributes
-    ----------
-    y
-        The solution.
-    updates
-        How many it took.
-    missed
-        The first update in the worst part of y, relative to it: how good a `Near` was; NaN if it
-        was not where the iteration began in the end.
-    rate
-        From there, the second update over the first, with the same factor; NaN if there are none.
-    """
+    def evaluate(self, y: Array) -> Point:
+        """Return the stage at y."""
+        ...
 
-    y: Array
-    updates: int
-    missed: float
-    rate: float
+    def factor(self, at: Point) -> Factor:
+        """Return the factorised Jacobian at a point."""
+        ...
+
+    def rounding(self, at: Point) -> float:
+        """Return the relative size that rounding errors give the residual at a point."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Near:
-    """A start that is thought to be so good that Newton may begin there.
-
-    Where its first update is large, or its own factor does not serve to the end, sweeps begin from
-    the ordinary start after all: where solutions meet, they and not Newton choose.
+    """A predicted solution.
 
     Attributes
     ----------
     y
-        The start.
-    kept
-        The factor of a Jacobian not far away, with which Newton may begin. It is replaced as one of
-        this stage would be.
-    expected, trusted
-        The ratio of the second update to the first that is expected, if the first is not larger
-        than `trusted`, relative to y. It spares the second one where it is small.
-    shares
-        How much of `Newton.share` counts in each part; by default all.
-    rough
-        The kept factor is that of an approximate Jacobian: an update by it that is larger than the
-        one before does not mean that the neighbourhood was left.
+        The prediction.
+    factor
+        Of a Jacobian not far away, with which to begin; None: one is made at y.
     """
 
     y: Array
-    kept: Factor | None = None
-    expected: float = math.inf
-    trusted: float = math.inf
-    shares: tuple[float, ...] | None = None
-    rough: bool = False
+    factor: Factor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(Generic[Point]):
+    """A solved stage, and how the iteration went.
+
+    Attributes
+    ----------
+    at
+        The solution: its residual was evaluated and is below the tolerance.
+    updates
+        Number of updates.
+    predicted
+        True if the iteration from the prediction led to it.
+    made
+        Where the last Jacobian was factorised, and its factor; None: nowhere.
+    """
+
+    at: Point
+    updates: int
+    predicted: bool
+    made: tuple[Point, Factor] | None
 
 
 @dataclass(frozen=True)
 class Newton:
-    """Lagged sweeps into the neighbourhood of the solution, then Newton with a kept factor.
+    """Newton's iteration with kept factors, and when a stage counts as solved.
 
-    The implicit stage of the paper's law can have several solutions, because theta(r) depends on
-    the direction of r. Sweeps with lagged coefficients go to the same one from any start; Newton
-    goes to the nearest. So sweeps come first, and Newton only polishes.
+    A stage is solved when its residual, in the dual norm and relative to the largest term of the
+    equation, is at most `tolerance`, or what rounding leaves; from a prediction that is good, at most `share` of what it had
+    there and at most `ceiling`: what a prediction misses is about what the time step leaves out.
+    The size of an update is no criterion: a factor of another point makes it small, too.
+
+    An update that does not reduce the residual is shortened until it does.
 
     Parameters
     ----------
     tolerance
-        Bound on the estimated error of each part of y, relative to its norm.
+        Bound on the relative residual.
     share
-        A stage that begins at a good prediction is solved to this share of what the prediction
-        missed, if that is more. A prediction follows the steps before: what it misses is about as
-        much as the time step itself leaves out. 0: always to `tolerance`.
+        Of the residual of a prediction that may be left. 0: always to `tolerance`.
+    ceiling
+        Bound on the relative residual with `share`.
     iterations
         At most this many updates.
     refresh
-        The Jacobian is factorised again when an update is more than this share of the last one.
-    basin
-        Relative update below which Newton takes over from sweeps.
+        The Jacobian is factorised again when an update leaves more than this share of the residual.
     """
 
-    tolerance: float = 1e-7
-    share: float = 0.1
+    tolerance: float = 1e-8
+    share: float = 0.03
+    ceiling: float = 1e-3
     iterations: int = 60
     refresh: float = 0.2
-    basin: float = 3e-2
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
     def solve(
         self,
-        equation: StageEquation,
-        y: Array | Callable[[], Array],
-        parts: Parts | None = None,
-        *,
-        lagged: bool = False,
+        equation: StageEquation[Point],
+        start: Array | Callable[[], Array],
         near: Near | None = None,
-    ) -> Solution:
-        """Return the solution, starting from y.
+    ) -> Solution[Point]:
+        """Return the solution of a stage.
 
         Parameters
         ----------
-        y
-            The start, or a function that returns it: with `near` it may not be needed.
-        parts
-            What of y is measured separately; by default nothing.
-        lagged
-            Begin with lagged sweeps.
+        start
+            Where to begin, or a function that returns it: with `near` it may not be needed.
         near
-            A better start.
+            A prediction.
 
         Raises
         ------
         StepFailed
             "not_converged", "not_finite" or "singular".
         """
-        return _Iteration(self, equation, y, parts, lagged, near).run()
+        iteration = _Iteration(self, equation)
+        if near is not None:
+            found = iteration.from_prediction(near)
+            if found is not None:
+                return found
+        return iteration.from_start(start() if callable(start) else start)
 
 
-class _Iteration:
-    """One solve: where it is, by which factor it goes on, and what it has seen.
+class _Iteration(Generic[Point]):
+    """One solve; `updates` counts over all of its attempts."""
 
-    Attributes
-    ----------
-    y, start, begin
-        Where it is, where it began, and where Newton did.
-    factor, kept
-        The factor at hand, and whether that of `Near.kept` was not yet given up.
-    sweeps
-        Lagged coefficients are held.
-    last
-        Size of the last update by the factor at hand or one like it, relative to what may be left
-        of the error; infinite where there is none to compare with.
-    limit
-        Relative size of an update of Newton that leaves the neighbourhood.
-    basin, stalled
-        Where Newton takes over from sweeps; sweeps in a row that changed everything.
-    miss
-        Squares of what may be left of the error in each part, because `near` missed that much more.
-    missed, rate
-        As in `Solution`.
-    """
-
-    def __init__(
-        self,
-        newton: Newton,
-        equation: StageEquation,
-        given: Array | Callable[[], Array],
-        parts: Parts | None,
-        lagged: bool,
-        near: Near | None,
-    ) -> None:
+    def __init__(self, newton: Newton, equation: StageEquation[Point]) -> None:
         self.newton = newton
         self.equation = equation
-        self.given = given
-        self.lagged = lagged
-        self.near = near
-        self.y = self.begin = self.start = _evaluated(given) if near is None else near.y
-        self.parts = parts or Parts.whole(len(self.y))
-        self.factor = None if near is None else near.kept
-        self.kept = self.factor is not None
-        self.rough = near is not None and near.rough
-        self.expected = math.inf if near is None else near.expected
-        self.trusted = math.inf if near is None else near.trusted
-        self.sweeps = lagged and near is None
-        self.last, self.basin, self.stalled = math.inf, newton.basin, 0
-        self.limit = math.inf if near is None else newton.basin
-        self.miss = [0.0] * len(self.parts.floors)
-        self.missed = self.rate = math.nan
+        self.updates = 0
+        self.made: tuple[Point, Factor] | None = None
 
-    def run(self) -> Solution:
-        """Return the solution."""
+    def from_prediction(self, near: Near) -> Solution[Point] | None:
+        """Return the solution that a prediction leads to; None if it was no good one."""
         newton = self.newton
-        for count in range(1, newton.iterations + 1):
-            new, size, excess = self._update(count)
-            ratio = excess / self.last
-            if ratio >= 0.5 and size <= ROUNDING:
-                break  # updates that no longer shrink down there are rounding errors
-            if count == 2 and self.near is not None:
-                self.rate = ratio
-            rate = self._believed(ratio, size)
-            done = excess * rate <= 1.0 - rate  # the error is rate/(1 - rate) times the update
-            # A kept factor that needs one or two more is not replaced now.
-            ends = self.kept and count <= 2 and excess * rate**3 <= 1.0 - rate
-            slow = ratio > newton.refresh and not (done or ends)
-            if self._left(size, slow):
-                self._return_to_sweeps()
-                continue
-            if not self.sweeps and math.isinf(self.last):
-                self.limit = size
-            self.y = new
-            if done:
+        at = self.equation.evaluate(near.y)
+        if not math.isfinite(at.size):
+            return None
+        allowed = max(newton.tolerance, min(newton.share * at.size, newton.ceiling))
+        factor, own = near.factor, False
+        left = FACTORS
+        while not self._solved(at, allowed):
+            if self.updates >= newton.iterations:
+                return None
+            if factor is None:
+                if left == 0:
+                    return None
+                left -= 1
+                try:
+                    factor, own = self._factor(at), True
+                except StepFailed:
+                    return None
+            try:
+                new, _ = self._updated(at, factor)
+            except StepFailed:
+                return None
+            if new.size < at.size:
+                if new.size > newton.refresh * at.size:
+                    factor = None
+                at = new
+            elif not own:
+                factor = None
+            elif at.size <= self.equation.rounding(at):
                 break
-            self.last = excess
-            self._go_on(size, slow)
-        else:
-            raise StepFailed(
-                "not_converged",
-                f"{newton.iterations} iterations left a relative update of {size:.1e}",
-            )
-        return Solution(new, count, self.missed, self.rate)
+            else:
+                return None
+        return Solution(at, self.updates, True, self.made)
 
-    def _update(self, count: int) -> tuple[Array, float, float]:
-        """Return the next y, and the size of the update in the worst part of y.
+    def from_start(self, start: Array) -> Solution[Point]:
+        """Return the solution; raises `StepFailed`."""
+        newton, equation = self.newton, self.equation
+        at = equation.evaluate(start)
+        factor: Factor | None = None
+        while not self._solved(at, newton.tolerance):
+            if self.updates >= newton.iterations:
+                raise StepFailed(
+                    "not_converged",
+                    f"{newton.iterations} iterations left a relative residual of {at.size:.1e}",
+                )
+            own = factor is None
+            factor = self._factor(at) if factor is None else factor
+            new, update = self._updated(at, factor)
+            if new.size >= at.size and own:
+                if at.size <= equation.rounding(at):
+                    break
+                new = self._damped(at, update)
+                if new is at:
+                    raise StepFailed(
+                        "not_converged",
+                        f"no update reduces the relative residual of {at.size:.1e}",
+                    )
+            slow = not new.size <= newton.refresh * at.size
+            if new.size < at.size:
+                at = new
+            factor = None if slow else factor
+        return Solution(at, self.updates, False, self.made)
 
-        First relative to y, then to what may be left of the error.
-        """
-        residual = self.equation.residual(self.y)
+    def _solved(self, at: Point, allowed: float) -> bool:
+        if not math.isfinite(at.size):
+            raise StepFailed("not_finite", "the iteration left the range of finite numbers")
+        return at.size <= allowed and at.resolved
+
+    def _factor(self, at: Point) -> Factor:
         try:
-            self.factor = self.factor or self.equation.factor(self.y, self.sweeps)
-            update = self.factor.solve(residual)
+            factor = self.equation.factor(at)
         except LinearAlgebraError as error:
             raise StepFailed("singular", str(error)) from error
-        new, parts = self.y - update, self.parts
-        squares, scales = parts.squares(update), parts.squares(new)
-        if not math.isfinite(sum(squares) + sum(scales)):
+        self.made = (at, factor)
+        return factor
+
+    def _updated(self, at: Point, factor: Factor) -> tuple[Point, Array]:
+        try:
+            update = factor.solve(at.residual)
+        except LinearAlgebraError as error:
+            raise StepFailed("singular", str(error)) from error
+        self.updates += 1
+        new = self.equation.evaluate(at.y - update)
+        if not math.isfinite(new.size):
             raise StepFailed("not_finite", "the iteration left the range of finite numbers")
-        begins = count == 1 and self.near is not None
-        if begins and self.near is not None:
-            shares = self.near.shares or (1.0,) * len(squares)
-            each = [self.newton.share * share for share in shares]
-            self.miss = parts.allowed(each, squares, scales)
-        strict = max(self.newton.tolerance, 1e-150) ** 2
-        size = excess = 0.0
-        for square, scale, floor, m in zip(squares, scales, parts.floors, self.miss, strict=True):
-            if square > 0.0:
-                scale = max(scale, floor)
-                size = max(size, square / scale)
-                excess = max(excess, square / max(strict * scale, m))
-        size, excess = math.sqrt(size), math.sqrt(excess)
-        if begins:
-            self.missed = size
-        return new, size, excess
+        return new, update
 
-    def _believed(self, ratio: float, size: float) -> float:
-        """Return the ratio of the next update to this one, as far as it can be known."""
-        if math.isinf(self.last):
-            return min(self.expected, 1.0) if size <= self.trusted else 1.0
-        # What converges slowly may only show later.
-        return max(ratio, SLOWEST) if self.lagged else ratio
-
-    def _left(self, size: float, slow: bool) -> bool:
-        """Return whether Newton has left the neighbourhood of where it began."""
-        if self.sweeps or not self.lagged:
-            return False
-        far = size >= self.limit and not (self.rough and self.kept)
-        return far or (slow and self.near is not None and not self.kept)
-
-    def _return_to_sweeps(self) -> None:
-        """Sweep on from where Newton began, and come closer; from the ordinary start after `near`.
-
-        Nothing that was seen from there counts.
-        """
-        if self.near is None:
-            self.basin *= 0.3
-        else:
-            self.begin = self.start = _evaluated(self.given)
-        self.y, self.factor, self.sweeps, self.near = self.begin, None, True, None
-        self.last = self.limit = self.expected = math.inf
-        self.stalled, self.miss = 0, [0.0] * len(self.miss)
-        self.missed = self.rate = math.nan
-
-    def _go_on(self, size: float, slow: bool) -> None:
-        """Choose the factor of the next update."""
-        self.stalled = self.stalled + 1 if self.sweeps and size > 0.9 else 0
-        jumps = self.sweeps and self.stalled == STALLED
-        if jumps:
-            self.y = self.start  # sweeps that jump about lead nowhere: Newton from where they began
-        if self.sweeps and (size <= self.basin or jumps):
-            # Newton's first update may be larger: sweeps creep, Newton goes all the way.
-            self.begin, self.factor, self.sweeps = self.y, None, False
-            self.last = self.expected = math.inf
-        elif self.kept and slow:
-            self.factor, self.kept = None, False  # a factor of its own begins anew
-            self.last = self.trusted = math.inf
-            self.expected = math.inf if self.rough else SLOWEST
-        elif self.sweeps or slow:
-            self.factor = None
-
-
-def _evaluated(start: Array | Callable[[], Array]) -> Array:
-    return start() if callable(start) else start
+    def _damped(self, at: Point, update: Array) -> Point:
+        """Return the stage after a part of an update that reduces the residual, if there is one."""
+        part = 1.0
+        for _ in range(HALVINGS):
+            part *= 0.5
+            new = self.equation.evaluate(at.y - part * update)
+            if new.size <= (1.0 - 0.1 * part) * at.size:
+                return new
+        return at

@@ -25,11 +25,12 @@ from livepde.linalg import (
 )
 from livepde.model import Model
 from livepde.stepping.corrections import At, Corrections, Kept, solved
-from livepde.stepping.newton import Newton, StepFailed
+from livepde.stepping.newton import TINY, Newton, StepFailed
 
 __all__ = ["ForwardStage"]
 
 STATE = 1e-8  # relative error of the state that corrections with a kept factor leave
+ROUNDING = 1e-15  # times the sizes of all terms: what their sum is exact to
 PASSES = 2  # corrections of the state by the factor of a q nearby; those of tangents are one less
 LINEAR = 1e-12  # relative asymmetry that is rounding
 
@@ -150,6 +151,17 @@ class ForwardStage:
             return None
         return compact(sp.csr_array(self._rows[1]["A"] @ tensor))
 
+    def dual(self, functional: Array) -> float:
+        """Return the dual norm of a functional on the state, by the diagonal of the mass."""
+        return math.sqrt(float((functional * functional) @ self._dual_weights))
+
+    @cached_property
+    def _dual_weights(self) -> Array:
+        diagonal = np.abs(self.model.mass.diagonal())
+        least = diagonal.max(initial=0.0) or 1.0
+        weights: Array = self.model.X.free / np.where(diagonal > 0.0, diagonal, least)
+        return weights
+
     @cached_property
     def _mass(self) -> sp.csr_array | Array:
         return compact(self.model.mass)
@@ -231,7 +243,7 @@ class ForwardStage:
             residual = system.matrix @ u - self._known(c, system, q, h, moment)
             return u - solved(self.factor(q, h, moment), residual * self.model.X.free)
         equation = _Equation(self, c, self.model.latent.value(q), h, moment)
-        return self.newton.solve(equation, u).y
+        return self.newton.solve(equation, u).at.y
 
     def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factorised Jacobian at a solved stage, for sensitivities."""
@@ -318,6 +330,16 @@ class _System:
 
 
 @dataclass(frozen=True, eq=False)
+class _Point:
+    """The stage of a nonlinear model at a state; see `livepde.stepping.newton.StagePoint`."""
+
+    y: Array
+    residual: Array
+    size: float
+    resolved: bool = True
+
+
+@dataclass(frozen=True, eq=False)
 class _Equation:
     stage: ForwardStage
     c: Array
@@ -329,13 +351,23 @@ class _Equation:
     def source(self) -> Array:
         return self.stage.model.F(self.moment)
 
-    def residual(self, y: Array) -> Array:
+    def evaluate(self, y: Array) -> _Point:
         model = self.stage.model
         rate = model.mass @ ((y - self.c) / self.h)
-        A = self.stage.form.vector("v", self.moment, q=self.q, u=y)
-        flux = model.B(y, self.moment) + A
-        masked: Array = (rate + flux - self.source) * model.X.free
-        return masked
+        driven = self.stage.form.vector("v", self.moment, q=self.q, u=y)
+        flux = model.B(y, self.moment)
+        residual = (rate + flux + driven - self.source) * model.X.free
+        own, *sizes = (
+            self.stage.dual(term) for term in (residual, rate, flux, driven, self.source)
+        )
+        return _Point(y, residual, own / max(*sizes, TINY))
 
-    def factor(self, y: Array, sweep: bool) -> Factor:
-        return self.stage._factorise(self.stage._data(y, self.q, self.h, self.moment))
+    def factor(self, at: _Point) -> Factor:
+        return self.stage._factorise(self.stage._data(at.y, self.q, self.h, self.moment))
+
+    def rounding(self, at: _Point) -> float:
+        stage, moment = self.stage, self.moment
+        data = np.abs(stage._data(at.y, self.q, self.h, moment))
+        sizes = stage._rows[0].matrix(data) @ np.maximum(np.abs(at.y), np.abs(self.c))
+        source = stage.dual(self.source)
+        return ROUNDING * stage.dual(sizes) / max(stage.dual(at.residual) / at.size, source, TINY)

@@ -1,4 +1,4 @@
-"""When nothing excites the unknowns any more, and noise goes on: `GradientLaw` holds q.
+"""Excitation gate: `GradientLaw` holds q while nothing but noise excites it.
 
 The law multiplies r by A(w), w = u_alpha + P u. At rest A(w) is noise, the same as in r, so that
 their product has a mean, and q drifts with it, the faster the larger the gain. Noise is independent
@@ -8,8 +8,10 @@ from sample to sample, and an excitation that is resolved in time is not: with t
     (a_k, a_{k-1}) / (|a_k| |a_{k-1}|)
 
 is about 1 for an excitation, and 0 for noise. For a process faster than the samples it may be 0,
-too; but then |a|^2 is as large as ever, whereas at rest it has fallen to that of the noise. Only
-both together are taken for a rest.
+too. So |a|^2 must have fallen, and what is left of it must be noise: the estimate u^ does not
+follow noise, so b_k of (A(w_k) e, p) - (A(u^_k) e, p) is as large as a_k then. It is far smaller
+where the estimate follows exact data, however small these have become. Only all three together
+close the gate.
 """
 
 from __future__ import annotations
@@ -28,19 +30,19 @@ from livepde.model import Model, h1_form, mass_form
 from livepde.observation import Split
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Excitation", "Probes", "Rest"]
+__all__ = ["Excitation", "ExcitationGate", "Probes"]
 
 PROBES = 16  # pairs of random functions: their products scatter by a quarter
 
 
 @dataclass(frozen=True)
-class Rest:
-    """When `GradientLaw` with a fixed gain holds q: nothing excites it any more but noise.
+class ExcitationGate:
+    """Holds q of `GradientLaw` with a constant gain while nothing but noise excites it.
 
-    A step holds q, and u goes on, if up to the sample before, in fading means, what excites q was
-    correlated from sample to sample by less than `correlation`, and its mean square was less than
-    `energy` of the largest that was correlated. An unknown that moves by itself (evolution=) goes
-    on by that. Note: "at_rest".
+    A step holds q, and u goes on, if up to the sample before, in fading means, the excitation of q
+    was correlated from sample to sample by less than `correlation`, its mean square was less than
+    `energy` of the largest that was correlated, and at least `noise` of it was not followed by the
+    estimate. An unknown that moves by itself (evolution=) goes on by that. Note: "at_rest".
 
     Noise that is itself correlated in time, as behind a stream stage that averages, is no noise
     here; where it is a third of the excitation or more, rests are not told from it.
@@ -53,29 +55,39 @@ class Rest:
         Least correlation of an excitation, in (0, 1).
     energy
         Share of the largest mean square to which a rest has fallen, in (0, 1).
+    noise
+        Share of the mean square that the estimate does not follow at a rest, in (0, 1).
     """
 
     window: float = 30.0
     correlation: float = 0.5
     energy: float = 0.1
+    noise: float = 0.25
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.window) and self.window >= 1):
-            raise LawError(f"Rest: window must be a number >= 1; got {self.window}.")
-        for name in ("correlation", "energy"):
+            raise LawError(f"ExcitationGate: window must be a number >= 1; got {self.window}.")
+        for name in ("correlation", "energy", "noise"):
             value = getattr(self, name)
             if not 0 < value < 1:
-                raise LawError(f"Rest: {name} must lie between 0 and 1; got {value}.")
+                raise LawError(f"ExcitationGate: {name} must lie between 0 and 1; got {value}.")
 
-    def holds(self, excitation: Excitation) -> bool:
-        """Return true at a rest."""
+    def closed(self, excitation: Excitation) -> bool:
+        """Return true at a rest: q is held."""
         return (
             excitation.correlation < self.correlation
             and excitation.energy < self.energy * excitation.largest
+            and excitation.missed > self.noise * excitation.energy
         )
 
-    def add(self, excitation: Excitation, a: Array) -> Excitation:
-        """Return the excitation after a sample in which the probes see a."""
+    def add(self, excitation: Excitation, a: Array, followed: Array) -> Excitation:
+        """Return the excitation after a sample.
+
+        Parameters
+        ----------
+        a, followed
+            What the probes see at w and at the estimate, shape (PROBES,).
+        """
         size = float(a @ a)
         scale = math.sqrt(size * excitation.size)
         share = 1.0 / self.window
@@ -86,7 +98,9 @@ class Rest:
         energy = excitation.energy + share * (size - excitation.energy)
         correlated = excitation.correlated + share * (product - excitation.correlated)
         largest = max(excitation.largest, correlated)
-        return Excitation(a, size, correlation, energy, correlated, largest)
+        left = float((a - followed) @ (a - followed))
+        missed = excitation.missed + share * (left - excitation.missed)
+        return Excitation(a, size, correlation, energy, correlated, largest, missed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +116,8 @@ class Excitation:
         with the sample before, in which noise and outliers have little part.
     largest
         The largest `correlated`.
+    missed
+        Fading mean square of what the estimate does not follow.
     """
 
     last: Array
@@ -110,11 +126,12 @@ class Excitation:
     energy: float
     correlated: float
     largest: float
+    missed: float
 
     @classmethod
     def none(cls) -> Excitation:
         """Return the value before any sample."""
-        return cls(np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0)
+        return cls(np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Probes:

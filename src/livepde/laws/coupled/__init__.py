@@ -1,0 +1,20 @@
+"""The coupled implicit stage of the gradient law: data, equation, solvers."""
+
+from __future__ import annotations
+
+from livepde.laws.coupled.equation import StageData, StageIterate, StageSolver, StageTerms
+from livepde.laws.coupled.forms import StageForms
+from livepde.laws.coupled.metric import Metric
+from livepde.laws.coupled.stage import CoupledStage, KeptFactor, StageProblem
+
+__all__ = [
+    "CoupledStage",
+    "KeptFactor",
+    "Metric",
+    "StageData",
+    "StageForms",
+    "StageIterate",
+    "StageProblem",
+    "StageSolver",
+    "StageTerms",
+]

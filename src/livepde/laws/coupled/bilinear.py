@@ -1,0 +1,172 @@
+"""Coupled stages with a bilinear A and an affine B, both constant in time: products made ahead."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.fem import Moment
+from livepde.laws.coupled.equation import Inside, StageData, StageIterate, StageTerms
+from livepde.laws.coupled.forms import AnyForm
+from livepde.laws.coupled.metric import Metric
+from livepde.laws.coupled.monolithic import MonolithicSolver
+from livepde.linalg import Array, Pattern, compact
+
+__all__ = ["BilinearSolver"]
+
+
+class BilinearSolver(MonolithicSolver):
+    """A residual is a few products with small or sparse matrices, and no form is evaluated."""
+
+    @classmethod
+    def of(cls, terms: StageTerms) -> BilinearSolver | None:
+        """Return it for a stage; None where A or B is another, or the mesh is large."""
+        forms = terms.forms
+        B = forms.model.form_B
+        if terms.auxiliary or not (B.affine and B.constant):
+            return None
+        parts = [form for form in (forms.A_in, forms.A_out) if form is not None]
+        if not all(_is_bilinear(form) for form in parts):
+            return None
+        return cls(terms)
+
+    @property
+    def keeps(self) -> bool:
+        return True
+
+    @cached_property
+    def _coupling(self) -> tuple[Pattern, sp.csr_array, sp.csr_array | None]:
+        """Pattern of A(w), and the maps to its data of w over omega, and of u elsewhere."""
+        forms, terms = self.terms.forms, self.terms
+        pattern = forms.model.form_A.pattern("v", "q")
+        kept = sp.diags_array(terms.free[pattern.rows] * terms.free_q[pattern.indices])
+
+        def placed(form: AnyForm) -> sp.csr_array:
+            own = form.pattern("v", "q")
+            return sp.csr_array(kept @ pattern.gather(own.rows, own.indices) @ _tensors(form)[0])
+
+        outside = None if forms.A_out is None else placed(forms.A_out)
+        return pattern, placed(forms.A_in), outside
+
+    @cached_property
+    def _jacobian(self) -> sp.csr_array:
+        """Map of (w, u, q, r) to the data of the Jacobian that change."""
+        forms, maps, m = self.terms.forms, self.maps, self.terms.size - self.terms.n
+        vq, vu, qu = _tensors(forms.A_in)
+        size, n = maps["M"].shape[0], self.terms.n
+        by_w = maps["A_in"] @ vq
+        by_u, by_q = sp.csr_array((size, n)), sp.csr_array((size, m))
+        by_r = sp.csr_array((size, n))
+        if forms.W is not None:
+            by_q = by_q + maps["A_in u"] @ vu
+            by_r = maps["A_in^T r, u"] @ qu
+        if forms.A_out is not None:
+            outside = _tensors(forms.A_out)
+            by_u = by_u + maps["A_out"] @ outside[0]
+            by_q = by_q + maps["A_out u"] @ outside[1]
+        return sp.csr_array(sp.hstack([by_w, by_u, by_q, by_r]))
+
+    @cached_property
+    def _slopes(self) -> tuple[sp.csr_array, sp.csr_array, Array]:
+        """B' over omega, and elsewhere with nu N; and B(0), on the free coefficients."""
+        forms, free = self.terms.forms, sp.diags_array(self.terms.free)
+        zero = np.zeros(self.terms.n)
+        inside = free @ forms.B_in.matrix("v", "u", u=zero)
+        outside = forms.hidden
+        if forms.B_out is not None:
+            outside = outside + forms.B_out.matrix("v", "u", u=zero)
+        offset = self.terms.free * forms.model.B(zero)
+        return sp.csr_array(inside), sp.csr_array(free @ outside), offset
+
+    @cached_property
+    def _fixed_data(self) -> Array:
+        """Data of the Jacobian that B adds."""
+        forms, zero = self.terms.forms, np.zeros(self.terms.n)
+        found = np.zeros(self.maps["M"].shape[0])
+        if forms.W is not None:
+            found += self.maps["B_in"] @ forms.B_in.data("v", "u", u=zero)
+        if forms.B_out is not None:
+            found += self.maps["B_out"] @ forms.B_out.data("v", "u", u=zero)
+        return found
+
+    @cached_property
+    def _products(self) -> dict[str, sp.csr_array | Array]:
+        forms, free = self.terms.forms, sp.diags_array(self.terms.free)
+        return {
+            "M": compact(sp.csr_array(free @ forms.model.mass)),
+            "r": compact(sp.csr_array(sp.vstack([forms.pull, forms.mass]))),
+            "G": compact(sp.csr_array(sp.diags_array(self.terms.free_q) @ self.terms.gram)),
+            "B_in": compact(self._slopes[0]),
+            "B_out": compact(self._slopes[1]),
+        }
+
+    def data(
+        self,
+        c: Array,
+        h: float,
+        moment: Moment,
+        u_alpha: Array,
+        metric: Metric,
+        w: Array | None = None,
+    ) -> StageData:
+        forms, products = self.terms.forms, self._products
+        known = forms.model.F(moment) * self.terms.free - self._slopes[2]
+        inside = None
+        if forms.W is None:
+            w = forms.model.impose(u_alpha, moment) if w is None else w
+            inside = Inside(self._coupling[1] @ w, products["B_in"] @ w)
+        return StageData(c, h, moment, u_alpha, metric, known, inside)
+
+    def evaluate(self, data: StageData, y: Array) -> StageIterate:
+        terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
+        u, q, c = y[:n], y[n:], data.c
+        r = forms.split.project(u) - data.u_alpha
+        w = u if forms.at_estimate else u - r
+        pattern, by_w, by_u = self._coupling
+        if data.inside is not None:
+            A_data, flux = data.inside.A, data.inside.flux
+        else:
+            A_data, flux = by_w @ w, products["B_in"] @ w
+        A_in = A = pattern.compact(A_data)
+        if by_u is not None:
+            A = pattern.compact(A_data + by_u @ u)
+        by_r = products["r"] @ r
+        Mr, mass_r = by_r[:n], by_r[n:]
+        norms = terms.norms(r, Mr, mass_r)
+        theta = terms.theta(data, norms)
+        rate = products["M"] @ ((u - c[:n]) / data.h)
+        driven, pull = A @ q, (theta * terms.free) * Mr
+        change, coupling = self.weighed(data.metric, q - c[n:]), A_in.T @ r
+        residual = np.empty_like(y)
+        residual[:n] = rate + flux + products["B_out"] @ u + driven + pull - data.source
+        residual[n:] = change - (coupling + data.metric.load) * terms.free_q
+        lines = ([rate, driven, pull, data.source], [change, data.metric.load, coupling])
+        size, resolved, scales = terms.measured(data, residual, lines, norms, theta)
+        return StageIterate(
+            y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r
+        )
+
+    def weighed(self, metric: Metric, change: Array) -> Array:
+        if metric.information is not None or metric.drift:
+            return super().weighed(metric, change) * self.terms.free_q
+        weighed: Array = self._products["G"] @ (metric.scale * change)
+        return weighed
+
+    def changing(self, data: StageData, at: StageIterate) -> Array:
+        n = self.terms.n
+        changing: Array = self._jacobian @ np.concatenate([at.w, at.y[:n], at.y[n:], at.r])
+        return changing + self._fixed_data
+
+
+def _is_bilinear(form: AnyForm) -> bool:
+    """Return whether all derivatives of a form are sparse matrices times coefficients."""
+    pairs = ("v", "q"), ("v", "u"), ("q", "u")
+    return all(isinstance(form.tensor(*pair), sp.csr_array) for pair in pairs)
+
+
+def _tensors(form: AnyForm) -> tuple[sp.csr_array, sp.csr_array, sp.csr_array]:
+    """Return the maps to the data of A(w), of d(A(w) q)/dw and of d(A(w)^T r)/dw."""
+    vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
+    return sp.csr_array(vq), sp.csr_array(vu), sp.csr_array(qu)

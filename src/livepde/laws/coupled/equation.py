@@ -1,0 +1,363 @@
+"""The nonlinear equation of one coupled stage: its residual, term by term, and when it is solved.
+
+With w = u_alpha + P u and r = R u - u_alpha, the unknowns y = (u, q) of one implicit Euler stage of
+(est_exact_q), (est_exact_u), or (noisy_q), (noisy_u), solve
+
+    M (u - c_u)/h + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
+    H (q - c_q)                                                      = load + A(w)^T r
+
+together (`Metric` says what H and load are), so that with full data the two terms with A cancel in
+the energy, as in the paper (align:neplusnr). Over omega w is the data, elsewhere the estimate.
+theta depends on all of r; its derivative is a rank-one term of the Jacobian. Where A is nonlinear
+in q, A(w) in the second line is its derivative.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.fem import Moment
+from livepde.laws.coupled.forms import StageForms
+from livepde.laws.coupled.metric import Metric
+from livepde.laws.damping import Damping, Residual
+from livepde.linalg import Array, Factor, Pattern
+from livepde.stepping import TINY
+
+__all__ = ["Inside", "StageData", "StageIterate", "StageSolver", "StageTerms"]
+
+FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
+RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
+ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
+
+
+@dataclass(frozen=True, eq=False)
+class Inside:
+    """What the data alone say over omega: A(w), a matrix or its data, and B(w), shape (n,)."""
+
+    A: Any
+    flux: Array
+
+
+@dataclass(frozen=True, eq=False)
+class StageData:
+    """What is given of one stage.
+
+    Attributes
+    ----------
+    c
+        (c_u, c_q), shape (n + m,).
+    h, moment
+        Step, and time and inputs at its end.
+    u_alpha
+        Observed part of the state, shape (n,).
+    metric
+        H and load of the second line.
+    source
+        F, shape (n,).
+    inside
+        A and B over omega, where the data give all of w there.
+    """
+
+    c: Array
+    h: float
+    moment: Moment
+    u_alpha: Array
+    metric: Metric
+    source: Array
+    inside: Inside | None
+
+
+@dataclass(frozen=True, eq=False)
+class StageIterate:
+    """The stage at a point y = (u, q).
+
+    Attributes
+    ----------
+    y, residual
+        Shape (n + m,).
+    size, resolved
+        See `livepde.stepping.newton.StagePoint`.
+    scales
+        Dual norms of the largest terms of the two lines.
+    w, r
+        What A and B see over omega, and the observed residual, shape (n,).
+    A_in
+        A(w) over omega, shape (n, m), where it is a matrix of its own.
+    theta
+        Weight of R^T M_op r.
+    norms
+        Squared norms of r.
+    Mr, mass_r
+        R^T M_op r and R^T M r over omega, shape (n,).
+    """
+
+    y: Array
+    residual: Array
+    size: float
+    resolved: bool
+    scales: tuple[float, float]
+    w: Array
+    r: Array
+    A_in: sp.csr_array | None
+    theta: float
+    norms: Residual
+    Mr: Array
+    mass_r: Array
+
+
+@dataclass(frozen=True, eq=False)
+class StageTerms:
+    """What all solvers of a stage share: its forms, gains and norms.
+
+    Parameters
+    ----------
+    forms
+        Forms over omega and elsewhere.
+    damping
+        Rule for theta.
+    memory
+        Pattern of `Metric.information`; None: there is none.
+    """
+
+    forms: StageForms
+    damping: Damping
+    memory: Pattern | None = None
+
+    @cached_property
+    def n(self) -> int:
+        """Number of coefficients of the state."""
+        return self.forms.model.X.dim
+
+    @cached_property
+    def size(self) -> int:
+        """n + m."""
+        return self.n + self.forms.model.Q.dim
+
+    @cached_property
+    def free(self) -> Array:
+        """One for each free coefficient of the state, shape (n,)."""
+        return self.forms.model.X.free
+
+    @cached_property
+    def free_q(self) -> Array:
+        """One for each free coefficient of the parameter, shape (m,)."""
+        return self.forms.model.Q.free
+
+    @cached_property
+    def gram(self) -> sp.csr_array:
+        """G_Q, or where that is dense a sparse matrix of which it is the Schur complement."""
+        return self.forms.model.Q.augmented
+
+    @cached_property
+    def auxiliary(self) -> int:
+        """Number of unknowns behind q that such a matrix has."""
+        return self.gram.shape[0] - self.forms.model.Q.dim
+
+    @cached_property
+    def linear(self) -> bool:
+        """True if A is linear in q."""
+        return self.forms.model.form_A.linear_in_parameter
+
+    @cached_property
+    def dual_weights(self) -> Array:
+        """Weights of the squared dual norms, shape (n + m,): the inverse diagonals of M and G_Q.
+
+        For functionals of the same kind, as a residual and the terms that it is the sum of, the
+        ratio of these norms is that of the dual norms, and larger where a residual is rough.
+        """
+        parts = []
+        for gram, free in (
+            (self.forms.model.mass, self.free),
+            (self.forms.model.Q.gram if not self.auxiliary else self.gram, self.free_q),
+        ):
+            diagonal = np.abs(gram.diagonal())[: len(free)]
+            floor = diagonal.max(initial=0.0) or 1.0
+            parts.append(free / np.where(diagonal > 0.0, diagonal, floor))
+        return np.concatenate(parts)
+
+    def dual(self, functional: Array, part: slice) -> float:
+        """Return the dual norm of a functional on u or q."""
+        return math.sqrt(float((functional * functional) @ self.dual_weights[part]))
+
+    @cached_property
+    def parts(self) -> tuple[slice, slice]:
+        """Where u and q stand in y."""
+        return slice(0, self.n), slice(self.n, self.size)
+
+    def measured(
+        self,
+        data: StageData,
+        residual: Array,
+        terms: tuple[list[Array], list[Array]],
+        norms: Residual,
+        theta: float,
+    ) -> tuple[float, bool, tuple[float, float]]:
+        """Return the relative size of a residual, whether it resolves r, and what it is relative to.
+
+        Parameters
+        ----------
+        terms
+            The terms of the first and of the second line.
+        """
+        sizes = []
+        for part, line in zip(self.parts, terms, strict=True):
+            own = self.dual(residual[part], part)
+            scale = max([self.dual(term, part) for term in line], default=0.0)
+            sizes.append((own, scale))
+        (state, scale), (other, scale_q) = sizes
+        # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
+        # theta may be far larger than 1/h; then M_op >= M holds r all the closer.
+        missed = state / (1.0 / data.h + theta)
+        known = float(data.u_alpha @ (self.forms.mass @ data.u_alpha))
+        r = math.sqrt(max(norms.X, 0.0)) + FLOOR * math.sqrt(max(known, 0.0))
+        resolved = missed <= RESOLVED * r or not self.forms.split.present.any()
+        relative = max(state / max(scale, TINY), other / max(scale_q, TINY))
+        return relative, resolved, (scale, scale_q)
+
+    def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
+        """Return the norms of r that a damping rule may use.
+
+        ||r||_V~ is the dual norm of M_op r over the test functions that stay within omega.
+        """
+        tests = self.forms.tests
+
+        def V() -> float:
+            return float(Mr @ tests.riesz(Mr))
+
+        return Residual(float(r @ mass_r), float(r @ Mr), V)
+
+    def theta(self, data: StageData, norms: Residual) -> float:
+        """Return the weight of R^T M_op r."""
+        own = data.metric.theta
+        return self.damping.theta(norms) if own is None else own
+
+    def slope(self, data: StageData, at: StageIterate) -> Array | None:
+        """Return the derivative of theta in u, shape (n,); None if it is zero."""
+        if data.metric.theta is not None:
+            return None
+        dX, dVX, dV = self.damping.slopes(at.norms)
+        row = (2.0 * dX) * at.mass_r + (2.0 * dVX) * at.Mr
+        if dV:
+            row = row + self.forms.pull.T @ ((2.0 * dV) * self.forms.tests.riesz(at.Mr))
+        return row if row.any() else None
+
+    def rounding(self, data: StageData, at: StageIterate) -> float:
+        """Return the relative size that rounding errors give the residual at a point."""
+        forms, model, n = self.forms, self.forms.model, self.n
+        u, q = np.abs(at.y[:n]), np.abs(at.y[n:])
+        c, v = np.abs(data.c), np.abs(at.w) + np.abs(data.u_alpha)
+        moment, w, own = data.moment, {"u": at.w}, {"u": at.y[:n]}
+        A = abs(forms.A_in.matrix("v", "q", moment, q=at.y[n:], **w))
+        first = abs(model.mass) @ ((u + c[:n]) / data.h) + A @ q + np.abs(data.source)
+        first += abs(forms.B_in.matrix("v", "u", moment, **w)) @ np.abs(at.w)
+        first += at.theta * (abs(forms.pull) @ (u + v)) + abs(forms.hidden) @ u
+        if forms.A_out is not None and forms.B_out is not None:
+            first += abs(forms.A_out.matrix("v", "q", moment, q=at.y[n:], **own)) @ q
+            first += abs(forms.B_out.matrix("v", "u", moment, **own)) @ u
+        gram = abs(self.gram)[: len(q), : len(q)]
+        second = data.metric.scale * (gram @ (q + c[n:])) + A.T @ (forms.split.R @ (u + v))
+        pairs = zip((first, second), self.parts, at.scales, strict=True)
+        sizes = [self.dual(line, part) / max(scale, TINY) for line, part, scale in pairs]
+        return ROUNDING * max(sizes)
+
+
+class StageSolver(ABC):
+    """Abstract solver of coupled stages: evaluates their equation and factorises its Jacobian."""
+
+    def __init__(self, terms: StageTerms) -> None:
+        self.terms = terms
+
+    @property
+    @abstractmethod
+    def keeps(self) -> bool:
+        """True if a factor is worth keeping from stage to stage."""
+
+    @property
+    @abstractmethod
+    def patience(self) -> int:
+        """Updates, beyond one for each stage, after which a kept factor is made again."""
+
+    @abstractmethod
+    def factor(self, data: StageData, at: StageIterate) -> Factor:
+        """Return the factorised Jacobian at a point."""
+
+    def kept(self, factor: Factor) -> Factor:
+        """Return what of a factor is kept for later stages."""
+        return factor
+
+    def data(
+        self,
+        c: Array,
+        h: float,
+        moment: Moment,
+        u_alpha: Array,
+        metric: Metric,
+        w: Array | None = None,
+    ) -> StageData:
+        """Return a stage, with what the data alone say over omega.
+
+        Parameters
+        ----------
+        w
+            u_alpha with the Dirichlet values, shape (n,); default those of the moment.
+        """
+        forms, source = self.terms.forms, self.terms.forms.model.F(moment)
+        inside = None
+        if forms.W is None and self.terms.linear:
+            w = forms.model.impose(u_alpha, moment) if w is None else w
+            A = forms.A_in.matrix("v", "q", moment, u=w)
+            inside = Inside(A, forms.B_in.vector("v", moment, u=w))
+        return StageData(c, h, moment, u_alpha, metric, source, inside)
+
+    def evaluate(self, data: StageData, y: Array) -> StageIterate:
+        """Return the stage at y."""
+        terms, forms, n = self.terms, self.terms.forms, self.terms.n
+        model, moment = forms.model, data.moment
+        u, q = y[:n], y[n:]
+        r = forms.split.project(u) - data.u_alpha
+        w = u if forms.at_estimate else u - r  # u_alpha + P u, since P = I - R
+        if data.inside is not None:
+            A_in, flux = data.inside.A, data.inside.flux
+            driven = A_in @ q
+        else:
+            A_in = forms.A_in.matrix("v", "q", moment, u=w, q=q)
+            flux = forms.B_in.vector("v", moment, u=w)
+            driven = A_in @ q if terms.linear else forms.A_in.vector("v", moment, u=w, q=q)
+        if forms.B_out is not None and forms.A_out is not None:
+            flux = flux + forms.B_out.vector("v", moment, u=u)
+            driven = driven + forms.A_out.vector("v", moment, u=u, q=q)
+        if forms.nu:
+            flux = flux + forms.hidden @ u
+        Mr, mass_r = forms.pull @ r, forms.mass @ r
+        norms = terms.norms(r, Mr, mass_r)
+        theta = terms.theta(data, norms)
+        rate = model.mass @ ((u - data.c[:n]) / data.h)
+        pull = theta * Mr
+        change = self.weighed(data.metric, q - data.c[n:])
+        coupling = A_in.T @ r
+        residual = np.empty_like(y)
+        residual[:n] = (rate + flux + driven + pull - data.source) * terms.free
+        residual[n:] = (change - data.metric.load - coupling) * terms.free_q
+        lines = ([rate, driven, pull, data.source], [change, data.metric.load, coupling])
+        size, resolved, scales = terms.measured(data, residual, lines, norms, theta)
+        return StageIterate(
+            y, residual, size, resolved, scales, w, r, A_in, theta, norms, Mr, mass_r
+        )
+
+    def weighed(self, metric: Metric, change: Array) -> Array:
+        """Return H times a change of q, a dual vector."""
+        model = self.terms.forms.model
+        scaled = metric.scale * change
+        if metric.drift:
+            scaled = scaled - metric.drift * (model.latent.generator @ change)
+        weighed = model.Q.dual(scaled)
+        if metric.information is not None and self.terms.memory is not None:
+            weighed = weighed + self.terms.memory.matrix(metric.information) @ change
+        return weighed

@@ -1,0 +1,238 @@
+"""The implicit stage of the paper's method, u and q in one system: its solver and its warm start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import brentq
+
+from livepde.fem import Moment
+from livepde.laws.coupled.bilinear import BilinearSolver
+from livepde.laws.coupled.blocks import BlockSolver
+from livepde.laws.coupled.equation import StageData, StageIterate, StageSolver, StageTerms
+from livepde.laws.coupled.metric import Metric
+from livepde.laws.coupled.monolithic import MonolithicSolver
+from livepde.linalg import Array, Factor
+from livepde.stepping import Near, Newton, Solution, StepFailed
+
+__all__ = ["CoupledStage", "KeptFactor", "StageProblem", "nearest_root"]
+
+SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
+STRIDE = 1.5  # factor between two values of theta that are tried
+WIDEST = 1e6  # factor to both sides within which theta is searched
+ACCURACY = 1e-8  # relative, of theta: Newton goes on from there
+
+
+@dataclass(frozen=True, eq=False)
+class KeptFactor:
+    """Where a factor was made that goes from stage to stage.
+
+    The factor itself is made again from this where it is gone, after a restart say: the numbers
+    that follow are the same.
+
+    Attributes
+    ----------
+    y, u_alpha, h
+        Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
+    scale, drift, information
+        Of its metric; `information` is empty without one.
+    spent
+        Updates that stages took since then, beyond one each.
+    """
+
+    y: Array
+    u_alpha: Array
+    h: float
+    scale: float
+    drift: float
+    information: Array
+    spent: int
+
+    @classmethod
+    def none(cls) -> KeptFactor:
+        """Return the value without a factor."""
+        return cls(np.zeros(0), np.zeros(0), 0.0, 0.0, 0.0, np.zeros(0), 0)
+
+    @classmethod
+    def made(cls, data: StageData, y: Array) -> KeptFactor:
+        """Return the value for a factor made at y in a stage."""
+        metric = data.metric
+        information = np.zeros(0) if metric.information is None else metric.information
+        return cls(y, data.u_alpha, data.h, metric.scale, metric.drift, information, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class StageProblem:
+    """One stage to be solved.
+
+    Attributes
+    ----------
+    c
+        (c_u, c_q), shape (n + m,).
+    h, moment
+        Step, and time and inputs at its end.
+    u_alpha
+        Observed part of the state, shape (n,).
+    metric
+        H and load of the second line.
+    """
+
+    c: Array
+    h: float
+    moment: Moment
+    u_alpha: Array
+    metric: Metric
+
+
+@dataclass(frozen=True, eq=False)
+class _Equation:
+    """The equation of one stage, as `Newton` sees it."""
+
+    solver: StageSolver
+    data: StageData
+
+    def evaluate(self, y: Array) -> StageIterate:
+        return self.solver.evaluate(self.data, y)
+
+    def factor(self, at: StageIterate) -> Factor:
+        return self.solver.factor(self.data, at)
+
+    def rounding(self, at: StageIterate) -> float:
+        return self.solver.terms.rounding(self.data, at)
+
+
+def nearest_root(function: Callable[[float], float], start: float) -> float | None:
+    """Return a root of a function of a positive number, the nearest one to both sides of a start.
+
+    None: there is none within a factor of `WIDEST`.
+    """
+    values = {0: function(start)}
+    if values[0] == 0.0:
+        return start
+    outward = 1 if values[0] > 0.0 else -1  # where theta is too small a root lies above it
+    for k in range(1, int(math.log(WIDEST) / math.log(STRIDE)) + 1):
+        for end in (outward * k, -outward * k):
+            values[end] = function(start * STRIDE**end)
+            inner = values[end - 1 if end > 0 else end + 1]
+            if (values[end] > 0.0) != (inner > 0.0):
+                near, far = sorted((start * STRIDE**end, start * STRIDE ** (end - np.sign(end))))
+                return float(brentq(function, near, far, rtol=ACCURACY))
+    return None
+
+
+class CoupledStage:
+    """Solves coupled stages for one set of sensors; see `livepde.laws.coupled.equation`."""
+
+    def __init__(self, terms: StageTerms, newton: Newton) -> None:
+        self.terms = terms
+        self.newton = newton
+        self._last: tuple[Array, Factor] | None = None
+
+    @cached_property
+    def solver(self) -> StageSolver:
+        """How it is solved: by blocks, by products made ahead, or as a whole."""
+        terms = self.terms
+        return BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
+
+    def solve(
+        self,
+        problem: StageProblem,
+        start: Callable[[], Array],
+        predicted: Array | None = None,
+        kept: KeptFactor | None = None,
+    ) -> tuple[Array, KeptFactor]:
+        """Return y = (u, q) of one stage, and the factor to keep; raises `StepFailed`.
+
+        Parameters
+        ----------
+        start
+            Returns where the iteration begins without a prediction, shape (n + m,).
+        predicted
+            A prediction of the solution, shape (n + m,).
+        kept
+            The factor that the stage before has kept.
+        """
+        solver, kept = self.solver, kept or KeptFactor.none()
+        p = problem
+        data = solver.data(p.c, p.h, p.moment, p.u_alpha, p.metric)
+        near = None
+        if predicted is not None:
+            near = Near(self._imposed(predicted, p.moment), self._factor(kept, problem))
+        equation = _Equation(solver, data)
+
+        def begin() -> Array:
+            return self._imposed(start(), p.moment)
+
+        try:
+            solved = self.newton.solve(equation, begin, near)
+        except StepFailed:
+            if data.metric.theta is not None:
+                raise
+            solved = self._by_theta(equation, begin())
+        return solved.at.y, self._kept(kept, data, solved)
+
+    def _by_theta(self, equation: _Equation, start: Array) -> Solution[StageIterate]:
+        """Return the solution whose theta is nearest to that of the start; raises `StepFailed`.
+
+        Where theta is given the stage is all but linear. So theta is found as the root of one
+        scalar function, which has a root: a rule is bounded and continuous.
+        """
+        data, newton = equation.data, replace(self.newton, share=0.0)
+        y = start
+
+        def gap(theta: float) -> float:
+            nonlocal y
+            fixed = replace(data, metric=replace(data.metric, theta=theta))
+            at = newton.solve(_Equation(self.solver, fixed), y).at
+            y = at.y
+            return self.terms.damping.theta(at.norms) - theta
+
+        first = max(equation.evaluate(start).theta, SMALLEST)
+        root = nearest_root(gap, first)
+        if root is None:
+            raise StepFailed("not_converged", "no weight theta of the damping solves the stage")
+        gap(root)
+        return newton.solve(equation, y, Near(y))
+
+    def _imposed(self, y: Array, moment: Moment) -> Array:
+        """Return y with the Dirichlet values of a moment."""
+        n, model = self.terms.n, self.terms.forms.model
+        imposed = y.copy()
+        imposed[:n] = model.impose(y[:n], moment)
+        return imposed
+
+    def _factor(self, kept: KeptFactor, problem: StageProblem) -> Factor | None:
+        """Return the factor that is kept, made again if the last one is another."""
+        if not len(kept.y) or kept.h != problem.h:
+            return None
+        last = self._last
+        if last is not None and last[0] is kept.y:
+            return last[1]
+        information = kept.information if len(kept.information) else None
+        metric = Metric(kept.scale, kept.drift, np.zeros_like(problem.metric.load), information)
+        n = self.terms.n
+        w = kept.u_alpha.copy()
+        fixed = self.terms.forms.model.X.fixed
+        w[fixed] = kept.y[:n][fixed]
+        data = self.solver.data(kept.y, kept.h, problem.moment, kept.u_alpha, metric, w)
+        at = self.solver.evaluate(data, kept.y)
+        factor = self.solver.kept(self.solver.factor(data, at))
+        self._last = (kept.y, factor)
+        return factor
+
+    def _kept(
+        self, kept: KeptFactor, data: StageData, solved: Solution[StageIterate]
+    ) -> KeptFactor:
+        """Return what becomes of the kept factor after a stage."""
+        if not self.solver.keeps:
+            return kept
+        if solved.made is not None:
+            at, factor = solved.made
+            self._last = (at.y, self.solver.kept(factor))
+            return KeptFactor.made(data, at.y)
+        spent = kept.spent + max(solved.updates - 1, 0)
+        return KeptFactor.none() if spent > self.solver.patience else replace(kept, spent=spent)

@@ -1,0 +1,229 @@
+"""The parts around the method of `GradientLaw`: stages, the rule for u_alpha, metric, gate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.fem import Moment
+from livepde.laws.base import Problem
+from livepde.laws.coupled import (
+    CoupledStage,
+    KeptFactor,
+    StageForms,
+    StageProblem,
+    StageTerms,
+)
+from livepde.laws.damping import Damping, ResidualDamping
+from livepde.laws.excitation import Excitation, ExcitationGate, Probes
+from livepde.laws.information import InformationMetric
+from livepde.laws.memory import Learning
+from livepde.laws.metrics import ConstantMetric, MetricRule, MetricStep
+from livepde.laws.observed_part import (
+    GeneralizedInverse,
+    ObservedPart,
+    ObservedPath,
+    RegularizedInverse,
+    SelfChosenSmoothing,
+)
+from livepde.laws.smoothing import smooths
+from livepde.linalg import Array, Pattern
+from livepde.stepping import Newton
+
+__all__ = ["GradientParts", "StageSequence", "constant_parts", "tuned_parts"]
+
+SAME = 1e-9  # of a step: times that are the same but for rounding
+MOST_STAGES = 8  # kept for different sets of present sensors
+
+
+@dataclass(frozen=True, eq=False)
+class GradientParts:
+    """What is computed once for a problem, and the rules around the method.
+
+    Attributes
+    ----------
+    problem, newton, damping
+        As given.
+    M_op, N_op, nu, at_estimate
+        As for `StageForms`.
+    observed, metric
+        Rules for u_alpha and for the metric of Q.
+    gate, probes
+        When q is held, and what tells; None: never.
+    memory
+        Pattern of the information, for `StageTerms`.
+    """
+
+    problem: Problem
+    newton: Newton
+    damping: Damping
+    M_op: Any
+    N_op: Any
+    nu: float
+    observed: ObservedPart[Any]
+    metric: MetricRule[Any]
+    gate: ExcitationGate | None = None
+    probes: Probes | None = None
+    memory: Pattern | None = None
+    at_estimate: bool = False
+    _stages: dict[bytes, CoupledStage] = field(default_factory=dict)
+
+    def stage(self, present: Array) -> CoupledStage:
+        """Return the coupled stage for the sensors present."""
+        key = present.tobytes()
+        stage = self._stages.get(key)
+        if stage is None:
+            if len(self._stages) >= MOST_STAGES:
+                self._stages.clear()
+            forms = StageForms(
+                self.problem.model,
+                self.problem.observed.split(present),
+                self.M_op,
+                self.N_op,
+                self.nu,
+                self.at_estimate,
+            )
+            terms = StageTerms(forms, self.damping, self.memory)
+            stage = self._stages[key] = CoupledStage(terms, self.newton)
+        return stage
+
+    def closed(self, excitation: Excitation) -> bool:
+        """Return true if the gate is closed: q is held."""
+        return self.gate is not None and self.gate.closed(excitation)
+
+    def excited(
+        self, excitation: Excitation, w: Array, u: Array, q: Array, moment: Moment
+    ) -> Excitation:
+        """Return the excitation after a sample, from w and the estimate u."""
+        if self.gate is None or self.probes is None:
+            return excitation
+        return self.gate.add(excitation, self.probes(w, q, moment), self.probes(u, q, moment))
+
+
+class StageSequence:
+    """The coupled stages of one interval, one after the other: a `Stage` for `advance`.
+
+    Attributes
+    ----------
+    kept
+        The factor that the last stage has kept.
+    """
+
+    def __init__(
+        self,
+        coupled: CoupledStage,
+        path: ObservedPath,
+        metric: MetricStep,
+        rate: Array | None,
+        kept: KeptFactor,
+    ) -> None:
+        self.coupled = coupled
+        self.path = path
+        self.metric = metric
+        self.slope = rate
+        self.kept = kept if rate is not None else KeptFactor.none()
+
+    def __call__(self, c: Array, t: float, h: float) -> Array:
+        """Return y = (u, q) at t of the stage that begins at c; raises `StepFailed`."""
+        n, project = self.coupled.terms.n, self.coupled.terms.forms.split.project
+        u_alpha = self.path.at(t).u
+        problem = StageProblem(
+            c, h, self.path.interval.at(t), u_alpha, self.metric(c[n:], h)
+        )
+        # The observed part moves with the data, the rest as in the step before.
+        follows = c.copy()
+        follows[:n] += u_alpha - self.path.at(max(t - h, self.path.interval.t0)).u
+
+        def start() -> Array:  # with r as it was
+            if self.slope is None:
+                return follows
+            moved = follows + h * self.slope
+            moved[:n] -= project(h * self.slope[:n])
+            return moved
+
+        predicted = None if self.slope is None else follows + h * self.slope
+        y, self.kept = self.coupled.solve(problem, start, predicted, self.kept)
+        return y
+
+    def rate(self, begin: Array, end: Array) -> Array:
+        """Return the change of (u - u_alpha, q) over the interval, per unit of time."""
+        n, interval = self.coupled.terms.n, self.path.interval
+        change = end - begin
+        change[:n] -= self.path.at(interval.t1).u - self.path.at(interval.t0).u
+        return change / (interval.t1 - interval.t0)
+
+
+def constant_parts(
+    problem: Problem,
+    gain: float,
+    damping: Damping,
+    newton: Newton,
+    *,
+    M_op: Any,
+    N_op: Any,
+    nu: float = 0.0,
+    sigma: float = 0.0,
+    gate: ExcitationGate | None = None,
+    at_estimate: bool = False,
+) -> GradientParts:
+    """Return the parts of a law with a constant gain."""
+    _require_linear_readings(problem)
+    regularises = problem.observed.observation.reconstruction.regularises
+    inverse = RegularizedInverse(problem) if regularises else GeneralizedInverse(problem)
+    return GradientParts(
+        problem=problem,
+        newton=_for_scheme(newton, problem),
+        damping=damping,
+        M_op=M_op,
+        N_op=N_op,
+        nu=nu,
+        observed=inverse,
+        metric=ConstantMetric(problem.model, gain, sigma),
+        gate=gate,
+        probes=None if gate is None else Probes(problem.model, problem.observed.split()),
+        at_estimate=at_estimate,
+    )
+
+
+def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> GradientParts:
+    """Return the parts of the law that tunes itself."""
+    _require_linear_readings(problem)
+    model, observation = problem.model, problem.observed.observation
+    if model.latent.moves:
+        raise LawError(
+            "GradientLaw: gain='auto' accumulates what is known of constant unknowns, and here "
+            "one moves (evolution=): give a number for gain, or use SensitivityLaw."
+        )
+    learning = Learning(model, observation.nodal)
+    observed: ObservedPart[Any] = GeneralizedInverse(problem)
+    if observation.reconstruction.regularises:
+        observed = RegularizedInverse(problem)
+    elif smooths(problem.observed):
+        observed = SelfChosenSmoothing(problem)
+    return GradientParts(
+        problem=problem,
+        newton=_for_scheme(newton, problem),
+        damping=ResidualDamping(),
+        M_op=None,
+        N_op=N_op,
+        nu=nu,
+        observed=observed,
+        metric=InformationMetric(learning),
+        memory=learning.pattern,
+    )
+
+
+def _for_scheme(newton: Newton, problem: Problem) -> Newton:
+    """Return the iteration for a scheme: one of second order leaves out less than a prediction."""
+    return replace(newton, share=0.0) if problem.control.scheme.order > 1 else newton
+
+
+def _require_linear_readings(problem: Problem) -> None:
+    if not problem.observed.linear:
+        raise LawError(
+            "this law needs readings z = G u, and this observation is not linear or sees a "
+            "parameter directly: use SensitivityLaw."
+        )

@@ -1,0 +1,122 @@
+"""The metric of Q in which q learns: a constant gain, or the information that the data have given.
+
+The second line (est_exact_q) reads q' = gain G_Q^{-1} A(w)^T r in coefficients. A rule says what
+stands for G_Q/gain in each stage, and carries what it needs for that from sample to sample.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from livepde.fem import Moment
+from livepde.laws.coupled import Metric
+from livepde.laws.coupled.forms import StageForms
+from livepde.linalg import Array
+from livepde.model import Model
+
+__all__ = ["ConstantMetric", "MetricRule", "MetricStep", "NoState", "Transition"]
+
+HOLD = 1e12  # times smaller is a gain that keeps q where it is
+
+MetricStep = Callable[[Array, float], Metric]
+"""(c_q, h) -> the metric of a stage that begins at c_q."""
+
+
+@dataclass(frozen=True)
+class NoState:
+    """The state of what carries nothing from sample to sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transition:
+    """What a step has done, for a rule to learn from.
+
+    Attributes
+    ----------
+    forms
+        The forms of the stage.
+    q, r, w
+        Parameter, observed residual and w = u_alpha + P u at its end.
+    moment, length
+        Time and inputs at its end, and how long it was.
+    same
+        True if the sensors are those of the sample before.
+    """
+
+    forms: StageForms
+    q: Array
+    r: Array
+    w: Array
+    moment: Moment
+    length: float
+    same: bool
+
+
+State = TypeVar("State")
+
+
+class MetricRule(ABC, Generic[State]):
+    """Abstract rule for the metric of Q."""
+
+    @abstractmethod
+    def init(self, q0: Array) -> State:
+        """Return the state before the first sample."""
+
+    @abstractmethod
+    def step(self, state: State, forms: StageForms, before: Transition) -> MetricStep:
+        """Return the metric of the stages of a step.
+
+        Parameters
+        ----------
+        before
+            What is known before the step: q and w at its beginning, with the new data in w.
+        """
+
+    @abstractmethod
+    def frozen(self, state: State, forms: StageForms, before: Transition) -> MetricStep:
+        """Return the same for a step in which q is held."""
+
+    def learn(self, state: State, after: Transition) -> State:
+        """Return the state after a step."""
+        return state
+
+    def notes(self, state: State, q: Array, length: float) -> Mapping[str, Any]:
+        """Return numbers worth keeping after a step."""
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantMetric(MetricRule[NoState]):
+    """G_Q/gain, and the stabilising term of (noisy_q): q' = gain G_Q^{-1} A(w)^T r - sigma q.
+
+    An unknown that moves by itself adds K (q - prior), with its generator K.
+    """
+
+    model: Model
+    gain: float
+    sigma: float
+
+    def init(self, q0: Array) -> NoState:
+        return NoState()
+
+    def step(self, state: NoState, forms: StageForms, before: Transition) -> MetricStep:
+        return lambda c, h: self.stage(c, h, self.gain, self.sigma)
+
+    def frozen(self, state: NoState, forms: StageForms, before: Transition) -> MetricStep:
+        return lambda c, h: self.stage(c, h, self.gain / HOLD, 0.0)
+
+    def stage(self, c: Array, h: float, gain: float, sigma: float) -> Metric:
+        """Return the metric of a stage that begins at c."""
+        latent, Q = self.model.latent, self.model.Q
+        load = np.zeros_like(c)
+        if sigma:
+            load = load - Q.dual(c) * (sigma / gain)
+        if latent.generator.nnz:
+            load = load + Q.dual(latent.generator @ (c - latent.prior)) / gain
+        drift = 1.0 / gain if latent.generator.nnz else 0.0
+        return Metric((1.0 / h + sigma) / gain, drift, load)

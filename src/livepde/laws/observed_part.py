@@ -1,0 +1,178 @@
+"""The observed part u_alpha of the state over one interval: G^+ z, or G_alpha z (section 3.2)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from livepde.laws.base import Problem
+from livepde.laws.metrics import NoState
+from livepde.laws.smoothing import Balance, Smoother
+from livepde.linalg import Array
+from livepde.observation import Reconstructed, Split
+from livepde.stepping import Interval
+
+__all__ = [
+    "GeneralizedInverse",
+    "ObservedPart",
+    "ObservedPath",
+    "RegularizedInverse",
+    "SelfChosenSmoothing",
+]
+
+LARGEST_MEMO = 8  # smoothers kept for different sets of present sensors
+
+State = TypeVar("State")
+
+
+class ObservedPath(ABC):
+    """u_alpha at any time of an interval, each found once."""
+
+    #: False while the samples cannot tell how noisy they are: nothing is learned from them.
+    ready = True
+
+    def __init__(self, problem: Problem, interval: Interval) -> None:
+        self.problem = problem
+        self.interval = interval
+        self._found: dict[float, Reconstructed] = {}
+
+    def at(self, t: float) -> Reconstructed:
+        """Return u_alpha at a time."""
+        if t not in self._found:
+            self._found[t] = self.find(self.interval.z(t), self.boundary(t))
+        return self._found[t]
+
+    def boundary(self, t: float) -> Array | None:
+        """Return the Dirichlet values, shape (n,); None if all of them are zero."""
+        model = self.problem.model
+        if model.homogeneous:
+            return None
+        return model.impose(np.zeros(model.X.dim), self.interval.at(t))
+
+    @abstractmethod
+    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
+        """Return u_alpha from measurements."""
+
+    def notes(self) -> Mapping[str, float]:
+        """Return numbers worth keeping, at the end of the interval."""
+        return {}
+
+
+class ObservedPart(ABC, Generic[State]):
+    """Abstract rule for u_alpha; what evolves is an explicit state."""
+
+    @abstractmethod
+    def init(self) -> State:
+        """Return the state before the first sample."""
+
+    @abstractmethod
+    def over(self, state: State, split: Split, interval: Interval) -> tuple[State, ObservedPath]:
+        """Return the state after the sample at the end of an interval, and u_alpha over it."""
+
+
+@dataclass(frozen=True, eq=False)
+class GeneralizedInverse(ObservedPart[NoState]):
+    """u_alpha = G^+ z."""
+
+    problem: Problem
+
+    def init(self) -> NoState:
+        return NoState()
+
+    def over(
+        self, state: NoState, split: Split, interval: Interval
+    ) -> tuple[NoState, ObservedPath]:
+        return state, _InversePath(self.problem, interval, split)
+
+
+class _InversePath(ObservedPath):
+    def __init__(self, problem: Problem, interval: Interval, split: Split) -> None:
+        super().__init__(problem, interval)
+        self.split = split
+
+    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
+        return Reconstructed(self.split.reconstruct(z, boundary), 0.0, 0.0, None)
+
+
+@dataclass(frozen=True, eq=False)
+class RegularizedInverse(ObservedPart[NoState]):
+    """u_alpha = G_alpha z, by the `reconstruction` of the observation."""
+
+    problem: Problem
+
+    def init(self) -> NoState:
+        return NoState()
+
+    def over(
+        self, state: NoState, split: Split, interval: Interval
+    ) -> tuple[NoState, ObservedPath]:
+        return state, _RegularizedPath(self.problem, interval)
+
+
+class _RegularizedPath(ObservedPath):
+    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
+        present = self.interval.present
+        return self.problem.observed.reconstruct(z, boundary=boundary, present=present)
+
+    def notes(self) -> Mapping[str, float]:
+        found = self.at(self.interval.t1)
+        return {"alpha": found.alpha, "misfit": found.misfit}
+
+
+class SelfChosenSmoothing(ObservedPart[Balance]):
+    """u_alpha smoothed as much as the noise of the samples asks for (`livepde.laws.smoothing`)."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self._smoothers: dict[bytes, Smoother] = {}
+
+    def init(self) -> Balance:
+        return Balance.none(self.problem.observed.size, self.problem.model.X.dim)
+
+    def over(
+        self, state: Balance, split: Split, interval: Interval
+    ) -> tuple[Balance, ObservedPath]:
+        smoother, model = self._smoother(split.present), self.problem.model
+        zero = np.zeros(model.X.dim)
+        times = (interval.t1,) if state.samples else (interval.t0, interval.t1)
+        for t in times:
+            z = interval.z1 if t == interval.t1 else interval.z0
+            state = smoother.add(state, z, model.impose(zero, interval.at(t)))
+        path = _SmoothedPath(self.problem, interval, split, smoother, smoother.alpha(state))
+        path.ready = not smoother.waits(state)
+        return state, path
+
+    def _smoother(self, present: Array) -> Smoother:
+        key = present.tobytes()
+        if key not in self._smoothers:
+            if len(self._smoothers) >= LARGEST_MEMO:
+                self._smoothers.clear()
+            self._smoothers[key] = Smoother(self.problem.observed, present)
+        return self._smoothers[key]
+
+
+class _SmoothedPath(_InversePath):
+    def __init__(
+        self,
+        problem: Problem,
+        interval: Interval,
+        split: Split,
+        smoother: Smoother,
+        alpha: float,
+    ) -> None:
+        super().__init__(problem, interval, split)
+        self.smoother = smoother
+        self.alpha = alpha
+
+    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
+        if self.alpha == 0.0:
+            return super().find(z, boundary)
+        known = np.zeros(self.problem.model.X.dim) if boundary is None else boundary
+        return Reconstructed(self.smoother(self.alpha, z, known), self.alpha, 0.0, None)
+
+    def notes(self) -> Mapping[str, float]:
+        return {"alpha": self.alpha}
