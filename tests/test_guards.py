@@ -13,7 +13,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.laws.guards import Scale
 from livepde.laws.past import Past, Samples
-from livepde.laws.rest import Excitation, Probes, pairs
+from livepde.laws.excitation import Excitation, Probes, pairs
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
 from livepde.stepping import ForwardStage, Interval
@@ -271,7 +271,7 @@ def holds(data: Any) -> np.ndarray:
 def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: float):
     model = reaction(lambda t: 1.0 * (t < 20.0))
     stream = list(full(model, 1000))
-    free = learned(model, stream, rest=None, sigma=sigma)
+    free = learned(model, stream, gate=None, sigma=sigma)
     held = learned(model, stream, sigma=sigma)
     first = int(np.flatnonzero(holds(held))[0])
     assert 400 < first < 500
@@ -313,7 +313,7 @@ def test_an_exact_excitation_that_dies_out_is_none():
 
 
 def test_a_rest_is_told_from_noise_alone():
-    rng, rest = np.random.default_rng(0), lp.Rest()
+    rng, rest = np.random.default_rng(0), lp.ExcitationGate()
     slow, noise = np.sin(0.1 * np.arange(300))[:, None], rng.standard_normal((300, 16))
 
     def after(*parts: np.ndarray) -> Excitation:
@@ -324,13 +324,13 @@ def test_a_rest_is_told_from_noise_alone():
 
     signal = 10.0 * slow * np.ones(16)
     for unit in (1e-9, 1.0, 1e9):
-        assert rest.holds(after(unit * (signal + noise), unit * noise))
-        assert not rest.holds(after(unit * (signal + noise)))
-        assert not rest.holds(after(unit * (signal + noise), unit * noise, unit * signal[100:105]))
-        assert not rest.holds(after(unit * (signal + noise), 0.1 * unit * signal))  # weak, no noise
-        assert not rest.holds(after(unit * noise))  # never more than that: perhaps a fast process
-        assert not rest.holds(after(unit * signal, 10.0 * unit * noise))
-    assert not rest.holds(after(np.zeros((300, 16))))
+        assert rest.closed(after(unit * (signal + noise), unit * noise))
+        assert not rest.closed(after(unit * (signal + noise)))
+        assert not rest.closed(after(unit * (signal + noise), unit * noise, unit * signal[100:105]))
+        assert not rest.closed(after(unit * (signal + noise), 0.1 * unit * signal))  # weak, no noise
+        assert not rest.closed(after(unit * noise))  # never more than that: perhaps a fast process
+        assert not rest.closed(after(unit * signal, 10.0 * unit * noise))
+    assert not rest.closed(after(np.zeros((300, 16))))
 
 
 def test_probes_see_the_same_by_assembly_in_every_unit():
@@ -362,7 +362,7 @@ def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
 @pytest.mark.parametrize("options", [{"window": 0.5}, {"correlation": 1.0}, {"energy": 0.0}])
 def test_rests_that_cannot_be_meant_are_refused(options: Any):
     with pytest.raises(lp.LawError, match=next(iter(options))):
-        lp.Rest(**options)
+        lp.ExcitationGate(**options)
 
 
 @pytest.mark.parametrize("options", [{"reach": 0.0}, {"runaway": -1.0}, {"past": 0}])

@@ -135,8 +135,8 @@ class Newton:
     """
 
     tolerance: float = 1e-8
-    share: float = 0.03
-    ceiling: float = 1e-3
+    share: float = 0.1
+    ceiling: float = 3e-3
     iterations: int = 60
     refresh: float = 0.2
 

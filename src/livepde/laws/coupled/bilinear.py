@@ -117,7 +117,8 @@ class BilinearSolver(MonolithicSolver):
         if forms.W is None:
             w = forms.model.impose(u_alpha, moment) if w is None else w
             inside = Inside(self._coupling[1] @ w, products["B_in"] @ w)
-        return StageData(c, h, moment, u_alpha, metric, known, inside)
+        sizes = self.terms.sizes(known, metric.load, u_alpha)
+        return StageData(c, h, moment, u_alpha, metric, known, inside, sizes)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
@@ -142,8 +143,9 @@ class BilinearSolver(MonolithicSolver):
         residual = np.empty_like(y)
         residual[:n] = rate + flux + products["B_out"] @ u + driven + pull - data.source
         residual[n:] = change - (coupling + data.metric.load) * terms.free_q
-        lines = ([rate, driven, pull, data.source], [change, data.metric.load, coupling])
-        size, resolved, scales = terms.measured(data, residual, lines, norms, theta)
+        first = [residual[:n], rate, driven, pull]
+        second = [residual[n:], change, coupling]
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
         return StageIterate(
             y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r
         )

@@ -41,7 +41,7 @@ from livepde.linalg import (
 __all__ = ["LARGE", "ApproximateFactor", "BlockJacobian", "BlockSolver"]
 
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
-TOLERANCE = 1e-2  # of GMRES, relative to the first approximation: Newton goes on from there
+TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
 SPENT = 24  # updates and iterations: about what new factors cost
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere

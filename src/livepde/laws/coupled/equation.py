@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -63,6 +64,8 @@ class StageData:
         F, shape (n,).
     inside
         A and B over omega, where the data give all of w there.
+    sizes
+        Dual norms of F and of the load, and ||u_alpha||_X.
     """
 
     c: Array
@@ -72,6 +75,7 @@ class StageData:
     metric: Metric
     source: Array
     inside: Inside | None
+    sizes: tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,44 +186,53 @@ class StageTerms:
             parts.append(free / np.where(diagonal > 0.0, diagonal, floor))
         return np.concatenate(parts)
 
-    def dual(self, functional: Array, part: slice) -> float:
-        """Return the dual norm of a functional on u or q."""
-        return math.sqrt(float((functional * functional) @ self.dual_weights[part]))
-
     @cached_property
     def parts(self) -> tuple[slice, slice]:
         """Where u and q stand in y."""
         return slice(0, self.n), slice(self.n, self.size)
 
+    @cached_property
+    def lumped(self) -> Array:
+        """Diagonal of the mass of the state, shape (n,): norms by it are equivalent to those of X."""
+        return np.abs(self.forms.model.mass.diagonal())
+
+    def duals(self, functionals: Sequence[Array], part: slice) -> list[float]:
+        """Return the dual norms of functionals on u or q."""
+        squares = np.square(np.array(functionals)) @ self.dual_weights[part]
+        found: list[float] = np.sqrt(squares).tolist()
+        return found
+
     def measured(
-        self,
-        data: StageData,
-        residual: Array,
-        terms: tuple[list[Array], list[Array]],
-        norms: Residual,
-        theta: float,
+        self, data: StageData, first: list[Array], second: list[Array], X: float, theta: float
     ) -> tuple[float, bool, tuple[float, float]]:
         """Return the relative size of a residual, whether it resolves r, and what it is relative to.
 
         Parameters
         ----------
-        terms
-            The terms of the first and of the second line.
+        first, second
+            Residual and changing terms of the two lines.
+        X
+            ||r||_X^2.
         """
-        sizes = []
-        for part, line in zip(self.parts, terms, strict=True):
-            own = self.dual(residual[part], part)
-            scale = max([self.dual(term, part) for term in line], default=0.0)
-            sizes.append((own, scale))
-        (state, scale), (other, scale_q) = sizes
+        state, *terms = self.duals(first, self.parts[0])
+        other, *terms_q = self.duals(second, self.parts[1])
+        scales = max(data.sizes[0], *terms), max(data.sizes[1], *terms_q)
+        relative = max(state / max(scales[0], TINY), other / max(scales[1], TINY))
         # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
-        # theta may be far larger than 1/h; then M_op >= M holds r all the closer.
         missed = state / (1.0 / data.h + theta)
-        known = float(data.u_alpha @ (self.forms.mass @ data.u_alpha))
-        r = math.sqrt(max(norms.X, 0.0)) + FLOOR * math.sqrt(max(known, 0.0))
-        resolved = missed <= RESOLVED * r or not self.forms.split.present.any()
-        relative = max(state / max(scale, TINY), other / max(scale_q, TINY))
-        return relative, resolved, (scale, scale_q)
+        r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
+        return relative, missed <= RESOLVED * r or not self.observes, scales
+
+    def sizes(self, source: Array, load: Array, u_alpha: Array) -> tuple[float, float, float]:
+        """Return the dual norms of what is given of the two lines, and ||u_alpha||_X."""
+        (own,) = self.duals([source], self.parts[0])
+        (other,) = self.duals([load], self.parts[1]) if load.any() else (0.0,)
+        return own, other, math.sqrt(float(self.lumped @ np.square(u_alpha)))
+
+    @cached_property
+    def observes(self) -> bool:
+        """True if a sensor is present."""
+        return bool(self.forms.split.present.any())
 
     def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
         """Return the norms of r that a damping rule may use.
@@ -264,7 +277,7 @@ class StageTerms:
         gram = abs(self.gram)[: len(q), : len(q)]
         second = data.metric.scale * (gram @ (q + c[n:])) + A.T @ (forms.split.R @ (u + v))
         pairs = zip((first, second), self.parts, at.scales, strict=True)
-        sizes = [self.dual(line, part) / max(scale, TINY) for line, part, scale in pairs]
+        sizes = [self.duals([line], part)[0] / max(scale, TINY) for line, part, scale in pairs]
         return ROUNDING * max(sizes)
 
 
@@ -314,7 +327,8 @@ class StageSolver(ABC):
             w = forms.model.impose(u_alpha, moment) if w is None else w
             A = forms.A_in.matrix("v", "q", moment, u=w)
             inside = Inside(A, forms.B_in.vector("v", moment, u=w))
-        return StageData(c, h, moment, u_alpha, metric, source, inside)
+        sizes = self.terms.sizes(source, metric.load, u_alpha)
+        return StageData(c, h, moment, u_alpha, metric, source, inside, sizes)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         """Return the stage at y."""
@@ -345,8 +359,9 @@ class StageSolver(ABC):
         residual = np.empty_like(y)
         residual[:n] = (rate + flux + driven + pull - data.source) * terms.free
         residual[n:] = (change - data.metric.load - coupling) * terms.free_q
-        lines = ([rate, driven, pull, data.source], [change, data.metric.load, coupling])
-        size, resolved, scales = terms.measured(data, residual, lines, norms, theta)
+        first = [residual[:n], rate, driven, pull]
+        second = [residual[n:], change, coupling]
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
         return StageIterate(
             y, residual, size, resolved, scales, w, r, A_in, theta, norms, Mr, mass_r
         )
