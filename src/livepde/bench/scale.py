@@ -17,7 +17,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from tempfile import TemporaryDirectory
@@ -30,15 +29,13 @@ from livepde.errors import ConfigurationError
 from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
-from livepde.laws.coupled import CoupledStage
-from livepde.laws.gains import Gains
-from livepde.laws.schur import BlockSolver
+from livepde.laws.coupled import Metric, StageForms, StageTerms
+from livepde.laws.coupled.blocks import BlockSolver
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
 from livepde.observation import Full, Subdomain
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.stepping import Advance, ImplicitEuler, Newton, simulate
-from livepde.stepping.newton import StepFailed
+from livepde.stepping import Advance, ImplicitEuler, simulate
 
 __all__ = [
     "GAINS",
@@ -332,18 +329,17 @@ def _bump(x: Any) -> Any:
 
 def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, str]]:
     """Return the iterations of a stage's first system, and the names of the engines."""
-    observed = Full().bind(model.state_space, model.X, model.parameter_space)
-    M_op = model.bilinear(h1_form)
-    gains = Gains(gain, ResidualDamping(c1), 0.0, 0.0, M_op, M_op)
-    stage = CoupledStage(model, observed.split(), gains, Newton(iterations=1))
-    blocks = stage.way
-    if not isinstance(blocks, BlockSolver):
+    split = Full().bind(model.state_space, model.X, model.parameter_space).split()
+    forms = StageForms(model, split, h1_form, h1_form, 0.0)
+    blocks = BlockSolver.of(StageTerms(forms, ResidualDamping(c1)))
+    if blocks is None:
         raise ConfigurationError(
             f"bench scale: a problem with {model.X.dim} nodes is not solved by blocks; take more."
         )
-    blocks.tolerance = TOLERANCE
     u = model.initial(_bump)
     c = np.concatenate([u, model.initial_parameter(0.5)])
-    with suppress(StepFailed):  # one update is all that is wanted
-        stage.solve(c, STEP, Moment(STEP), observed.split().R @ u, c.copy())
-    return blocks.iterations[0], (blocks.engines["S"], blocks.engines["C"])
+    metric = Metric(1.0 / (gain * STEP), 0.0, np.zeros(model.Q.dim))
+    data = blocks.data(c, STEP, Moment(STEP), split.project(u), metric)
+    at = blocks.evaluate(data, c)
+    _, count = blocks.factor(data, at).iterate(at.residual, TOLERANCE)
+    return count, (blocks.engines["S"], blocks.engines["C"])

@@ -19,7 +19,6 @@ from livepde.laws.guards import Guards
 from livepde.laws.jumps import Jumps
 from livepde.laws.operators import diffusion_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
-
 from livepde.laws.sensitivity import Replay, SensitivityLaw
 
 __all__ = [
@@ -30,8 +29,8 @@ __all__ = [
     "ConstantDamping",
     "Constants",
     "Damping",
-    "ExcitationGate",
     "ExactBound",
+    "ExcitationGate",
     "GradientLaw",
     "Guards",
     "Jumps",

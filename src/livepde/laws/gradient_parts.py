@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Problem
@@ -130,9 +128,7 @@ class StageSequence:
         """Return y = (u, q) at t of the stage that begins at c; raises `StepFailed`."""
         n, project = self.coupled.terms.n, self.coupled.terms.forms.split.project
         u_alpha = self.path.at(t).u
-        problem = StageProblem(
-            c, h, self.path.interval.at(t), u_alpha, self.metric(c[n:], h)
-        )
+        problem = StageProblem(c, h, self.path.interval.at(t), u_alpha, self.metric(c[n:], h))
         # The observed part moves with the data, the rest as in the step before.
         follows = c.copy()
         follows[:n] += u_alpha - self.path.at(max(t - h, self.path.interval.t0)).u

@@ -40,9 +40,7 @@ class InformationMetric(MetricRule[Learned]):
         seen = learning.coupling(forms, before.w, before.q, before.moment)
         spread = HOLD * learning.spread(state, seen, h)
         zero = np.zeros_like(before.q)
-        return lambda c, h: Metric(
-            spread / PULL, 0.0, zero, state.information / PULL, PULL / h
-        )
+        return lambda c, h: Metric(spread / PULL, 0.0, zero, state.information / PULL, PULL / h)
 
     def learn(self, state: Learned, after: Transition) -> Learned:
         learning, h = self.learning, after.length

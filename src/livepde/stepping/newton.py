@@ -114,8 +114,9 @@ class Newton:
     """Newton's iteration with kept factors, and when a stage counts as solved.
 
     A stage is solved when its residual, in the dual norm and relative to the largest term of the
-    equation, is at most `tolerance`, or what rounding leaves; from a prediction that is good, at most `share` of what it had
-    there and at most `ceiling`: what a prediction misses is about what the time step leaves out.
+    equation, is at most `tolerance`, or what rounding leaves; from a prediction that is good, at
+    most `share` of what it had there and at most `ceiling`: what a prediction misses is about what
+    the time step leaves out.
     The size of an update is no criterion: a factor of another point makes it small, too.
 
     An update that does not reduce the residual is shortened until it does.

@@ -18,7 +18,7 @@ It serves Newton as a kept factor; where it reduces the residual too little, GMR
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -188,10 +188,6 @@ class BlockJacobian:
     curved: sp.csr_array | None
     border: tuple[Array, Array] | None = None
 
-    def bordered(self, column: Array, row: Array) -> BlockJacobian:
-        """Return K with column row^T, of shape (n, n), added to S."""
-        return replace(self, border=(column, row))
-
     def apply(self, x: Array) -> Array:
         """Return K x, auxiliary unknowns behind (u, q)."""
         terms = self.solver.terms
@@ -235,6 +231,10 @@ class BlockJacobian:
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
+        return self.iterate(b, TOLERANCE)[0]
+
+    def iterate(self, b: Array, tolerance: float) -> tuple[Array, int]:
+        """Return x with K x = b to a tolerance, and the iterations that it took."""
         terms, approximate = self.solver.terms, self.approximate
         n, size = terms.n, terms.size
         padded = np.zeros(size + terms.auxiliary)
@@ -246,8 +246,8 @@ class BlockJacobian:
         def scaled(r: Array) -> Array:
             return approximate.whole(r) * scale
 
-        x, _ = gmres(self.apply, scaled, padded, TOLERANCE, ITERATIONS, REMEDY)
-        return x[:size]
+        x, count = gmres(self.apply, scaled, padded, tolerance, ITERATIONS, REMEDY)
+        return x[:size], count
 
 
 @dataclass(frozen=True, eq=False)

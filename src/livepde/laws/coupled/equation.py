@@ -141,7 +141,7 @@ class StageTerms:
 
     @cached_property
     def size(self) -> int:
-        """n + m."""
+        """N + m."""
         return self.n + self.forms.model.Q.dim
 
     @cached_property
@@ -205,7 +205,7 @@ class StageTerms:
     def measured(
         self, data: StageData, first: list[Array], second: list[Array], X: float, theta: float
     ) -> tuple[float, bool, tuple[float, float]]:
-        """Return the relative size of a residual, whether it resolves r, and what it is relative to.
+        """Return the relative size of a residual, whether it resolves r, and the scales of both.
 
         Parameters
         ----------

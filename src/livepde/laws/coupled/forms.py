@@ -114,7 +114,7 @@ class StageForms:
 
     @cached_property
     def hidden(self) -> sp.csr_array:
-        """nu P^T N_op P over omega, and nu N_op outside of it (MN2), shape (n, n)."""
+        """Nu P^T N_op P over omega, and nu N_op outside of it (MN2), shape (n, n)."""
         n, P = self.model.X.dim, self.split.P
         if not self.nu:
             return sp.csr_array((n, n))

@@ -1,4 +1,4 @@
-"""The implicit stage of the paper's method, u and q in one system: its solver and its warm start."""
+"""The implicit stage of the paper's method, u and q in one system: solver and warm start."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy  # scipy.optimize is slow to load, and rarely needed
 
 from livepde.fem import Moment
 from livepde.laws.coupled.bilinear import BilinearSolver
@@ -120,7 +120,7 @@ def nearest_root(function: Callable[[float], float], start: float) -> float | No
             inner = values[end - 1 if end > 0 else end + 1]
             if (values[end] > 0.0) != (inner > 0.0):
                 near, far = sorted((start * STRIDE**end, start * STRIDE ** (end - np.sign(end))))
-                return float(brentq(function, near, far, rtol=ACCURACY))
+                return float(scipy.optimize.brentq(function, near, far, rtol=ACCURACY))
     return None
 
 
