@@ -117,7 +117,8 @@ class BilinearSolver(MonolithicSolver):
         if forms.W is None:
             w = forms.model.impose(u_alpha, moment) if w is None else w
             inside = Inside(self._coupling[1] @ w, products["B_in"] @ w)
-        return StageData(c, h, moment, u_alpha, metric, known, inside)
+        observed = self.terms.observed(u_alpha)
+        return StageData(c, h, moment, u_alpha, observed, metric, known, inside)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
@@ -134,7 +135,7 @@ class BilinearSolver(MonolithicSolver):
             A = pattern.compact(A_data + by_u @ u)
         by_r = products["r"] @ r
         Mr, mass_r = by_r[:n], by_r[n:]
-        norms = terms.norms(r, Mr, mass_r)
+        norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
         rate = products["M"] @ ((u - c[:n]) / data.h)
         driven, pull = A @ q, (theta * terms.free) * Mr

@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ __all__ = ["Inside", "StageData", "StageIterate", "StageSolver", "StageTerms"]
 
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
+STIFFEST = 1e6  # times 1/h, of theta: then a step takes all but this part of r away
 ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
 
 
@@ -57,6 +59,8 @@ class StageData:
         Step, and time and inputs at its end.
     u_alpha
         Observed part of the state, shape (n,).
+    observed
+        Function that returns the squared norms of u_alpha, computed once.
     metric
         H and load of the second line.
     source
@@ -69,6 +73,7 @@ class StageData:
     h: float
     moment: Moment
     u_alpha: Array
+    observed: Callable[[], Residual]
     metric: Metric
     source: Array
     inside: Inside | None
@@ -215,13 +220,27 @@ class StageTerms:
         # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
         # theta may be far larger than 1/h; then M_op >= M holds r all the closer.
         missed = state / (1.0 / data.h + theta)
-        known = float(data.u_alpha @ (self.forms.mass @ data.u_alpha))
-        r = math.sqrt(max(norms.X, 0.0)) + FLOOR * math.sqrt(max(known, 0.0))
+        r = math.sqrt(max(norms.X, 0.0)) + FLOOR * math.sqrt(max(data.observed().X, 0.0))
         resolved = missed <= RESOLVED * r or not self.forms.split.present.any()
         relative = max(state / max(scale, TINY), other / max(scale_q, TINY))
         return relative, resolved, (scale, scale_q)
 
-    def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
+    def observed(self, u_alpha: Array) -> Callable[[], Residual]:
+        """Return a function that computes the norms of u_alpha when it is called first."""
+
+        @cache
+        def norms() -> Residual:
+            return self.norms(u_alpha, self.forms.pull @ u_alpha, self.forms.mass @ u_alpha)
+
+        return norms
+
+    def norms(
+        self,
+        r: Array,
+        Mr: Array,
+        mass_r: Array,
+        observed: Callable[[], Residual] | None = None,
+    ) -> Residual:
         """Return the norms of r that a damping rule may use.
 
         ||r||_V~ is the dual norm of M_op r over the test functions that stay within omega.
@@ -231,16 +250,24 @@ class StageTerms:
         def V() -> float:
             return float(Mr @ tests.riesz(Mr))
 
-        return Residual(float(r @ mass_r), float(r @ Mr), V)
+        return Residual(float(r @ mass_r), float(r @ Mr), V, observed)
+
+    def damped(self, data: StageData, norms: Residual) -> float:
+        """Return the theta of the rule, with a bound that keeps the stage solvable.
+
+        A rule with a pull that does not vanish with r has no bound of its own while u_alpha is
+        zero, or tiny.
+        """
+        return min(self.damping.theta(norms), STIFFEST / data.h)
 
     def theta(self, data: StageData, norms: Residual) -> float:
         """Return the weight of R^T M_op r."""
         own = data.metric.theta
-        return self.damping.theta(norms) if own is None else own
+        return self.damped(data, norms) if own is None else own
 
     def slope(self, data: StageData, at: StageIterate) -> Array | None:
         """Return the derivative of theta in u, shape (n,); None if it is zero."""
-        if data.metric.theta is not None:
+        if data.metric.theta is not None or at.theta >= STIFFEST / data.h:
             return None
         dX, dVX, dV = self.damping.slopes(at.norms)
         row = (2.0 * dX) * at.mass_r + (2.0 * dVX) * at.Mr
@@ -314,7 +341,8 @@ class StageSolver(ABC):
             w = forms.model.impose(u_alpha, moment) if w is None else w
             A = forms.A_in.matrix("v", "q", moment, u=w)
             inside = Inside(A, forms.B_in.vector("v", moment, u=w))
-        return StageData(c, h, moment, u_alpha, metric, source, inside)
+        observed = self.terms.observed(u_alpha)
+        return StageData(c, h, moment, u_alpha, observed, metric, source, inside)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         """Return the stage at y."""
@@ -336,7 +364,7 @@ class StageSolver(ABC):
         if forms.nu:
             flux = flux + forms.hidden @ u
         Mr, mass_r = forms.pull @ r, forms.mass @ r
-        norms = terms.norms(r, Mr, mass_r)
+        norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
         rate = model.mass @ ((u - data.c[:n]) / data.h)
         pull = theta * Mr

@@ -189,7 +189,7 @@ class CoupledStage:
             fixed = replace(data, metric=replace(data.metric, theta=theta))
             at = newton.solve(_Equation(self.solver, fixed), y).at
             y = at.y
-            return self.terms.damping.theta(at.norms) - theta
+            return self.terms.damped(data, at.norms) - theta
 
         first = max(equation.evaluate(start).theta, SMALLEST)
         root = nearest_root(gap, first)
