@@ -26,8 +26,11 @@ D = Norms(X=0.01, VX=0.02, V=0.1)
 P = Norms(X=0.03, VX=0.1, V=0.7)
 
 
+SEEN = Norms(X=1.0, VX=3.0, V=10.0)  # of u_alpha
+
+
 def residual(n: Norms) -> lp.Residual:
-    return lp.Residual(n.X**2, n.VX**2, lambda: n.V**2)
+    return n.residual(SEEN)
 
 
 def mu(theta: float, norm: float) -> float:
@@ -98,6 +101,27 @@ def test_rules_are_bounded_at_vanishing_residuals():
     assert ExactBound(C, 0.0, 1.0).theta(zero) == lp.ResidualDamping(1.0).theta(zero)
     assert SmoothedBound(C, 0, 0, 0, c1=2.0).theta(zero) == 2.0
     assert NoisyBound(C, 0.1, 0.3, D, theta_max=7.0).theta(zero) == 7.0
+    nothing = Norms().residual(Norms())
+    assert ExactBound(C, 0.1, 1.0).theta(nothing) == SmoothedBound(C, 1, 1, 1).theta(nothing) == 1.0
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e5])
+def test_floors_are_relative_to_the_observed_state(scale):
+    """With bounds of p, d and their rates in the same unit, theta does not depend on that unit."""
+
+    def scaled(n: Norms) -> Norms:
+        return Norms(scale * n.X, scale * n.VX, scale * n.V)
+
+    for size in (0.0, 1e-5, 1.0):
+        r = Norms(size * R.X, size * R.VX, size * R.V)
+        rules = (ExactBound(C, P.V), SmoothedBound(C, P.V, D.V, 0.6))
+        others = (
+            ExactBound(C, scale * P.V),
+            SmoothedBound(C, scale * P.V, scale * D.V, scale * 0.6),
+        )
+        for rule, other in zip(rules, others, strict=True):
+            found = other.theta(scaled(r).residual(scaled(SEEN)))
+            assert found == pytest.approx(rule.theta(r.residual(SEEN)))
 
 
 @pytest.mark.parametrize(

@@ -299,18 +299,27 @@ class TestDamping:
         assert rule.slopes(lp.Residual(0.0, 0.0, lambda: np.nan)) == (0.0, 0.0, 0.0)
 
     def test_constant_damping(self):
+        """theta = mu / ||r||_V~ with a floor that is relative to ||u_alpha||_V~."""
         rule = lp.ConstantDamping(3.0, floor=0.5)
-        assert rule.theta(lp.Residual(0.0, 0.0, lambda: 0.0)) == 6.0
-        assert rule.theta(lp.Residual(1.0, 1.0, lambda: 6.0)) == pytest.approx(3 / 2.5)
+        for size in (1.0, 1e5):
+            seen = lp.Residual(0.0, 0.0, lambda size=size: size**2)
+            zero = lp.Residual(0.0, 0.0, lambda: 0.0, lambda seen=seen: seen)
+            assert rule.theta(zero) == pytest.approx(6.0 / size)
+            assert rule.theta(zero.replaced(1.0, 1.0, lambda size=size: 6.0 * size**2)) == (
+                pytest.approx(3 / 2.5 / size)
+            )
+        nothing = lp.Residual(0.0, 0.0, lambda: 0.0)
+        assert (rule.theta(nothing), rule.slopes(nothing)) == (0.0, (0.0, 0.0, 0.0))
 
     @pytest.mark.parametrize("rule", [lp.ResidualDamping(2.0), lp.ConstantDamping(3.0, floor=0.1)])
     def test_slopes_are_derivatives(self, rule):
         at = np.array([0.7, 1.9, 2.3])
+        seen = lp.Residual(1.0, 2.0, lambda: 4.0)
 
         def theta(x):
-            return rule.theta(lp.Residual(x[0], x[1], lambda: x[2]))
+            return rule.theta(lp.Residual(x[0], x[1], lambda: x[2], lambda: seen))
 
-        slopes = rule.slopes(lp.Residual(at[0], at[1], lambda: at[2]))
+        slopes = rule.slopes(lp.Residual(at[0], at[1], lambda: at[2], lambda: seen))
         for k, slope in enumerate(slopes):
             step = 1e-6 * np.eye(3)[k]
             assert slope == pytest.approx((theta(at + step) - theta(at - step)) / 2e-6, abs=1e-5)

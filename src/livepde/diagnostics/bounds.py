@@ -21,7 +21,7 @@ from livepde.laws.bounds import (
     theta_noisy,
     theta_smoothed,
 )
-from livepde.laws.damping import Damping, Residual
+from livepde.laws.damping import Damping
 from livepde.linalg import Array
 from livepde.result import Estimate
 from livepde.streams import Twin
@@ -175,7 +175,7 @@ class TwinTracker:
         self._last = (estimate.t, d)
         theta = 0.0
         if self.damping is not None:
-            theta = self.damping.theta(Residual(norms.X**2, norms.VX**2, lambda: norms.V**2))
+            theta = self.damping.theta(norms.residual(seen.norms(u_alpha)))
         e = estimate.q - twin.q
         found = Errors(
             estimate.t,

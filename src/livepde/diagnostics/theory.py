@@ -25,7 +25,7 @@ from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
 from livepde.laws.bounds import Constants, Norms
-from livepde.laws.damping import Damping, Residual
+from livepde.laws.damping import Damping
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
@@ -175,7 +175,7 @@ class OnlineTracker:
         norms = self.spaces.observed_part.norms(r)
         theta = np.nan
         if self.damping is not None:
-            theta = self.damping.theta(Residual(norms.X**2, norms.VX**2, lambda: norms.V**2))
+            theta = self.damping.theta(norms.residual(self.spaces.observed_part.norms(u_alpha)))
         d = self._noise_size(z, u_alpha, alpha)
         self.moments.append(_Moment(estimate.t, norms, theta, d))
         # Only a law with a damping rule works with u_alpha + P u.

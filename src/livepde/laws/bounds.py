@@ -39,6 +39,11 @@ class Norms:
     VX: float = 0.0
     V: float = 0.0
 
+    def residual(self, observed: Norms) -> Residual:
+        """Return these norms, of r, and those of u_alpha as a damping rule takes them."""
+        seen = Residual(observed.X**2, observed.VX**2, lambda: observed.V**2)
+        return Residual(self.X**2, self.VX**2, lambda: self.V**2, lambda: seen)
+
 
 @dataclass(frozen=True)
 class Constants:
@@ -204,8 +209,8 @@ class ExactBound(Damping):
     c1
         As in `ResidualDamping`.
     floor
-        The first term is 0/0 at r = 0: below ||r||_X = floor the pull is linear, and weaker than
-        the bound.
+        A share of ||u_alpha||_X: the first term is 0/0 at r = 0. Where ||r||_X is smaller the pull
+        is linear, and weaker than the bound.
     """
 
     constants: Constants
@@ -220,8 +225,7 @@ class ExactBound(Damping):
 
     def theta(self, r: Residual) -> float:
         c = self.constants
-        pull = 2.0 * c.L_C / c.c_M * self.p_bound / max(np.sqrt(r.X), self.floor)
-        return float(max(pull, self.c1) * _share(r))
+        return _pulled(r, 2.0 * c.L_C / c.c_M * self.p_bound, self.c1, self.floor)
 
 
 @dataclass(frozen=True)
@@ -261,8 +265,7 @@ class SmoothedBound(Damping):
     def theta(self, r: Residual) -> float:
         c = self.constants
         rough = c.L_C * (self.d_bound + self.p_bound) + self.rate_bound
-        pull = 2.0 / c.c_M * rough / max(np.sqrt(r.X), self.floor)
-        return float(max(pull, self.c1) * _share(r))
+        return _pulled(r, 2.0 / c.c_M * rough, self.c1, self.floor)
 
 
 @dataclass(frozen=True)
@@ -319,6 +322,12 @@ class NoisyBound(Damping):
             self.constants, self.e_bound, self.p_bound, size, d, self.sigma, self.c1
         )
         return min(asked, self.theta_max)
+
+
+def _pulled(r: Residual, pull: float, c1: float, floor: float) -> float:
+    """Return max{pull / ||r||_X, c_1} ||r||_X^2 / ||r||_VX~^2, floored; c_1 where all is zero."""
+    size = float(np.sqrt(max(r.X, floor**2 * r.observed.X))) if pull > 0.0 else 0.0
+    return max(pull / size if size > 0.0 else 0.0, c1) * _share(r)
 
 
 def _share(r: Residual) -> float:

@@ -6,9 +6,11 @@ theta = mu / ||r||_V~, which multiplies R M r. A rule may use only what is known
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -18,25 +20,43 @@ __all__ = ["ConstantDamping", "Damping", "Residual", "ResidualDamping"]
 
 
 class Residual:
-    """Squared norms of the observed residual r = R u - u_alpha, each computed when asked for.
+    """Squared norms of the observed residual r = R u - u_alpha, and of u_alpha to compare it with.
 
     Parameters
     ----------
     X, VX
         ||r||_X^2 and ||r||_VX~^2 = (M_op r, r).
     V
-        Function that returns ||r||_V~^2, discretised as the X-norm of the operator M_op r.
+        Function that returns ||r||_V~^2, the squared dual norm of M_op r.
+    observed
+        Function that returns the squared norms of u_alpha; None: nothing is observed.
     """
 
-    def __init__(self, X: float, VX: float, V: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        X: float,
+        VX: float,
+        V: Callable[[], float],
+        observed: Callable[[], Residual] | None = None,
+    ) -> None:
         self.X = X
         self.VX = VX
         self._V = V
+        self._observed = observed
 
-    @property
+    @cached_property
     def V(self) -> float:
         """||r||_V~^2."""
         return self._V()
+
+    @cached_property
+    def observed(self) -> Residual:
+        """Squared norms of u_alpha: the size of the state, to which floors are relative."""
+        return Residual(0.0, 0.0, lambda: 0.0) if self._observed is None else self._observed()
+
+    def replaced(self, X: float, VX: float, V: Callable[[], float]) -> Residual:
+        """Return other norms of r beside the same of u_alpha."""
+        return Residual(X, VX, V, lambda: self.observed)
 
 
 class Damping(ABC):
@@ -58,13 +78,15 @@ class Damping(ABC):
             reads.append(True)
             return r.V
 
-        theta = self.theta(Residual(r.X, r.VX, norm))
+        theta = self.theta(r.replaced(r.X, r.VX, norm))
         step = 1.0 + 1e-6
-        dX = (self.theta(Residual(step * r.X, r.VX, lambda: r.V)) - theta) if r.X > 0 else 0.0
-        dVX = (self.theta(Residual(r.X, step * r.VX, lambda: r.V)) - theta) if r.VX > 0 else 0.0
-        dV = 0.0
+        dX = dVX = dV = 0.0
+        if r.X > 0:
+            dX = self.theta(r.replaced(step * r.X, r.VX, lambda: r.V)) - theta
+        if r.VX > 0:
+            dVX = self.theta(r.replaced(r.X, step * r.VX, lambda: r.V)) - theta
         if reads and r.V > 0:
-            dV = (self.theta(Residual(r.X, r.VX, lambda: step * r.V)) - theta) / (1e-6 * r.V)
+            dV = (self.theta(r.replaced(r.X, r.VX, lambda: step * r.V)) - theta) / (1e-6 * r.V)
         return dX / (1e-6 * r.X or 1.0), dVX / (1e-6 * r.VX or 1.0), dV
 
 
@@ -96,7 +118,16 @@ class ResidualDamping(Damping):
 class ConstantDamping(Damping):
     """A constant mu, as in the paper's noisy experiments.
 
-    theta = mu / sqrt(||r||_V~^2 + floor^2): below `floor` the pull is linear instead of 0/0.
+    theta = mu / sqrt(||r||_V~^2 + (floor ||u_alpha||_V~)^2): for a residual that is smaller than
+    `floor` times the state the pull is linear instead of 0/0. Where u_alpha = 0, theta is
+    mu / ||r||_V~, and 0 at r = 0.
+
+    Parameters
+    ----------
+    mu
+        In the unit of ||u||_V~ per time.
+    floor
+        A share of ||u_alpha||_V~, so without unit: the run is the same in every unit of u.
     """
 
     mu: float = 1.0
@@ -107,4 +138,9 @@ class ConstantDamping(Damping):
             raise LawError("ConstantDamping: needs mu >= 0 and floor > 0.")
 
     def theta(self, r: Residual) -> float:
-        return float(self.mu / np.sqrt(r.V + self.floor**2))
+        size = math.sqrt(r.V + self.floor**2 * r.observed.V)
+        return self.mu / size if size > 0.0 else 0.0
+
+    def slopes(self, r: Residual) -> tuple[float, float, float]:
+        squared = r.V + self.floor**2 * r.observed.V
+        return 0.0, 0.0, -0.5 * self.mu * squared**-1.5 if squared > 0.0 else 0.0

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.base import Problem
@@ -87,6 +89,12 @@ class GradientParts:
             terms = StageTerms(forms, self.damping, self.memory)
             stage = self._stages[key] = CoupledStage(terms, self.newton)
         return stage
+
+    def prepared(self) -> GradientParts:
+        """Return the same with the stage of all sensors prepared, before the first sample comes."""
+        present = np.ones(self.problem.observed.size, dtype=bool)
+        self.stage(present).solver.prepare()
+        return self
 
     def closed(self, excitation: Excitation) -> bool:
         """Return true if the gate is closed: q is held."""
@@ -181,7 +189,7 @@ def constant_parts(
         gate=gate,
         probes=None if gate is None else Probes(problem.model, problem.observed.split()),
         at_estimate=at_estimate,
-    )
+    ).prepared()
 
 
 def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> GradientParts:
@@ -209,7 +217,7 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         observed=observed,
         metric=InformationMetric(learning),
         memory=learning.pattern,
-    )
+    ).prepared()
 
 
 def _for_scheme(newton: Newton, problem: Problem) -> Newton:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -62,8 +63,8 @@ class StageEquation(Protocol[Point]):
         """Return the stage at y."""
         ...
 
-    def factor(self, at: Point) -> Factor:
-        """Return the factorised Jacobian at a point."""
+    def factor(self, at: Point, last: Factor | None) -> Factor:
+        """Return the factorised Jacobian at a point; `last` is one of another point."""
         ...
 
     def rounding(self, at: Point) -> float:
@@ -97,15 +98,12 @@ class Solution(Generic[Point]):
         The solution: its residual was evaluated and is below the tolerance.
     updates
         Number of updates.
-    predicted
-        True if the iteration from the prediction led to it.
     made
         Where the last Jacobian was factorised, and its factor; None: nowhere.
     """
 
     at: Point
     updates: int
-    predicted: bool
     made: tuple[Point, Factor] | None
 
 
@@ -137,7 +135,7 @@ class Newton:
 
     tolerance: float = 1e-8
     share: float = 0.1
-    ceiling: float = 3e-3
+    ceiling: float = 5e-3
     iterations: int = 60
     refresh: float = 0.2
 
@@ -164,14 +162,16 @@ class Newton:
         """
         iteration = _Iteration(self, equation)
         if near is not None:
-            found = iteration.from_prediction(near)
-            if found is not None:
-                return found
-        return iteration.from_start(start() if callable(start) else start)
+            at = equation.evaluate(near.y)
+            allowed = max(self.tolerance, min(self.share * at.size, self.ceiling))
+            with suppress(StepFailed):  # the prediction was no good one
+                return iteration.run(at, near.factor, allowed, FACTORS)
+        at = equation.evaluate(start() if callable(start) else start)
+        return iteration.run(at, None, self.tolerance, self.iterations)
 
 
 class _Iteration(Generic[Point]):
-    """One solve; `updates` counts over all of its attempts."""
+    """Newton's iteration for one stage; `updates` counts over all of its attempts."""
 
     def __init__(self, newton: Newton, equation: StageEquation[Point]) -> None:
         self.newton = newton
@@ -179,79 +179,50 @@ class _Iteration(Generic[Point]):
         self.updates = 0
         self.made: tuple[Point, Factor] | None = None
 
-    def from_prediction(self, near: Near) -> Solution[Point] | None:
-        """Return the solution that a prediction leads to; None if it was no good one."""
-        newton = self.newton
-        at = self.equation.evaluate(near.y)
-        if not math.isfinite(at.size):
-            return None
-        allowed = max(newton.tolerance, min(newton.share * at.size, newton.ceiling))
-        factor, own = near.factor, False
-        left = FACTORS
-        while not self._solved(at, allowed):
-            if self.updates >= newton.iterations:
-                return None
-            if factor is None:
-                if left == 0:
-                    return None
-                left -= 1
-                try:
-                    factor, own = self._factor(at), True
-                except StepFailed:
-                    return None
-            try:
-                new, _ = self._updated(at, factor)
-            except StepFailed:
-                return None
-            if new.size < at.size:
-                if new.size > newton.refresh * at.size:
-                    factor = None
-                at = new
-            elif not own:
-                factor = None
-            elif at.size <= self.equation.rounding(at):
-                break
-            else:
-                return None
-        return Solution(at, self.updates, True, self.made)
+    def run(
+        self, at: Point, factor: Factor | None, allowed: float, factors: int
+    ) -> Solution[Point]:
+        """Return the solution; raises `StepFailed`.
 
-    def from_start(self, start: Array) -> Solution[Point]:
-        """Return the solution; raises `StepFailed`."""
-        newton, equation = self.newton, self.equation
-        at = equation.evaluate(start)
-        factor: Factor | None = None
-        while not self._solved(at, newton.tolerance):
-            if self.updates >= newton.iterations:
+        Parameters
+        ----------
+        at
+            Where to begin.
+        factor
+            With which to begin; None: one is made.
+        allowed
+            Relative size of the residual at which the stage is solved.
+        factors
+            At most this many are made.
+        """
+        newton, last = self.newton, factor
+        while not self._solved(at, allowed):
+            fresh = factor is None
+            if self.updates >= newton.iterations or (fresh and factors == 0):
                 raise StepFailed(
                     "not_converged",
-                    f"{newton.iterations} iterations left a relative residual of {at.size:.1e}",
+                    f"{self.updates} updates left a relative residual of {at.size:.1e}",
                 )
-            own = factor is None
-            factor = self._factor(at) if factor is None else factor
+            if factor is None:
+                factor, factors = self._factor(at, last), factors - 1
             new, update = self._updated(at, factor)
-            if new.size >= at.size and own:
-                if at.size <= equation.rounding(at):
+            if fresh and not new.size < at.size:
+                if at.size <= self.equation.rounding(at):
                     break
                 new = self._damped(at, update)
-                if new is at:
-                    raise StepFailed(
-                        "not_converged",
-                        f"no update reduces the relative residual of {at.size:.1e}",
-                    )
             slow = not new.size <= newton.refresh * at.size
-            if new.size < at.size:
-                at = new
-            factor = None if slow else factor
-        return Solution(at, self.updates, False, self.made)
+            at = new if new.size < at.size else at
+            last, factor = factor, None if slow else factor
+        return Solution(at, self.updates, self.made)
 
     def _solved(self, at: Point, allowed: float) -> bool:
         if not math.isfinite(at.size):
             raise StepFailed("not_finite", "the iteration left the range of finite numbers")
         return at.size <= allowed and at.resolved
 
-    def _factor(self, at: Point) -> Factor:
+    def _factor(self, at: Point, last: Factor | None) -> Factor:
         try:
-            factor = self.equation.factor(at)
+            factor = self.equation.factor(at, last)
         except LinearAlgebraError as error:
             raise StepFailed("singular", str(error)) from error
         self.made = (at, factor)
@@ -269,11 +240,13 @@ class _Iteration(Generic[Point]):
         return new, update
 
     def _damped(self, at: Point, update: Array) -> Point:
-        """Return the stage after a part of an update that reduces the residual, if there is one."""
+        """Return the stage after a part of an update that reduces the residual."""
         part = 1.0
         for _ in range(HALVINGS):
             part *= 0.5
             new = self.equation.evaluate(at.y - part * update)
             if new.size <= (1.0 - 0.1 * part) * at.size:
                 return new
-        return at
+        raise StepFailed(
+            "not_converged", f"no update reduces the relative residual of {at.size:.1e}"
+        )

@@ -362,7 +362,7 @@ class _Equation:
         )
         return _Point(y, residual, own / max(*sizes, TINY))
 
-    def factor(self, at: _Point) -> Factor:
+    def factor(self, at: _Point, last: Factor | None) -> Factor:
         return self.stage._factorise(self.stage._data(at.y, self.q, self.h, self.moment))
 
     def rounding(self, at: _Point) -> float:

@@ -36,6 +36,10 @@ class BilinearSolver(MonolithicSolver):
     def keeps(self) -> bool:
         return True
 
+    def prepare(self) -> None:
+        super().prepare()
+        _ = self._products, self._coupling, self._jacobian, self._fixed_data
+
     @cached_property
     def _coupling(self) -> tuple[Pattern, sp.csr_array, sp.csr_array | None]:
         """Pattern of A(w), and the maps to its data of w over omega, and of u elsewhere."""
@@ -118,7 +122,8 @@ class BilinearSolver(MonolithicSolver):
             w = forms.model.impose(u_alpha, moment) if w is None else w
             inside = Inside(self._coupling[1] @ w, products["B_in"] @ w)
         sizes = self.terms.sizes(known, metric.load, u_alpha)
-        return StageData(c, h, moment, u_alpha, metric, known, inside, sizes)
+        observed = self.terms.observed(u_alpha)
+        return StageData(c, h, moment, u_alpha, metric, known, inside, sizes, observed)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
@@ -135,7 +140,7 @@ class BilinearSolver(MonolithicSolver):
             A = pattern.compact(A_data + by_u @ u)
         by_r = products["r"] @ r
         Mr, mass_r = by_r[:n], by_r[n:]
-        norms = terms.norms(r, Mr, mass_r)
+        norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
         rate = products["M"] @ ((u - c[:n]) / data.h)
         driven, pull = A @ q, (theta * terms.free) * Mr

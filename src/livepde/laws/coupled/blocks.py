@@ -26,7 +26,13 @@ import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Field
-from livepde.laws.coupled.equation import StageData, StageIterate, StageSolver, StageTerms
+from livepde.laws.coupled.equation import (
+    MadeAt,
+    StageData,
+    StageIterate,
+    StageSolver,
+    StageTerms,
+)
 from livepde.linalg import (
     Array,
     BandedSolver,
@@ -43,6 +49,8 @@ __all__ = ["LARGE", "ApproximateFactor", "BlockJacobian", "BlockSolver"]
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
+PATIENCE = 8  # iterations with factors of another point beyond which they are made again
+REFRESH = 0.5  # of the residual: an update costs a twentieth of new factors
 SPENT = 24  # updates and iterations: about what new factors cost
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
 ROUNDING = 1e-12  # asymmetry of a symmetric matrix, relative to its largest entry
@@ -72,8 +80,21 @@ class BlockSolver(StageSolver):
     def patience(self) -> int:
         return SPENT
 
-    def kept(self, factor: Factor) -> Factor:
-        return factor.approximate if isinstance(factor, BlockJacobian) else factor
+    @property
+    def refresh(self) -> float:
+        return REFRESH
+
+    def kept(self, factor: Factor, data: StageData, at: StageIterate) -> tuple[Factor, MadeAt]:
+        if isinstance(factor, BlockJacobian):
+            return factor.approximate, factor.approximate.made
+        return super().kept(factor, data, at)
+
+    def prepare(self) -> None:
+        forms = self.terms.forms
+        _ = self.lumped, forms.pull, forms.mass, forms.hidden
+        for form in (forms.A_in, forms.A_out):
+            if form is not None:
+                form.tensor("v", "q"), form.tensor("v", "u")
 
     @cached_property
     def lumped(self) -> Array:
@@ -83,7 +104,9 @@ class BlockSolver(StageSolver):
         rows = np.asarray(abs(mass).sum(axis=1)).ravel()
         return np.where(rows > 0.0, rows, 1.0)
 
-    def factor(self, data: StageData, at: StageIterate) -> BlockJacobian:
+    def factor(
+        self, data: StageData, at: StageIterate, last: Factor | None = None
+    ) -> BlockJacobian:
         terms, forms = self.terms, self.terms.forms
         form, moment, n = forms.A_in, data.moment, terms.n
         u, q, free, free_q = at.y[:n], at.y[n:], terms.free, terms.free_q
@@ -111,7 +134,11 @@ class BlockSolver(StageSolver):
         rates = self.lumped * (1.0 / data.h + at.theta * np.abs(forms.split.R.diagonal()))
         row = terms.slope(data, at)
         border = None if row is None else (at.Mr * free, row * free)
-        return BlockJacobian(self, S, forward, A, self._metric(data), rates, back, curved, border)
+        blocks = S, forward, A, self._metric(data), rates
+        if isinstance(last, BlockJacobian):
+            last = last.approximate
+        known = last if isinstance(last, ApproximateFactor) else None
+        return BlockJacobian(self, MadeAt(data, at.y), known, *blocks, back, curved, border)
 
     def _metric(self, data: StageData) -> sp.csr_array:
         """Return H on the free coefficients, with its auxiliary unknowns."""
@@ -176,9 +203,15 @@ class BlockJacobian:
         Derivatives of A(w)^T r in u and in q; None if they are held or zero.
     border
         (b, a): b a^T is added to S.
+    made
+        The point.
+    last
+        Approximate inverse of another point, which preconditions as long as it serves.
     """
 
     solver: BlockSolver
+    made: MadeAt
+    last: ApproximateFactor | None
     S: sp.csr_array
     forward: sp.csr_array
     A: sp.csr_array
@@ -207,14 +240,19 @@ class BlockJacobian:
         out[n:size] -= coupling
         return out
 
-    @cached_property
+    @property
     def approximate(self) -> ApproximateFactor:
-        """The approximate inverse."""
+        """The approximate inverse that served: that of another point, or one of its own."""
+        return self.own if self.last is None or "own" in vars(self) else self.last
+
+    @cached_property
+    def own(self) -> ApproximateFactor:
+        """The approximate inverse of this point."""
         solver, terms = self.solver, self.solver.terms
         state = solver.factorise("S", self.S)
         C = sp.csr_array(self.H + _widened(self._information(state), terms.auxiliary))
         schur = solver.factorise("C", C, approximate=True)
-        return ApproximateFactor(solver, state, schur, self.forward, self.A)
+        return ApproximateFactor(solver, self.made, state, schur, self.forward, self.A)
 
     def _information(self, state: Factor) -> sp.csr_array:
         """Return what stands for A_in^T R S^{-1} A in C."""
@@ -231,23 +269,31 @@ class BlockJacobian:
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
-        return self.iterate(b, TOLERANCE)[0]
+        if self.approximate is self.last:
+            try:
+                return self._solve(b, self.last, PATIENCE)
+            except LinearAlgebraError:
+                pass  # it is too far away: one of this point
+        return self._solve(b, self.own, ITERATIONS)
 
-    def iterate(self, b: Array, tolerance: float) -> tuple[Array, int]:
-        """Return x with K x = b to a tolerance, and the iterations that it took."""
-        terms, approximate = self.solver.terms, self.approximate
+    def _solve(self, b: Array, approximate: ApproximateFactor, limit: int) -> Array:
+        terms = self.solver.terms
         n, size = terms.n, terms.size
         padded = np.zeros(size + terms.auxiliary)
         padded[:size] = b
-        first = approximate.whole(padded)
-        sizes = [float(np.linalg.norm(part)) or 1.0 for part in (first[:n], first[n:size])]
-        scale = np.repeat(1.0 / np.array(sizes), [n, len(first) - n])  # u and q count the same
+        scale: Array | None = None
 
         def scaled(r: Array) -> Array:
-            return approximate.whole(r) * scale
+            nonlocal scale
+            z = approximate.whole(r)
+            if scale is None:  # u and q count the same
+                sizes = [float(np.linalg.norm(part)) or 1.0 for part in (z[:n], z[n:size])]
+                scale = np.repeat(1.0 / np.array(sizes), [n, len(z) - n])
+            z *= scale
+            return z
 
-        x, count = gmres(self.apply, scaled, padded, tolerance, ITERATIONS, REMEDY)
-        return x[:size], count
+        x, _ = gmres(self.apply, scaled, padded, TOLERANCE, limit, REMEDY)
+        return x[:size]
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +301,7 @@ class ApproximateFactor:
     """The approximate inverse of K by factors of S and C, as a `Factor`."""
 
     solver: BlockSolver
+    made: MadeAt
     state: Factor
     schur: Factor
     forward: sp.csr_array

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -31,10 +31,11 @@ from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array, Factor, Pattern
 from livepde.stepping import TINY
 
-__all__ = ["Inside", "StageData", "StageIterate", "StageSolver", "StageTerms"]
+__all__ = ["Inside", "MadeAt", "StageData", "StageIterate", "StageSolver", "StageTerms"]
 
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
+STIFFEST = 1e6  # times 1/h, of theta: then a step takes all but this part of r away
 ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
 
 
@@ -66,6 +67,8 @@ class StageData:
         A and B over omega, where the data give all of w there.
     sizes
         Dual norms of F and of the load, and ||u_alpha||_X.
+    observed
+        Function that returns the squared norms of u_alpha, computed once.
     """
 
     c: Array
@@ -76,6 +79,7 @@ class StageData:
     source: Array
     inside: Inside | None
     sizes: tuple[float, float, float]
+    observed: Callable[[], Residual]
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +197,7 @@ class StageTerms:
 
     @cached_property
     def lumped(self) -> Array:
-        """Diagonal of the mass of the state, shape (n,): norms by it are equivalent to those of X."""
+        """Diagonal of the mass, shape (n,): the norm by it is equivalent to that of X."""
         return np.abs(self.forms.model.mass.diagonal())
 
     def duals(self, functionals: Sequence[Array], part: slice) -> list[float]:
@@ -234,7 +238,22 @@ class StageTerms:
         """True if a sensor is present."""
         return bool(self.forms.split.present.any())
 
-    def norms(self, r: Array, Mr: Array, mass_r: Array) -> Residual:
+    def observed(self, u_alpha: Array) -> Callable[[], Residual]:
+        """Return a function that computes the norms of u_alpha when it is called first."""
+
+        @cache
+        def norms() -> Residual:
+            return self.norms(u_alpha, self.forms.pull @ u_alpha, self.forms.mass @ u_alpha)
+
+        return norms
+
+    def norms(
+        self,
+        r: Array,
+        Mr: Array,
+        mass_r: Array,
+        observed: Callable[[], Residual] | None = None,
+    ) -> Residual:
         """Return the norms of r that a damping rule may use.
 
         ||r||_V~ is the dual norm of M_op r over the test functions that stay within omega.
@@ -244,16 +263,24 @@ class StageTerms:
         def V() -> float:
             return float(Mr @ tests.riesz(Mr))
 
-        return Residual(float(r @ mass_r), float(r @ Mr), V)
+        return Residual(float(r @ mass_r), float(r @ Mr), V, observed)
+
+    def damped(self, data: StageData, norms: Residual) -> float:
+        """Return the theta of the rule, with a bound that keeps the stage solvable.
+
+        A rule with a pull that does not vanish with r has no bound of its own while u_alpha is
+        zero, or tiny.
+        """
+        return min(self.damping.theta(norms), STIFFEST / data.h)
 
     def theta(self, data: StageData, norms: Residual) -> float:
         """Return the weight of R^T M_op r."""
         own = data.metric.theta
-        return self.damping.theta(norms) if own is None else own
+        return self.damped(data, norms) if own is None else own
 
     def slope(self, data: StageData, at: StageIterate) -> Array | None:
         """Return the derivative of theta in u, shape (n,); None if it is zero."""
-        if data.metric.theta is not None:
+        if data.metric.theta is not None or at.theta >= STIFFEST / data.h:
             return None
         dX, dVX, dV = self.damping.slopes(at.norms)
         row = (2.0 * dX) * at.mass_r + (2.0 * dVX) * at.Mr
@@ -281,6 +308,14 @@ class StageTerms:
         return ROUNDING * max(sizes)
 
 
+@dataclass(frozen=True, eq=False)
+class MadeAt:
+    """Where a factor was made: the data of a stage, and a point y, shape (n + m,)."""
+
+    data: StageData
+    y: Array
+
+
 class StageSolver(ABC):
     """Abstract solver of coupled stages: evaluates their equation and factorises its Jacobian."""
 
@@ -297,13 +332,25 @@ class StageSolver(ABC):
     def patience(self) -> int:
         """Updates, beyond one for each stage, after which a kept factor is made again."""
 
-    @abstractmethod
-    def factor(self, data: StageData, at: StageIterate) -> Factor:
-        """Return the factorised Jacobian at a point."""
+    @property
+    def refresh(self) -> float:
+        """Share of the residual beyond which an update is worth a new factor."""
+        return 0.2
 
-    def kept(self, factor: Factor) -> Factor:
-        """Return what of a factor is kept for later stages."""
-        return factor
+    @abstractmethod
+    def factor(self, data: StageData, at: StageIterate, last: Factor | None = None) -> Factor:
+        """Return the factorised Jacobian at a point.
+
+        `last`, a factor of a point not far away, may serve an iterative solver.
+        """
+
+    def kept(self, factor: Factor, data: StageData, at: StageIterate) -> tuple[Factor, MadeAt]:
+        """Return what of a factor is kept for later stages, and where that was made."""
+        return factor, MadeAt(data, at.y)
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Compute what does not depend on the samples."""
 
     def data(
         self,
@@ -328,7 +375,8 @@ class StageSolver(ABC):
             A = forms.A_in.matrix("v", "q", moment, u=w)
             inside = Inside(A, forms.B_in.vector("v", moment, u=w))
         sizes = self.terms.sizes(source, metric.load, u_alpha)
-        return StageData(c, h, moment, u_alpha, metric, source, inside, sizes)
+        observed = self.terms.observed(u_alpha)
+        return StageData(c, h, moment, u_alpha, metric, source, inside, sizes, observed)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         """Return the stage at y."""
@@ -350,7 +398,7 @@ class StageSolver(ABC):
         if forms.nu:
             flux = flux + forms.hidden @ u
         Mr, mass_r = forms.pull @ r, forms.mass @ r
-        norms = terms.norms(r, Mr, mass_r)
+        norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
         rate = model.mass @ ((u - data.c[:n]) / data.h)
         pull = theta * Mr

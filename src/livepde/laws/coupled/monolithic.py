@@ -51,7 +51,10 @@ class MonolithicSolver(StageSolver):
             found += maps["B_out"] @ forms.B_out.data("v", "u", moment, u=u)
         return found
 
-    def factor(self, data: StageData, at: StageIterate) -> Factor:
+    def prepare(self) -> None:
+        _ = self._parts, self._pull
+
+    def factor(self, data: StageData, at: StageIterate, last: Factor | None = None) -> Factor:
         terms, metric = self.terms, data.metric
         found = self.changing(data, at)
         found += self._fixed(data)

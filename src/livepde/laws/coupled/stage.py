@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import scipy  # scipy.optimize is slow to load, and rarely needed
@@ -13,7 +12,13 @@ import scipy  # scipy.optimize is slow to load, and rarely needed
 from livepde.fem import Moment
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.blocks import BlockSolver
-from livepde.laws.coupled.equation import StageData, StageIterate, StageSolver, StageTerms
+from livepde.laws.coupled.equation import (
+    MadeAt,
+    StageData,
+    StageIterate,
+    StageSolver,
+    StageTerms,
+)
 from livepde.laws.coupled.metric import Metric
 from livepde.laws.coupled.monolithic import MonolithicSolver
 from livepde.linalg import Array, Factor
@@ -58,9 +63,9 @@ class KeptFactor:
         return cls(np.zeros(0), np.zeros(0), 0.0, 0.0, 0.0, np.zeros(0), 0)
 
     @classmethod
-    def made(cls, data: StageData, y: Array) -> KeptFactor:
-        """Return the value for a factor made at y in a stage."""
-        metric = data.metric
+    def of(cls, made: MadeAt) -> KeptFactor:
+        """Return the value for a factor made at a point of a stage."""
+        data, y, metric = made.data, made.y, made.data.metric
         information = np.zeros(0) if metric.information is None else metric.information
         return cls(y, data.u_alpha, data.h, metric.scale, metric.drift, information, 0)
 
@@ -98,8 +103,8 @@ class _Equation:
     def evaluate(self, y: Array) -> StageIterate:
         return self.solver.evaluate(self.data, y)
 
-    def factor(self, at: StageIterate) -> Factor:
-        return self.solver.factor(self.data, at)
+    def factor(self, at: StageIterate, last: Factor | None) -> Factor:
+        return self.solver.factor(self.data, at, last)
 
     def rounding(self, at: StageIterate) -> float:
         return self.solver.terms.rounding(self.data, at)
@@ -129,14 +134,9 @@ class CoupledStage:
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
-        self.newton = newton
+        self.solver = BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
+        self.newton = replace(newton, refresh=max(newton.refresh, self.solver.refresh))
         self._last: tuple[Array, Factor] | None = None
-
-    @cached_property
-    def solver(self) -> StageSolver:
-        """How it is solved: by blocks, by products made ahead, or as a whole."""
-        terms = self.terms
-        return BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
 
     def solve(
         self,
@@ -189,7 +189,7 @@ class CoupledStage:
             fixed = replace(data, metric=replace(data.metric, theta=theta))
             at = newton.solve(_Equation(self.solver, fixed), y).at
             y = at.y
-            return self.terms.damping.theta(at.norms) - theta
+            return self.terms.damped(data, at.norms) - theta
 
         first = max(equation.evaluate(start).theta, SMALLEST)
         root = nearest_root(gap, first)
@@ -220,7 +220,7 @@ class CoupledStage:
         w[fixed] = kept.y[:n][fixed]
         data = self.solver.data(kept.y, kept.h, problem.moment, kept.u_alpha, metric, w)
         at = self.solver.evaluate(data, kept.y)
-        factor = self.solver.kept(self.solver.factor(data, at))
+        factor, _ = self.solver.kept(self.solver.factor(data, at), data, at)
         self._last = (kept.y, factor)
         return factor
 
@@ -232,7 +232,9 @@ class CoupledStage:
             return kept
         if solved.made is not None:
             at, factor = solved.made
-            self._last = (at.y, self.solver.kept(factor))
-            return KeptFactor.made(data, at.y)
+            known, made = self.solver.kept(factor, data, at)
+            if made.y is not kept.y:
+                self._last = (made.y, known)
+                return KeptFactor.of(made)
         spent = kept.spent + max(solved.updates - 1, 0)
         return KeptFactor.none() if spent > self.solver.patience else replace(kept, spent=spent)
