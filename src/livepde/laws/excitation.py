@@ -152,14 +152,13 @@ class Probes:
             self.fixed = np.array(rows)
             self.pairs = np.zeros((0, PROBES)), np.zeros((0, PROBES))  # no longer needed
 
-    def __call__(self, w: Array, q: Array, moment: Moment) -> Array:
-        """Return what the pairs see, shape (PROBES,)."""
+    def __call__(self, states: Array, q: Array, moment: Moment) -> Array:
+        """Return what the pairs see of several states, shapes (n, k) -> (PROBES, k)."""
         if self.fixed is not None:
-            return self.fixed @ w
+            return self.fixed @ states
         p, e = self.pairs
-        A = self.form.matrix("v", "q", moment, u=w, q=q)
-        seen: Array = ((A @ e) * p).sum(axis=0)
-        return seen
+        matrices = (self.form.matrix("v", "q", moment, u=w, q=q) for w in states.T)
+        return np.stack([((A @ e) * p).sum(axis=0) for A in matrices], axis=1)
 
 
 def pairs(model: Model, split: Split) -> tuple[Array, Array]:

@@ -106,7 +106,8 @@ class GradientParts:
         """Return the excitation after a sample, from w and the estimate u."""
         if self.gate is None or self.probes is None:
             return excitation
-        return self.gate.add(excitation, self.probes(w, q, moment), self.probes(u, q, moment))
+        seen = self.probes(np.stack([w, u], axis=1), q, moment)
+        return self.gate.add(excitation, seen[:, 0], seen[:, 1])
 
 
 class StageSequence:

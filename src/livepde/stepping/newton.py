@@ -82,10 +82,13 @@ class Near:
         The prediction.
     factor
         Of a Jacobian not far away, with which to begin; None: one is made at y.
+    refresh
+        Share of the residual beyond which an update by it makes a new factor worth its cost.
     """
 
     y: Array
     factor: Factor | None = None
+    refresh: float = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +168,9 @@ class Newton:
             at = equation.evaluate(near.y)
             allowed = max(self.tolerance, min(self.share * at.size, self.ceiling))
             with suppress(StepFailed):  # the prediction was no good one
-                return iteration.run(at, near.factor, allowed, FACTORS)
+                return iteration.run(at, near, allowed, FACTORS)
         at = equation.evaluate(start() if callable(start) else start)
-        return iteration.run(at, None, self.tolerance, self.iterations)
+        return iteration.run(at, Near(at.y), self.tolerance, self.iterations)
 
 
 class _Iteration(Generic[Point]):
@@ -179,23 +182,19 @@ class _Iteration(Generic[Point]):
         self.updates = 0
         self.made: tuple[Point, Factor] | None = None
 
-    def run(
-        self, at: Point, factor: Factor | None, allowed: float, factors: int
-    ) -> Solution[Point]:
+    def run(self, at: Point, near: Near, allowed: float, factors: int) -> Solution[Point]:
         """Return the solution; raises `StepFailed`.
 
         Parameters
         ----------
-        at
-            Where to begin.
-        factor
-            With which to begin; None: one is made.
+        at, near
+            Where to begin, and with which factor.
         allowed
             Relative size of the residual at which the stage is solved.
         factors
             At most this many are made.
         """
-        newton, last = self.newton, factor
+        newton, factor, last = self.newton, near.factor, near.factor
         while not self._solved(at, allowed):
             fresh = factor is None
             if self.updates >= newton.iterations or (fresh and factors == 0):
@@ -210,7 +209,8 @@ class _Iteration(Generic[Point]):
                 if at.size <= self.equation.rounding(at):
                     break
                 new = self._damped(at, update)
-            slow = not new.size <= newton.refresh * at.size
+            refresh = near.refresh if factor is near.factor else newton.refresh
+            slow = not new.size <= refresh * at.size
             at = new if new.size < at.size else at
             last, factor = factor, None if slow else factor
         return Solution(at, self.updates, self.made)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -41,18 +43,11 @@ class BilinearSolver(MonolithicSolver):
         _ = self._products, self._coupling, self._jacobian, self._fixed_data
 
     @cached_property
-    def _coupling(self) -> tuple[Pattern, sp.csr_array, sp.csr_array | None]:
-        """Pattern of A(w), and the maps to its data of w over omega, and of u elsewhere."""
+    def _coupling(self) -> tuple[_Coupling, _Coupling | None]:
+        """A(w) over omega as a function of w, and outside of it as one of u."""
         forms, terms = self.terms.forms, self.terms
-        pattern = forms.model.form_A.pattern("v", "q")
-        kept = sp.diags_array(terms.free[pattern.rows] * terms.free_q[pattern.indices])
-
-        def placed(form: AnyForm) -> sp.csr_array:
-            own = form.pattern("v", "q")
-            return sp.csr_array(kept @ pattern.gather(own.rows, own.indices) @ _tensors(form)[0])
-
-        outside = None if forms.A_out is None else placed(forms.A_out)
-        return pattern, placed(forms.A_in), outside
+        inside = _Coupling.of(forms.A_in, terms)
+        return inside, None if forms.A_out is None else _Coupling.of(forms.A_out, terms)
 
     @cached_property
     def _jacobian(self) -> sp.csr_array:
@@ -120,7 +115,7 @@ class BilinearSolver(MonolithicSolver):
         inside = None
         if forms.W is None:
             w = forms.model.impose(u_alpha, moment) if w is None else w
-            inside = Inside(self._coupling[1] @ w, products["B_in"] @ w)
+            inside = Inside(self._coupling[0].at(w), products["B_in"] @ w)
         sizes = self.terms.sizes(known, metric.load, u_alpha)
         observed = self.terms.observed(u_alpha)
         return StageData(c, h, moment, u_alpha, metric, known, inside, sizes, observed)
@@ -130,21 +125,21 @@ class BilinearSolver(MonolithicSolver):
         u, q, c = y[:n], y[n:], data.c
         r = forms.split.project(u) - data.u_alpha
         w = u if forms.at_estimate else u - r
-        pattern, by_w, by_u = self._coupling
+        coupling_in, coupling_out = self._coupling
         if data.inside is not None:
-            A_data, flux = data.inside.A, data.inside.flux
+            (A, transposed), flux = data.inside.A, data.inside.flux
         else:
-            A_data, flux = by_w @ w, products["B_in"] @ w
-        A_in = A = pattern.compact(A_data)
-        if by_u is not None:
-            A = pattern.compact(A_data + by_u @ u)
+            (A, transposed), flux = coupling_in.at(w), products["B_in"] @ w
+        driven = A @ q
+        if coupling_out is not None:
+            driven = driven + coupling_out.at(u)[0] @ q
         by_r = products["r"] @ r
         Mr, mass_r = by_r[:n], by_r[n:]
         norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
         rate = products["M"] @ ((u - c[:n]) / data.h)
-        driven, pull = A @ q, (theta * terms.free) * Mr
-        change, coupling = self.weighed(data.metric, q - c[n:]), A_in.T @ r
+        pull = (theta * terms.free) * Mr
+        change, coupling = self.weighed(data.metric, q - c[n:]), transposed @ r
         residual = np.empty_like(y)
         residual[:n] = rate + flux + products["B_out"] @ u + driven + pull - data.source
         residual[n:] = change - (coupling + data.metric.load) * terms.free_q
@@ -165,6 +160,28 @@ class BilinearSolver(MonolithicSolver):
         n = self.terms.n
         changing: Array = self._jacobian @ np.concatenate([at.w, at.y[:n], at.y[n:], at.r])
         return changing + self._fixed_data
+
+
+@dataclass(frozen=True, eq=False)
+class _Coupling:
+    """A(w) on the free coefficients, as a matrix whose data are linear in w."""
+
+    pattern: Pattern
+    data: sp.csr_array
+
+    @classmethod
+    def of(cls, form: AnyForm, terms: StageTerms) -> _Coupling:
+        pattern = form.pattern("v", "q")
+        kept = terms.free[pattern.rows] * terms.free_q[pattern.indices]
+        return cls(pattern, sp.csr_array(sp.diags_array(kept) @ _tensors(form)[0]))
+
+    def at(self, w: Array) -> tuple[Any, Any]:
+        """Return A(w) and its transpose; small ones are dense."""
+        data = self.data @ w
+        if self.pattern.small:
+            dense = self.pattern.compact(data)
+            return dense, dense.T
+        return self.pattern.matrix(data), self.pattern.transposed(data)
 
 
 def _is_bilinear(form: AnyForm) -> bool:

@@ -334,7 +334,7 @@ class StageSolver(ABC):
 
     @property
     def refresh(self) -> float:
-        """Share of the residual beyond which an update is worth a new factor."""
+        """Share of the residual that an update by a kept factor may leave before a new one pays."""
         return 0.2
 
     @abstractmethod

@@ -135,7 +135,7 @@ class CoupledStage:
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
         self.solver = BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
-        self.newton = replace(newton, refresh=max(newton.refresh, self.solver.refresh))
+        self.newton = newton
         self._last: tuple[Array, Factor] | None = None
 
     def solve(
@@ -161,7 +161,8 @@ class CoupledStage:
         data = solver.data(p.c, p.h, p.moment, p.u_alpha, p.metric)
         near = None
         if predicted is not None:
-            near = Near(self._imposed(predicted, p.moment), self._factor(kept, problem))
+            y, factor = self._imposed(predicted, p.moment), self._factor(kept, problem)
+            near = Near(y, factor, solver.refresh)
         equation = _Equation(solver, data)
 
         def begin() -> Array:
