@@ -1,0 +1,529 @@
+r"""Dense reference implementation of the method of Boiger and Kaltenbacher (2016), NumPy only.
+
+It shares no code with the rest of livepde, so that both can be compared. It treats the example of
+section 4, (PDEdiff) and (obsdiff), on a mesh of (0, 1):
+
+    u_t - (D u_x)_x + q u = f,    u = 0 at both ends,    z = u on omega
+
+R u = chi_omega u and P u = chi_(Omega \ omega) u act under the integrals: w = u_alpha + P u is
+u_alpha on omega and the estimate u elsewhere. With the suffix _in for integrals over omega and _out
+for those over Omega \ omega, a step of implicit Euler for (noisy_q) and (noisy_u) reads
+
+    G_Q (q - q_old) / (gain h) + (sigma / gain) G_Q q - A_in(u_alpha)^T (u - u_alpha) = 0
+
+    M (u - u_old) / h + B_in u_alpha + B_out u + [A_in(u_alpha) + A_out(u)] q
+        + theta M_op (u - u_alpha) + nu N_op u = F
+
+with (A(u) q, v) = int q u v, (B u, v) = int D u' v', the mass matrix M, M_op and N_op of (MN1) and
+(MN2), theta = mu / ||r||_V~ for r = R u - u_alpha, and the Gram matrix G_Q / gain of Q; gain = 1
+is the paper's. (est_exact_q) and (est_exact_u) are the case of exact data and alpha = sigma = 0.
+
+At nu > 0 a step can have several solutions, see `Step.solve`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
+from numpy.typing import NDArray
+
+__all__ = [
+    "Discretisation",
+    "LineSpace",
+    "Setting",
+    "Step",
+    "Trajectory",
+    "fitted",
+    "residuals",
+    "run",
+]
+
+Array: TypeAlias = NDArray[np.float64]
+Kind: TypeAlias = Literal["constant", "P1", "hermite"]
+Ends: TypeAlias = Literal["free", "zero", "clamped"]
+
+# Shape functions on (0, 1): a row holds the coefficients of 1, s, s^2, s^3. Those of "hermite" are
+# phi_j and psi_j of section 4, cell by cell.
+SHAPES: dict[str, Array] = {
+    "constant": np.array([[1.0]]),
+    "P1": np.array([[1.0, -1], [0, 1]]),
+    "hermite": np.array([[1.0, 0, -3, 2], [0, 1, -2, 1], [0, 0, 3, -2], [0, 0, -1, 1]]),
+}
+PER_NODE = {"constant": 0, "P1": 1, "hermite": 2}
+
+# Largest residual of a step that counts as solved, relative to the terms of its equation. Rounding
+# leaves 1e-15 on 16 nodes and 2e-14 on 61.
+TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class LineSpace:
+    """Finite elements on a mesh of (0, 1).
+
+    Parameters
+    ----------
+    nodes
+        Increasing, from 0 to 1: x_1, ..., x_N of section 4.
+    kind
+        "P1"; "hermite": cubic, with the dofs [value, slope] node by node; "constant": one number.
+    ends
+        "free"; "zero": no value functions at the ends of (0, 1); "clamped": neither value nor slope
+        functions there, which is the space of section 4, j = 2, ..., N - 1.
+    """
+
+    nodes: Array
+    kind: Kind
+    ends: Ends = "zero"
+
+    @cached_property
+    def size(self) -> int:
+        """Number of dofs, fixed ones included."""
+        return max(1, PER_NODE[self.kind] * len(self.nodes))
+
+    @cached_property
+    def free(self) -> NDArray[np.intp]:
+        """Indices of the dofs that are not fixed to zero."""
+        per_node = PER_NODE[self.kind]
+        count = {"free": 0, "zero": min(per_node, 1), "clamped": per_node}[self.ends]
+        fixed = [start + i for start in (0, self.size - per_node) for i in range(count)]
+        return np.setdiff1d(np.arange(self.size), fixed)
+
+    def basis(self, x: Array, order: int = 0) -> Array:
+        """Return derivatives of the free basis functions, shape (points, free dofs)."""
+        cell = np.clip(np.searchsorted(self.nodes, x, "right") - 1, 0, len(self.nodes) - 2)
+        length = np.diff(self.nodes)[cell]
+        local = polyval((x - self.nodes[cell]) / length, polyder(SHAPES[self.kind].T, order))
+        local = local / length**order
+        if self.kind == "hermite":
+            local[1::2] *= length  # the dofs are slopes in x, not in the coordinate of the cell
+        values = np.zeros((len(x), self.size))
+        for i, row in enumerate(local):
+            values[np.arange(len(x)), PER_NODE[self.kind] * cell + i] = row
+        return values[:, self.free]
+
+    def interpolate(self, function: Callable[[Any], Any]) -> Array:
+        """Return the free coefficients of the interpolant of an analytic function."""
+        # A complex step gives slopes that are exact to rounding, without a formula for them.
+        values = np.asarray(function(self.nodes + 1e-40j), complex) * np.ones(len(self.nodes))
+        dofs = np.stack([values.real, values.imag / 1e-40], axis=1)[:, : PER_NODE[self.kind]]
+        found: Array = dofs.ravel() if self.kind != "constant" else values.real[:1]
+        return found[self.free]
+
+    def interpolate_all(self, function: Callable[[Any, float], Any], times: Array) -> Array:
+        """Return the free coefficients of a function of (x, t), a row for each time."""
+
+        def row(t: float) -> Array:
+            return self.interpolate(lambda x: function(x, t))
+
+        return np.array([row(t) for t in times])
+
+    def extend(self, coefficients: Array) -> Array:
+        """Insert zeros for the fixed dofs, along the last axis."""
+        extended = np.zeros((*coefficients.shape[:-1], self.size))
+        extended[..., self.free] = coefficients
+        return extended
+
+
+def fitted(count: int, omega: tuple[float, float]) -> Array:
+    """Return a uniform mesh whose inner nodes nearest to the ends of omega are moved onto them."""
+    nodes = np.linspace(0, 1, count)
+    for end in omega:
+        if 0 < end < 1:
+            nodes[1 + np.argmin(abs(nodes[1:-1] - end))] = end
+    return nodes
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """Process, discretisation, data, and parameters of the method."""
+
+    # Process; functions are analytic. Without a source, F_k = M (U_k - U_(k-1)) / h + B U_k
+    # + A(U_k) q*, for which the interpolants U_k of u* solve the discrete process exactly.
+    q_true: Callable[[Any], Any]
+    u_true: Callable[[Any, float], Any]
+    f: Callable[[Any, float], Any] | None = None
+    D: Callable[[Any], Any] = np.ones_like
+
+    # Spaces; `nodes` may be the number of nodes of a uniform mesh. 5 Gauss points in each cell are
+    # exact for products of three cubics.
+    nodes: Array | int = 31
+    state: Kind = "hermite"
+    state_ends: Ends = "zero"
+    parameter: Kind = "hermite"
+    parameter_ends: Ends = "zero"
+    inner: Literal["L2", "H1"] = "H1"
+    points: int = 5
+
+    # Observed interval. If `cut`, cells that contain an end of it are divided there for the
+    # quadrature; else omega is reduced to the cells that lie in its closure.
+    omega: tuple[float, float] = (0.0, 1.0)
+    cut: bool = False
+
+    # Samples are taken at k h, k = 0, ..., steps. The true states are interpolants of u* if the
+    # truth is "exact", or come from implicit Euler with the same elements and steps. The error of
+    # the data is a function of (x, t) that is interpolated and added.
+    h: float = 0.6
+    steps: int = 100
+    truth: Literal["discrete", "exact"] = "discrete"
+    error: Callable[[Any, float], Any] | None = None
+
+    # The method; u starts at the true state. theta = c1 ||r||_X^2 / ||r||_VX~^2, which is the lower
+    # bound of Assumption cond:mu02, plus mu / (||r||_V~^2 + floor^2 ||u_alpha||_V~^2)^(1/2), which
+    # is a constant mu, made continuous at r = 0. The penalty belongs to alpha, see `reconstruct`.
+    q0: Callable[[Any], Any] = np.zeros_like
+    gain: float = 1.0
+    c1: float = 0.0
+    mu: float = 0.0
+    floor: float = 1e-3
+    nu: float = 0.0
+    sigma: float = 0.0
+    alpha: float = 0.0
+    penalty: Literal["L2", "H2"] = "L2"
+
+
+def form(left: Array, weights: Array, right: Array) -> Array:
+    """Return the matrix of a bilinear form: sum over points p of left_pi weights_p right_pj."""
+    return left.T @ (weights[:, None] * right)
+
+
+class Discretisation:
+    """Spaces, quadrature, matrices and norms of a setting; all act on free dofs.
+
+    Attributes
+    ----------
+    X, Q
+        Spaces of state and parameter.
+    x, weights, inside
+        Quadrature points and weights, and which of the points lie in omega.
+    v, xi
+        Basis functions of X and Q at the points.
+    M, M_in, B_in, B_out, M_op, N_op, G_Q
+        Matrices of the equations above; M_in is the mass matrix of omega.
+    observed
+        Dofs of X whose basis functions meet omega.
+    """
+
+    def __init__(self, setting: Setting) -> None:
+        given = setting.nodes
+        nodes = np.linspace(0, 1, given) if isinstance(given, int) else given
+        self.setting = setting
+        self.X = LineSpace(nodes, setting.state, setting.state_ends)
+        self.Q = LineSpace(nodes, setting.parameter, setting.parameter_ends)
+
+        cells = np.union1d(nodes, setting.omega) if setting.cut else nodes
+        s, w = np.polynomial.legendre.leggauss(setting.points)
+        length = np.diff(cells)
+        self.x = (cells[:-1, None] + length[:, None] * (s + 1) / 2).ravel()
+        self.weights = (length[:, None] * w / 2).ravel()
+        a, b = setting.omega
+        self.inside = np.repeat((cells[:-1] > a - 1e-12) & (cells[1:] < b + 1e-12), len(s))
+        w_in, w_out = self.weights * self.inside, self.weights * ~self.inside
+
+        self.v, dv, ddv = (self.X.basis(self.x, order) for order in range(3))
+        self.xi, dxi = (self.Q.basis(self.x, order) for order in range(2))
+        D = setting.D(self.x)
+        self.M, self.M_in = form(self.v, self.weights, self.v), form(self.v, w_in, self.v)
+        self.B_in, self.B_out = form(dv, w_in * D, dv), form(dv, w_out * D, dv)
+        self.M_op = form(dv, w_in * abs(D), dv) + self.M_in
+        self.N_op = form(dv, w_out * abs(D), dv) + form(self.v, w_out, self.v)
+        self.G_Q = form(self.xi, self.weights, self.xi)
+        if setting.inner == "H1":
+            self.G_Q += form(dxi, self.weights, dxi)
+
+        self.observed = np.flatnonzero(self.v[self.inside].any(axis=0))
+        self._penalty = self.M_in if setting.penalty == "L2" else form(ddv, w_in, ddv)
+        within = np.flatnonzero(
+            ~self.v[~self.inside].any(axis=0)
+        )  # functions with support in omega
+        self._V_tilde = self.M_op[within].T @ np.linalg.solve(
+            self.M[np.ix_(within, within)], self.M_op[within]
+        )
+        self._H1 = np.linalg.inv(np.linalg.cholesky(self.M + form(dv, self.weights, dv)))
+        self._Q = np.linalg.inv(np.linalg.cholesky(self.G_Q))
+
+    def V_tilde(self, r: Array) -> float:
+        """Return ||r||_V~ as sup (M_op r, phi) / ||phi||_L2 over phi with support in omega."""
+        return float(np.sqrt(r @ self._V_tilde @ r))
+
+    def V_hat(self, p: Array) -> float:
+        """Return ||P p||_V^ by its formula, ||(D p')'||_L2 + ||p||_L2; for cubic elements."""
+        D = self.setting.D(self.x + 1e-40j)
+        flux = D.real * (self.X.basis(self.x, 2) @ p)
+        flux += D.imag / 1e-40 * (self.X.basis(self.x, 1) @ p)
+        w_out = self.weights * ~self.inside
+        return float(np.sqrt(w_out @ flux**2) + np.sqrt(w_out @ (self.v @ p) ** 2))
+
+    def relative_X(self, *terms: Array) -> float:
+        """Return the norm of the sum of functionals on H^1, relative to the sum of their norms."""
+        sizes = [np.linalg.norm(self._H1 @ term) for term in (sum(terms), *terms)]
+        return float(sizes[0] / (sum(sizes[1:]) or 1.0))
+
+    def relative_Q(self, *terms: Array) -> float:
+        """Return the same for functionals on Q."""
+        sizes = [np.linalg.norm(self._Q @ term) for term in (sum(terms), *terms)]
+        return float(sizes[0] / (sum(sizes[1:]) or 1.0))
+
+    def A(self, values: Array) -> Array:
+        """Return the matrix of A(u), from the values of u at the quadrature points."""
+        at = values != 0
+        return form(self.v[at], self.weights[at] * values[at], self.xi[at])
+
+    def reconstruct(self, z: Array) -> Array:
+        """Return u_alpha = G_alpha z, G_alpha = (G* G + alpha I)^-1 G*, section 3.2.
+
+        It minimises ||v - z||^2 + alpha |v|^2 over omega, where |v| is the norm of X = L2, so that
+        u_alpha = z / (1 + alpha), or the L2 norm of v'' (penalty "H2").
+        """
+        if self.setting.alpha == 0:
+            return z
+        of = np.ix_(self.observed, self.observed)
+        normal = self.M_in[of] + self.setting.alpha * self._penalty[of]
+        u_alpha = np.zeros_like(z)
+        u_alpha[self.observed] = np.linalg.solve(normal, self.M_in[of] @ z[self.observed])
+        return u_alpha
+
+    def theta(self, r: Array, u_alpha: Array) -> tuple[float, Array]:
+        """Return theta(r) = mu / ||r||_V~ and its derivative."""
+        c1, mu = self.setting.c1, self.setting.mu
+        theta, derivative = 0.0, np.zeros_like(r)
+        if c1 and r[self.observed].any():
+            X, VX = self.M_in @ r, self.M_op @ r
+            quotient = float((r @ X) / (r @ VX))
+            theta += c1 * quotient
+            derivative += 2 * c1 / (r @ VX) * (X - quotient * VX)
+        if mu:
+            norm = float(np.hypot(self.V_tilde(r), self.setting.floor * self.V_tilde(u_alpha)))
+            theta += mu / norm
+            derivative -= mu / norm**3 * (self._V_tilde @ r)
+        return theta, derivative
+
+
+class Step:
+    """Equations of one step of implicit Euler, with their solver; all arrays in free dofs."""
+
+    def __init__(self, at: Discretisation, u_old: Array, q_old: Array, z: Array, F: Array) -> None:
+        self.at, self.u_old, self.q_old, self.F = at, u_old, q_old, F
+        self.u_alpha = at.reconstruct(z)
+        self.A_in = at.A(at.inside * (at.v @ self.u_alpha))
+        scale = at.setting.gain / (1 / at.setting.h + at.setting.sigma)
+        self._dq = scale * np.linalg.solve(at.G_Q, self.A_in.T)
+
+    def q(self, u: Array) -> Array:
+        """Return the solution q of the equation of q, which is linear, for a given u.
+
+        The equation of u with q(u) inserted has a scaling that does not depend on the gain.
+        """
+        h, sigma = self.at.setting.h, self.at.setting.sigma
+        return self.q_old / (1 + sigma * h) + self._dq @ (u - self.u_alpha)
+
+    def rule(self, u: Array) -> float:
+        """Return theta(u - u_alpha)."""
+        return self.at.theta(u - self.u_alpha, self.u_alpha)[0]
+
+    def terms_u(self, u: Array, q: Array, theta: float) -> list[Array]:
+        """Return the terms of the equation of u, all on its left-hand side."""
+        at, h = self.at, self.at.setting.h
+        return [
+            at.M @ u / h,
+            at.M @ self.u_old / -h,
+            at.B_in @ self.u_alpha,
+            at.B_out @ u,
+            self.A_in @ q,
+            at.A(~at.inside * (at.v @ u)) @ q,
+            theta * (at.M_op @ (u - self.u_alpha)),
+            at.setting.nu * (at.N_op @ u),
+            -self.F,
+        ]
+
+    def terms_q(self, u: Array, q: Array) -> list[Array]:
+        """Return the terms of the equation of q, all on its left-hand side."""
+        G_Q, h = self.at.G_Q / self.at.setting.gain, self.at.setting.h
+        data_terms = [self.A_in.T @ -u, self.A_in.T @ self.u_alpha]
+        return [G_Q @ q / h, G_Q @ self.q_old / -h, self.at.setting.sigma * (G_Q @ q), *data_terms]
+
+    def residual(self, u: Array, q: Array) -> float:
+        """Return the larger residual of both equations, relative to their terms."""
+        of_u = self.at.relative_X(*self.terms_u(u, q, self.rule(u)))
+        return max(of_u, self.at.relative_Q(*self.terms_q(u, q)))
+
+    def jacobian(self, u: Array, theta: float | None) -> Array:
+        """Return d/du of the equation of u with q(u), for theta(r) or a given theta."""
+        at, h, out = self.at, self.at.setting.h, ~self.at.inside
+        A = self.A_in + at.A(out * (at.v @ u))
+        A_out_q = form(at.v[out], at.weights[out] * (at.xi[out] @ self.q(u)), at.v[out])
+        fixed = at.M / h + at.B_out + at.setting.nu * at.N_op + A_out_q + A @ self._dq
+        if theta is not None:
+            return fixed + theta * at.M_op
+        r = u - self.u_alpha
+        theta, slope = at.theta(r, self.u_alpha)
+        return fixed + theta * at.M_op + np.outer(at.M_op @ r, slope)
+
+    def newton(self, u: Array, theta: float | None = None, goal: float = 1e-15) -> Array:
+        """Solve the equation of u with q(u) by damped Newton, for theta(r) or a given theta.
+
+        It ends at the goal for the relative residual, or where no part of a Newton step decreases
+        the residual: it is solved to rounding then, or stuck, and the caller has to look.
+        """
+        at = self.at
+
+        def equation(u: Array) -> tuple[Array, float, float]:
+            terms = self.terms_u(u, self.q(u), self.rule(u) if theta is None else theta)
+            residual = np.sum(terms, axis=0)
+            return residual, float(np.linalg.norm(at._H1 @ residual)), at.relative_X(*terms)
+
+        residual, size, share = equation(u)
+        for _ in range(50):
+            if share <= goal:
+                break
+            change = np.linalg.solve(self.jacobian(u, theta), -residual)
+            for length in 0.5 ** np.arange(12):
+                trial = equation(u + length * change)
+                if trial[1] < size:
+                    break
+            else:
+                break
+            u, (residual, size, share) = u + length * change, trial
+        return u
+
+    def solve(self, theta: float) -> tuple[Array, Array, float]:
+        """Return u, q and their residual.
+
+        With theta held, Newton is safe: only A_out(u) q is nonlinear then. So theta is a root of
+        theta(r(theta)) - theta, a scalar function. It is bracketed, from a start, on the side that
+        the sign at the start tells; the bracket is halved until Newton on all of the equation,
+        with the derivative of theta, ends within it.
+
+        There may be several roots: c1 ||r||_X^2 / ||r||_VX~^2 turns with the shape of r, which for
+        nu > 0 need not tend to zero. With theta of the step before as start the solution is
+        the one that continues that step.
+
+        Raises
+        ------
+        ArithmeticError
+            If the residual stays above TOLERANCE.
+        """
+        u = self.newton(self.u_old) if theta == 0 else self._continued(np.log(theta))
+        q = self.q(u)
+        residual = self.residual(u, q)
+        if not residual <= TOLERANCE:
+            raise ArithmeticError(
+                f"a step has the relative residual {residual:.1e}, expected at most {TOLERANCE:g}"
+            )
+        return u, q, residual
+
+    def _continued(self, near: float) -> Array:
+        """Return u for the root log theta that is next to `near` on the side `solve` tells."""
+
+        def mismatch(log_theta: float, u: Array) -> tuple[float, Array]:
+            u = self.newton(u, np.exp(log_theta), goal=1e-9)
+            return np.log(max(self.rule(u), 1e-300)) - log_theta, u
+
+        start, u = mismatch(near, self.u_old)
+        far, stride = near, start
+        for _ in range(60):
+            far = near + np.clip(stride, -1.5, 1.5)
+            value, found = mismatch(far, u)
+            if value * start <= 0:
+                break
+            near, u, stride = far, found, 2 * stride
+        for k in range(60):
+            if k % 3 == 0:
+                solved = self.newton(u)
+                root = np.log(max(self.rule(solved), 1e-300))
+                between = min(near, far) - 1e-6 <= root <= max(near, far) + 1e-6
+                if between and self.residual(solved, self.q(solved)) <= TOLERANCE:
+                    return solved
+            middle = (near + far) / 2
+            value, found = mismatch(middle, u)
+            if value * start > 0:
+                near, u = middle, found
+            else:
+                far = middle
+        return self.newton(u)
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Estimates, data and truth at times k h: a row for each time, with zeros for fixed dofs.
+
+    Attributes
+    ----------
+    at
+        Discretisation; `at.X.free[at.observed]` are the columns of Z with data.
+    times, Q, U
+        Times, shape (samples,); estimates of q and u, shapes (samples, m) and (samples, n).
+    Z
+        Data: coefficients on omega, nodes at its ends included; the other columns are zero.
+    theta, residuals
+        theta of each step and its relative residual.
+    q_true, U_true, F
+        Coefficients of q* and of the true states; loads F_k.
+    """
+
+    at: Discretisation
+    times: Array
+    Q: Array
+    U: Array
+    Z: Array
+    theta: Array
+    residuals: Array
+    q_true: Array
+    U_true: Array
+    F: Array
+
+
+def truth(at: Discretisation, times: Array) -> tuple[Array, Array, Array]:
+    """Return the free coefficients of q* and of the true states, and the loads F_k."""
+    setting, h = at.setting, at.setting.h
+    q = at.Q.interpolate(setting.q_true)
+    U = at.X.interpolate_all(setting.u_true, times)
+    C = at.B_in + at.B_out + form(at.v, at.weights * (at.xi @ q), at.v)
+    if setting.f is None:
+        return q, U, np.diff(U, axis=0, prepend=U[:1]) @ at.M / h + U @ C
+    F = np.array([at.v.T @ (at.weights * setting.f(at.x, t)) for t in times])
+    if setting.truth == "discrete":
+        for k in range(1, len(U)):
+            U[k] = np.linalg.solve(at.M / h + C, at.M @ U[k - 1] / h + F[k])
+    return q, U, F
+
+
+def run(setting: Setting) -> Trajectory:
+    """Make the data of a setting and run the method on them.
+
+    Raises
+    ------
+    ArithmeticError
+        If a step is not solved.
+    """
+    at = Discretisation(setting)
+    times = setting.h * np.arange(setting.steps + 1.0)
+    q_true, U_true, F = truth(at, times)
+    data, Z = U_true.copy(), np.zeros_like(U_true)
+    if setting.error is not None:
+        data += at.X.interpolate_all(setting.error, times)
+    Z[:, at.observed] = data[:, at.observed]
+
+    U, Q = U_true.copy(), np.tile(at.Q.interpolate(setting.q0), (len(times), 1))
+    theta, residual = np.zeros(len(times)), np.zeros(len(times))
+    for k in range(1, len(times)):
+        step = Step(at, U[k - 1], Q[k - 1], Z[k], F[k])
+        U[k], Q[k], residual[k] = step.solve(theta[k - 1] or step.rule(U[k - 1]))
+        theta[k] = step.rule(U[k])
+    Q, q_true = at.Q.extend(Q), at.Q.extend(q_true)
+    U, Z, U_true, F = (at.X.extend(rows) for rows in (U, Z, U_true, F))
+    return Trajectory(at, times, Q, U, Z, theta, residual, q_true, U_true, F)
+
+
+def residuals(at: Discretisation, Q: Array, U: Array, Z: Array, F: Array) -> Array:
+    """Return the relative residual of each step of any trajectory, rows as in `Trajectory`.
+
+    Where a step has several solutions, this tells whether a trajectory is one of them.
+    """
+    q, (u, z, f) = Q[:, at.Q.free], (rows[:, at.X.free] for rows in (U, Z, F))
+    steps = [Step(at, u[k - 1], q[k - 1], z[k], f[k]) for k in range(1, len(u))]
+    return np.array([step.residual(u[k], q[k]) for k, step in enumerate(steps, 1)])
