@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -175,5 +176,6 @@ def _is_bilinear(form: AnyForm) -> bool:
 
 def _tensors(form: AnyForm) -> tuple[sp.csr_array, sp.csr_array, sp.csr_array]:
     """Return the maps to the data of A(w), of d(A(w) q)/dw and of d(A(w)^T r)/dw."""
-    vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
-    return sp.csr_array(vq), sp.csr_array(vu), sp.csr_array(qu)
+    pairs = ("v", "q"), ("v", "u"), ("q", "u")
+    vq, vu, qu = (cast("sp.csr_array", form.tensor(*pair)) for pair in pairs)
+    return vq, vu, qu
