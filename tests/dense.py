@@ -1,7 +1,7 @@
 """The coupled stage on a line by NumPy alone: P1 elements, A(u) q = q u, B(u) = -u''.
 
-Nothing of livepde's forms, spaces or stages is used, its damping rules alone: the matrices are assembled by loops over
-elements, with the integrals over omega apart from those over the rest.
+Of livepde its damping rules are used, and nothing of its forms, spaces or stages: the matrices are
+assembled by loops over elements, with the integrals over omega apart from those over the rest.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -25,7 +25,6 @@ import livepde as lp
 from livepde.fem import Moment
 from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
 from livepde.laws.coupled import stage as stage_module
-from livepde.laws.coupled.stage import nearest_root
 from livepde.laws.metrics import ConstantMetric
 from livepde.model import h1_form
 from livepde.stepping import ForwardStage, Near, StepFailed
@@ -244,7 +243,7 @@ def test_an_accepted_stage_is_solved_in_every_unit(size, rule, gain):
             continue
         break
     assert dense.relative(y, *given) <= 3 * newton.tolerance
-    assert halvings <= 1
+    assert halvings <= 2
 
 
 @pytest.mark.parametrize("spoiled", [0.5, 3.0, -1.0, 1e6, 1e-6])
