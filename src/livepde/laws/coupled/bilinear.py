@@ -122,7 +122,7 @@ class BilinearSolver(MonolithicSolver):
         if forms.W is None:
             w = forms.model.impose(u_alpha, moment) if w is None else w
             inside = Inside(self._coupling[1] @ w, products["B_in"] @ w)
-        sizes = self.terms.sizes(known, metric.load, u_alpha)
+        sizes = self.terms.sizes(c, h, known, u_alpha, metric)
         observed = self.terms.observed(u_alpha)
         return StageData(c, h, moment, u_alpha, metric, known, inside, sizes, observed)
 
