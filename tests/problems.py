@@ -90,7 +90,9 @@ def reaction(
     )
 
 
-def excited(cells: int = 20, element: Any = None, f: Any = None, **options: Any) -> lp.Model:
+def excited(
+    cells: int = 20, element: Any = None, f: Any = None, mesh: Any = None, **options: Any
+) -> lp.Model:
     """Return the excited twin of DESIGN.md, fact 5: its u* is `excited_u`, its q* `excited_q`."""
     element = element or ElementLineHermite()
 
@@ -100,7 +102,7 @@ def excited(cells: int = 20, element: Any = None, f: Any = None, **options: Any)
         rate = np.cos(t) / 2 * s1 - 0.35 * np.sin(0.7 * t) * s2
         return rate + pi**2 * a * s1 + 4 * pi**2 * b * s2 + excited_q(x) * (a * s1 + b * s2)
 
-    return reaction(line(cells), element, f=f or source, **options)
+    return reaction(mesh or line(cells), element, f=f or source, **options)
 
 
 def excited_q(x: Any) -> Any:
@@ -146,15 +148,26 @@ class Slope:
 
 
 class Cubic:
-    """x^3 = x for x = y - 5: sweeps go to 1 from x > 0, Newton anywhere."""
+    """x^3 = x for x = y - 5, as an equation of `Newton`: roots at 4, 5 and 6."""
 
     def __init__(self):
-        self.sweeps = []
+        self.factors = 0
 
-    def residual(self, y):
+    def evaluate(self, y):
         x = y - 5.0
-        return x**3 - x
+        return Point(y, x**3 - x, 6.0)
 
-    def factor(self, y, sweep):
-        self.sweeps.append(sweep)
-        return Slope(2.0 if sweep else 3.0 * (y[0] - 5.0) ** 2 - 1.0)
+    def factor(self, at):
+        self.factors += 1
+        return Slope(3.0 * (at.y[0] - 5.0) ** 2 - 1.0)
+
+    def rounding(self, at):
+        return 1e-16
+
+
+class Point:
+    """A point of an equation, with the size of its residual relative to a scale."""
+
+    def __init__(self, y, residual, scale=1.0, resolved=True):
+        self.y, self.residual, self.resolved = y, residual, resolved
+        self.size = float(np.max(np.abs(residual) / scale))

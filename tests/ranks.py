@@ -4,9 +4,9 @@ import sys
 
 import numpy as np
 import scipy.sparse as sp
+from livepde.laws.distributed import Distributed
 
 import livepde as lp
-from livepde.laws.distributed import Distributed
 from livepde.linalg import Pattern, choose, in_use
 from livepde.parallel import petsc
 from livepde.stepping import Advance, ImplicitEuler, Newton, simulate

@@ -104,7 +104,7 @@ def test_sensors_name_their_component(mesh):
         (lp.Points([0.25], of="c"), 0.25),
         (lp.Points([0.25], of="s"), 0.75),
         (lp.Averages(half, of="s"), 0.75),
-        (lp.Subdomain(lambda x: x[0] > 0.95, of="s"), 0.0),
+        (lp.Subdomain(lambda x: x[0] > 0.9, of="s"), [0.1, 0.0]),
     ):
         assert sensor.bind(*spaces).G @ u == pytest.approx(expected, abs=1e-9)
     with pytest.raises(lp.SpaceError, match=r"components \['c', 's'\]: say which"):

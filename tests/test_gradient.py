@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from dense import DenseStage
 from problems import (
     CASES,
     excited,
@@ -22,11 +23,13 @@ from skfem import ElementLineHermite, ElementLineP1, ElementQuad1, MeshQuad
 
 import livepde as lp
 from livepde.fem import Moment
-from livepde.laws.coupled import CoupledStage
-from livepde.laws.gains import Gains
-from livepde.stepping import ForwardStage, StepFailed
+from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
+from livepde.laws.coupled import stage as stage_module
+from livepde.laws.metrics import ConstantMetric
+from livepde.model import h1_form
+from livepde.stepping import ForwardStage, Near, StepFailed
 
-EXACT = lp.Newton(tolerance=1e-13)
+EXACT = lp.Newton(tolerance=1e-13, share=0.0)
 
 
 def identifier(model, law, sensors=None, **options):
@@ -179,34 +182,112 @@ def test_precomputed_products_do_not_change_the_numbers():
     np.testing.assert_allclose(curved, fast, atol=1e-10)
 
 
-def test_stage_solves_its_equations():
-    """The two equations of CoupledStage, written out with dense matrices."""
-    model = excited(8)
-    observed = observe(model, lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8)))
-    split = observed.split()
-    rng = np.random.default_rng(0)
-    M_op = model.bilinear(lambda u, v, x: u * v + laplace(u, v, x))
-    for damping in (lp.ResidualDamping(3.0), lp.ConstantDamping(2.0, floor=0.1)):
-        gains = Gains(50.0, damping, 0.4, 0.3, M_op, model.mass)
-        stage = CoupledStage(model, split, gains, EXACT)
-        n, h, moment = model.X.dim, 0.3, Moment(0.3)
-        c = 0.3 * rng.standard_normal(n + model.Q.dim)
-        c[:n] *= model.X.free
-        u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
-        y, _ = stage.solve(c, h, moment, u_alpha, c.copy())
-        u, q = y[:n], y[n:]
-        r, w = split.R @ u - u_alpha, u_alpha + split.P @ u
-        Mr = split.R.T @ M_op @ r
-        theta = damping.theta(stage.norms(r, Mr, split.R.T @ model.mass @ r))
-        A = model.A(w, moment)
-        PNP = split.P.T @ model.mass @ split.P
-        first = model.mass @ (u - c[:n]) / h + model.B(w, moment) + A(q)
-        first += theta * Mr + 0.4 * PNP @ u - model.F(moment)
-        second = model.Q.gram @ (q - c[n:]) / (50 * h) + 0.3 / 50 * model.Q.gram @ q
-        second -= A.transposed(r)
-        scale = abs(model.F(moment)).max()
-        assert abs(first * model.X.free).max() <= 1e-10 * scale
-        assert abs(second).max() <= 1e-10 * scale
+def stage_of(model, split, rule, newton=EXACT, nu=0.0, **options):
+    """Return the coupled stage with M and N of (MN1), (MN2)."""
+    forms = StageForms(model, split, h1_form, h1_form, nu, **options)
+    return CoupledStage(StageTerms(forms, rule), newton)
+
+
+def a_stage(rule, gain=50.0, nu=0.4, sigma=0.3, size=1.0, h=0.3, seed=0, newton=EXACT):
+    """Return a stage with data that miss its start, and the same by dense matrices.
+
+    With u in another unit, `size` times as large, the same gain is one over size squared.
+    """
+    gain, nodes = gain / size**2, lp.interval(0.0, 1.0, 16, through=(0.3, 0.8))
+    model = excited(16, ElementLineP1(), mesh=nodes)
+    split = observe(model, lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8))).split()
+    x = nodes.p[0]
+    inside = (x[:-1] >= 0.3) & (x[1:] <= 0.8)
+    dense = DenseStage(x, inside, gain, rule, nu, sigma)
+    np.testing.assert_array_equal(np.flatnonzero(inside), split.omega)
+    rng, n = np.random.default_rng(seed), model.X.dim
+    c = rng.standard_normal(n + model.Q.dim)
+    c[:n] *= size * model.X.free
+    u_alpha = split.R @ (size * model.initial(lambda x: excited_u(x, 0.3)))
+    metric = ConstantMetric(model, gain, sigma).stage(c[n:], h, gain, sigma)
+    problem = StageProblem(c, h, Moment(0.3), u_alpha, metric)
+    given = (c, h, u_alpha, model.F(Moment(0.3)) * model.X.free)
+    return stage_of(model, split, rule, newton, nu), problem, dense, given
+
+
+RULES = [
+    lp.ResidualDamping(0.0),
+    lp.ResidualDamping(3.0),
+    lp.ConstantDamping(2.0, floor=0.1),
+    lp.ConstantDamping(0.5, floor=1e-3),
+]
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("nu", [0.0, 0.4])
+def test_stage_solves_its_equations(rule, nu):
+    """The two equations, written out with dense matrices and integrals over omega and the rest."""
+    stage, problem, dense, given = a_stage(rule, nu=nu)
+    y, _ = stage.solve(problem, problem.c.copy)
+    assert dense.relative(y, *given) <= 1e-12
+    assert dense.relative(y + 1e-6 * problem.c, *given) > 1e-9  # which would show a wrong solution
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3, 1e5])
+@pytest.mark.parametrize("rule", [lp.ResidualDamping(1.0), lp.ConstantDamping(0.5, floor=1e-3)])
+@pytest.mark.parametrize("gain", [1.0, 1e4])
+def test_an_accepted_stage_is_solved_in_every_unit(size, rule, gain):
+    """The residual counts, whatever the size of the state: acceptance has no unit."""
+    newton = lp.Newton(share=0.0)
+    for halvings in range(9):
+        h = 0.3 / 2**halvings
+        stage, problem, dense, given = a_stage(rule, gain=gain, size=size, h=h, newton=newton)
+        try:
+            y, _ = stage.solve(problem, problem.c.copy)
+        except StepFailed:
+            continue
+        break
+    assert dense.relative(y, *given) <= 3 * newton.tolerance
+    assert halvings <= 2
+
+
+@pytest.mark.parametrize("spoiled", [0.5, 3.0, -1.0, 1e6, 1e-6])
+def test_a_wrong_factor_is_never_accepted(spoiled):
+    """A factor of another point makes updates small; the residual stays."""
+
+    class Spoiled:
+        def __init__(self, inner):
+            self.inner = inner
+
+        def solve(self, b):
+            return self.inner.solve(b) / spoiled
+
+    newton = lp.Newton(share=0.0)
+    stage, problem, dense, given = a_stage(lp.ResidualDamping(1.0), newton=newton)
+    other = 10.0 * np.random.default_rng(5).standard_normal(len(problem.c))
+    p = problem
+    data = stage.solver.data(p.c, p.h, p.moment, p.u_alpha, p.metric)
+    factor = Spoiled(stage.solver.factor(data, stage.solver.evaluate(data, other)))
+    equation = stage_module._Equation(stage.solver, data)
+    solved = newton.solve(equation, p.c, Near(p.c.copy(), factor))
+    assert solved.at.size <= newton.tolerance
+    assert dense.relative(solved.at.y, *given) <= 3 * newton.tolerance
+
+
+def test_a_share_is_one_of_the_residual_that_the_prediction_had():
+    newton = lp.Newton(share=0.03)
+    stage, problem, dense, given = a_stage(lp.ResidualDamping(1.0), newton=newton)
+    exact, _ = stage.solve(problem, problem.c.copy)
+    assert dense.relative(exact, *given) <= 3 * newton.tolerance  # without a prediction: none
+    predicted = exact + 1e-4 * np.random.default_rng(1).standard_normal(len(exact))
+    predicted[[0, stage.terms.n - 1]] = 0.0
+    found, _ = stage.solve(problem, problem.c.copy, predicted)
+    missed = dense.relative(predicted, *given)
+    assert dense.relative(found, *given) <= 2 * min(0.03 * missed, newton.ceiling)
+
+
+def test_a_strict_tolerance_below_rounding_is_reached_as_far_as_numbers_go():
+    for seed in range(5):
+        stage, problem, dense, given = a_stage(
+            lp.ResidualDamping(1.0), gain=1e4, size=1e4, seed=seed, newton=lp.Newton(1e-17)
+        )
+        y, _ = stage.solve(problem, problem.c.copy)
+        assert dense.relative(y, *given) <= 1e-12
 
 
 @pytest.mark.parametrize("scheme", [lp.ImplicitEuler(), lp.Alexander2()])
@@ -237,7 +318,7 @@ def test_a_missing_sensor_takes_no_part():
 
 
 def test_stabilising_term_decays_q():
-    model = excited(6, sigma=None) if False else excited(6)
+    model = excited(6)
     ident = identifier(model, lp.GradientLaw(sigma=0.7, newton=EXACT), q0=3.0)
     nothing = np.full(ident.observed.size, np.nan)
     q0 = ident.estimate().q
@@ -343,8 +424,8 @@ class TestDamping:
         law = lp.GradientLaw()
         stage = law.prepare(problem).stage(np.ones(problem.observed.size, dtype=bool))
         r = np.random.default_rng(0).standard_normal(model.X.dim) * model.X.free
-        Mr = stage.RM @ r
-        norms = stage.norms(r, Mr, model.mass @ r)
+        Mr = stage.terms.forms.pull @ r
+        norms = stage.terms.norms(r, Mr, stage.terms.forms.mass @ r)
         assert pytest.approx(model.X.norm(r) ** 2) == norms.X
         assert pytest.approx(r @ model.bilinear(law.M_op) @ r) == norms.VX
         assert pytest.approx(model.X.norm(model.X.riesz(Mr)) ** 2) == norms.V
@@ -422,17 +503,25 @@ def test_checked_contract():
         ).raise_if_failed()
 
 
+def free_stage(model, rule=None):
+    """Return a stage of a model without sensors, and its problem from c on."""
+    split = observe(model, lp.Full()).split(np.zeros(14, dtype=bool))
+    stage = stage_of(model, split, rule or lp.ResidualDamping())
+
+    def problem(c, h=0.1):
+        metric = ConstantMetric(model, 1.0, 0.0).stage(c[model.X.dim :], h, 1.0, 0.0)
+        return StageProblem(c, h, Moment(h), np.zeros(model.X.dim), metric)
+
+    return stage, problem
+
+
 def test_forward_stage_agrees_with_the_coupled_stage_without_data():
     model = excited(8)
-    split = observe(model, lp.Full()).split(np.zeros(14, dtype=bool))
-    mass = model.mass
-    stage = CoupledStage(
-        model, split, Gains(1.0, lp.ResidualDamping(), 0.0, 0.0, mass, mass), EXACT
-    )
+    stage, problem = free_stage(model)
     rng = np.random.default_rng(1)
     c = rng.standard_normal(model.X.dim + model.Q.dim)
     c[: model.X.dim] *= model.X.free
-    y, _ = stage.solve(c, 0.1, Moment(0.1), np.zeros(model.X.dim), c.copy())
+    y, _ = stage.solve(problem(c), c.copy)
     u = ForwardStage(model).solve(c[: model.X.dim], c[model.X.dim :], 0.1, Moment(0.1))
     np.testing.assert_allclose(y[: model.X.dim], u, atol=1e-9)
     np.testing.assert_allclose(y[model.X.dim :], c[model.X.dim :], atol=1e-9)
@@ -440,13 +529,11 @@ def test_forward_stage_agrees_with_the_coupled_stage_without_data():
 
 def test_a_stage_that_cannot_converge():
     model = excited(8)
-    split = observe(model, lp.Full()).split()
-    mass = model.mass
-    gains = Gains(1.0, lp.ResidualDamping(), 0.0, 0.0, mass, mass)
-    stage = CoupledStage(model, split, gains, EXACT)
+    stage, problem = free_stage(model)
     c = np.full(model.X.dim + model.Q.dim, np.nan)
-    with pytest.raises(StepFailed):
-        stage.solve(c, 0.1, Moment(0.1), np.zeros(model.X.dim), c.copy())
+    with pytest.raises(StepFailed) as caught:
+        stage.solve(problem(c), c.copy)
+    assert caught.value.code == "not_finite"
 
 
 def test_a_model_in_the_plane_is_identified():

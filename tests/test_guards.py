@@ -11,9 +11,9 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
+from livepde.laws.excitation import Excitation, Probes, pairs
 from livepde.laws.guards import Scale
 from livepde.laws.past import Past, Samples
-from livepde.laws.excitation import Excitation, Probes, pairs
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
 from livepde.stepping import ForwardStage, Interval
@@ -327,7 +327,9 @@ def test_a_rest_is_told_from_noise_alone():
         assert rest.closed(after(unit * (signal + noise), unit * noise))
         assert not rest.closed(after(unit * (signal + noise)))
         assert not rest.closed(after(unit * (signal + noise), unit * noise, unit * signal[100:105]))
-        assert not rest.closed(after(unit * (signal + noise), 0.1 * unit * signal))  # weak, no noise
+        assert not rest.closed(
+            after(unit * (signal + noise), 0.1 * unit * signal)
+        )  # weak, no noise
         assert not rest.closed(after(unit * noise))  # never more than that: perhaps a fast process
         assert not rest.closed(after(unit * signal, 10.0 * unit * noise))
     assert not rest.closed(after(np.zeros((300, 16))))

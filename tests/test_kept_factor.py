@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from livepde.laws.bilinear import Bilinear, BilinearEquation
+from livepde.laws.gains import Gains
+from livepde.laws.warm import Misses
 from problems import Cubic
 
 import livepde as lp
 from livepde.bench.step import problem
-from livepde.laws.bilinear import Bilinear, BilinearEquation
 from livepde.laws.coupled import CoupledStage
-from livepde.laws.gains import Gains
-from livepde.laws.warm import Misses
 from livepde.linalg import SuperLUSolver
 from livepde.stepping import Near
 

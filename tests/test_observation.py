@@ -89,14 +89,95 @@ def test_inverse_is_the_moore_penrose_inverse_in_X():
     assert model.X.inner(split.R @ u, split.P @ u) == pytest.approx(0.0, abs=1e-14)
 
 
-def test_subdomain_selects_free_coefficients_of_omega():
+def test_subdomain_selects_the_elements_in_omega_with_the_nodes_on_their_ends():
     model = reaction(line(10), ElementLineHermite())
-    observed = observe(model, lp.Subdomain(inside))
-    assert observed.size == 10  # values and slopes at 0.3, 0.4, 0.5, 0.6, 0.7
-    np.testing.assert_array_equal(observed.split().R.diagonal().nonzero()[0], np.arange(6, 16))
+    sensors = lp.Subdomain(inside)
+    observed = observe(model, sensors)
+    np.testing.assert_array_equal(sensors.elements(model.state_block), [3, 4, 5, 6, 7])
+    assert observed.size == 12  # values and slopes at 0.3, 0.4, ..., 0.8
+    np.testing.assert_array_equal(observed.split().R.diagonal().nonzero()[0], np.arange(6, 18))
+    np.testing.assert_array_equal(observed.split().omega, [3, 4, 5, 6, 7])
     full = observe(model, lp.Full())
     assert full.size == 22 - 2
     np.testing.assert_array_equal(full.split().P.diagonal().nonzero()[0], [0, 20])
+    assert full.split().omega is None  # integrals over all of the domain
+
+
+@pytest.mark.parametrize("cells", [16, 31, 61])
+def test_omega_begins_and_ends_at_nodes_that_the_mesh_is_given(cells):
+    """u|_omega with both ends: 0.3 and 0.87 are seen, and nothing beyond."""
+    mesh = lp.interval(0.0, 1.0, cells, through=(0.3, 0.87))
+    model = reaction(mesh, ElementLineP1())
+    observed = observe(model, lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87)))
+    seen = np.sort(observed.G @ mesh.p[0])
+    assert (seen[0], seen[-1]) == (0.3, 0.87)
+    nodes = np.sort(mesh.p[0])
+    np.testing.assert_array_equal(seen, nodes[(nodes >= 0.3) & (nodes <= 0.87)])
+    split = observed.split()
+    ends = mesh.p[0][mesh.t[:, split.omega]]
+    assert (ends.min(), ends.max()) == (0.3, 0.87)
+    assert np.ptp(ends, axis=0).sum() == pytest.approx(0.57)
+
+
+def test_an_element_that_omega_cuts_is_left_out():
+    model = reaction(line(10), ElementLineP1())
+    cut = observe(model, lp.Subdomain(lambda x: (x[0] > 0.35) & (x[0] < 0.81)))
+    fits = observe(model, lp.Subdomain(lambda x: (x[0] > 0.4) & (x[0] < 0.8)))
+    np.testing.assert_array_equal(cut.G.toarray(), fits.G.toarray())
+    np.testing.assert_array_equal(cut.split().omega, fits.split().omega)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_omega_is_where_the_observed_coefficients_give_all_of_the_state(name):
+    """w = u_alpha + P u is known there: no function that the sensors do not see reaches it."""
+    model = CASES[name].model()
+    sensors = lp.Subdomain(inside)
+    split = observe(model, sensors).split()
+    omega = np.arange(model.mesh.nelements) if split.omega is None else split.omega
+    # Next to the Dirichlet boundary the data may give all of the state beyond omega, too.
+    assert set(sensors.elements(model.state_block)) <= set(omega)
+    on_omega = model.form_M.on(omega).matrix("v", "u")
+    hidden = sp.diags_array(model.X.free) @ split.P
+    assert abs(on_omega @ hidden).max() == 0.0
+
+
+def test_sensors_that_fail_shrink_omega():
+    model = reaction(line(10), ElementLineP1())
+    observed = observe(model, lp.Subdomain(inside))
+    present = np.ones(observed.size, dtype=bool)
+    present[2] = False  # the node at 0.5
+    np.testing.assert_array_equal(observed.split(present).omega, [3, 6, 7])
+    assert len(observed.split(np.zeros(observed.size, dtype=bool)).omega) == 0
+
+
+def test_omega_of_one_component_is_where_that_one_is_known():
+    mesh, field = line(10), ElementLineP1()
+    model = lp.Model(
+        {"a": lp.Field(mesh, field), "b": lp.Field(mesh, field)},
+        lp.Scalar(1.0),
+        A=lambda q, u, v, x: q * u.a * v.b,
+    )
+    one = observe(model, lp.Subdomain(inside, of="a")).split()
+    combined = observe(model, lp.Combined([lp.Subdomain(inside, of="a")])).split()
+    np.testing.assert_array_equal(one.omega, [3, 4, 5, 6, 7])
+    np.testing.assert_array_equal(combined.omega, [3, 4, 5, 6, 7])
+    mixed = lp.Combined([lp.Subdomain(inside, of="a"), lp.Points({"far": 0.93}, of="b")])
+    assert observe(model, mixed).split().omega is None  # of points there is no omega
+
+
+def test_regions_that_are_none_are_refused_in_a_sentence():
+    bad = [
+        ([lambda x: x[0] < 0.5], "expected a mapping, sensor name -> predicate .*; got \\[<func"),
+        (lambda x: x[0] < 0.5, "expected a mapping, sensor name -> predicate .*; got <func"),
+        (0.5, r"as in Averages\({'core': lambda x: x\[0\] < 0\.1}\); got 0\.5"),
+        ({"core": (0.1, 0.2)}, r"'core': \(0\.1, 0\.2\) is no region; expected the name of a"),
+        ({"core": None}, "'core': None is no region"),
+        ({3: "left"}, "3: 'left' is no region"),
+        ({}, "at least one region"),
+    ]
+    for regions, message in bad:
+        with pytest.raises(lp.ObservationError, match=message):
+            lp.Averages(regions)
 
 
 def test_averages_are_integrals():
@@ -217,8 +298,16 @@ def test_sensors_that_do_not_fit():
         (model, lambda: lp.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
         (model, lambda: lp.Matrix(np.full((1, 13), np.nan)), "not finite"),
         (model, lambda: lp.Matrix(np.eye(13)[:2], labels=["a", "a"]), "must differ"),
-        (model, lambda: lp.Subdomain(lambda x: x[0] > 30), "no free coefficient"),
-        (model, lambda: lp.Subdomain(lambda x: x[0] == 0), "no free coefficient"),
+        (
+            model,
+            lambda: lp.Subdomain(lambda x: x[0] > 30),
+            "no element of the mesh with a free coefficient",
+        ),
+        (
+            model,
+            lambda: lp.Subdomain(lambda x: x[0] == 0),
+            "no element of the mesh with a free coefficient",
+        ),
     ]
     for owner, build, message in bad:
         with pytest.raises(lp.ObservationError, match=message):

@@ -146,3 +146,23 @@ def test_every_module_imports():
     for module in pkgutil.walk_packages(livepde.__path__, "livepde."):
         if module.name != "livepde.__main__":
             importlib.import_module(module.name)
+
+
+def test_no_modules_import_each_other():
+    """Imports for type checkers included: a module is understood after those that it imports."""
+    root = Path(livepde.__file__).parent
+    modules = {
+        ".".join(("livepde", *path.relative_to(root).with_suffix("").parts)): path
+        for path in root.rglob("*.py")
+    }
+    imports: dict[str, set[str]] = {}
+    for name, path in modules.items():
+        imports[name] = found = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                asked = {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+                found |= asked & modules.keys() - {name}
+    while imports:
+        leaves = {name for name, found in imports.items() if not found}
+        assert leaves, f"in or behind a circle: {sorted(imports)}"
+        imports = {name: found - leaves for name, found in imports.items() if name not in leaves}

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from livepde.laws.gains import Gains
 from problems import excited, excited_q, excited_u, laplace, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.laws.coupled import CoupledStage
-from livepde.laws.gains import Gains
 from livepde.laws.relatives import _Linear
 from livepde.model import mass_form
 from livepde.reproduce.relatives import EXPECTED, LAWS, law

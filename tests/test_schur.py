@@ -6,13 +6,13 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from livepde.laws.bilinear import Bilinear
 
 import livepde as lp
 from livepde.bench import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws import jacobian, schur
-from livepde.laws.bilinear import Bilinear
 from livepde.linalg import choice
 
 EXACT = lp.Newton(tolerance=1e-11, share=0.0)

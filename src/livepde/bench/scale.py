@@ -341,5 +341,6 @@ def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, s
     metric = Metric(1.0 / (gain * STEP), 0.0, np.zeros(model.Q.dim))
     data = blocks.data(c, STEP, Moment(STEP), split.project(u), metric)
     at = blocks.evaluate(data, c)
-    _, count = blocks.factor(data, at).iterate(at.residual, TOLERANCE)
+    K = blocks.factor(data, at)
+    _, count = K.iterate(at.residual, K.own, TOLERANCE)
     return count, (blocks.engines["S"], blocks.engines["C"])

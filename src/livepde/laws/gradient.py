@@ -201,7 +201,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             metric=learned,
             excitation=work.excited(state.excitation, u - r, u, q, moment),
         )
-        notes = {"residual": lambda: model.X.norm(r), **path.notes()}
+        notes: dict[str, Any] = {"residual": lambda: model.X.norm(r), **path.notes()}
         notes |= work.metric.notes(learned, q, length)
         if frozen:
             notes["at_rest" if path.ready else "waits"] = 1.0

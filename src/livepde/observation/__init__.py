@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livepde.observation.base import Observation, Observed, Split
+from livepde.observation.base import Observation, Observed
 from livepde.observation.combined import Calibrated, Combined
 from livepde.observation.functionals import Functionals
 from livepde.observation.moving import Moving
@@ -18,6 +18,7 @@ from livepde.observation.reconstruction import (
     Tikhonov,
 )
 from livepde.observation.sensors import Averages, LineIntegrals, Matrix, Points
+from livepde.observation.split import Split
 from livepde.observation.subdomain import Full, Subdomain
 
 __all__ = [

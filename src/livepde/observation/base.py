@@ -1,4 +1,4 @@
-"""Observations G: X -> Z, and the splitting of the state into observed and unobserved part."""
+"""Observations G: X -> Z, and sensors bound to a state space."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from livepde.observation.reconstruction import (
     Reconstruction,
     Reconstructor,
 )
+from livepde.observation.split import Split, is_selection
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Observation", "Observed", "Split", "numbers"]
+__all__ = ["Observation", "Observed", "numbers"]
 
 Direct = Callable[[Any, Place], Any]
 STEP = 1e-30  # of the complex step
@@ -115,92 +116,6 @@ class Observation:
         return Observed(self, state, X, parameter)
 
 
-@dataclass(frozen=True, eq=False)
-class Split:
-    """The projections R = G^+ G on N(G)^perp and P = I - R on N(G), and G^+ itself.
-
-    Attributes
-    ----------
-    R, P
-        Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, so
-        they belong to P.
-    inverse
-        G^+ on the present sensors, shape (n, present).
-    present
-        Which sensors take part, shape (sensors,).
-    G
-        Their rows of G, shape (present, n).
-    vectors
-        A basis of N(G)^perp, shape (n, k); None if `inverse` is one.
-    omega
-        Elements on which the data give the state, of sensors that read it on a subdomain: there the
-        paper's chi_omega is one, and integrals over Omega are split into those over `omega`, with
-        the data, and those over the other elements, with the estimate. None: all elements, where R
-        and P alone split the state.
-    """
-
-    R: sp.csr_array
-    P: sp.csr_array
-    inverse: sp.csr_array
-    present: Array
-    G: sp.csr_array
-    vectors: Array | None = None
-    omega: IntArray | None = None
-
-    @property
-    def basis(self) -> Array:
-        """A basis of N(G)^perp, shape (n, k)."""
-        return self.inverse.toarray() if self.vectors is None else self.vectors
-
-    @cached_property
-    def _diagonal(self) -> Array | None:
-        """Diagonal of R if that is all of it."""
-        alone = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
-        return self.R.diagonal() if alone else None
-
-    @cached_property
-    def _complete(self) -> bool:
-        """True if all sensors are present."""
-        return bool(self.present.all())
-
-    @cached_property
-    def _selected(self) -> IntArray | None:
-        """Which coefficient each present sensor shows, if every one shows one as it is."""
-        selects = self.vectors is None and _is_selection(sp.csr_array(self.inverse.T))
-        return sp.csr_array(self.inverse.T).indices if selects else None
-
-    def project(self, u: Array) -> Array:
-        """Return R u."""
-        projected: Array = self.R @ u if self._diagonal is None else self._diagonal * u
-        return projected
-
-    def project_transposed(self, f: Array) -> Array:
-        """Return R^T f."""
-        projected: Array = self.R.T @ f if self._diagonal is None else self._diagonal * f
-        return projected
-
-    def reconstruct(self, z: Array, boundary: Array | None) -> Array:
-        """Return the observed part R u* = G^+ z of the state in X, shape (n,).
-
-        Parameters
-        ----------
-        z
-            Measurements, shape (sensors,); missing ones (NaN) take no part.
-        boundary
-            A coefficient vector that holds the Dirichlet values and is zero elsewhere. None: all of
-            it is zero.
-        """
-        known = z if self._complete else z[self.present]
-        if boundary is not None and boundary.any():
-            known = known - self.G @ boundary
-        if self._selected is None:
-            part: Array = self.inverse @ known
-            return part
-        part = np.zeros(self.R.shape[0])
-        part[self._selected] = known
-        return part
-
-
 class Observed:
     """An observation bound to a state space: what the sensors read, with its derivative.
 
@@ -231,6 +146,11 @@ class Observed:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
         self._splits: dict[bytes, Split] = {}
         self._reconstructors: dict[bytes, Reconstructor] = {}
+
+    @property
+    def nodal(self) -> bool:
+        """True if G^+ is taken in coefficients, false if in the inner product of X."""
+        return self.observation.nodal
 
     @cached_property
     def noise(self) -> Array | None:
@@ -278,7 +198,7 @@ class Observed:
     @cached_property
     def _shown(self) -> IntArray | None:
         """Which coefficient each sensor shows, if every one shows one as it is."""
-        return self.G.indices if _is_selection(self.G) else None
+        return self.G.indices if is_selection(self.G) else None
 
     @property
     def linear(self) -> bool:
@@ -402,7 +322,7 @@ class Observed:
         G = sp.csr_array(self.G[np.flatnonzero(present)])
         tangent = sp.csr_array(G @ sp.diags_array(self.X.free))
         tangent.eliminate_zeros()
-        if self.observation.nodal and _is_selection(tangent):
+        if self.observation.nodal and is_selection(tangent):
             inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
             omega = self._observed_elements(tangent.indices)
@@ -447,12 +367,6 @@ class Observed:
                 complete = known[start + block.element_dofs].all(axis=0)
                 inside = inside & complete if len(inside) else complete
         return None if inside.all() and len(inside) else np.flatnonzero(inside)
-
-
-def _is_selection(G: sp.csr_array) -> bool:
-    """Return true if every row picks one coefficient, and no two the same."""
-    one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
-    return one_each and len(np.unique(G.indices)) == len(G.indices)
 
 
 def numbers(parameter: FunctionSpace, q: Array) -> Any:

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import scipy
@@ -25,13 +25,13 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, ddot, dot, grad, hess
 from livepde.linalg import Array, Mask
-
-if TYPE_CHECKING:
-    from livepde.observation.base import Observed
+from livepde.observation.split import Split
+from livepde.spaces import HilbertSpace
 
 __all__ = [
     "Alpha",
     "Apriori",
+    "BoundSensors",
     "Discrepancy",
     "Pseudoinverse",
     "Reconstructed",
@@ -174,6 +174,38 @@ class Discrepancy(Alpha):
         return float(np.exp(root))
 
 
+class BoundSensors(Protocol):
+    """Sensors bound to a state space, as reconstructions see them: `livepde.observation.Observed`.
+
+    Attributes
+    ----------
+    state, X
+        The state space, with and without its components.
+    """
+
+    state: FunctionSpace
+    X: HilbertSpace
+
+    @property
+    def G(self) -> sp.csr_array:
+        """Matrix of the sensors, shape (sensors, n)."""
+        ...
+
+    @property
+    def noise(self) -> Array | None:
+        """Standard deviation of each sensor, shape (sensors,), or None if it is not known."""
+        ...
+
+    @property
+    def nodal(self) -> bool:
+        """True if G^+ is taken in coefficients, false if in the inner product of X."""
+        ...
+
+    def split(self, present: Array | None = None) -> Split:
+        """Return R, P and G^+ for the sensors present."""
+        ...
+
+
 class Reconstructor(ABC):
     """G_alpha for one set of present sensors, factorised."""
 
@@ -201,7 +233,7 @@ class Reconstruction(ABC):
         return True
 
     @abstractmethod
-    def prepare(self, observed: Observed, present: Array) -> Reconstructor:
+    def prepare(self, observed: BoundSensors, present: Array) -> Reconstructor:
         """Return what is computed once for a set of present sensors."""
 
 
@@ -213,12 +245,12 @@ class Pseudoinverse(Reconstruction):
     def regularises(self) -> bool:
         return False
 
-    def prepare(self, observed: Observed, present: Array) -> Reconstructor:
+    def prepare(self, observed: BoundSensors, present: Array) -> Reconstructor:
         return _Inverse(observed, present)
 
 
 class _Inverse(Reconstructor):
-    def __init__(self, observed: Observed, present: Array) -> None:
+    def __init__(self, observed: BoundSensors, present: Array) -> None:
         self.split = observed.split(present)
         self.weights = weights(observed, present)
 
@@ -285,7 +317,7 @@ class Tikhonov(Reconstruction):
                 f"{self.alpha!r}."
             )
 
-    def prepare(self, observed: Observed, present: Array) -> Reconstructor:
+    def prepare(self, observed: BoundSensors, present: Array) -> Reconstructor:
         return Spectral(self, observed, present)
 
 
@@ -297,7 +329,7 @@ class Spectral(Reconstructor):
     not closed) as well as where k is zero (what |.| does not see).
     """
 
-    def __init__(self, config: Tikhonov, observed: Observed, present: Array) -> None:
+    def __init__(self, config: Tikhonov, observed: BoundSensors, present: Array) -> None:
         self.config = config
         self.present = present
         if (count := int(present.sum())) > MOST_SENSORS:
@@ -366,9 +398,9 @@ class Spectral(Reconstructor):
         return delta, rule.choose(misfit, delta, self.rho)
 
 
-def weights(observed: Observed, present: Array) -> sp.csr_array:
+def weights(observed: BoundSensors, present: Array) -> sp.csr_array:
     """Return the Gram matrix of Z for the sensors present (see `Tikhonov`)."""
-    if observed.observation.nodal:
+    if observed.nodal:
         inverse = observed.split(present).inverse
         return sp.csr_array(inverse.T @ observed.X.gram @ inverse)
     if observed.noise is None:
@@ -376,7 +408,7 @@ def weights(observed: Observed, present: Array) -> sp.csr_array:
     return sp.csr_array(sp.diags_array(observed.noise[present] ** -2.0))
 
 
-def noise_level(observed: Observed, present: Array, gram: sp.csr_array) -> float | None:
+def noise_level(observed: BoundSensors, present: Array, gram: sp.csr_array) -> float | None:
     """Return delta, the root mean square of ||noise||_Z, or None if the noise is not known."""
     if observed.noise is None:
         return None
@@ -390,7 +422,7 @@ def _norm(z: Array, gram: sp.csr_array) -> float:
 class _Inside:
     """The part of the mesh a penalty is integrated over."""
 
-    def __init__(self, observed: Observed, basis: Array) -> None:
+    def __init__(self, observed: BoundSensors, basis: Array) -> None:
         self.space: FunctionSpace = observed.state
         if len(self.space.fields) > 1:
             raise ObservationError(
@@ -398,7 +430,7 @@ class _Inside:
             )
         self.block: FieldBlock = self.space.component()[0]
         self.cells: Mask | None = None  # all
-        if observed.observation.nodal:
+        if observed.nodal:
             known = np.zeros(self.block.size, dtype=bool)
             known[np.flatnonzero(np.abs(basis).any(axis=1))] = True
             known[self.block.fixed] = True
@@ -431,7 +463,7 @@ class _Inside:
         return ~touched
 
 
-def _penalty(norm: str | Integrand, observed: Observed, basis: Array) -> sp.csr_array:
+def _penalty(norm: str | Integrand, observed: BoundSensors, basis: Array) -> sp.csr_array:
     """Return the matrix of |v|^2 on all coefficients, shape (n, n)."""
     if norm == "X":
         free = sp.diags_array(observed.X.free)

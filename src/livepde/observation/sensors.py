@@ -84,8 +84,20 @@ class Averages(Observation):
     regions: Mapping[str, Predicate | str]
 
     def __post_init__(self) -> None:
-        if not self.regions:
+        given: Any = self.regions
+        if not isinstance(given, Mapping):
+            raise ObservationError(
+                "Averages: expected a mapping, sensor name -> predicate on x or name of a boundary "
+                f"or subdomain, as in Averages({{'core': lambda x: x[0] < 0.1}}); got {given!r}."
+            )
+        if not given:
             raise ObservationError("Averages: give at least one region.")
+        for name, region in given.items():
+            if not (isinstance(name, str) and (isinstance(region, str) or callable(region))):
+                raise ObservationError(
+                    f"Averages: {name!r}: {region!r} is no region; expected the name of a sensor, "
+                    "and a predicate on x or the name of a boundary or subdomain of the mesh."
+                )
 
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.regions)

@@ -67,8 +67,8 @@ class StageEquation(Protocol[Point]):
         """Return the factorised Jacobian at a point; `last` is one of another point."""
         ...
 
-    def rounding(self, at: Point) -> float:
-        """Return the relative size that rounding errors give the residual at a point."""
+    def limited(self, at: Point, allowed: float) -> bool:
+        """Return true if rounding errors are all that keeps a residual above the size allowed."""
         ...
 
 
@@ -206,7 +206,7 @@ class _Iteration(Generic[Point]):
                 factor, factors = self._factor(at, last), factors - 1
             new, update = self._updated(at, factor)
             if fresh and not new.size < at.size:
-                if at.size <= self.equation.rounding(at):
+                if self.equation.limited(at, allowed):
                     break
                 new = self._damped(at, update)
             refresh = near.refresh if factor is near.factor else newton.refresh

@@ -365,9 +365,10 @@ class _Equation:
     def factor(self, at: _Point, last: Factor | None) -> Factor:
         return self.stage._factorise(self.stage._data(at.y, self.q, self.h, self.moment))
 
-    def rounding(self, at: _Point) -> float:
+    def limited(self, at: _Point, allowed: float) -> bool:
         stage, moment = self.stage, self.moment
         data = np.abs(stage._data(at.y, self.q, self.h, moment))
         sizes = stage._rows[0].matrix(data) @ np.maximum(np.abs(at.y), np.abs(self.c))
-        source = stage.dual(self.source)
-        return ROUNDING * stage.dual(sizes) / max(stage.dual(at.residual) / at.size, source, TINY)
+        own = stage.dual(at.residual)
+        rounding = ROUNDING * max(stage.dual(sizes), stage.dual(self.source))
+        return own <= max(allowed * own / max(at.size, TINY), rounding)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -116,7 +116,7 @@ class BilinearSolver(MonolithicSolver):
         if forms.W is None:
             w = forms.model.impose(u_alpha, moment) if w is None else w
             inside = Inside(self._coupling[0].at(w), products["B_in"] @ w)
-        sizes = self.terms.sizes(known, metric.load, u_alpha)
+        sizes = self.terms.sizes(c, h, known, u_alpha, metric)
         observed = self.terms.observed(u_alpha)
         return StageData(c, h, moment, u_alpha, metric, known, inside, sizes, observed)
 
@@ -192,5 +192,6 @@ def _is_bilinear(form: AnyForm) -> bool:
 
 def _tensors(form: AnyForm) -> tuple[sp.csr_array, sp.csr_array, sp.csr_array]:
     """Return the maps to the data of A(w), of d(A(w) q)/dw and of d(A(w)^T r)/dw."""
-    vq, vu, qu = form.tensor("v", "q"), form.tensor("v", "u"), form.tensor("q", "u")
-    return sp.csr_array(vq), sp.csr_array(vu), sp.csr_array(qu)
+    pairs = ("v", "q"), ("v", "u"), ("q", "u")
+    vq, vu, qu = (cast("sp.csr_array", form.tensor(*pair)) for pair in pairs)
+    return vq, vu, qu

@@ -271,29 +271,32 @@ class BlockJacobian:
         """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
         if self.approximate is self.last:
             try:
-                return self._solve(b, self.last, PATIENCE)
+                return self.iterate(b, self.last, limit=PATIENCE)[0]
             except LinearAlgebraError:
                 pass  # it is too far away: one of this point
-        return self._solve(b, self.own, ITERATIONS)
+        return self.iterate(b, self.own)[0]
 
-    def _solve(self, b: Array, approximate: ApproximateFactor, limit: int) -> Array:
+    def iterate(
+        self,
+        b: Array,
+        approximate: ApproximateFactor,
+        tolerance: float = TOLERANCE,
+        limit: int = ITERATIONS,
+    ) -> tuple[Array, int]:
+        """Return x with K x = b, and the iterations of GMRES that took."""
         terms = self.solver.terms
         n, size = terms.n, terms.size
         padded = np.zeros(size + terms.auxiliary)
         padded[:size] = b
-        scale: Array | None = None
+        first = approximate.whole(padded)
+        sizes = [float(np.linalg.norm(part)) or 1.0 for part in (first[:n], first[n:size])]
+        scale = np.repeat(1.0 / np.array(sizes), [n, len(first) - n])  # u and q count the same
 
         def scaled(r: Array) -> Array:
-            nonlocal scale
-            z = approximate.whole(r)
-            if scale is None:  # u and q count the same
-                sizes = [float(np.linalg.norm(part)) or 1.0 for part in (z[:n], z[n:size])]
-                scale = np.repeat(1.0 / np.array(sizes), [n, len(z) - n])
-            z *= scale
-            return z
+            return (first if r is padded else approximate.whole(r)) * scale
 
-        x, _ = gmres(self.apply, scaled, padded, TOLERANCE, limit, REMEDY)
-        return x[:size]
+        x, count = gmres(self.apply, scaled, padded, tolerance, limit, REMEDY)
+        return x[:size], count
 
 
 @dataclass(frozen=True, eq=False)

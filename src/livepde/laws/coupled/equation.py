@@ -36,6 +36,7 @@ __all__ = ["Inside", "MadeAt", "StageData", "StageIterate", "StageSolver", "Stag
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
 STIFFEST = 1e6  # times 1/h, of theta: then a step takes all but this part of r away
+RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
 ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
 
 
@@ -66,7 +67,8 @@ class StageData:
     inside
         A and B over omega, where the data give all of w there.
     sizes
-        Dual norms of F and of the load, and ||u_alpha||_X.
+        Least scales of the residuals of both lines, and ||u_alpha||_X. Scales are the dual norms of
+        F and of the load, or of changes by `RESTING` of c if these are larger.
     observed
         Function that returns the squared norms of u_alpha, computed once.
     """
@@ -191,6 +193,12 @@ class StageTerms:
         return np.concatenate(parts)
 
     @cached_property
+    def diagonal(self) -> Array:
+        """Diagonals of M and G_Q on the free coefficients, shape (n + m,)."""
+        weights = self.dual_weights
+        return np.divide(1.0, weights, out=np.zeros_like(weights), where=weights > 0.0)
+
+    @cached_property
     def parts(self) -> tuple[slice, slice]:
         """Where u and q stand in y."""
         return slice(0, self.n), slice(self.n, self.size)
@@ -198,7 +206,8 @@ class StageTerms:
     @cached_property
     def lumped(self) -> Array:
         """Diagonal of the mass, shape (n,): the norm by it is equivalent to that of X."""
-        return np.abs(self.forms.model.mass.diagonal())
+        diagonal: Array = np.abs(self.forms.model.mass.diagonal())
+        return diagonal
 
     def duals(self, functionals: Sequence[Array], part: slice) -> list[float]:
         """Return the dual norms of functionals on u or q."""
@@ -227,11 +236,18 @@ class StageTerms:
         r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
         return relative, missed <= RESOLVED * r or not self.observes, scales
 
-    def sizes(self, source: Array, load: Array, u_alpha: Array) -> tuple[float, float, float]:
-        """Return the dual norms of what is given of the two lines, and ||u_alpha||_X."""
+    def sizes(
+        self, c: Array, h: float, source: Array, u_alpha: Array, metric: Metric
+    ) -> tuple[float, float, float]:
+        """Return the sizes of what is given of a stage, see `StageData`."""
+        # Where nothing moves, all terms of a line are rounding errors, and none is a scale.
+        unchanged = np.square(c) * self.diagonal
+        least = math.sqrt(float(unchanged[: self.n].sum())) / h
+        least_q = math.sqrt(float(unchanged[self.n :].sum())) * metric.scale
         (own,) = self.duals([source], self.parts[0])
-        (other,) = self.duals([load], self.parts[1]) if load.any() else (0.0,)
-        return own, other, math.sqrt(float(self.lumped @ np.square(u_alpha)))
+        (other,) = self.duals([metric.load], self.parts[1]) if metric.load.any() else (0.0,)
+        known = math.sqrt(float(self.lumped @ np.square(u_alpha)))
+        return max(own, RESTING * least), max(other, RESTING * least_q), known
 
     @cached_property
     def observes(self) -> bool:
@@ -288,8 +304,18 @@ class StageTerms:
             row = row + self.forms.pull.T @ ((2.0 * dV) * self.forms.tests.riesz(at.Mr))
         return row if row.any() else None
 
-    def rounding(self, data: StageData, at: StageIterate) -> float:
-        """Return the relative size that rounding errors give the residual at a point."""
+    def limited(self, data: StageData, at: StageIterate, allowed: float) -> bool:
+        """Return true if each line is as small as allowed, or what rounding errors make of it.
+
+        Line by line: one that is small beside the rounding errors of the other is not solved.
+        """
+        left = (at.residual[part] for part in self.parts)
+        own = [self.duals([line], part)[0] for line, part in zip(left, self.parts, strict=True)]
+        sizes = zip(own, at.scales, self.rounding(data, at), strict=True)
+        return all(line <= max(allowed * scale, rounding) for line, scale, rounding in sizes)
+
+    def rounding(self, data: StageData, at: StageIterate) -> tuple[float, float]:
+        """Return the dual norms of what rounding errors make of both lines at a point."""
         forms, model, n = self.forms, self.forms.model, self.n
         u, q = np.abs(at.y[:n]), np.abs(at.y[n:])
         c, v = np.abs(data.c), np.abs(at.w) + np.abs(data.u_alpha)
@@ -303,9 +329,9 @@ class StageTerms:
             first += abs(forms.B_out.matrix("v", "u", moment, **own)) @ u
         gram = abs(self.gram)[: len(q), : len(q)]
         second = data.metric.scale * (gram @ (q + c[n:])) + A.T @ (forms.split.R @ (u + v))
-        pairs = zip((first, second), self.parts, at.scales, strict=True)
-        sizes = [self.duals([line], part)[0] / max(scale, TINY) for line, part, scale in pairs]
-        return ROUNDING * max(sizes)
+        (state,) = self.duals([first], self.parts[0])
+        (other,) = self.duals([second], self.parts[1])
+        return ROUNDING * state, ROUNDING * other
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,7 +400,7 @@ class StageSolver(ABC):
             w = forms.model.impose(u_alpha, moment) if w is None else w
             A = forms.A_in.matrix("v", "q", moment, u=w)
             inside = Inside(A, forms.B_in.vector("v", moment, u=w))
-        sizes = self.terms.sizes(source, metric.load, u_alpha)
+        sizes = self.terms.sizes(c, h, source, u_alpha, metric)
         observed = self.terms.observed(u_alpha)
         return StageData(c, h, moment, u_alpha, metric, source, inside, sizes, observed)
 

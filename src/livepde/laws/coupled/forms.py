@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.fem import Composed, Form
-from livepde.linalg import Array
+from livepde.linalg import IntArray
 from livepde.model import Model
 from livepde.observation import Split
 from livepde.spaces import HilbertSpace
@@ -54,7 +54,7 @@ class StageForms:
     at_estimate: bool = False
 
     @cached_property
-    def _outside(self) -> Array | None:
+    def _outside(self) -> IntArray | None:
         """The elements outside of omega; None where there are none."""
         omega = self.split.omega
         if omega is None:

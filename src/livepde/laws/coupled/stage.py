@@ -106,8 +106,8 @@ class _Equation:
     def factor(self, at: StageIterate, last: Factor | None) -> Factor:
         return self.solver.factor(self.data, at, last)
 
-    def rounding(self, at: StageIterate) -> float:
-        return self.solver.terms.rounding(self.data, at)
+    def limited(self, at: StageIterate, allowed: float) -> bool:
+        return self.solver.terms.limited(self.data, at, allowed)
 
 
 def nearest_root(function: Callable[[float], float], start: float) -> float | None:
