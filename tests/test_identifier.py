@@ -135,26 +135,69 @@ def test_configurations_that_do_not_fit():
         identifier().estimate()
 
 
-def test_a_failed_step_reports_and_the_stream_goes_on():
-    """Newton is given one iteration for a nonlinear reaction, then enough."""
+def cubic_decay(law, u0=1.0, **options):
+    """Return an identifier of a nonlinear reaction, u_t + u^3 + q u = 0, seen in a part."""
     model = lp.Model(
         lp.Field(line(6), ElementLineP1(), quadrature=6),
         lp.Scalar(1.0),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: u**3 * v,
     )
-    law = lp.GradientLaw(newton=lp.Newton(iterations=1))
-    ident = lp.Identifier(model, lp.Full(), law, u0=1.0)
+    return lp.Identifier(model, lp.Subdomain(lambda x: x[0] < 0.4), law, u0=u0, **options)
+
+
+def limited(iterations):
+    """Return a law that may not iterate often, with a linear pull: it has no other way."""
+    newton = lp.Newton(iterations=iterations, tolerance=1e-3, share=0.0)
+    return lp.GradientLaw(damping=lp.ResidualDamping(0.0), newton=newton, gate=None)
+
+
+def test_a_failed_step_reports_and_the_stream_goes_on():
+    """Newton is given one iteration for a nonlinear reaction, then enough."""
+    ident = cubic_decay(limited(1), u0=3.0)
+    z = np.full(ident.observed.size, 0.5)
     before = ident.estimate()
-    estimate = ident.step(1.0, np.full(7, 0.5))
+    estimate = ident.step(1.0, z)
     assert estimate.status.code == "not_converged"
     assert "dt_max" in estimate.status.remedy
     assert "not_converged" in str(estimate.status)
     np.testing.assert_array_equal(estimate.u, before.u)
     assert ident.t == 0.0
-    good = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=1.0)
+    good = cubic_decay(lp.GradientLaw())
     good._state = ident._state
-    assert good.step(1.5, np.full(7, 0.4)).status.ok
+    assert good.step(1.5, z).status.ok
+
+
+def test_a_stage_that_is_not_solved_is_halved_as_often_as_asked():
+    """With two iterations short substeps can be solved, and long ones cannot."""
+    z = np.full(3, 0.5)
+    first = {}
+    for halvings in (0, 1, 5, 8):
+        ident = cubic_decay(limited(2), u0=3.0, halvings=halvings)
+        before, first[halvings] = ident.estimate(), ident.step(0.1, z)
+        if not first[halvings].status.ok:
+            assert first[halvings].status.code == "not_converged"
+            np.testing.assert_array_equal(first[halvings].u, before.u)
+    assert not first[0].status.ok
+    assert not first[1].status.ok
+    assert first[8].steps > 2
+    np.testing.assert_array_equal(first[5].u, first[8].u)
+    assert cubic_decay(lp.GradientLaw()).problem.control.halvings == lp.Advance.halvings == 8
+
+
+def test_without_halvings_solved_steps_are_the_same():
+    one, other = cubic_decay(lp.GradientLaw()), cubic_decay(lp.GradientLaw(), halvings=0)
+    for k in range(1, 6):
+        a, b = (ident.step(0.1 * k, np.full(3, 0.9**k)) for ident in (one, other))
+        assert (a.steps, b.steps) == (1, 1)
+        np.testing.assert_array_equal(a.u, b.u)
+        np.testing.assert_array_equal(a.q, b.q)
+
+
+@pytest.mark.parametrize("halvings", [-1, 1.5, "8", None, True, 31])
+def test_halvings_that_cannot_be_meant(halvings):
+    with pytest.raises(lp.ConfigurationError, match="halvings must be a whole number from 0 to 30"):
+        cubic_decay(lp.GradientLaw(), halvings=halvings)
 
 
 @pytest.mark.parametrize(
@@ -293,14 +336,15 @@ def test_progress_is_silent_where_nobody_watches(capsys):
 def test_substeps_are_those_made_by_hand():
     model = excited(8)
     z = np.zeros(lp.Full().bind(model.state_space, model.X, model.parameter_space).size)
-    divided = lp.Identifier(model, lp.Full(), lp.GradientLaw(), q0=1.0, dt_max=0.1)
+    law = lp.GradientLaw(newton=lp.Newton(tolerance=1e-12, share=0.0))
+    divided = lp.Identifier(model, lp.Full(), law, q0=1.0, dt_max=0.1)
     estimate = divided.step(0.4, z)
     assert estimate.steps == 4
-    by_hand = lp.Identifier(model, lp.Full(), lp.GradientLaw(), q0=1.0)
+    by_hand = lp.Identifier(model, lp.Full(), law, q0=1.0)
     for k in range(1, 5):
         found = by_hand.step(0.1 * k, z)
-    np.testing.assert_allclose(estimate.u, found.u, atol=1e-6)
-    np.testing.assert_allclose(estimate.q, found.q, atol=1e-6)
+    np.testing.assert_allclose(estimate.u, found.u, atol=1e-8)
+    np.testing.assert_allclose(estimate.q, found.q, atol=1e-8)
 
 
 def test_rows_of_a_pandas_table_count_by_name():
