@@ -300,8 +300,9 @@ def conditions(
             third,
             nu * (1 + ROUNDING) >= asked,
             f"nu = {nu:.3g} is below the paper's bound, which asks for up to {asked.max():.3g}; "
-            "take `unobserved_damping`. nu biases the unobserved part: where the process itself "
-            "damps it (D > 0) leave nu = 0.",
+            "take `unobserved_damping`, or go on: the bound is sufficient, not necessary, and nu "
+            "pulls P u to zero, not to the truth. Where the process itself damps P u (D > 0) "
+            "nu = 0 serves, too.",
         )
     )
     if data == "noisy":
