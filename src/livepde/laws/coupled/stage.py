@@ -12,6 +12,7 @@ import scipy  # scipy.optimize is slow to load, and rarely needed
 from livepde.fem import Moment
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.blocks import BlockSolver
+from livepde.laws.coupled.distributed import DistributedSolver
 from livepde.laws.coupled.equation import (
     MadeAt,
     StageData,
@@ -134,7 +135,8 @@ class CoupledStage:
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
-        self.solver = BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
+        large = DistributedSolver.of(terms) or BlockSolver.of(terms)
+        self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
         self.newton = newton
         self._last: tuple[Array, Factor] | None = None
 
