@@ -91,8 +91,14 @@ class DenseStage:
         reach = np.zeros(n, dtype=bool)
         reach[:-1][outside] = reach[1:][outside] = True
         tests = np.flatnonzero(~reach & (np.arange(n) > 0) & (np.arange(n) < n - 1))
-        norms = r @ mass_in @ r, r @ M_op @ r, lambda: self.dual(M_op @ r, mass, tests) ** 2
-        weight = self.rule.theta(lp.Residual(*norms))
+
+        def norms(v: np.ndarray, *seen: Any) -> lp.Residual:
+            Mv = M_op @ v
+            return lp.Residual(
+                v @ mass_in @ v, v @ Mv, lambda: self.dual(Mv, mass, tests) ** 2, *seen
+            )
+
+        weight = self.rule.theta(norms(r, lambda: norms(u_alpha)))
         gram = mass + stiff
         state = [
             mass @ (u - c[:n]) / h,

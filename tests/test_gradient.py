@@ -144,8 +144,8 @@ def partly_observed(scheme, steps, h_total=1.0, **options):
     )
     sensors = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8))
     law = lp.GradientLaw(
-        gain=30.0, damping=lp.ResidualDamping(2.0), nu=0.3, sigma=0.2, newton=EXACT
-    )
+        gain=30.0, damping=lp.ResidualDamping(0.5), nu=0.3, sigma=0.2, newton=EXACT
+    )  # where r passes zero theta jumps, by up to c_1: a larger one hides the orders
     ident = identifier(model, law, sensors, q0=1.0, u0=lambda x: x[0] * (1 - x[0]), scheme=scheme)
     nodes = ident.observed.G @ model.state.mesh.p[0]
 
@@ -166,7 +166,7 @@ def test_order_in_time_of_the_coupled_step(scheme, order):
     reference = partly_observed(lp.Alexander2(), 1280)
     steps = (20, 40, 80, 160)
     errors = [abs(partly_observed(scheme, n) - reference).max() for n in steps]
-    np.testing.assert_allclose(rates(errors), order, atol=0.2)
+    np.testing.assert_allclose(rates(errors), order, atol=0.1)
 
 
 def test_precomputed_products_do_not_change_the_numbers():
@@ -458,12 +458,13 @@ def test_sensors_that_see_the_parameter_are_refused():
 
 def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
     model = excited(10)
-    ident = identifier(model, lp.GradientLaw(gain=1e4, newton=lp.Newton(iterations=1)), q0=1.0)
+    law = lp.GradientLaw(gain=1e4, newton=lp.Newton(iterations=1))
+    ident = identifier(model, law, q0=1.0, halvings=0)
     before = ident.estimate()
     z = np.full(ident.observed.size, 0.3)
     failed = ident.step(0.1, z)
     assert failed.status.code == "not_converged"
-    assert "iterations" in failed.status.detail
+    assert "residual" in failed.status.detail
     assert "smaller" in failed.status.remedy
     assert failed.status.remedy in str(failed.status)
     np.testing.assert_array_equal(failed.q, before.q)

@@ -135,16 +135,21 @@ def test_configurations_that_do_not_fit():
         identifier().estimate()
 
 
-def test_a_failed_step_reports_and_the_stream_goes_on():
-    """Newton is given one iteration for a nonlinear reaction, then enough."""
+def cubic_decay(law, **options):
+    """Return an identifier of a nonlinear reaction, u_t + u^3 + q u = 0."""
     model = lp.Model(
         lp.Field(line(6), ElementLineP1(), quadrature=6),
         lp.Scalar(1.0),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: u**3 * v,
     )
+    return lp.Identifier(model, lp.Full(), law, u0=1.0, **options)
+
+
+def test_a_failed_step_reports_and_the_stream_goes_on():
+    """Newton is given one iteration for a nonlinear reaction, then enough."""
     law = lp.GradientLaw(newton=lp.Newton(iterations=1))
-    ident = lp.Identifier(model, lp.Full(), law, u0=1.0)
+    ident = cubic_decay(law, halvings=0)
     before = ident.estimate()
     estimate = ident.step(1.0, np.full(7, 0.5))
     assert estimate.status.code == "not_converged"
@@ -152,9 +157,40 @@ def test_a_failed_step_reports_and_the_stream_goes_on():
     assert "not_converged" in str(estimate.status)
     np.testing.assert_array_equal(estimate.u, before.u)
     assert ident.t == 0.0
-    good = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=1.0)
+    good = cubic_decay(lp.GradientLaw())
     good._state = ident._state
     assert good.step(1.5, np.full(7, 0.4)).status.ok
+
+
+def test_a_stage_that_is_not_solved_is_halved_as_often_as_asked():
+    """With one iteration short substeps can be solved, and long ones cannot."""
+    law = lp.GradientLaw(newton=lp.Newton(iterations=1, tolerance=1e-3, share=0.0), gate=None)
+    z = np.full(7, 0.9)
+    taken = {}
+    for halvings in (0, 1, 8):
+        estimate = cubic_decay(law, halvings=halvings).step(0.1, z)
+        taken[halvings] = estimate.steps if estimate.status.ok else 0
+    assert taken[0] == 0
+    assert taken[8] > 2
+    enough = cubic_decay(law, halvings=int(np.log2(taken[8])) + 1).step(0.1, z)
+    assert enough.steps == taken[8]
+    by_default = cubic_decay(lp.GradientLaw()).problem.control
+    assert by_default.halvings == lp.Advance.halvings == 8
+
+
+def test_without_halvings_solved_steps_are_the_same():
+    one, other = cubic_decay(lp.GradientLaw()), cubic_decay(lp.GradientLaw(), halvings=0)
+    for k in range(1, 6):
+        a, b = (ident.step(0.1 * k, np.full(7, 0.9**k)) for ident in (one, other))
+        assert (a.steps, b.steps) == (1, 1)
+        np.testing.assert_array_equal(a.u, b.u)
+        np.testing.assert_array_equal(a.q, b.q)
+
+
+@pytest.mark.parametrize("halvings", [-1, 1.5, "8", None, True, 31])
+def test_halvings_that_cannot_be_meant(halvings):
+    with pytest.raises(lp.ConfigurationError, match="halvings must be a whole number from 0 to 30"):
+        cubic_decay(lp.GradientLaw(), halvings=halvings)
 
 
 @pytest.mark.parametrize(
@@ -293,14 +329,15 @@ def test_progress_is_silent_where_nobody_watches(capsys):
 def test_substeps_are_those_made_by_hand():
     model = excited(8)
     z = np.zeros(lp.Full().bind(model.state_space, model.X, model.parameter_space).size)
-    divided = lp.Identifier(model, lp.Full(), lp.GradientLaw(), q0=1.0, dt_max=0.1)
+    law = lp.GradientLaw(newton=lp.Newton(tolerance=1e-12, share=0.0))
+    divided = lp.Identifier(model, lp.Full(), law, q0=1.0, dt_max=0.1)
     estimate = divided.step(0.4, z)
     assert estimate.steps == 4
-    by_hand = lp.Identifier(model, lp.Full(), lp.GradientLaw(), q0=1.0)
+    by_hand = lp.Identifier(model, lp.Full(), law, q0=1.0)
     for k in range(1, 5):
         found = by_hand.step(0.1 * k, z)
-    np.testing.assert_allclose(estimate.u, found.u, atol=1e-6)
-    np.testing.assert_allclose(estimate.q, found.q, atol=1e-6)
+    np.testing.assert_allclose(estimate.u, found.u, atol=1e-8)
+    np.testing.assert_allclose(estimate.q, found.q, atol=1e-8)
 
 
 def test_rows_of_a_pandas_table_count_by_name():

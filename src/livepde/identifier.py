@@ -58,6 +58,9 @@ class Identifier:
         Sensors that are never assimilated, only scored.
     scheme, dt_max
         Time scheme; a longer interval between samples is divided into substeps.
+    halvings
+        A substep that is not solved is halved at most this often, before the step is a failed
+        status. 0: that at once, as where steps are to be those of the samples and no others.
     assimilate_from
         Samples before this time drive inputs and are scored, but not assimilated.
     hold
@@ -82,6 +85,7 @@ class Identifier:
         withheld: Observation | None = None,
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
+        halvings: int = Advance.halvings,
         assimilate_from: float = -np.inf,
         hold: bool = False,
     ) -> None:
@@ -102,7 +106,7 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
-        control = Advance(scheme or ImplicitEuler(), dt_max, hold=hold)
+        control = Advance(scheme or ImplicitEuler(), dt_max, halvings, hold)
         self.problem = Problem(model, self.observed, control)
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)

@@ -9,12 +9,15 @@ from functools import cached_property
 
 import numpy as np
 
+from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.stepping.newton import StepFailed
 from livepde.stepping.schemes import Scheme, Stage
 
 __all__ = ["Advance", "Interval", "advance"]
+
+MOST_HALVINGS = 30  # beyond, a substep is shorter than what times resolve
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +109,7 @@ class Advance:
     dt_max
         Longest substep; a longer interval is divided evenly.
     halvings
-        A substep that fails is halved at most this often.
+        A substep that fails is halved at most this often; 0: it fails at once.
     hold
         Whether inputs are held between samples at what the later one brings, as an actuator that
         is set anew at each sample leaves them; else they change linearly.
@@ -116,6 +119,13 @@ class Advance:
     dt_max: float = np.inf
     halvings: int = 8
     hold: bool = False
+
+    def __post_init__(self) -> None:
+        whole = isinstance(self.halvings, int | np.integer) and not isinstance(self.halvings, bool)
+        if not (whole and 0 <= self.halvings <= MOST_HALVINGS):
+            raise ConfigurationError(
+                f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {self.halvings!r}."
+            )
 
     def over(self, interval: Interval) -> Interval:
         """Return an interval with its inputs as they are taken."""
