@@ -49,14 +49,26 @@ def f(x: Any, t: float) -> Any:
     return (D * np.pi**2 - 1 / (1 + t) + q_true(x)) * u_true(x, t)
 
 
-def build(std: float = 1.0, nodes: int = N) -> tuple[Model, Subdomain]:
-    """Return the paper's model, with a prior deviation of q, and observation."""
+def build(
+    std: float = 1.0, nodes: int = N, *, clamped: bool = False
+) -> tuple[Model, Subdomain]:
+    """Return the paper's model, with a prior deviation of q, and observation.
+
+    Parameters
+    ----------
+    std
+        Prior deviation of q.
+    nodes
+        Of the uniform mesh.
+    clamped
+        Take the paper's space, which has no slope functions at the ends; else they are kept.
+    """
     mesh = interval(0, 1, nodes - 1)
     element = hermite(mesh)
     zero = {"boundary": 0.0}
     model = Model(
-        state=Field(mesh, element, dirichlet=zero),
-        parameter=Field(mesh, element, inner="H1", dirichlet=zero, std=std),
+        state=Field(mesh, element, dirichlet=zero, clamped=clamped),
+        parameter=Field(mesh, element, inner="H1", dirichlet=zero, std=std, clamped=clamped),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: D * dot(grad(u), grad(v)),
         f=f,
