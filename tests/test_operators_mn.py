@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from problems import CASES, line, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.operators import observed_operator, unobserved_operator
+from livepde.laws.coupled.forms import StageForms
+from livepde.laws.operators import diffusion_operator
 from livepde.reproduce import EXPERIMENTS, degenerate
 from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, ImplicitEuler
@@ -21,47 +23,66 @@ def left(x):
     return x[0] < 0.5
 
 
+def integrated(model, D, nu=1.0):
+    """Return M over the left half and N over the right one, as the law integrates them."""
+    MN = diffusion_operator(D)
+    forms = StageForms(model, observe(model, lp.Subdomain(left)).split(), MN, MN, nu)
+    return forms.pull, forms.hidden, forms
+
+
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("D", [1.0, -1.0, lambda x: x[0] - 0.5])
-def test_gradients_count_on_one_part_each(name, D):
-    """M + N = |D| grad grad + 2 mass, both symmetric and coercive: (M v, v) >= ||v||_X^2."""
+def test_M_and_N_share_the_domain(name, D):
+    """M + N = |D| grad grad + mass over Omega, each symmetric and coercive on its part."""
     model = CASES[name].model(dirichlet={})
-    M, N = (
-        model.bilinear(operator(left, D)) for operator in (observed_operator, unobserved_operator)
-    )
+    M, N, forms = integrated(model, D)
     absolute = (lambda x: np.abs(D(x))) if callable(D) else abs(D)
 
     def whole(u, v, x):
         weight = absolute(x) if callable(absolute) else absolute
-        return weight * lp.dot(lp.grad(u), lp.grad(v)) + 2 * u * v
+        return weight * lp.dot(lp.grad(u), lp.grad(v)) + u * v
 
     np.testing.assert_allclose((M + N).toarray(), model.bilinear(whole).toarray(), atol=1e-12)
-    for operator in (M, N):
+    for operator, mass in ((M, forms.mass), (N, model.mass - forms.mass)):
         np.testing.assert_allclose(operator.toarray(), operator.T.toarray(), atol=1e-14)
-        assert np.linalg.eigvalsh((operator - model.mass).toarray()).min() > -1e-12
+        assert np.linalg.eigvalsh((operator - mass).toarray()).min() > -1e-12
 
 
 def test_the_norm_of_VX():
-    """(M v, v)_X = ||sqrt|D| v'||^2 on omega + ||v||^2, for v = x and D = -4 on (0, 1/2)."""
+    """(M v, v)_X = ||sqrt|D| v'||^2 + ||v||^2 over omega = (0, 1/2), for v = x and D = -4."""
     model = reaction(line(), ElementLineP1(), dirichlet={})
     v = model.initial(lambda x: x[0])
-    M = model.bilinear(observed_operator(left, -4.0))
-    N = model.bilinear(unobserved_operator(left, lambda x: np.where(x[0] < 0.5, -4.0, 2.0)))
-    assert v @ M @ v == pytest.approx(4.0 * 0.5 + 1 / 3)
-    assert v @ N @ v == pytest.approx(2.0 * 0.5 + 1 / 3)
+    M, N, _ = integrated(model, lambda x: np.where(x[0] < 0.5, -4.0, 2.0))
+    assert v @ M @ v == pytest.approx(4.0 * 0.5 + 1 / 24)
+    assert v @ N @ v == pytest.approx(2.0 * 0.5 + 7 / 24)
+
+
+@pytest.mark.parametrize("cells", [12, 24, 48])
+def test_what_is_hidden_has_no_gradient_of_the_splitting(cells):
+    """(N u, u) of u = 1 is the length of the rest on every mesh: P u does not fall to zero."""
+    model = reaction(line(cells), ElementLineP1(), dirichlet={})
+    one = np.ones(model.X.dim)
+    M, N, _ = integrated(model, 1.0)
+    assert one @ N @ one == pytest.approx(0.5)
+    assert one @ M @ one == pytest.approx(0.5)
 
 
 def test_the_law_takes_them():
-    """PNP sees the unobserved part of N only, and RMR the observed one of M."""
+    """N is integrated over the rest only and M over omega; they share the node between."""
     model = reaction(line(), ElementLineP1())
-    law = lp.GradientLaw(M_op=observed_operator(left, -1.0), N_op=unobserved_operator(left, -1.0))
+    MN = diffusion_operator(-1.0)
+    law = lp.GradientLaw(nu=1.0, M_op=MN, N_op=MN)
     work = law.prepare(
         lp.Problem(model, observe(model, lp.Subdomain(left)), Advance(ImplicitEuler()))
     )
-    stage = work.stage(np.ones(work.problem.observed.size, dtype=bool))
-    hidden = np.flatnonzero(stage.split.P.diagonal())
-    assert set(np.unique(stage.PNP.nonzero()[0])) <= set(hidden)
-    assert not set(np.unique(stage.RMR.nonzero()[0])) & set(hidden)
+    forms = work.stage(np.ones(work.problem.observed.size, dtype=bool)).terms.forms
+    x = model.state.mesh.p[0]
+    for operator, side in ((forms.pull, x <= 0.5), (forms.hidden, x >= 0.5)):
+        rows = np.unique((sp.diags_array(model.X.free) @ operator).nonzero()[0])
+        assert set(rows) <= set(np.flatnonzero(side))
+    M, N, _ = integrated(model, -1.0)
+    np.testing.assert_allclose(forms.pull.toarray(), M.toarray())
+    np.testing.assert_allclose(forms.hidden.toarray(), N.toarray())
 
 
 @pytest.fixture(scope="module")

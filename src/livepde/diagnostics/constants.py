@@ -5,255 +5,32 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, eigsh
 
+from livepde.diagnostics.parts import DENSE, Border, Images, Part
 from livepde.errors import ConfigurationError
 from livepde.fem import START, Moment
-from livepde.laws.bounds import Constants, Norms
-from livepde.linalg import Array
+from livepde.laws.bounds import Constants
+from livepde.linalg import Array, IntArray
 from livepde.model import Model, h1_form
 from livepde.observation import Observed, Split
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Part", "Spaces", "constants"]
 
-DENSE = 400  # eigenproblems up to this size are solved densely, larger ones by Lanczos
+Pair: TypeAlias = tuple[sp.csr_array, sp.csr_array]
+
 LARGEST_DENSE_BASIS = 2000  # unknowns, where R is not a selection
 LARGEST_TRACE = 2e7  # m n^2 up to which the bound of A(v) is computed over all of Q
 NONLINEAR = (
     "The constants are those of C(q, u) = A(u) q + B(u) (ass:equation). This model is not linear "
     "in what is estimated (a transform, or a form nonlinear in q): the paper's theory is silent."
 )
-Map = Callable[[Array], Array]
-
-
-def _columns(apply: Map) -> Map:
-    """Return a linear map of vectors that takes matrices, too."""
-
-    def mapped(x: Array) -> Array:
-        if x.ndim == 1:
-            return apply(x)
-        return np.column_stack([apply(column) for column in x.T])
-
-    return mapped
-
-
-def largest(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> float:
-    """Return the largest eigenvalue of top x = lambda bottom x, both symmetric, bottom > 0.
-
-    Dense for small problems, else Lanczos from a fixed start (the same number in every run).
-
-    Parameters
-    ----------
-    top, bottom, bottom_inverse
-        Functions of vectors and of matrices; the inverse is needed for Lanczos alone.
-    """
-    if size == 0:
-        return 0.0
-    if size <= DENSE or bottom_inverse is None:
-        one = np.eye(size)
-        A, B = top(one), bottom(one)
-        values = eigh(0.5 * (A + A.T), 0.5 * (B + B.T), eigvals_only=True)
-        return max(float(values[-1]), 0.0)
-    shape = (size, size)
-    operators = [
-        LinearOperator(shape, matvec=f, dtype=float) for f in (top, bottom, bottom_inverse)
-    ]
-    start = np.random.default_rng(0).standard_normal(size)
-    found = eigsh(
-        operators[0],
-        k=1,
-        M=operators[1],
-        Minv=operators[2],
-        v0=start,
-        tol=1e-8,
-        return_eigenvectors=False,
-    )
-    return max(float(found[0]), 0.0)
-
-
-def _root(x: Array, y: Array) -> float:
-    """Return the square root of a product that is negative by rounding at most."""
-    return float(np.sqrt(max(float(x @ y), 0.0)))
-
-
-class Part:
-    """One part of the state, observed (range of R) or unobserved (of P), with its norms.
-
-    ||v||_VX^2 = (M_op v, v) and ||v||_V = ||R^T M_op v|| in the dual of X, as in the damping rules,
-    unless other forms are given; for M of (MN1) that is the paper's choice.
-
-    Parameters
-    ----------
-    model
-        The process.
-    projection
-        R, or P; shape (n, n).
-    basis
-        Of its range on the free coefficients, shape (n, k).
-    rest
-        Of the range of the other projection, shape (n, l).
-    operator
-        Matrix of M, or N, shape (n, n).
-    VX, V
-        Matrices of other norms, or None.
-    """
-
-    def __init__(
-        self,
-        model: Model,
-        projection: sp.csr_array,
-        basis: sp.csr_array,
-        rest: sp.csr_array,
-        operator: sp.csr_array,
-        VX: sp.csr_array | None,
-        V: sp.csr_array | None,
-    ) -> None:
-        self.model = model
-        self.basis = basis
-        self.rest = rest
-        self.size = int(basis.shape[1])
-        self._tested = sp.csr_array(projection.T @ operator)
-        self._VX = operator if VX is None else VX
-        self._V = V
-
-    def norms(self, v: Array) -> Norms:
-        """Return the three norms of an element of this part, coefficients of shape (n,)."""
-        X = self.model.X
-        if self._V is not None:
-            return Norms(X.norm(v), _root(v, self._VX @ v), _root(v, self._V @ v))
-        dual = self._tested @ v
-        return Norms(X.norm(v), _root(v, self._VX @ v), _root(dual, X.riesz(dual)))
-
-    def root_mean_square(self, factor: Array) -> Norms:
-        """Return sqrt(E ||v||^2) in the three norms, for v of covariance factor @ factor.T."""
-        X, mass = self.model.X, self.model.mass
-        dual = self._tested @ factor
-        V = X.riesz(dual) if self._V is None else self._V @ factor
-        left = dual if self._V is None else factor
-        pairs = ((factor, mass @ factor), (factor, self._VX @ factor), (left, V))
-        return Norms(*(_root(np.ravel(a), np.ravel(b)) for a, b in pairs))
-
-    # --- matrices on the basis -------------------------------------------------------------------
-
-    def _on_basis(self, matrix: sp.csr_array) -> sp.csr_array:
-        return sp.csr_array(self.basis.T @ matrix @ self.basis)
-
-    @cached_property
-    def gram_X(self) -> sp.csr_array:
-        """(v, w)_X on the basis."""
-        return self._on_basis(self.model.mass)
-
-    @cached_property
-    def gram_VX(self) -> sp.csr_array:
-        """(v, w)_VX on the basis."""
-        return self._on_basis(self._VX)
-
-    @cached_property
-    def operator(self) -> sp.csr_array:
-        """The symmetric part of (M v, w)_X on the basis."""
-        image = sp.csr_array(self.basis.T @ (self._tested @ self.basis))
-        return sp.csr_array(0.5 * (image + image.T))
-
-    def image(self, x: Array) -> Array:
-        """Return the X-gram of M: x -> E^T M^T X^{-1} M E x."""
-        dual = self._tested @ (self.basis @ x)
-        result: Array = self.basis.T @ (self._tested.T @ self.model.X.riesz(dual))
-        return result
-
-    def gram_V(self, x: Array) -> Array:
-        """Return (x, .)_V on the basis."""
-        if self._V is not None:
-            result: Array = self.basis.T @ (self._V @ (self.basis @ x))
-            return result
-        return self.image(x)
-
-    @cached_property
-    def schur(self) -> Map:
-        """S with x^T S x = min over the other part w of ||E x + w||_X^2; S^{-1} = E^T X^{-1} E."""
-        if not self.rest.shape[1]:
-            return lambda x: self.gram_X @ x
-        other = HilbertSpace(sp.csr_array(self.rest.T @ self.model.mass @ self.rest))
-        mixed = sp.csr_array(self.rest.T @ self.model.mass @ self.basis)
-        return lambda x: self.gram_X @ x - mixed.T @ other.riesz(mixed @ x)
-
-    @cached_property
-    def inverse_V(self) -> Map:
-        """Inverse of `gram_V`."""
-        if self._V is not None:
-            return HilbertSpace(self._on_basis(self._V)).riesz
-        own = HilbertSpace(self.operator)
-        return lambda x: own.riesz(self.schur(own.riesz(x)))
-
-    # --- constants -------------------------------------------------------------------------------
-
-    def embedding_V_VX(self) -> float:
-        """C with ||v||_VX <= C ||v||_V."""
-        top = largest(lambda x: self.gram_VX @ x, self.gram_V, self.inverse_V, self.size)
-        return float(np.sqrt(top))
-
-    def embedding_VX_X(self) -> float:
-        """C with ||v||_X <= C ||v||_VX."""
-        return float(np.sqrt(self._sparse(self.gram_X, self.gram_VX)))
-
-    def coercivity(self) -> float:
-        """The c of (M v, v)_X >= c ||v||_VX^2; 1 if VX is the norm of M itself."""
-        return 1.0 / self._sparse(self.gram_VX, self.operator) if self.size else 1.0
-
-    def boundedness(self) -> float:
-        """The C of ||R M v||_X <= C ||v||_V; 1 if V is the norm of M itself."""
-        if not self.size:
-            return 1.0
-        return float(np.sqrt(largest(self.image, self.gram_V, self.inverse_V, self.size)))
-
-    def lipschitz(self, jacobian: sp.csr_array) -> float:
-        """Largest ||J v||_X / ||v||_V for the Jacobian J of C(q, .)."""
-
-        def image(x: Array) -> Array:
-            dual = jacobian @ (self.basis @ x)
-            result: Array = self.basis.T @ (jacobian.T @ self.model.X.riesz(dual))
-            return result
-
-        return float(np.sqrt(largest(image, self.gram_V, self.inverse_V, self.size)))
-
-    def ratio(self) -> float:
-        """A bound of ||v||_V ||v||_X / ||v||_VX^2, 1/c_int of (interpol).
-
-        By Kantorovich's inequality: with M x = lambda S x on this part the quotient is at most
-        (a + b)/(2 sqrt(a b)) for the extreme lambdas a and b; the norm of X exceeds that of S by at
-        most the factor of the mass that couples the two parts.
-        """
-        if not self.size:
-            return 1.0
-        own = HilbertSpace(self.operator)
-
-        def inverse_schur(x: Array) -> Array:
-            result: Array = self.basis.T @ self.model.X.riesz(self.basis @ x)
-            return result
-
-        top = largest(lambda x: self.operator @ x, self.schur, inverse_schur, self.size)
-        least = 1.0 / largest(self.schur, lambda x: self.operator @ x, own.riesz, self.size)
-        coupling = largest(lambda x: self.gram_X @ x, self.schur, inverse_schur, self.size)
-        bound = np.sqrt(coupling) * (least + top) / (2.0 * np.sqrt(least * top))
-        if self._V is not None:
-            image_inverse = _columns(lambda x: own.riesz(self.schur(own.riesz(x))))
-            bound *= np.sqrt(largest(self.gram_V, self.image, image_inverse, self.size))
-        return float(bound / self.coercivity_reversed())
-
-    def coercivity_reversed(self) -> float:
-        """The least ||v||_VX^2 / (M v, v)_X."""
-        return 1.0 / self._sparse(self.operator, self.gram_VX)
-
-    def _sparse(self, top: sp.csr_array, bottom: sp.csr_array) -> float:
-        inverse = HilbertSpace(bottom) if self.size else None
-        return largest(
-            lambda x: top @ x, lambda x: bottom @ x, inverse.riesz if inverse else None, self.size
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,17 +81,142 @@ class Spaces:
         """R, P and G^+ with all sensors present."""
         return self.observed.split()
 
-    def _matrix(self, form: Any) -> sp.csr_array | None:
+    @cached_property
+    def observed_part(self) -> Part:
+        """V~ and VX~: functions on omega, or the range of R."""
+        return self._parts[0]
+
+    @cached_property
+    def hidden_part(self) -> Part:
+        """V^ and VX^: functions outside of omega, or the range of P."""
+        return self._parts[1]
+
+    def images(self, jacobian: Callable[[IntArray | None], sp.csr_array]) -> tuple[Images, Images]:
+        """Return what C' makes of the two parts, for `Part.lipschitz`.
+
+        Parameters
+        ----------
+        jacobian
+            Function that returns the matrix of C' on some elements; None: on all.
+        """
+        if self._regions is None:
+            whole = [(self.model.X, jacobian(None))]
+            return whole, whole
+        (inside, J), outside = (
+            (self._on(mass), jacobian(cells))
+            for cells, mass in zip(self._regions, self._masses, strict=True)
+        )
+        seen = [(inside, sp.csr_array(J @ self.split.R))]
+        return seen, [(inside, sp.csr_array(J @ self._unseen)), outside]
+
+    def observed_A(self, w: Array, moment: Moment = START, q: Array | None = None) -> sp.csr_array:
+        """Return A(w), over omega where there is one: dual vectors of X in columns, shape (n, m).
+
+        Parameters
+        ----------
+        q
+            As in `Model.A`.
+        """
+        model, form = self.model, self.model.form_A
+        if self._regions is not None:
+            form = form.on(self._regions[0])
+        return form.matrix("v", "q", moment, u=w, q=model.latent.prior if q is None else q)
+
+    # --- the two parts ---------------------------------------------------------------------------
+
+    @cached_property
+    def _parts(self) -> tuple[Part, Part]:
+        operators = self._of(self.M_op), self._of(self.N_op)
+        if operators[0] is None or operators[1] is None:
+            raise ConfigurationError("Spaces: M_op and N_op must be integrands (u, v, x).")
+        M, N = operators[0][0], operators[1][1]
+        VX = self._of(self.VX) or (M, N)
+        V = self._of(self.V) or (None, None)
+        if self._regions is None:
+            return self._projected(M, N, VX, V)
+        return self._integrated(M, N, VX, V)
+
+    def _of(self, form: Any) -> tuple[sp.csr_array, sp.csr_array] | None:
+        """Return the matrices of an integrand for the observed and for the unobserved part."""
         if form is None:
             return None
-        if sp.issparse(form):
+        if self._regions is None:
             given: Any = form
-            return sp.csr_array(given)
-        return self.model.bilinear(form)
+            matrix = sp.csr_array(given) if sp.issparse(form) else self.model.bilinear(form)
+            return matrix, matrix
+        if sp.issparse(form):
+            raise ConfigurationError(
+                "Spaces: with a Subdomain norms are integrals over omega and over the rest: give "
+                "an integrand (u, v, x) in place of a matrix."
+            )
+        inside, outside = (self.model.bilinear(form, cells) for cells in self._regions)
+        return self._divided(inside, outside)
+
+    def _projected(
+        self, M: sp.csr_array, N: sp.csr_array, VX: Pair, V: tuple[Any, Any]
+    ) -> tuple[Part, Part]:
+        """Return the ranges of R and P, for sensors without a subdomain."""
+        X = self.model.X
+        seen, hidden = self.bases
+        free = sp.diags_array(X.free)
+        R, P = (sp.csr_array(matrix @ free) for matrix in (self.split.R, self.split.P))
+        return (
+            Part(X, seen, hidden, sp.csr_array(R.T @ M), VX[0], V[0], R),
+            Part(X, hidden, seen, sp.csr_array(P.T @ N), VX[1], V[1], P),
+        )
+
+    def _integrated(
+        self, M: sp.csr_array, N: sp.csr_array, VX: Pair, V: tuple[Any, Any]
+    ) -> tuple[Part, Part]:
+        """Return the functions on omega and those on the rest; both own its boundary."""
+        X, regions = self.model.X, self._regions or ()
+        inside, outside = self._masses
+        masses = self._divided(inside, outside)
+        spaces = [self._on(mass) for mass in masses]
+        smooth = self._divided(*(self.model.bilinear(h1_form, cells) for cells in regions))
+        parts = []
+        for k, operator in enumerate((M, N)):
+            own, other = spaces[k], spaces[1 - k]
+            reach = np.flatnonzero((own.free < 1) | (other.free > 0))
+            tests = HilbertSpace(X.gram, own.name, reach)
+            basis = sp.csr_array(sp.eye_array(X.dim, format="csr")[:, own.free > 0])
+            nothing = sp.csr_array((X.dim, 0))
+            border = Border(own, tests, smooth[k])
+            parts.append(Part(own, basis, nothing, operator, VX[k], V[k], border=border))
+        return parts[0], parts[1]
+
+    @cached_property
+    def _regions(self) -> tuple[IntArray, IntArray] | None:
+        """The elements of omega and the others; None: there is no subdomain."""
+        omega = self.split.omega
+        if omega is None:
+            return None
+        return omega, np.setdiff1d(np.arange(self.model.mesh.nelements), omega).astype(omega.dtype)
+
+    @cached_property
+    def _masses(self) -> tuple[sp.csr_array, ...]:
+        """Mass matrices of the two regions."""
+        form = self.model.form_M
+        return tuple(form.on(cells).matrix("v", "u") for cells in self._regions or ())
+
+    @cached_property
+    def _unseen(self) -> sp.csr_array:
+        """P on the free coefficients: components without a sensor, within omega too."""
+        return sp.csr_array(self.split.P @ sp.diags_array(self.model.X.free))
+
+    def _divided(self, inside: sp.csr_array, outside: sp.csr_array) -> Pair:
+        """Return R^T inside R, and P^T inside P + outside."""
+        R, P = self.split.R, self._unseen
+        return sp.csr_array(R.T @ inside @ R), sp.csr_array(P.T @ inside @ P + outside)
+
+    def _on(self, mass: sp.csr_array) -> HilbertSpace:
+        """Return X with a mass matrix that does not see all coefficients."""
+        unseen = (mass.diagonal() <= 0.0) | (self.model.X.free == 0.0)
+        return HilbertSpace(mass, "X", np.flatnonzero(unseen))
 
     @cached_property
     def bases(self) -> tuple[sp.csr_array, sp.csr_array]:
-        """Bases of the ranges of R and P on the free coefficients."""
+        """Bases of the ranges of R and P on the free coefficients, without a subdomain."""
         X, R = self.model.X, self.split.R
         diagonal = R.diagonal()
         if abs(R - sp.diags_array(diagonal)).nnz == 0 and set(np.unique(diagonal)) <= {0.0, 1.0}:
@@ -338,28 +240,6 @@ class Spaces:
         whole[free, :rank] = left[:, :rank]
         whole[free, rank:] = rest[:, :hidden_rank]
         return sp.csr_array(whole[:, :rank]), sp.csr_array(whole[:, rank:])
-
-    @cached_property
-    def observed_part(self) -> Part:
-        """Range of R with V~ and VX~."""
-        return self._part(self.split.R, self.bases, self.M_op)
-
-    @cached_property
-    def hidden_part(self) -> Part:
-        """Range of P with V^ and VX^."""
-        seen, hidden = self.bases
-        return self._part(self.split.P, (hidden, seen), self.N_op)
-
-    def _part(
-        self, projection: sp.csr_array, bases: tuple[sp.csr_array, sp.csr_array], form: Any
-    ) -> Part:
-        operator = self._matrix(form)
-        if operator is None:
-            raise ConfigurationError("Spaces: M_op and N_op must be integrands (u, v, x).")
-        free = sp.diags_array(self.model.X.free)
-        tangent = sp.csr_array(projection @ free)
-        VX, V = self._matrix(self.VX), self._matrix(self.V)
-        return Part(self.model, tangent, *bases, operator, VX, V)
 
 
 def constants(
@@ -413,9 +293,16 @@ def constants(
     lipschitz = 0.0
     affine = model.affine
     for u in states[:1] if affine else states:
-        jacobian = model.form_A.matrix("v", "u", moment, u=u, q=q)
-        jacobian = sp.csr_array(jacobian + model.form_B.matrix("v", "u", moment, u=u))
-        lipschitz = max(lipschitz, seen.lipschitz(jacobian), hidden.lipschitz(jacobian))
+
+        def jacobian(cells: IntArray | None, u: Array = u) -> sp.csr_array:
+            A, B = model.form_A, model.form_B
+            if cells is not None:
+                A, B = A.on(cells), B.on(cells)
+            slope = A.matrix("v", "u", moment, u=u, q=q) + B.matrix("v", "u", moment, u=u)
+            return sp.csr_array(slope)
+
+        of_seen, of_hidden = spaces.images(jacobian)
+        lipschitz = max(lipschitz, seen.lipschitz(of_seen), hidden.lipschitz(of_hidden))
     if not affine:
         sampled.append("L_C")
     norms = [_norm_of_A(model, u, moment)[0] for u in states]

@@ -55,6 +55,10 @@ class Spectrum:
     def error_bounds(self, window: float, rate: float) -> Array:
         """Return 2 gamma_0 ||d~||_X / epsilon for each mode, as in th:parameter_noisesmooth.
 
+        The theorem bounds the error of q by it in the limit only under the link conditions
+        (cond:link, see `link`), which no data error meets that does not vanish. Without them it is
+        a scale, and no bound.
+
         A mode whose bound exceeds its size in Q (1: the prior deviation, for gain 1) is not pinned
         by data whose error changes at that rate.
         """
@@ -97,6 +101,8 @@ class ExcitationState:
 @dataclass(frozen=True, eq=False)
 class Excitation:
     """Accumulates integral over [t, t + gamma_0] of R A(w) d tau along a run, window by window.
+
+    Of a `Subdomain` R A(w) is A(w) on omega.
 
     w = u_alpha + P u is what the law itself knows, so this needs no truth. The windows are
     disjoint; a window ends at the first sample at or after its length.
@@ -164,7 +170,7 @@ class Excitation:
         at = None
         if q is not None and not model.form_A.linear_in_parameter:
             at = model.latent.inverse(q)
-        now = model.A(w, moment, at).matrix
+        now = self.spaces.observed_A(w, moment, at)
         if state.last is None or state.integral is None:
             empty = sp.csr_array(now.shape)
             return replace(state, t=t, begun=t, last=now, integral=empty)
@@ -184,9 +190,7 @@ class Excitation:
         if x.ndim == 2 and x.shape[1] > width:
             starts = range(0, x.shape[1], width)
             return np.hstack([self._gramian(integral, x[:, k : k + width]) for k in starts])
-        X, R = self.spaces.model.X, self.spaces.split.R
-        image = R @ X.riesz(integral @ x)
-        back: Array = integral.T @ X.riesz(R.T @ (self.spaces.model.mass @ image))
+        back: Array = integral.T @ self.spaces.observed_part.projected(integral @ x)
         return back
 
     def spectrum(self, state: ExcitationState, *, latest: bool = False) -> Spectrum:

@@ -56,6 +56,9 @@ def link(
 ) -> Link:
     """Fit one link condition.
 
+    Both are hypotheses of the theorems on the convergence of q. With a data error that does not
+    vanish that of lambda fails: theta tends to zero with r, x does not.
+
     C >= (integral over [t, t + gamma_0] of (x^a/theta)^(1/(a - 1)))^((a - 1)/a), and
     C >= sup x/theta for a = 1. For lambda x = ||p||_V^ (with noise + ||d||_V~), which needs the
     truth; for kappa x = mu.
@@ -127,7 +130,11 @@ class Interpolation:
 
 
 def interpolation(norms: Sequence[Norms]) -> Interpolation:
-    """Return the extreme quotients along a run; C_int is at most 1 for the norms of M itself."""
+    """Return the extreme quotients along a run.
+
+    C_int is at most 1 for the norms of M itself, of an r without flux through the boundary of
+    omega.
+    """
     least = 1e-10 * max((n.X for n in norms), default=0.0)  # the rest is rounding
     quotients = [n.VX**2 / (n.V * n.X) for n in norms if n.V > 0 and least < n.X]
     if not quotients:

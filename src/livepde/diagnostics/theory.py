@@ -55,6 +55,12 @@ NEEDS_TRUTH = (
     "error bounds of the three propositions, T* itself, and lambda of the link conditions. A twin "
     "experiment of the same model evaluates them."
 )
+LINKED = (
+    "That the error of q vanishes (th:parameter), or is at most 2 gamma_0/epsilon_0 sup ||d~||_X "
+    "in the limit (th:parameter_noisesmooth), is promised only with persistence of excitation "
+    "(asspof) and the link conditions (cond:link). Those fail for every data error that does not "
+    "vanish."
+)
 SNAPSHOTS = 6  # states at which C_A is taken
 SHOWN = 8  # modes
 NORMS = ("X", "VX", "V")
@@ -172,10 +178,12 @@ class OnlineTracker:
         z = observed.linearised(z, estimate.u)
         u_alpha, alpha = self._reconstruct(z, boundary)
         r = observed.split(np.isfinite(z)).R @ (estimate.u - boundary) - u_alpha
-        norms = self.spaces.observed_part.norms(r)
+        part = self.spaces.observed_part
+        norms = part.norms(r)
         theta = np.nan
         if self.damping is not None:
-            theta = self.damping.theta(norms.residual(self.spaces.observed_part.norms(u_alpha)))
+            size = part.stage_norms(u_alpha)
+            theta = self.damping.theta(part.stage_norms(r).residual(size))
         d = self._noise_size(z, u_alpha, alpha)
         self.moments.append(_Moment(estimate.t, norms, theta, d))
         # Only a law with a damping rule works with u_alpha + P u.
@@ -331,6 +339,7 @@ def theory_report(
         notes.append(NEEDS_TRUTH)
     else:
         reports = _with_truth(followed, found, identifier.law, tables)
+        notes.append(LINKED)
     return TheoryReport(tuple(tables), tuple(reports), tuple(notes), found, spectrum, stopping)
 
 

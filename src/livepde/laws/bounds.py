@@ -182,6 +182,10 @@ def unobserved_damping(c: Constants, e_bound: float, nu_min: float = 0.0) -> flo
     needs only ||e||_Q, which never exceeds its start: e_bound^2 = ||e(0)||_Q^2 + ||r(0)||_X^2.
     With d != 0 there is no such constant: the noisy bound grows without limit as p vanishes.
 
+    It is a large number, of the order of the inverse size of an element, and the bound on mu has
+    then to cover nu times the flux of u through the boundary of omega, too: `ExactBound` with a
+    p_bound of about nu ||P u*||_V^.
+
     >>> unobserved_damping(Constants(1.0, 0.0, hidden_ratio=2.0), e_bound=1.0)
     8.0
     """

@@ -304,6 +304,7 @@ NOTES = [
     "Gain, c1, window and tau were fixed before these seeds were drawn, but found on this twin "
     "with other seeds: not tuned to this noise, yet not blind to the truth.",
     "sup |d~| is the noise part of the rate of the smoothed data's error in L2: times "
-    "2 gamma_0/epsilon_0 it bounds the limit superior of ||q^ - q*||_Q "
-    "(th:parameter_noisesmooth).",
+    "2 gamma_0/epsilon_0 it would bound the limit superior of ||q^ - q*||_Q "
+    "(th:parameter_noisesmooth) under the link conditions (cond:link), which no data error meets "
+    "that does not vanish.",
 ]

@@ -152,9 +152,10 @@ class Smoothed(Iterable[Sample]):
         """Return the root mean square of ||d~||_Z after the last sample, from `d_rate`.
 
         For `Subdomain` and G^+ that is ||d~||_X; G_alpha only shrinks it in X. The channels are
-        taken as independent. The last theorem of the paper bounds the limit superior of
-        ||q^ - q*||_Q by 2 gamma_0 / epsilon_0 times its supremum over time
-        (th:parameter_noisesmooth).
+        taken as independent. Under the link conditions (cond:link) the last theorem of
+        the paper bounds the limit superior of ||q^ - q*||_Q by 2 gamma_0 / epsilon_0 times its
+        supremum over time (th:parameter_noisesmooth); no data error meets them that does not
+        vanish.
 
         Parameters
         ----------

@@ -35,7 +35,7 @@ __all__ = ["Inside", "MadeAt", "StageData", "StageIterate", "StageSolver", "Stag
 
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
-STIFFEST = 1e6  # times 1/h, of theta: then a step takes all but this part of r away
+STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r away
 RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
 ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
 
