@@ -366,8 +366,10 @@ class FieldBlock(Block):
         return analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
 
     def _value_dofs(self, name: str) -> IntArray:
-        # Essential conditions fix values; derivative unknowns (u_x, u_n, ...) stay free.
-        names = [n for n in (self.field.element.dofnames or []) if "_" not in n]
+        # Essential conditions fix values; derivative unknowns (u_x, u_n, ...) stay free, unless
+        # the field is clamped.
+        values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
+        names = None if self.field.clamped else values
         found: IntArray = np.unique(
             self._tied(self.at(None if name == "boundary" else name, names))
         )
@@ -397,7 +399,7 @@ class FieldBlock(Block):
         found: list[tuple[IntArray, Any]] = []
         for name, value in self.field.dirichlet.items():
             found.append((self._value_dofs(name), value))
-            for axis in range(self.field.mesh.dim()):
+            for axis in range(0 if self.field.clamped else self.field.mesh.dim()):
                 dofs = self._slope_dofs(name, axis)
                 if len(dofs):
                     slope = _slope(value, axis, self.width) if callable(value) else 0.0

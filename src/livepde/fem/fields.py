@@ -227,6 +227,9 @@ class Field(_Prior):
     dirichlet
         Essential boundary values: name of a boundary ("boundary" for all of it) -> a number, a
         function g(x, t), or a `Channel` of the stream. For a parameter only 0 (H^1_0).
+    clamped
+        With `dirichlet`, all coefficients on these boundaries are zero: those of slopes, too. Else
+        only values are given there.
     std
         Prior deviation of a parameter: the inner product is divided by std**2, so that the
         prior covariance is the inverse Gram matrix.
@@ -252,6 +255,7 @@ class Field(_Prior):
     transform: str | None = None
     evolution: Evolution = CONSTANT
     periodic: Sequence[tuple[str, str]] = ()
+    clamped: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.inner, str) and self.inner not in ("L2", "H1", "H2"):
@@ -270,6 +274,12 @@ class Field(_Prior):
                     f"dirichlet: the value on '{name}' is unknown; let it enter weakly, by a "
                     f"penalty: On('{name}', lambda q, u, v, x: 100 * D / x.h * (u - q.value) * v)."
                 )
+        values = list(self.dirichlet.values())
+        if self.clamped and (not values or any(value != 0.0 for value in values)):
+            raise SpaceError(
+                'clamped=True fixes values and slopes to zero: give dirichlet={"boundary": 0.0}, '
+                "and no other value."
+            )
         for name in [name for pair in self.periodic for name in pair]:
             if name not in known - {"boundary"}:
                 raise SpaceError(

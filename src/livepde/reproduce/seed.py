@@ -4,8 +4,12 @@
 
 with D = 1, q* = 0.025 x^2 - 0.025 x, u* = sin(pi x)/(1 + t), N = 31 cubic Hermite nodes, implicit
 Euler with h = 0.6 to t = 60, omega = (0.3, 0.87), exact data, q^(0) = 0: their first figure. The
-paper does not name the inner product's scale (`gain`); the table shows what it does, and what the
-law does that tunes itself.
+paper does not name the inner product's scale (`gain`); the table shows what it does.
+
+All settings are the paper's (`livepde.paper`). Its space has no slope functions at the ends, where
+u* and q* have slopes; a second table keeps them, as `Field` does by default, and adds the law that
+tunes itself. omega is the union of the elements within (0.3, 0.87), up to 26/30: the uniform mesh
+has no node at 0.87.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde import plots
+from livepde import paper, plots
 from livepde.fem import Field, dot, grad, hermite, interval
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
@@ -49,14 +53,24 @@ def f(x: Any, t: float) -> Any:
     return (D * np.pi**2 - 1 / (1 + t) + q_true(x)) * u_true(x, t)
 
 
-def build(std: float = 1.0, nodes: int = N) -> tuple[Model, Subdomain]:
-    """Return the paper's model, with a prior deviation of q, and observation."""
+def build(std: float = 1.0, nodes: int = N, *, clamped: bool = False) -> tuple[Model, Subdomain]:
+    """Return the paper's model, with a prior deviation of q, and observation.
+
+    Parameters
+    ----------
+    std
+        Prior deviation of q.
+    nodes
+        Of the uniform mesh.
+    clamped
+        Take the paper's space, which has no slope functions at the ends; else they are kept.
+    """
     mesh = interval(0, 1, nodes - 1)
     element = hermite(mesh)
     zero = {"boundary": 0.0}
     model = Model(
-        state=Field(mesh, element, dirichlet=zero),
-        parameter=Field(mesh, element, inner="H1", dirichlet=zero, std=std),
+        state=Field(mesh, element, dirichlet=zero, clamped=clamped),
+        parameter=Field(mesh, element, inner="H1", dirichlet=zero, std=std, clamped=clamped),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: D * dot(grad(u), grad(v)),
         f=f,
@@ -64,54 +78,52 @@ def build(std: float = 1.0, nodes: int = N) -> tuple[Model, Subdomain]:
     return model, Subdomain(lambda x: (x[0] > OMEGA[0]) & (x[0] < OMEGA[1]))
 
 
+def twin_of(clamped: bool, **options: Any) -> Twin:
+    """Return the paper's process in one of the two spaces; `options` of `Twin`."""
+    model, omega = build(clamped=clamped)
+    given = {"q_true": q_true, "u_true": u_true, "times": TIMES, **options}
+    return Twin(model=model, observation=omega, **given)
+
+
 def identify(twin: Twin, gain: float, c1: float, progress: bool = False) -> Track:
     """Run the paper's method on the samples of a twin."""
-    law = GradientLaw(gain=gain, damping=ResidualDamping(c1))
-    return _track(twin, law, _label(gain, c1), progress)
+    identifier = paper.identifier(
+        twin.model, twin.observation, gain=gain, damping=ResidualDamping(c1), D=D, u0=start
+    )
+    return track(identifier, twin, _label(gain, c1), progress)
 
 
-def _track(twin: Twin, law: GradientLaw, label: str, progress: bool) -> Track:
-    identifier = Identifier(twin.model, twin.observation, law, q0=0.0, u0=lambda x: u_true(x, 0.0))
-    return track(identifier, twin, label, progress)
+def start(x: Any) -> Any:
+    """The exact state at t = 0, which all runs start from."""
+    return u_true(x, 0.0)
+
+
+def _auto(twin: Twin, progress: bool) -> Track:
+    law = GradientLaw(gain="auto")
+    identifier = Identifier(twin.model, twin.observation, law, q0=0.0, u0=start)
+    return track(identifier, twin, "gradient, auto", progress)
 
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     """Run the whole table and return it with checks and figures."""
-    model, omega = build()
-    shared = {"model": model, "observation": omega, "times": TIMES, "u_true": u_true}
-    twin = Twin(q_true=q_true, truth=truth, fine_dt=0.03, **shared)  # type: ignore[arg-type]
+    discrete = truth == "discrete"
+    twin = twin_of(clamped=discrete, truth=truth, fine_dt=0.03)  # else its slopes are an error, too
     tracks = {case: identify(twin, *case, progress) for case in EXPECTED}
-    auto = _track(twin, GradientLaw(gain="auto"), "gradient, auto", progress)
-    rows: list[tuple[Any, Any, Track, float | None]] = [
-        (*case, found, EXPECTED[case]) for case, found in tracks.items()
-    ]
-    rows.append(("auto", None, auto, None))
-    table = Table(
-        f"relative L2 error of q, truth = {truth}",
-        ["gain", "c1", "q = 0", "t = 6", "t = 60", "expected", "error of u", "divided steps"],
-        [
-            [
-                gain,
-                c1,
-                twin.baseline(0.0),
-                found.error(6.0),
-                found.error(60.0),
-                expected if truth == "discrete" else None,
-                found.u_error,
-                found.divided,
-            ]
-            for gain, c1, found, expected in rows
-        ],
-    )
-    nothing = Twin(q_true=0.0, **shared)  # type: ignore[arg-type]
-    effect = _distance(nothing, twin) if truth == "discrete" else _distance(nothing, _crime(twin))
-    if truth == "discrete":
-        checks, notes = _learned(tracks, effect)
+    known = EXPECTED if discrete else {}
+    tables = [_table(f"relative L2 error of q, truth = {truth}", twin, tracks, known)]
+    nothing = twin_of(clamped=discrete, q_true=0.0)
+    if discrete:
+        other = twin_of(clamped=False)
+        kept = {case: identify(other, *case, progress) for case in WITH_SLOPES}
+        auto = _auto(other, progress)
+        tables.append(_table("the same, slopes at the ends kept", other, kept, WITH_SLOPES))
+        tables[1].rows.append(_row(other, "auto", None, auto, None))
+        checks, notes = _learned(tracks, kept, _distance(nothing, twin))
         checks.append(Check("error of q at t = 60, gradient, auto", auto.error(60.0), AUTO, "<="))
     else:
-        checks, notes = _hidden(twin, tracks, effect)
+        checks, notes = _hidden(twin, tracks, _distance(nothing, twin_of(clamped=False)))
     return Outcome(
-        tables=[table],
+        tables=tables,
         checks=checks,
         notes=notes,
         dataset=tracks[BEST].result.to_xarray(),
@@ -123,15 +135,25 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     )
 
 
+def _table(
+    title: str,
+    twin: Twin,
+    tracks: dict[tuple[float, float], Track],
+    known: dict[tuple[float, float], float],
+) -> Table:
+    columns = ["gain", "c1", "q = 0", "t = 6", "t = 60", "expected", "error of u", "divided steps"]
+    rows = [_row(twin, *case, found, known.get(case)) for case, found in tracks.items()]
+    return Table(title, columns, rows)
+
+
+def _row(twin: Twin, gain: Any, c1: Any, found: Track, expected: float | None) -> list[Any]:
+    errors = [twin.baseline(0.0), found.error(6.0), found.error(60.0)]
+    return [gain, c1, *errors, expected, found.u_error, found.divided]
+
+
 def _label(gain: float, c1: float) -> str:
     exponent = f"{gain:.0e}".replace("e+0", "e")
     return f"gain {exponent if gain >= 1e4 else f'{gain:g}'}, c1 = {c1:g}"
-
-
-def _crime(twin: Twin) -> Twin:
-    """Return the same twin with data of the estimator's own scheme."""
-    shared = {"model": twin.model, "observation": twin.observation, "times": twin.times}
-    return Twin(q_true=q_true, u_true=u_true, **shared)  # type: ignore[arg-type]
 
 
 def _distance(one: Twin, other: Twin) -> float:
@@ -141,16 +163,24 @@ def _distance(one: Twin, other: Twin) -> float:
     return max(X.norm(u - v) / X.norm(v) for u, v in pairs)
 
 
-def _learned(tracks: dict[tuple[float, float], Track], effect: float) -> tuple[Any, Any]:
+def _learned(
+    tracks: dict[tuple[float, float], Track],
+    kept: dict[tuple[float, float], Track],
+    effect: float,
+) -> tuple[Any, Any]:
     """Checks and words for data of the same scheme: q is found."""
     checks = [
         Check(
-            f"error of q at t = 60, {_label(gain, c1)}",
-            tracks[gain, c1].error(60.0),
+            f"error of q at t = 60, {_label(gain, c1)}{where}",
+            found[gain, c1].error(60.0),
             (expected * (1 - TOLERANCE), expected * (1 + TOLERANCE)),
             "in",
         )
-        for (gain, c1), expected in EXPECTED.items()
+        for where, found, known in (
+            ("", tracks, EXPECTED),
+            (", slopes at the ends kept", kept, WITH_SLOPES),
+        )
+        for (gain, c1), expected in known.items()
     ]
     settled = [tracks[case] for case in SETTLED]
     late = [found.errors[found.times >= SETTLED_FROM - 1e-9] for found in settled]
@@ -170,7 +200,9 @@ def _learned(tracks: dict[tuple[float, float], Track], effect: float) -> tuple[A
             SHIFTED,
             ">=",
         ),
-        Check("divided steps", float(sum(t.divided for t in tracks.values())), 0.0, "<="),
+        Check(
+            "failed steps", float(sum(np.isnan(t.errors).sum() for t in tracks.values())), 0.0, "<="
+        ),
     ]
     notes = [
         f"The data carry almost no information: q* against q = 0 changes u by {effect:.2%} at "
@@ -179,6 +211,8 @@ def _learned(tracks: dict[tuple[float, float], Track], effect: float) -> tuple[A
         "right, because omega = (0.3, 0.87) lies to the right of the middle.",
         "With gain 1e4 what is left is the part outside of omega, where the law only extends q "
         "smoothly.",
+        "The paper's space (j = 2, ..., N - 1) has no slopes at the ends, where u* and q* have "
+        "some; that costs up to a fourteenth of the accuracy of q.",
     ]
     return checks, notes
 
@@ -186,7 +220,7 @@ def _learned(tracks: dict[tuple[float, float], Track], effect: float) -> tuple[A
 def _hidden(twin: Twin, tracks: dict[tuple[float, float], Track], effect: float) -> tuple[Any, Any]:
     """Checks and words for data of the exact solution: the scheme's own error hides q."""
     errors = [found.error(60.0) for found in tracks.values()]
-    truncation = _distance(_crime(twin), twin)
+    truncation = _distance(twin_of(clamped=False), twin)
     source = "the exact u*" if twin.truth == "analytic" else "a run with 20 times smaller steps"
     checks = [
         Check("smallest error of q at t = 60, any gain", min(errors), HIDDEN, ">="),
@@ -235,20 +269,31 @@ SEED = Experiment(
 )
 
 # What it must show: (gain, c1) -> relative L2 error of q at t = 60 with discrete truth, measured
-# once with dense matrices and plain Picard sweeps (design, fact 3).
+# with the dense implementation in reference.py: `run(Setting(..., state_ends="clamped",
+# parameter_ends="clamped", omega=(0.3, 0.87)))`, and the same with "zero". The laws agree with it
+# in all these digits. They are those of the paper's splitting, by integrals over omega; with R and
+# P that select coefficients the second table is 0.80, 0.06, 0.12, 0.04, 0.04, which is no method of
+# the paper.
 EXPECTED = {
-    (1.0, 0.1): 0.80,
-    (100.0, 0.1): 0.06,
-    (100.0, 1.0): 0.12,
-    (1e4, 0.1): 0.04,
-    (1e4, 1.0): 0.04,
+    (1.0, 0.1): 0.8424,
+    (100.0, 0.1): 0.1239,
+    (100.0, 1.0): 0.1333,
+    (1e4, 0.1): 0.0643,
+    (1e4, 1.0): 0.0690,
 }
-TOLERANCE = 0.2
+WITH_SLOPES = {
+    (1.0, 0.1): 0.8364,
+    (100.0, 0.1): 0.1159,
+    (100.0, 1.0): 0.1285,
+    (1e4, 0.1): 0.0599,
+    (1e4, 1.0): 0.0643,
+}
+TOLERANCE = 0.02
 AUTO = 0.06  # without a hand-set gain
 LIKE_PAPER = (100.0, 1.0)
 BEST = (1e4, 1.0)
 SETTLED = ((1e4, 0.1), (1e4, 1.0))
 SETTLED_FROM = 6.0
-SMALL = 0.05
+SMALL = 0.071
 SHIFTED = 0.51  # the paper's figure: shifted to the right
 HIDDEN = 0.5  # with analytic truth the error of q stays above this for every gain

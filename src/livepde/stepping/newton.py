@@ -208,6 +208,9 @@ class _Iteration(Generic[Point]):
             if fresh and not new.size < at.size:
                 if self.equation.limited(at, allowed):
                     break
+                if self.equation.limited(new, allowed):  # one line may be limited long before
+                    at = new
+                    break
                 new = self._damped(at, update)
             refresh = near.refresh if factor is near.factor else newton.refresh
             slow = not new.size <= refresh * at.size
