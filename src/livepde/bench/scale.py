@@ -341,6 +341,5 @@ def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, s
     metric = Metric(1.0 / (gain * STEP), 0.0, np.zeros(model.Q.dim))
     data = blocks.data(c, STEP, Moment(STEP), split.project(u), metric)
     at = blocks.evaluate(data, c)
-    K = blocks.factor(data, at)
-    _, count = K.iterate(at.residual, K.own, TOLERANCE)
+    _, count = blocks.factor(data, at).iterate(at.residual, TOLERANCE)
     return count, (blocks.engines["S"], blocks.engines["C"])

@@ -63,8 +63,8 @@ class StageEquation(Protocol[Point]):
         """Return the stage at y."""
         ...
 
-    def factor(self, at: Point, last: Factor | None) -> Factor:
-        """Return the factorised Jacobian at a point; `last` is one of another point."""
+    def factor(self, at: Point) -> Factor:
+        """Return the factorised Jacobian at a point."""
         ...
 
     def limited(self, at: Point, allowed: float) -> bool:
@@ -194,7 +194,7 @@ class _Iteration(Generic[Point]):
         factors
             At most this many are made.
         """
-        newton, factor, last = self.newton, near.factor, near.factor
+        newton, factor = self.newton, near.factor
         while not self._solved(at, allowed):
             fresh = factor is None
             if self.updates >= newton.iterations or (fresh and factors == 0):
@@ -203,7 +203,7 @@ class _Iteration(Generic[Point]):
                     f"{self.updates} updates left a relative residual of {at.size:.1e}",
                 )
             if factor is None:
-                factor, factors = self._factor(at, last), factors - 1
+                factor, factors = self._factor(at), factors - 1
             new, update = self._updated(at, factor)
             if fresh and not new.size < at.size:
                 if self.equation.limited(at, allowed):
@@ -215,7 +215,7 @@ class _Iteration(Generic[Point]):
             refresh = near.refresh if factor is near.factor else newton.refresh
             slow = not new.size <= refresh * at.size
             at = new if new.size < at.size else at
-            last, factor = factor, None if slow else factor
+            factor = None if slow else factor
         return Solution(at, self.updates, self.made)
 
     def _solved(self, at: Point, allowed: float) -> bool:
@@ -223,9 +223,9 @@ class _Iteration(Generic[Point]):
             raise StepFailed("not_finite", "the iteration left the range of finite numbers")
         return at.size <= allowed and at.resolved
 
-    def _factor(self, at: Point, last: Factor | None) -> Factor:
+    def _factor(self, at: Point) -> Factor:
         try:
-            factor = self.equation.factor(at, last)
+            factor = self.equation.factor(at)
         except LinearAlgebraError as error:
             raise StepFailed("singular", str(error)) from error
         self.made = (at, factor)

@@ -362,7 +362,7 @@ class _Equation:
         )
         return _Point(y, residual, own / max(*sizes, TINY))
 
-    def factor(self, at: _Point, last: Factor | None) -> Factor:
+    def factor(self, at: _Point) -> Factor:
         return self.stage._factorise(self.stage._data(at.y, self.q, self.h, self.moment))
 
     def limited(self, at: _Point, allowed: float) -> bool:

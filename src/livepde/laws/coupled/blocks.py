@@ -27,7 +27,6 @@ import scipy.sparse as sp
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Field
 from livepde.laws.coupled.equation import (
-    MadeAt,
     StageData,
     StageIterate,
     StageSolver,
@@ -49,7 +48,6 @@ __all__ = ["LARGE", "ApproximateFactor", "BlockJacobian", "BlockSolver"]
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
-PATIENCE = 8  # iterations with factors of another point beyond which they are made again
 REFRESH = 0.5  # of the residual: an update costs a twentieth of new factors
 SPENT = 12  # updates and iterations: about what new factors cost
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
@@ -84,10 +82,8 @@ class BlockSolver(StageSolver):
     def refresh(self) -> float:
         return REFRESH
 
-    def kept(self, factor: Factor, data: StageData, at: StageIterate) -> tuple[Factor, MadeAt]:
-        if isinstance(factor, BlockJacobian):
-            return factor.approximate, factor.approximate.made
-        return super().kept(factor, data, at)
+    def kept(self, factor: Factor) -> Factor:
+        return factor.approximate if isinstance(factor, BlockJacobian) else factor
 
     def prepare(self) -> None:
         forms = self.terms.forms
@@ -104,9 +100,7 @@ class BlockSolver(StageSolver):
         rows = np.asarray(abs(mass).sum(axis=1)).ravel()
         return np.where(rows > 0.0, rows, 1.0)
 
-    def factor(
-        self, data: StageData, at: StageIterate, last: Factor | None = None
-    ) -> BlockJacobian:
+    def factor(self, data: StageData, at: StageIterate) -> BlockJacobian:
         terms, forms = self.terms, self.terms.forms
         form, moment, n = forms.A_in, data.moment, terms.n
         u, q, free, free_q = at.y[:n], at.y[n:], terms.free, terms.free_q
@@ -135,10 +129,7 @@ class BlockSolver(StageSolver):
         row = terms.slope(data, at)
         border = None if row is None else (at.Mr * free, row * free)
         blocks = S, forward, A, self._metric(data), rates
-        if isinstance(last, BlockJacobian):
-            last = last.approximate
-        known = last if isinstance(last, ApproximateFactor) else None
-        return BlockJacobian(self, MadeAt(data, at.y), known, *blocks, back, curved, border)
+        return BlockJacobian(self, *blocks, back, curved, border)
 
     def _metric(self, data: StageData) -> sp.csr_array:
         """Return H on the free coefficients, with its auxiliary unknowns."""
@@ -203,15 +194,9 @@ class BlockJacobian:
         Derivatives of A(w)^T r in u and in q; None if they are held or zero.
     border
         (b, a): b a^T is added to S.
-    made
-        The point.
-    last
-        Approximate inverse of another point, which preconditions as long as it serves.
     """
 
     solver: BlockSolver
-    made: MadeAt
-    last: ApproximateFactor | None
     S: sp.csr_array
     forward: sp.csr_array
     A: sp.csr_array
@@ -240,19 +225,14 @@ class BlockJacobian:
         out[n:size] -= coupling
         return out
 
-    @property
-    def approximate(self) -> ApproximateFactor:
-        """The approximate inverse that served: that of another point, or one of its own."""
-        return self.own if self.last is None or "own" in vars(self) else self.last
-
     @cached_property
-    def own(self) -> ApproximateFactor:
-        """The approximate inverse of this point."""
+    def approximate(self) -> ApproximateFactor:
+        """The approximate inverse."""
         solver, terms = self.solver, self.solver.terms
         state = solver.factorise("S", self.S)
         C = sp.csr_array(self.H + _widened(self._information(state), terms.auxiliary))
         schur = solver.factorise("C", C, approximate=True)
-        return ApproximateFactor(solver, self.made, state, schur, self.forward, self.A)
+        return ApproximateFactor(solver, state, schur, self.forward, self.A)
 
     def _information(self, state: Factor) -> sp.csr_array:
         """Return what stands for A_in^T R S^{-1} A in C."""
@@ -269,22 +249,11 @@ class BlockJacobian:
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b to the tolerance; raises `LinearAlgebraError`."""
-        if self.approximate is self.last:
-            try:
-                return self.iterate(b, self.last, limit=PATIENCE)[0]
-            except LinearAlgebraError:
-                pass  # it is too far away: one of this point
-        return self.iterate(b, self.own)[0]
+        return self.iterate(b, TOLERANCE)[0]
 
-    def iterate(
-        self,
-        b: Array,
-        approximate: ApproximateFactor,
-        tolerance: float = TOLERANCE,
-        limit: int = ITERATIONS,
-    ) -> tuple[Array, int]:
+    def iterate(self, b: Array, tolerance: float) -> tuple[Array, int]:
         """Return x with K x = b, and the iterations of GMRES that took."""
-        terms = self.solver.terms
+        terms, approximate = self.solver.terms, self.approximate
         n, size = terms.n, terms.size
         padded = np.zeros(size + terms.auxiliary)
         padded[:size] = b
@@ -295,7 +264,7 @@ class BlockJacobian:
         def scaled(r: Array) -> Array:
             return (first if r is padded else approximate.whole(r)) * scale
 
-        x, count = gmres(self.apply, scaled, padded, tolerance, limit, REMEDY)
+        x, count = gmres(self.apply, scaled, padded, tolerance, ITERATIONS, REMEDY)
         return x[:size], count
 
 
@@ -304,7 +273,6 @@ class ApproximateFactor:
     """The approximate inverse of K by factors of S and C, as a `Factor`."""
 
     solver: BlockSolver
-    made: MadeAt
     state: Factor
     schur: Factor
     forward: sp.csr_array

@@ -127,7 +127,7 @@ class DistributedSolver(StageSolver):
             y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r
         )
 
-    def factor(self, data: StageData, at: StageIterate, last: Factor | None = None) -> Factor:
+    def factor(self, data: StageData, at: StageIterate) -> Factor:
         terms, u = self.terms, self.model.u
         row = terms.slope(data, at)
         slope = np.zeros(terms.n) if row is None else row

@@ -31,7 +31,7 @@ from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array, Factor, Pattern
 from livepde.stepping import TINY
 
-__all__ = ["Inside", "MadeAt", "StageData", "StageIterate", "StageSolver", "StageTerms"]
+__all__ = ["Inside", "StageData", "StageIterate", "StageSolver", "StageTerms"]
 
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
@@ -334,14 +334,6 @@ class StageTerms:
         return ROUNDING * state, ROUNDING * other
 
 
-@dataclass(frozen=True, eq=False)
-class MadeAt:
-    """Where a factor was made: the data of a stage, and a point y, shape (n + m,)."""
-
-    data: StageData
-    y: Array
-
-
 class StageSolver(ABC):
     """Abstract solver of coupled stages: evaluates their equation and factorises its Jacobian."""
 
@@ -364,15 +356,12 @@ class StageSolver(ABC):
         return 0.2
 
     @abstractmethod
-    def factor(self, data: StageData, at: StageIterate, last: Factor | None = None) -> Factor:
-        """Return the factorised Jacobian at a point.
+    def factor(self, data: StageData, at: StageIterate) -> Factor:
+        """Return the factorised Jacobian at a point."""
 
-        `last`, a factor of a point not far away, may serve an iterative solver.
-        """
-
-    def kept(self, factor: Factor, data: StageData, at: StageIterate) -> tuple[Factor, MadeAt]:
-        """Return what of a factor is kept for later stages, and where that was made."""
-        return factor, MadeAt(data, at.y)
+    def kept(self, factor: Factor) -> Factor:
+        """Return the part of a factor that is kept for later stages."""
+        return factor
 
     @abstractmethod
     def prepare(self) -> None:

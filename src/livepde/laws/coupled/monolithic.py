@@ -54,7 +54,7 @@ class MonolithicSolver(StageSolver):
     def prepare(self) -> None:
         _ = self._parts, self._pull
 
-    def factor(self, data: StageData, at: StageIterate, last: Factor | None = None) -> Factor:
+    def factor(self, data: StageData, at: StageIterate) -> Factor:
         terms, metric = self.terms, data.metric
         found = self.changing(data, at)
         found += self._fixed(data)

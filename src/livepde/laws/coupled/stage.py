@@ -15,7 +15,6 @@ from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.blocks import BlockSolver
 from livepde.laws.coupled.distributed import DistributedSolver
 from livepde.laws.coupled.equation import (
-    MadeAt,
     StageData,
     StageIterate,
     StageSolver,
@@ -65,9 +64,9 @@ class KeptFactor:
         return cls(np.zeros(0), np.zeros(0), 0.0, 0.0, 0.0, np.zeros(0), 0)
 
     @classmethod
-    def of(cls, made: MadeAt) -> KeptFactor:
-        """Return the value for a factor made at a point of a stage."""
-        data, y, metric = made.data, made.y, made.data.metric
+    def of(cls, data: StageData, y: Array) -> KeptFactor:
+        """Return the value for a factor made at a point y of a stage."""
+        metric = data.metric
         information = np.zeros(0) if metric.information is None else metric.information
         return cls(y, data.u_alpha, data.h, metric.scale, metric.drift, information, 0)
 
@@ -105,8 +104,8 @@ class _Equation:
     def evaluate(self, y: Array) -> StageIterate:
         return self.solver.evaluate(self.data, y)
 
-    def factor(self, at: StageIterate, last: Factor | None) -> Factor:
-        return self.solver.factor(self.data, at, last)
+    def factor(self, at: StageIterate) -> Factor:
+        return self.solver.factor(self.data, at)
 
     def limited(self, at: StageIterate, allowed: float) -> bool:
         return self.solver.terms.limited(self.data, at, allowed)
@@ -226,7 +225,7 @@ class CoupledStage:
         w[fixed] = kept.y[:n][fixed]
         data = self.solver.data(kept.y, kept.h, problem.moment, kept.u_alpha, metric, w)
         at = self.solver.evaluate(data, kept.y)
-        factor, _ = self.solver.kept(self.solver.factor(data, at), data, at)
+        factor = self.solver.kept(self.solver.factor(data, at))
         self._last = (kept.y, factor)
         return factor
 
@@ -238,9 +237,7 @@ class CoupledStage:
             return kept
         if solved.made is not None:
             at, factor = solved.made
-            known, made = self.solver.kept(factor, data, at)
-            if made.y is not kept.y:
-                self._last = (made.y, known)
-                return KeptFactor.of(made)
+            self._last = (at.y, self.solver.kept(factor))
+            return KeptFactor.of(data, at.y)
         spent = kept.spent + max(solved.updates - 1, 0)
         return KeptFactor.none() if spent > self.solver.patience else replace(kept, spent=spent)
