@@ -103,7 +103,7 @@ def test_one_update_is_enough_in_most_steps():
     assert np.mean(updates[10:] == 1) > 0.7
     for one, other in zip(few[10:], exact[10:], strict=True):
         assert np.linalg.norm(one.q - other.q) < 5e-4 * np.linalg.norm(other.q)
-        assert np.linalg.norm(one.u - other.u) < 1e-5 * np.linalg.norm(other.u)
+        assert np.linalg.norm(one.u - other.u) < 2e-5 * np.linalg.norm(other.u)
 
 
 def test_a_start_that_suddenly_misses_more_is_followed_further():
