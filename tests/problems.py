@@ -157,12 +157,12 @@ class Cubic:
         x = y - 5.0
         return Point(y, x**3 - x, 6.0)
 
-    def factor(self, at):
+    def factor(self, at, last=None):
         self.factors += 1
         return Slope(3.0 * (at.y[0] - 5.0) ** 2 - 1.0)
 
-    def rounding(self, at):
-        return 1e-16
+    def limited(self, at, allowed):
+        return at.size <= 1e-16
 
 
 class Point:

@@ -6,16 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from livepde.laws.bilinear import Bilinear, BilinearEquation
-from livepde.laws.gains import Gains
-from livepde.laws.warm import Misses
-from problems import Cubic
 
 import livepde as lp
 from livepde.bench.step import problem
-from livepde.laws.coupled import CoupledStage
+from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.linalg import SuperLUSolver
-from livepde.stepping import Near
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +39,7 @@ def test_a_kept_factor_changes_no_number(plate, monkeypatch):
 
     monkeypatch.setattr(SuperLUSolver, "factorise", counted)
     kept, few = run()
-    monkeypatch.setattr(Bilinear, "keeps", False)
+    monkeypatch.setattr(BilinearSolver, "keeps", False)
     fresh, many = run()
     assert few < many
     for one, other in zip(kept, fresh, strict=True):
@@ -52,9 +47,11 @@ def test_a_kept_factor_changes_no_number(plate, monkeypatch):
         assert one.q == pytest.approx(other.q, rel=0, abs=1e-6 * np.abs(other.q).max())
 
 
-def test_a_kept_factor_is_made_again_after_a_restart(plate, tmp_path):
+@pytest.mark.parametrize(
+    "law", [lp.GradientLaw(1.0, lp.ResidualDamping(0.1)), lp.GradientLaw("auto")], ids=["1", "auto"]
+)
+def test_a_kept_factor_is_made_again_after_a_restart(law, plate, tmp_path):
     given, samples = plate
-    law = lp.GradientLaw(1.0, lp.ResidualDamping(0.1))
 
     def fresh():
         return lp.Identifier(given.model, given.omega, law, q0=0.0, u0=given.u0)
@@ -63,7 +60,7 @@ def test_a_kept_factor_is_made_again_after_a_restart(plate, tmp_path):
     for sample in samples[1:8]:
         whole.step(*sample)
         half.step(*sample)
-    assert len(whole._state.warm.kept.y)
+    assert len(whole._state.kept.y)
     half.save(tmp_path / "half.npz")
     again = fresh()
     again.load(tmp_path / "half.npz")
@@ -74,6 +71,7 @@ def test_a_kept_factor_is_made_again_after_a_restart(plate, tmp_path):
 
 
 ROD = problem(31)
+EXACT = lp.Newton(share=0.0, tolerance=1e-10)
 
 
 def rod(newton, scheme=None, gain=1e4, given=ROD):
@@ -83,38 +81,39 @@ def rod(newton, scheme=None, gain=1e4, given=ROD):
     identifier = lp.Identifier(ROD.model, ROD.omega, law, q0=0.0, u0=ROD.u0, scheme=scheme)
     estimates, updates = [], []
     with pytest.MonkeyPatch.context() as patch:
-        count = [0]
+        solved = []
 
-        def counted(self, y, residual=BilinearEquation.residual):
-            count[0] += 1
-            return residual(self, y)
+        def counted(self, *args, solve=lp.Newton.solve):
+            solved.append(solve(self, *args))
+            return solved[-1]
 
-        patch.setattr(BilinearEquation, "residual", counted)
+        patch.setattr(lp.Newton, "solve", counted)
         for t, u in given.forward(given.q_true):
             if t > 0.0:
-                count[0] = 0
+                solved.clear()
                 estimates.append(identifier.step(t, G @ u))
-                updates.append(count[0])
+                updates.append(sum(one.updates for one in solved))
     return estimates, np.array(updates)
 
 
 def test_one_update_is_enough_in_most_steps():
     few, updates = rod(lp.Newton())
-    exact, more = rod(lp.Newton(share=0.0, tolerance=1e-10))
+    exact, more = rod(EXACT)
     assert updates[10:].mean() < 1.3 < 2.5 < more[10:].mean()
     assert np.mean(updates[10:] == 1) > 0.7
     for one, other in zip(few[10:], exact[10:], strict=True):
-        assert np.linalg.norm(one.q - other.q) < 2e-4 * np.linalg.norm(other.q)
-        assert np.linalg.norm(one.u - other.u) < 1e-5 * np.linalg.norm(other.u)
+        assert np.linalg.norm(one.q - other.q) < 5e-4 * np.linalg.norm(other.q)
+        assert np.linalg.norm(one.u - other.u) < 2e-5 * np.linalg.norm(other.u)
 
 
 def test_a_start_that_suddenly_misses_more_is_followed_further():
-    """What the factor left of errors before says little then: theta has turned."""
+    """A factor of another theta serves badly then: theta has turned."""
     given = replace(ROD, width=0.55)
+    norm = ROD.model.X.norm
     few, _ = rod(lp.Newton(), gain=1e2, given=given)
-    exact, _ = rod(lp.Newton(share=0.0, tolerance=1e-10), gain=1e2, given=given)
+    exact, _ = rod(EXACT, gain=1e2, given=given)
     for one, other in zip(few, exact, strict=True):
-        assert np.linalg.norm(one.u - other.u) < 0.01 * np.linalg.norm(other.u)
+        assert norm(one.u - other.u) < 2e-3 * norm(other.u)
 
 
 def test_a_scheme_of_second_order_solves_its_stages_to_the_end():
@@ -123,27 +122,22 @@ def test_a_scheme_of_second_order_solves_its_stages_to_the_end():
     assert all(np.array_equal(a.q, b.q) for a, b in zip(one[0], other[0], strict=True))
 
 
-def test_noise_is_no_error_of_the_time_step():
-    """With it the starts miss something new in each step, and stages are solved further."""
-    misses = Misses(np.ones(2), np.array([0.0, 1.0]), 1.0, size=3)
-    assert misses.shares(np.array([0.9, -0.4, 0.3])) == (0.9, 0.0, 0.3)
-    near, start = np.array([6.01]), np.array([5.6])
-    cubic = Cubic()
-    found = lp.Newton().solve(cubic, start, lagged=True, near=Near(near, shares=(0.0,)))
-    assert abs(found.y[0] - 6.0) < 1e-6
-    rough = lp.Newton().solve(cubic, start, lagged=True, near=Near(near))
-    assert rough.updates < found.updates
+def test_most_steps_make_no_factor(plate, monkeypatch):
+    """A kept factor saves factorisations: and every stage is solved with it."""
+    given, samples = plate
+    made = []
+    factor = BilinearSolver.factor
 
+    def counted(self, data, at, last=None):
+        made.append(at)
+        return factor(self, data, at, last)
 
-def test_misses_that_follow_each_other_show_in_each_part():
-    stage = CoupledStage(
-        ROD.model,
-        ROD.omega.bind(ROD.model.state_space, ROD.model.X, ROD.model.parameter_space).split(),
-        Gains(1.0, lp.ResidualDamping(), 0.0, 0.0, ROD.model.mass, ROD.model.mass),
-        lp.Newton(),
-    )
-    before, misses = np.random.default_rng(0).standard_normal(stage.size), stage.misses
-    factors = np.array([0.5, -0.25, 3.0])
-    trend = misses.trend(before * misses.spread(factors), before)
-    np.testing.assert_allclose(trend, [0.5, -0.25, 1.0])
-    np.testing.assert_array_equal(misses.trend(before, 0.0 * before), 0.0)
+    monkeypatch.setattr(BilinearSolver, "factor", counted)
+    law = lp.GradientLaw(1.0, lp.ResidualDamping(0.1))
+    identifier = lp.Identifier(given.model, given.omega, law, q0=0.0, u0=given.u0)
+    counts = []
+    for sample in samples[1:]:
+        made.clear()
+        assert identifier.step(*sample).status.ok
+        counts.append(len(made))
+    assert np.mean(np.array(counts[5:]) == 0) > 0.7

@@ -262,7 +262,10 @@ def square(cells=12):
 @pytest.mark.parametrize(
     ("law", "sensors"),
     [
-        (lp.GradientLaw(10.0), lp.Subdomain(lambda x: x[0] < 0.6)),
+        (
+            lp.GradientLaw(10.0, newton=lp.Newton(tolerance=1e-11, share=0.0)),
+            lp.Subdomain(lambda x: x[0] < 0.6),
+        ),
         (lp.SensitivityLaw(modes=4, noise=1e-3), lp.Points([(0.3, 0.4), (0.7, 0.6)])),
     ],
 )

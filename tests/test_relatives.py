@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from livepde.laws.gains import Gains
 from problems import excited, excited_q, excited_u, laplace, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.coupled import CoupledStage
+from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
+from livepde.laws.metrics import ConstantMetric
 from livepde.laws.relatives import _Linear
 from livepde.model import mass_form
 from livepde.reproduce.relatives import EXPECTED, LAWS, law
@@ -89,21 +89,26 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     model = reaction(lp.interval(0.0, 1.0, 10), ElementLineP1(), B=B)
     observed = PART.bind(model.state_space, model.X, model.parameter_space)
     split, gain, mu, h = observed.split(), 50.0, 3.0, 0.2
-    M_op = model.bilinear(mass_form)
-    gains = Gains(gain, _Linear(mu), 0.0, 0.0, M_op, M_op, at_estimate=True)
-    stage = CoupledStage(model, split, gains, Newton(tolerance=1e-12))
+    forms = StageForms(model, split, None, None, 0.0, at_estimate=True)
+    stage = CoupledStage(StageTerms(forms, _Linear(mu)), Newton(tolerance=1e-12, share=0.0))
     rng, n = np.random.default_rng(0), model.X.dim
     c = 0.3 * rng.standard_normal(n + model.Q.dim)
     c[:n] *= model.X.free
     u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
-    y, _ = stage.solve(c, h, lp.Moment(0.2), u_alpha, np.zeros_like(c))
+    metric = ConstantMetric(model, gain, 0.0).stage(c[n:], h, gain, 0.0)
+    problem = StageProblem(c, h, lp.Moment(0.2), u_alpha, metric)
+    y, _ = stage.solve(problem, lambda: np.zeros_like(c))
     u, q = y[:n], y[n:]
-    r, A = split.R @ u - u_alpha, model.A(u)
-    state = model.mass @ (u - c[:n]) / h + model.B(u) + A.matrix @ q
-    state += mu * (split.R.T @ (model.mass @ r)) - model.F(lp.Moment(0.2))
-    learned = model.Q.gram @ (q - c[n:]) / (gain * h) - A.matrix.T @ r
-    assert np.abs(state * model.X.free).max() < 1e-9
-    assert np.abs(learned * model.Q.free).max() < 1e-9
+    r = split.R @ u - u_alpha
+    omega = model.bilinear(mass_form, split.omega)
+    inside, outside = split.omega, np.setdiff1d(np.arange(model.mesh.nelements), split.omega)
+    A_in, A_out = (model.form_A.on(part).matrix("v", "q", u=u) for part in (inside, outside))
+    assert abs(A_in + A_out - model.A(u).matrix).max() < 1e-13
+    state = model.mass @ (u - c[:n]) / h + model.B(u) + model.A(u).matrix @ q
+    state += mu * (split.R.T @ (omega @ r)) - model.F(lp.Moment(0.2))
+    learned = model.Q.gram @ (q - c[n:]) / (gain * h) - A_in.T @ r
+    assert np.abs(state * model.X.free).max() < 1e-10
+    assert np.abs(learned * model.Q.free).max() < 1e-10
 
 
 @pytest.mark.parametrize("kind", [lp.BaumeisterLaw, lp.KueglerLaw])

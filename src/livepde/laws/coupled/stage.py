@@ -44,8 +44,8 @@ class KeptFactor:
     ----------
     y, u_alpha, h
         Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
-    scale, drift, information
-        Of its metric; `information` is empty without one.
+    scale, drift, information, theta
+        Of its metric; `information` is empty and `theta` NaN without one.
     spent
         Updates that stages took since then, beyond one each.
     """
@@ -56,19 +56,21 @@ class KeptFactor:
     scale: float
     drift: float
     information: Array
+    theta: float
     spent: int
 
     @classmethod
     def none(cls) -> KeptFactor:
         """Return the value without a factor."""
-        return cls(np.zeros(0), np.zeros(0), 0.0, 0.0, 0.0, np.zeros(0), 0)
+        return cls(np.zeros(0), np.zeros(0), 0.0, 0.0, 0.0, np.zeros(0), math.nan, 0)
 
     @classmethod
     def of(cls, data: StageData, y: Array) -> KeptFactor:
         """Return the value for a factor made at a point y of a stage."""
         metric = data.metric
         information = np.zeros(0) if metric.information is None else metric.information
-        return cls(y, data.u_alpha, data.h, metric.scale, metric.drift, information, 0)
+        theta = math.nan if metric.theta is None else metric.theta
+        return cls(y, data.u_alpha, data.h, metric.scale, metric.drift, information, theta, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +220,9 @@ class CoupledStage:
         if last is not None and last[0] is kept.y:
             return last[1]
         information = kept.information if len(kept.information) else None
-        metric = Metric(kept.scale, kept.drift, np.zeros_like(problem.metric.load), information)
+        theta = None if math.isnan(kept.theta) else kept.theta
+        load = np.zeros_like(problem.metric.load)
+        metric = Metric(kept.scale, kept.drift, load, information, theta)
         n = self.terms.n
         w = kept.u_alpha.copy()
         fixed = self.terms.forms.model.X.fixed
