@@ -313,34 +313,87 @@ def test_an_exact_excitation_that_dies_out_is_none():
 
 
 def test_a_rest_is_told_from_noise_alone():
-    rng, rest = np.random.default_rng(0), lp.ExcitationGate()
+    rng, gate = np.random.default_rng(0), lp.ExcitationGate()
     slow, noise = np.sin(0.1 * np.arange(300))[:, None], rng.standard_normal((300, 16))
 
-    def after(*parts: np.ndarray) -> Excitation:
+    def after(seen: np.ndarray, followed: np.ndarray) -> Excitation:
         state = Excitation.none()
-        for a in np.vstack(parts):
-            state = rest.add(state, a)
+        for a, b in zip(seen, followed, strict=True):
+            state = gate.add(state, a, b)
         return state
 
-    signal = 10.0 * slow * np.ones(16)
+    def closed(*parts: tuple[Any, Any], unit: float = 1.0) -> bool:
+        """Each part: what the estimate follows, and what it does not."""
+        followed = np.vstack([one for one, _ in parts])
+        left = np.vstack([other for _, other in parts])
+        return gate.closed(after(unit * (followed + left), unit * followed))
+
+    signal, none = 10.0 * slow * np.ones(16), np.zeros((300, 16))
+    fast = np.random.default_rng(1).standard_normal((300, 16))
     for unit in (1e-9, 1.0, 1e9):
-        assert rest.closed(after(unit * (signal + noise), unit * noise))
-        assert not rest.closed(after(unit * (signal + noise)))
-        assert not rest.closed(after(unit * (signal + noise), unit * noise, unit * signal[100:105]))
-        assert not rest.closed(
-            after(unit * (signal + noise), 0.1 * unit * signal)
-        )  # weak, no noise
-        assert not rest.closed(after(unit * noise))  # never more than that: perhaps a fast process
-        assert not rest.closed(after(unit * signal, 10.0 * unit * noise))
-    assert not rest.closed(after(np.zeros((300, 16))))
+        assert closed((signal, noise), (none, noise), unit=unit)
+        assert closed((signal, none), (none, 1e-3 * noise), unit=unit)
+        assert not closed((signal, noise), unit=unit)
+        assert not closed((signal, noise), (none, noise), (signal[100:105], noise[:5]), unit=unit)
+        assert not closed((signal, noise), (0.1 * signal, none), unit=unit)  # weak, no noise
+        assert not closed((none, noise), unit=unit)  # never more than that: perhaps a fast process
+        assert not closed((signal, none), (none, 10.0 * noise), unit=unit)
+        # Exact, but not resolved in time, and far smaller than it was.
+        assert not closed((signal, none), (0.1 * fast, none), unit=unit)
+        # The same while the estimate is still off, by more than what is left to see.
+        assert not closed((signal, none), (0.1 * fast, 0.3 * signal), unit=unit)
+        # A little noise on it is no rest.
+        assert not closed((signal, none), (0.1 * fast, 0.02 * noise), unit=unit)
+    assert not gate.closed(after(none, none))
+
+
+FAST = np.random.default_rng(1).standard_normal(2000)
+PART = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.9))
+
+
+@pytest.mark.parametrize("gain", [1.0, 1e4])
+@pytest.mark.parametrize("sensors", [lp.Full(), PART], ids=["full", "part"])
+@pytest.mark.parametrize(
+    ("after", "h"),
+    [(lambda t: FAST[round(t / 0.2)], 0.2), (lambda t: 0.3 * np.sin(2.9 * t), 1.0)],
+    ids=["random", "badly resolved"],
+)
+def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensors, after, h):
+    """What remains is a thousandth of what was, and not correlated from sample to sample."""
+    model = reaction(lambda t: 30.0 if t < 50.5 * h else after(t))
+    seen = [
+        list(np.flatnonzero(model.X.free)).index(k) for k in sensors.selected(model.state_block)
+    ]
+    stream = [(t, z[seen]) for t, z in full(model, 400, h=h, noise=0.0)]
+    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(1.0))
+    identifier = lp.Identifier(model, sensors, law, u0=0.0)
+    for t, z in stream:
+        assert "at_rest" not in identifier.step(t, z).notes
+    last = identifier._state.excitation
+    assert last.energy < 0.01 * last.largest  # by this alone, and by
+    assert last.correlation < 0.5  # this, it would be held
+
+
+@pytest.mark.parametrize("gain", [1.0, 1e4])
+@pytest.mark.parametrize("c1", [0.1, 1.0])
+def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):
+    model = reaction(lambda t: 1.0 * (t < 50.0))
+    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(c1))
+    identifier = lp.Identifier(model, lp.Full(), law, u0=0.0)
+    held = ["at_rest" in identifier.step(*sample).notes for sample in full(model, 400, h=0.5)]
+    first = held.index(True)
+    assert 100 < first < 300
+    assert all(held[first:])
 
 
 def test_probes_see_the_same_by_assembly_in_every_unit():
     model = reaction(lambda t: 1.0)
     split = lp.Full().bind(model.state_space, model.X, model.parameter_space).split()
     probes = Probes(model, split)
-    w, q = np.random.default_rng(0).standard_normal((2, model.X.dim))
+    q, *states = np.random.default_rng(0).standard_normal((3, model.X.dim))
+    w = np.transpose(states)
     seen = probes(w, q, lp.Moment(0.0))
+    assert seen.shape == (16, 2)
     assert probes.fixed is not None
     probes.fixed, probes.pairs = None, pairs(model, split)
     np.testing.assert_allclose(probes(w, q, lp.Moment(0.0)), seen, rtol=1e-10)
@@ -361,7 +414,9 @@ def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
     assert all(one.notes == other.notes for one, other in pairs)
 
 
-@pytest.mark.parametrize("options", [{"window": 0.5}, {"correlation": 1.0}, {"energy": 0.0}])
+@pytest.mark.parametrize(
+    "options", [{"window": 0.5}, {"correlation": 1.0}, {"energy": 0.0}, {"noise": 1.0}]
+)
 def test_rests_that_cannot_be_meant_are_refused(options: Any):
     with pytest.raises(lp.LawError, match=next(iter(options))):
         lp.ExcitationGate(**options)

@@ -47,7 +47,7 @@ def serial():
 
 def test_nothing_starts_mpi_unless_it_is_asked_for():
     code = (
-        "import sys, livepde, livepde.cli, livepde.parallel, livepde.laws.distributed\n"
+        "import sys, livepde, livepde.cli, livepde.parallel, livepde.laws.coupled.distributed\n"
         "assert not {'mpi4py', 'petsc4py'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -151,6 +151,26 @@ def test_a_failure_on_one_rank_ends_all(tmp_path):
     done = mpirun(2, tmp_path / "broken.py")
     assert done.returncode != 0
     assert "rank 1 of 2 failed, which ends all of them: ValueError: one rank only" in done.stderr
+
+
+REFUSED = """
+import ranks
+from livepde.parallel import petsc
+
+with petsc() as engine:
+    if engine:
+        ranks.refused()
+"""
+
+
+@needs_mpi
+def test_the_gradient_law_of_a_subdomain_is_refused_on_several_ranks_in_a_sentence(tmp_path):
+    (tmp_path / "refused.py").write_text(REFUSED)
+    done = mpirun(2, tmp_path / "refused.py")
+    assert done.returncode != 0
+    (said,) = (line for line in done.stderr.splitlines() if line.startswith("livepde.errors.Law"))
+    assert "only where all of the state is observed" in said
+    assert said.endswith("run it on one rank, observe Full(), or use SensitivityLaw.")
 
 
 @needs_mpi

@@ -61,6 +61,8 @@ class Errors:
         ||d~||_X, the rate of d since the sample before; 0 at the first.
     theta
         What the damping rule gives for r_alpha.
+    u_alpha
+        ||u_alpha||_X, to which floors are relative.
     """
 
     t: float
@@ -72,6 +74,7 @@ class Errors:
     Pu: float
     rate: float
     theta: float
+    u_alpha: float = 0.0
 
     @property
     def energy(self) -> float:
@@ -193,6 +196,7 @@ class TwinTracker:
             hidden.norms(exact).V,
             rate,
             theta,
+            seen.norms(u_alpha).X,
         )
         self.errors.append(found)
         return found
@@ -268,8 +272,8 @@ def conditions(
     c1
         Of the stronger bound on mu for the convergence of the state.
     floor
-        Of the damping rule: where the observed residual is smaller, in X, it counts as zero, and a
-        bound on mu as fulfilled (mu r/||r|| is any vector up to mu there).
+        Of the damping rule: where ||r_alpha||_X is below this share of ||u_alpha||_X it counts as
+        zero, and a bound on mu as fulfilled (mu r/||r|| is any vector up to mu there).
     """
     n = len(errors)
     if not n:
@@ -284,7 +288,8 @@ def conditions(
     lines = []
     for name, level in [(first, 0.0), *([(second, c1)] if c1 > 0 else [])]:
         asked = np.array([asked_theta(item, level) for item in errors])
-        asked[_values(errors, lambda item: item.r_alpha.X) <= floor] = 0.0
+        zero = _values(errors, lambda item: item.r_alpha.X - floor * item.u_alpha) <= 0.0
+        asked[zero] = 0.0
         lines.append(
             line(
                 name,

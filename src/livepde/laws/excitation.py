@@ -8,10 +8,14 @@ from sample to sample, and an excitation that is resolved in time is not: with t
     (a_k, a_{k-1}) / (|a_k| |a_{k-1}|)
 
 is about 1 for an excitation, and 0 for noise. For a process faster than the samples it may be 0,
-too. So |a|^2 must have fallen, and what is left of it must be noise: the estimate u^ does not
-follow noise, so b_k of (A(w_k) e, p) - (A(u^_k) e, p) is as large as a_k then. It is far smaller
-where the estimate follows exact data, however small these have become. Only all three together
-close the gate.
+too. So |a|^2 must have fallen, and what is left of it must be noise. Noise is what the estimate u^
+does not follow from one sample to the next: with b_k of (A(w_k) e, p) - (A(u^_k) e, p) the mean of
+
+    |b_k - b_{k-1}|^2 / (|a_k|^2 + |a_{k-1}|^2)
+
+is about 1 for noise. It is far smaller where the estimate follows exact data, however small these
+have become, and where it is still off after a transient: that error is smooth in time. Only all
+three together close the gate.
 """
 
 from __future__ import annotations
@@ -41,8 +45,9 @@ class ExcitationGate:
 
     A step holds q, and u goes on, if up to the sample before, in fading means, the excitation of q
     was correlated from sample to sample by less than `correlation`, its mean square was less than
-    `energy` of the largest that was correlated, and at least `noise` of it was not followed by the
-    estimate. An unknown that moves by itself (evolution=) goes on by that. Note: "at_rest".
+    `energy` of the largest that was correlated, and more than the share `noise` of it changed from
+    sample to sample as the estimate did not. An unknown that moves by itself (evolution=) goes on
+    by that. Note: "at_rest".
 
     Noise that is itself correlated in time, as behind a stream stage that averages, is no noise
     here; where it is a third of the excitation or more, rests are not told from it.
@@ -56,7 +61,7 @@ class ExcitationGate:
     energy
         Share of the largest mean square to which a rest has fallen, in (0, 1).
     noise
-        Share of the mean square that the estimate does not follow at a rest, in (0, 1).
+        Share of the square that is noise at a rest, in (0, 1).
     """
 
     window: float = 30.0
@@ -77,7 +82,7 @@ class ExcitationGate:
         return (
             excitation.correlation < self.correlation
             and excitation.energy < self.energy * excitation.largest
-            and excitation.missed > self.noise * excitation.energy
+            and excitation.noise > self.noise
         )
 
     def add(self, excitation: Excitation, a: Array, followed: Array) -> Excitation:
@@ -98,9 +103,11 @@ class ExcitationGate:
         energy = excitation.energy + share * (size - excitation.energy)
         correlated = excitation.correlated + share * (product - excitation.correlated)
         largest = max(excitation.largest, correlated)
-        left = float((a - followed) @ (a - followed))
-        missed = excitation.missed + share * (left - excitation.missed)
-        return Excitation(a, size, correlation, energy, correlated, largest, missed)
+        left, noise = a - followed, excitation.noise
+        if scale > 0.0:
+            jump = left - excitation.left
+            noise += share * (min(float(jump @ jump) / (size + excitation.size), 1.0) - noise)
+        return Excitation(a, left, size, correlation, energy, correlated, largest, noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,29 +116,31 @@ class Excitation:
 
     Attributes
     ----------
-    last, size
-        What the probes have seen in the last sample, shape (PROBES,), and its square.
+    last, left, size
+        What the probes have seen in the last sample, and what of it the estimate did not follow,
+        shape (PROBES,); and the square of the first.
     correlation, energy, correlated
         Fading means: of the correlation of successive samples, of the square, and of the product
         with the sample before, in which noise and outliers have little part.
     largest
         The largest `correlated`.
-    missed
-        Fading mean square of what the estimate does not follow.
+    noise
+        Fading mean of the share of the square that is noise.
     """
 
     last: Array
+    left: Array
     size: float
     correlation: float
     energy: float
     correlated: float
     largest: float
-    missed: float
+    noise: float
 
     @classmethod
     def none(cls) -> Excitation:
         """Return the value before any sample."""
-        return cls(np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+        return cls(np.zeros(PROBES), np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Probes:

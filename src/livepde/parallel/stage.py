@@ -1,13 +1,13 @@
 """The coupled stage of the gradient law on many ranks: what each of them does.
 
-A rank evaluates the forms on its cells and one layer beyond, and so has its rows of the residual
-and of the Jacobian
+All of the state is observed, so that A and B see the data w alone. A rank evaluates them on its
+cells and one layer beyond, and so has its rows of the equation's terms and of the Jacobian
 
-    K = [[S, A], [-A^T R - ..., G]]
+    K = [[S, A], [-A^T, H]],    S = M/h + theta M_op
 
 complete. What crosses ranks are values of u and q on the layer, inner products, and what PETSc's
-products and multigrid exchange. K is solved by GMRES, preconditioned as in `livepde.laws.schur`: a
-cycle of multigrid (GAMG) for S and one for C = G + A^T R D^{-1} R^T A.
+products and multigrid exchange. K is solved by GMRES, preconditioned as in
+`livepde.laws.coupled.blocks`: a cycle of multigrid (GAMG) for S and one for C = H + A^T D^{-1} A.
 """
 
 from __future__ import annotations
@@ -26,58 +26,47 @@ from livepde.parallel.shares import Share, SharedModel
 from livepde.parallel.solver import owned
 from livepde.parallel.team import Team
 
-__all__ = ["SharedEquation", "SharedJacobian", "SharedStage", "Weights"]
+__all__ = ["SharedEquation", "SharedJacobian", "SharedStage"]
 
-TOLERANCE = 1e-2  # of u and of q, relative to their first approximation: Newton goes on from there
+TOLERANCE = 1e-2  # of the residual, in the norm of Newton's: it goes on from there
 ITERATIONS = 60  # each keeps a vector
 MORE = 2  # times as many iterations as with new multigrid hierarchies: then they are made again
 REMEDY = "take a smaller gain or a smaller time step."
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Numbers of the law; see `livepde.laws.gains.Gains`."""
-
-    gain: float
-    nu: float
-    sigma: float
-    at_estimate: bool
-
-
 class SharedStage:
-    """What a rank keeps of a stage: forms on its cells, its rows of what is constant.
+    """A rank's part of a stage: forms on its cells, and its rows of what is constant.
 
     Parameters
     ----------
     model
         Key of the `SharedModel`.
-    observed
-        Diagonal of R, shape (n,).
     free_u, free_q
         Ones at free coefficients, shapes (n,) and (m,).
+    dual_weights
+        Of the squared dual norms of a residual, zero at fixed coefficients, shape (n + m,).
     rows
-        Of each rank: its rows of M, R^T M_op, P^T N_op P and G_Q; on rank 0.
+        Of each rank: its rows of M, R^T M_op R and G_Q; on rank 0.
     """
 
     def __init__(
         self,
         team: Team,
         model: int,
-        weights: Weights,
-        observed: Array,
         free_u: Array,
         free_q: Array,
+        dual_weights: Array,
         rows: list[tuple[sp.csr_array, ...]] | None,
     ) -> None:
         shared: SharedModel = team.part(model)
         self.team = team
-        self.weights = weights
         self.u, self.q = shared.u, shared.q
         self.A, self.B = shared.A, shared.B
         self.linear: bool = self.A.linear_in_parameter
-        self.mass, self.RM, self.PNP, self.gram = team.comm.scatter(rows)
-        self.observed, self.free_u, self.free_q = observed, free_u, free_q
-        self.W = np.ones_like(observed) if weights.at_estimate else 1.0 - observed
+        self.mass, self.pull, self.gram = team.comm.scatter(rows)
+        self.free_u, self.free_q = free_u, free_q
+        roots = np.where(dual_weights > 0.0, np.sqrt(dual_weights), 1.0)
+        self.roots = roots[self.u.rows], roots[self.u.dim + self.q.rows]
         free = sp.diags_array(free_u)
         lumped = np.asarray(abs(self.mass @ free).sum(axis=1)).ravel()
         lumped *= free_u[self.u.rows]
@@ -88,11 +77,21 @@ class SharedStage:
         """Free what PETSc holds."""
         self.renew()
 
+    def prepare(self) -> None:
+        """Lay out the blocks of K."""
+        for block in self.blocks.values():
+            block.data({})
+
     def renew(self) -> None:
         """Let the next solve make new hierarchies."""
         if self.hierarchies is not None:
             self.hierarchies.close()
         self.hierarchies = None
+
+    def spread(self, values: Array) -> tuple[Array, Array]:
+        """Return u and q with all coefficients, zero where this rank does not reach."""
+        many = len(self.u.reach)
+        return _spread(values[:many], self.u), _spread(values[many:], self.q)
 
     @cached_property
     def blocks(self) -> dict[str, _Block]:
@@ -100,18 +99,13 @@ class SharedStage:
         u, q, A = self.u, self.q, self.A
         ones_u, ones_q = np.ones(u.dim), np.ones(q.dim)
         free_u, free_q = self.free_u, self.free_q
-        seen, unseen = self.observed * free_u, self.W * free_u
         uu, uq, qu, qq = (_Block(*pair) for pair in ((u, u), (u, q), (q, u), (q, q)))
         uu.add("M", *_own(self.mass, u), free_u, free_u)
-        uu.add("B", *_entries(self.B.pattern("v", "u")), free_u, unseen)
-        uu.add("Au", *_entries(A.pattern("v", "u")), free_u, unseen)
-        uu.add("RMR", *_own(self.RM, u), free_u, seen)
-        uu.add("PNP", *_own(self.PNP, u), free_u, free_u)
+        uu.add("pull", *_own(self.pull, u), free_u, free_u)
         uu.add("fixed", u.rows, u.rows, 1.0 - free_u, ones_u)
-        uq.add("A", *_entries(A.pattern("v", "q")), free_u, free_q)
         rows, cols = _entries(A.pattern("v", "q"))
-        qu.add("A", cols, rows, -free_q, seen)
-        qu.add("Aq", *_entries(A.pattern("q", "u")), -free_q, unseen)
+        uq.add("A", rows, cols, free_u, free_q)
+        qu.add("A", cols, rows, -free_q, free_u)
         qq.add("G", *_own(self.gram, q), free_q, free_q)
         if not self.linear:
             qq.add("Aqq", *_entries(A.pattern("q", "q")), -free_q, free_q)
@@ -177,7 +171,7 @@ def _own(matrix: sp.csr_array, rows: Share) -> tuple[IntArray, IntArray]:
 
 
 class SharedEquation:
-    """A rank's rows of one stage: its residual.
+    """A rank's rows of the equation of one stage, term by term.
 
     Parameters
     ----------
@@ -185,8 +179,10 @@ class SharedEquation:
         Key of the `SharedStage`.
     h, t, inputs
         Length and time of the step, and the input channels then.
+    scale
+        Weight of G_Q.
     known
-        Of each rank: c_u, u_alpha and c_q where it reaches, and its rows of the source; on rank 0.
+        Of each rank: w, c_u and c_q where it reaches; on rank 0.
     """
 
     def __init__(
@@ -196,52 +192,63 @@ class SharedEquation:
         h: float,
         t: float,
         inputs: dict[str, float],
+        scale: float,
         known: list[Array] | None,
     ) -> None:
         self.team = team
         self.stage: SharedStage = team.part(stage)
         self.h = h
         self.moment = Moment(t, Inputs(inputs))
+        self.scale = scale
         u, q = self.stage.u, self.stage.q
-        many, some = len(u.reach), len(q.reach)
-        got = np.empty(2 * many + some + len(u.rows))
+        got = np.empty(2 * len(u.reach) + len(q.reach))
         team.scatter(known, got)
-        c_u, alpha, c_q, self.source = np.split(got, np.cumsum([many, many, some]))
-        self.c_u, self.u_alpha = _spread(c_u, u), _spread(alpha, u)
-        self.c_q = _spread(c_q, q)
+        self.w = _spread(got[: len(u.reach)], u)
+        self.c_u, self.c_q = self.stage.spread(got[len(u.reach) :])
 
     def close(self) -> None:
         """Nothing of PETSc is held."""
 
-    def residual(self, values: list[Array] | None) -> list[Array] | None:
-        """Return, of each rank, its rows of the first line, of R^T M_op r, R^T M r and the second.
+    @cached_property
+    def _linear_A(self) -> sp.csr_array:
+        return self.stage.A.matrix("v", "q", self.moment, u=self.w)
 
-        The first line is without theta R^T M_op r: theta depends on all of r.
+    def A(self, q: Array) -> sp.csr_array:
+        """Return A(w) on the cells of this rank, or its derivative at q, shape (n, m)."""
+        if self.stage.linear:
+            return self._linear_A
+        return self.stage.A.matrix("v", "q", self.moment, u=self.w, q=q)
+
+    def flux(self) -> list[Array] | None:
+        """Return B(w), of each rank its rows."""
+        u = self.stage.u
+        return self.team.gather(self.stage.B.vector("v", self.moment, u=self.w)[u.rows], u.sizes)
+
+    def terms(self, values: list[Array] | None) -> list[Array] | None:
+        """Return M (u - c_u)/h, A(w) q, R^T M_op r, M r, scale G_Q (q - c_q) and A(w)^T r.
+
+        Parameters
+        ----------
+        values
+            Of each rank: u and q where it reaches; on rank 0.
         """
-        stage, weights = self.stage, self.stage.weights
+        stage = self.stage
         got = np.empty(len(stage.u.reach) + len(stage.q.reach))
         self.team.scatter(values, got)
-        u = _spread(got[: len(stage.u.reach)], stage.u)
-        self.at_q = q = _spread(got[len(stage.u.reach) :], stage.q)
-        self.r = r = stage.observed * u - self.u_alpha
-        self.w = w = u if weights.at_estimate else u - r
+        u, q = stage.spread(got)
+        r = stage.free_u * (u - self.w)
         rows, rows_q = stage.u.rows, stage.q.rows
-        A = stage.A.matrix("v", "q", self.moment, u=w, q=q)
-        C = A @ q if stage.linear else stage.A.vector("v", self.moment, u=w, q=q)
-        flux = stage.B.vector("v", self.moment, u=w) + C
-        rate = stage.mass @ ((u - self.c_u) / self.h)
-        first = rate + flux[rows] + weights.nu * (stage.PNP @ u) - self.source
-        gain = weights.gain
-        drive = (q - self.c_q) / (gain * self.h) + (weights.sigma / gain) * q
-        second = stage.gram @ drive - (A.T @ r)[rows_q]
+        A = self.A(q)
+        driven = A @ q if stage.linear else stage.A.vector("v", self.moment, u=self.w, q=q)
         mine = [
-            first * stage.free_u[rows],
-            stage.RM @ r,
-            stage.observed[rows] * (stage.mass @ r),
-            second * stage.free_q[rows_q],
+            stage.mass @ ((u - self.c_u) / self.h),
+            driven[rows],
+            stage.pull @ r,
+            stage.free_u[rows] * (stage.mass @ r),
+            self.scale * (stage.gram @ (q - self.c_q)),
+            (A.T @ r)[rows_q],
         ]
-        sizes = 3 * stage.u.sizes + stage.q.sizes
-        return self.team.gather(np.concatenate(mine), sizes)
+        return self.team.gather(np.concatenate(mine), 4 * stage.u.sizes + 2 * stage.q.sizes)
 
 
 def _spread(values: Array, share: Share) -> Array:
@@ -252,7 +259,7 @@ def _spread(values: Array, share: Share) -> Array:
 
 
 class SharedJacobian:
-    """A rank's rows of K at the point of the last residual of an equation.
+    """A rank's rows of K at a point.
 
     Parameters
     ----------
@@ -260,48 +267,50 @@ class SharedJacobian:
         Key of the `SharedEquation`.
     theta
         Of the damping.
-    sweep
-        Without what r adds to K.
+    scales
+        Dual norms that residuals of the two lines are relative to.
+    values
+        Of each rank: u and q where it reaches; on rank 0.
     border
-        Of each rank: its rows of b and a where b a^T is added to S; on rank 0. Empty: nothing is.
+        Of each rank: its rows of b and a where b a^T is added to S; on rank 0.
     """
 
     def __init__(
-        self, team: Team, equation: int, theta: float, sweep: bool, border: list[Array] | None
+        self,
+        team: Team,
+        equation: int,
+        theta: float,
+        scales: tuple[float, float],
+        values: list[Array] | None,
+        border: list[Array] | None,
     ) -> None:
         at: SharedEquation = team.part(equation)
         self.stage = stage = at.stage
         self.team = team
-        self.tolerance = TOLERANCE
-        blocks, weights, form = stage.blocks, stage.weights, stage.A
-        point = {"u": at.w, "q": at.at_q}
-        flux = form.data("v", "q", at.moment, **point)
-        forward = {
+        got = np.empty(len(stage.u.reach) + len(stage.q.reach))
+        team.scatter(values, got)
+        u, q = stage.spread(got)
+        A = at.A(q).data
+        state = {
             "M": stage.mass.data / at.h,
-            "B": stage.B.data("v", "u", at.moment, u=at.w),
-            "Au": form.data("v", "u", at.moment, **point),
-            "RMR": theta * stage.RM.data,
-            "PNP": weights.nu * stage.PNP.data,
+            "pull": theta * stage.pull.data,
             "fixed": np.ones(len(stage.u.rows)),
         }
-        back = {"A": flux}
-        metric = {
-            "G": (1.0 / at.h + weights.sigma) / weights.gain * stage.gram.data,
-            "fixed": np.ones(len(stage.q.rows)),
-        }
-        if not sweep:
-            back["Aq"] = form.data("q", "u", at.moment, v=at.r, **point)
-            if not stage.linear:
-                metric["Aqq"] = form.data("q", "q", at.moment, v=at.r, **point)
-        parts = {"uu": forward, "uq": {"A": flux}, "qu": back, "qq": metric}
-        data = {name: blocks[name].data(part) for name, part in parts.items()}
+        metric = {"G": at.scale * stage.gram.data, "fixed": np.ones(len(stage.q.rows))}
+        if not stage.linear:
+            r = stage.free_u * (u - at.w)
+            metric["Aqq"] = stage.A.data("q", "q", at.moment, u=at.w, v=r, q=q)
+        parts = {"uu": state, "uq": {"A": A}, "qu": {"A": A}, "qq": metric}
+        data = {name: stage.blocks[name].data(part) for name, part in parts.items()}
         finite = all(np.isfinite(values).all() for values in data.values())
         if not all(team.comm.allgather(finite)):
             raise LinearAlgebraError("The matrix holds values that are not finite.")
         self.S, self.A, self.Back, self.G = (
-            blocks[name].matrix(team, values) for name, values in data.items()
+            stage.blocks[name].matrix(team, values) for name, values in data.items()
         )
-        self.rate = stage.lumped * (1.0 / at.h + theta * stage.observed[stage.u.rows])
+        pairs = zip(stage.roots, scales, strict=True)
+        self.weights = np.concatenate([roots / (scale or 1.0) for roots, scale in pairs])
+        self.rate = stage.lumped * (1.0 / at.h + theta * stage.free_u[stage.u.rows])
         self.u, self.v = self.S.createVecs()
         self.q, self.p = self.G.createVecs()
         self.column, self.row = self._bordered(border)
@@ -327,7 +336,7 @@ class SharedJacobian:
 
         scaled = self.A.copy()
         scale = self.S.createVecLeft()
-        scale.setArray(self.stage.observed[self.stage.u.rows] / np.sqrt(self.rate))
+        scale.setArray(self.stage.free_u[self.stage.u.rows] / np.sqrt(self.rate))
         scaled.diagonalScale(L=scale)
         C = scaled.transposeMatMult(scaled)
         C.axpy(1.0, self.G, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
@@ -335,22 +344,23 @@ class SharedJacobian:
         scale.destroy()
         return C
 
-    def split(self, x: Any) -> tuple[Any, Any]:
-        """Return the parts of a vector as vectors of their own."""
-        values, n = x.getArray(readonly=True), len(self.stage.u.rows)
+    def split(self, values: Array) -> tuple[Any, Any]:
+        """Return the rows of u and of q as vectors."""
+        n = len(self.stage.u.rows)
         self.u.setArray(values[:n])
         self.q.setArray(values[n:])
         return self.u, self.q
 
     def mult(self, matrix: Any, x: Any, y: Any) -> None:
-        """Set y = K x; PETSc calls this."""
-        u, q = self.split(x)
+        """Set y = D K x with the weights D of the rows; PETSc calls this."""
+        u, q = self.split(x.getArray(readonly=True))
         self.S.mult(u, self.v)
         self.A.multAdd(q, self.v, self.v)
         self.v.axpy(self.row.dot(u), self.column)
         self.G.mult(q, self.p)
         self.Back.multAdd(u, self.p, self.p)
-        y.setArray(np.concatenate([self.v.getArray(readonly=True), self.p.getArray(readonly=True)]))
+        parts = [self.v.getArray(readonly=True), self.p.getArray(readonly=True)]
+        y.setArray(self.weights * np.concatenate(parts))
 
     def solve(self, pieces: list[Array] | None) -> list[Array] | None:
         """Return the rows of each rank of x with K x = b, to the tolerance."""
@@ -383,12 +393,13 @@ class SharedJacobian:
         ksp.setOperators(K)
         ksp.setType(PETSc.KSP.Type.GMRES)
         ksp.setGMRESRestart(ITERATIONS)
-        ksp.setTolerances(rtol=self.tolerance, atol=0.0, max_it=ITERATIONS)
+        ksp.setPCSide(PETSc.PC.Side.RIGHT)  # so that the residual is Newton's
+        ksp.setTolerances(rtol=TOLERANCE, atol=0.0, max_it=ITERATIONS)
         pc = ksp.getPC()
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(_Preconditioner(self, stage.hierarchies))
         x, b = K.createVecs()
-        b.setArray(mine)
+        b.setArray(self.weights * mine)
         ksp.solve(b, x)
         self.found: Array = x.getArray().copy()
         count, good = ksp.getIterationNumber(), ksp.getConvergedReason() > 0
@@ -415,35 +426,7 @@ class _Hierarchies:
         self.first = 0
         self.S = at.S.copy()
         self.C = at.schur()
-        self.state, self.metric = self._state(at.stage), self._cycle(self.C)
-
-    def _state(self, stage: SharedStage) -> Any:
-        """Return what solves with S: where R selects coefficients, the unobserved ones first.
-
-        Only they take part in B(w) and A(w) q, so that S without M_uo/h is a block triangle, and
-        its diagonal blocks are what multigrid is made for.
-        """
-        from petsc4py import PETSc
-
-        unseen, seen = stage.W * stage.free_u, stage.observed
-        if not (unseen.any() and seen.any()) or stage.weights.at_estimate:
-            return self._cycle(self.S)
-        pc = PETSc.PC().create(self.S.getComm())
-        pc.setOperators(self.S)
-        pc.setType(PETSc.PC.Type.FIELDSPLIT)
-        pc.setFieldSplitType(PETSc.PC.CompositeType.MULTIPLICATIVE)
-        mine = stage.u.number[stage.u.rows]
-        second = seen[stage.u.rows] != 0.0
-        for name, at in (("unseen", ~second), ("seen", second)):
-            rows = np.asarray(mine[at], dtype=PETSc.IntType)
-            members = PETSc.IS().createGeneral(rows, comm=self.S.getComm())
-            pc.setFieldSplitIS((name, members))
-            members.destroy()
-        pc.setUp()
-        for ksp in pc.getFieldSplitSubKSP():
-            ksp.setType(PETSc.KSP.Type.PREONLY)
-            ksp.getPC().setType(PETSc.PC.Type.GAMG)
-        return pc
+        self.state, self.metric = self._cycle(self.S), self._cycle(self.C)
 
     @staticmethod
     def _cycle(matrix: Any) -> Any:
@@ -461,24 +444,19 @@ class _Hierarchies:
             item.destroy()
 
 
+@dataclass(frozen=True, eq=False)
 class _Preconditioner:
-    """The block triangle of S and C, scaled so that u and q count the same; PETSc calls it."""
+    """The block triangle of S and C, an approximate inverse of K; PETSc calls it."""
 
-    def __init__(self, at: SharedJacobian, hierarchies: _Hierarchies) -> None:
-        self.at = at
-        self.hierarchies = hierarchies
-        self.scale: tuple[float, float] | None = None
+    at: SharedJacobian
+    hierarchies: _Hierarchies
 
     def apply(self, pc: Any, x: Any, y: Any) -> None:
         """Set y to the approximate solution for x."""
         at = self.at
-        u, q = at.split(x)
+        u, q = at.split(x.getArray(readonly=True) / at.weights)
         self.hierarchies.state.apply(u, at.v)
         at.Back.mult(at.v, at.p)
         at.p.aypx(-1.0, q)
         self.hierarchies.metric.apply(at.p, at.q)
-        if self.scale is None:
-            self.scale = (at.v.norm() or 1.0, at.q.norm() or 1.0)
-        first, second = self.scale
-        values = (at.v.getArray(readonly=True) / first, at.q.getArray(readonly=True) / second)
-        y.setArray(np.concatenate(values))
+        y.setArray(np.concatenate([at.v.getArray(readonly=True), at.q.getArray(readonly=True)]))

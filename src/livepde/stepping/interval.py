@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -121,10 +122,11 @@ class Advance:
     hold: bool = False
 
     def __post_init__(self) -> None:
-        whole = isinstance(self.halvings, int | np.integer) and not isinstance(self.halvings, bool)
-        if not (whole and 0 <= self.halvings <= MOST_HALVINGS):
+        given: Any = self.halvings
+        whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
+        if not (whole and 0 <= given <= MOST_HALVINGS):
             raise ConfigurationError(
-                f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {self.halvings!r}."
+                f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {given!r}."
             )
 
     def over(self, interval: Interval) -> Interval:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import scipy  # scipy.optimize is slow to load, and rarely needed
@@ -12,6 +13,7 @@ import scipy  # scipy.optimize is slow to load, and rarely needed
 from livepde.fem import Moment
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.blocks import BlockSolver
+from livepde.laws.coupled.distributed import DistributedSolver
 from livepde.laws.coupled.equation import (
     MadeAt,
     StageData,
@@ -115,17 +117,19 @@ def nearest_root(function: Callable[[float], float], start: float) -> float | No
 
     None: there is none within a factor of `WIDEST`.
     """
-    values = {0: function(start)}
-    if values[0] == 0.0:
+    # Each value is asked for once: that of a stage depends on where its iteration began.
+    values = cache(function)
+    first = values(start)
+    if first == 0.0:
         return start
-    outward = 1 if values[0] > 0.0 else -1  # where theta is too small a root lies above it
+    outward = 1 if first > 0.0 else -1  # where theta is too small a root lies above it
     for k in range(1, int(math.log(WIDEST) / math.log(STRIDE)) + 1):
         for end in (outward * k, -outward * k):
-            values[end] = function(start * STRIDE**end)
-            inner = values[end - 1 if end > 0 else end + 1]
-            if (values[end] > 0.0) != (inner > 0.0):
-                near, far = sorted((start * STRIDE**end, start * STRIDE ** (end - np.sign(end))))
-                return float(scipy.optimize.brentq(function, near, far, rtol=ACCURACY))
+            inner = end - 1 if end > 0 else end + 1
+            near, far = start * STRIDE**inner, start * STRIDE**end
+            if (values(far) > 0.0) != (values(near) > 0.0):
+                low, high = sorted((near, far))
+                return float(scipy.optimize.brentq(values, low, high, rtol=ACCURACY))
     return None
 
 
@@ -134,7 +138,8 @@ class CoupledStage:
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
-        self.solver = BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
+        large = DistributedSolver.of(terms) or BlockSolver.of(terms)
+        self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
         self.newton = newton
         self._last: tuple[Array, Factor] | None = None
 
