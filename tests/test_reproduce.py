@@ -45,24 +45,27 @@ def test_registry_names_its_experiments() -> None:
 
 def test_seed_shows_the_table_of_the_design(discrete: Outcome) -> None:
     assert discrete.ok, [check for check in discrete.checks if not check.ok]
-    (table,) = discrete.tables
-    *rows, auto = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    paper, (*kept, auto) = (
+        [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+        for table in discrete.tables
+    )
     assert auto["gain"] == "auto"
-    assert auto["t = 60"] == values(discrete)["error of q at t = 60, gradient, auto"] <= 0.06
-    assert [(row["gain"], row["c1"]) for row in rows] == list(seed.EXPECTED)
-    for row in rows:
-        assert row["q = 0"] == pytest.approx(1.0)
-        assert row["expected"] == seed.EXPECTED[row["gain"], row["c1"]]
-        assert row["t = 60"] == pytest.approx(row["expected"], rel=0.2)
-        assert row["divided steps"] == 0
-    assert values(discrete)["largest error of q at t = 60, gain 1e4"] <= 0.05
+    assert auto["t = 60"] == values(discrete)["error of q at t = 60, gradient, auto"]
+    for rows, expected in ((paper, seed.EXPECTED), (kept, seed.WITH_SLOPES)):
+        assert [(row["gain"], row["c1"]) for row in rows] == list(expected)
+        for row in rows:
+            assert row["q = 0"] == pytest.approx(1.0)
+            assert row["expected"] == expected[row["gain"], row["c1"]]
+            assert row["t = 60"] == pytest.approx(row["expected"], rel=0.005)
+            assert row["divided steps"] == 0
+    assert values(discrete)["largest error of q at t = 60, gain 1e4"] <= 0.071
     json.dumps(discrete.to_dict(), allow_nan=False)
 
 
 def test_seed_with_exact_data_says_that_truncation_hides_q(analytic: Outcome) -> None:
     assert analytic.ok
-    errors = [row[analytic.tables[0].columns.index("t = 60")] for row in analytic.tables[0].rows]
-    assert min(errors) > 0.5
+    errors = [row[analytic.tables[0].columns.index("t = 6")] for row in analytic.tables[0].rows]
+    assert min(errors) > 2.0
     (note,) = analytic.notes
     assert "truncation error" in note
     assert "hides q" in note
@@ -105,7 +108,7 @@ def test_seed_dataset_is_the_run_with_the_highest_gain(discrete: Outcome) -> Non
     assert data.sizes["time"] == 101
     exact = seed.q_true([data["x"].values])
     last = data["q"].values[-1]
-    assert np.linalg.norm(last - exact) < 0.05 * np.linalg.norm(exact)
+    assert np.linalg.norm(last - exact) < 0.07 * np.linalg.norm(exact)
     assert not any("true" in str(name) for name in data)  # a run never holds the truth
 
 
@@ -166,7 +169,8 @@ def test_progress_shows_a_bar_for_every_run(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr("livepde.reproduce.experiment.watched", spy)
     EXPERIMENTS["seed"].run(progress=True)
-    assert shown == [*(seed._label(*case) for case in seed.EXPECTED), "gradient, auto"]
+    cases = [seed._label(*case) for case in seed.EXPECTED]
+    assert shown == [*cases, *cases, "gradient, auto"]
     assert shown[-2] == "gain 1e4, c1 = 1"
 
 

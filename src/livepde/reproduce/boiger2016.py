@@ -4,8 +4,11 @@ First figure: partial exact data, t = 0, 6, 15, 30, 45, 60; q left, u right. Sec
 10 % noise to t = 75; above q at several times, below ||e||_Q^2 + ||r||_X^2 over time.
 
 The paper says "Gaussian noise with different noise levels", constant mu and nu found by hindsight,
-and no more: neither where the noise enters, nor the scale of the inner product of Q (our `gain`).
-So the second figure is run with two noise models, both of relative size E ||d||_Z = level ||z||_Z
+and no more: neither where the noise enters, nor the scale of the inner product of Q (our `gain`),
+nor where its data come from. The first figure rests on a gain of 100 and on data of the same
+discretisation ("discrete"): with gain 1 the error of q is 0.84, and data of the exact u* hide q
+(`livepde reproduce seed`). All settings that the paper does name are its own (`livepde.paper`).
+The second figure is run with two noise models, both of relative size E ||d||_Z = level ||z||_Z
 in every sample and independent from sample to sample:
 
     nodal     independent in every coefficient, values and slopes (`RelativeNoise`), alpha = 0
@@ -18,15 +21,15 @@ mu and gain are of the paper's hindsight kind: picked by looking at runs whose t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
 
-from livepde import plots
+from livepde import paper, plots
 from livepde.identifier import Identifier, Sample
-from livepde.laws import AnyLaw, ConstantDamping, GradientLaw, ResidualDamping
+from livepde.laws import AnyLaw, ConstantDamping, ResidualDamping
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.reproduce import seed, seed_excited
@@ -42,11 +45,11 @@ SEEDS = (0, 1, 2, 3, 4)
 END = 75.0
 BAND = 4  # modes of the band-limited noise
 SHOWN = (0.0, 6.0, 15.0, 30.0, 45.0, 75.0)
-FIRST = GradientLaw(gain=100.0, damping=ResidualDamping(1.0))
-NOISY = GradientLaw(gain=100.0, damping=ConstantDamping(mu=1.0))
-STIFF = GradientLaw(gain=100.0, damping=ConstantDamping(mu=10.0))
-EXCITED = GradientLaw(gain=40.0, damping=ConstantDamping(mu=1.0))
-BIASED = GradientLaw(gain=100.0, damping=ResidualDamping(1.0), nu=0.1)
+NUS = (0.0, 0.01, 0.1)  # of the first figure; the paper varies nu between 0.1 and 1000
+FIRST = paper.law(100.0, ResidualDamping(1.0))
+NOISY = paper.law(100.0, ConstantDamping(mu=1.0))
+STIFF = paper.law(100.0, ConstantDamping(mu=10.0))
+EXCITED = paper.law(40.0, ConstantDamping(mu=1.0))
 
 Kind = Literal["nodal", "band"]
 Runs = dict[tuple[str, float], "Ensemble"]
@@ -171,7 +174,7 @@ def ensemble(
     result = Result(model, twin.observed, None)
     numbers = watched(seeds, len(seeds), f"{kind} noise, {level:.2%}") if progress else seeds
     for number in numbers:
-        identifier = Identifier(model, twin.observation, law, q0=0.0, u0=case.start)
+        identifier = Identifier(model, twin.observation, law, q0=0.0, u0=case.start, halvings=0)
         estimates = []
         for sample in case.samples(kind, level, number):
             estimate = identifier.step(sample.t, sample.z)
@@ -202,10 +205,8 @@ def _squares(rows: Array, gram: Any) -> Array:
 
 def paper_case(q_true: Any = seed.q_true) -> NoisyTwin:
     """Return the paper's example, partial data, to t = 75."""
-    model, omega = seed.build()
     times = 0.6 * np.arange(round(END / 0.6) + 1)
-    twin = Twin(model=model, observation=omega, q_true=q_true, u_true=seed.u_true, times=times)
-    return NoisyTwin(twin, lambda x: seed.u_true(x, 0.0))
+    return NoisyTwin(seed.twin_of(clamped=True, q_true=q_true, times=times), seed.start)
 
 
 def excited_case() -> NoisyTwin:
@@ -225,26 +226,22 @@ def excited_case() -> NoisyTwin:
 # --- first figure --------------------------------------------------------------------------------
 
 
-def first(progress: bool = False) -> tuple[Track, Track, Table]:
-    """Run the first figure, without and with a nu of the paper's range."""
-    model, omega = seed.build()
-    twin = Twin(
-        model=model,
-        observation=omega,
-        q_true=seed.q_true,
-        u_true=seed.u_true,
-        times=seed.TIMES,
-    )
-    runs = []
-    for law in (FIRST, BIASED):
-        identifier = Identifier(model, omega, law, q0=0.0, u0=lambda x: seed.u_true(x, 0.0))
-        runs.append(track(identifier, twin, f"first figure, nu = {law.nu:g}", progress))
+def first(progress: bool = False) -> tuple[dict[float, Track], Table]:
+    """Run the first figure, without nu and with two of them."""
+    twin = seed.twin_of(clamped=True)
+    runs = {}
+    for nu in NUS:
+        law = replace(FIRST, nu=nu)
+        identifier = Identifier(
+            twin.model, twin.observation, law, q0=0.0, u0=seed.start, halvings=0
+        )
+        runs[nu] = track(identifier, twin, f"first figure, nu = {nu:g}", progress)
     table = Table(
         "First figure: relative L2 error of q, partial exact data, gain 100, c1 = 1",
-        ["t", "q = 0", "nu = 0", "nu = 0.1"],
-        [[t, twin.baseline(0.0), *(run.error(t) for run in runs)] for t in seed.SHOWN],
+        ["t", "q = 0", *(f"nu = {nu:g}" for nu in NUS)],
+        [[t, twin.baseline(0.0), *(run.error(t) for run in runs.values())] for t in seed.SHOWN],
     )
-    return runs[0], runs[1], table
+    return runs, table
 
 
 # --- second figure -------------------------------------------------------------------------------
@@ -384,27 +381,19 @@ def semiconvergence(runs: Runs, levels: Sequence[float]) -> list[Check]:
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     """Run both figures and the second one for the excited twin."""
-    plain, biased, table = first(progress)
+    runs, table = first(progress)
+    plain = runs[0.0]
     paper, paper_table, alone = paper_noise(progress=progress)
     excited, excited_table = excited_noise(progress=progress)
-    x, q = _profile(plain)
     checks = [
-        Check("first figure: error of q at t = 60", plain.error(60.0), CLOSE, "<="),
-        Check("first figure: relative error of u at t = 60", plain.u_error, TRACKED, "<="),
-        Check(
-            "first figure: centre of gravity of q at t = 60 (exact 0.5)",
-            float((x * q).sum() / q.sum()),
-            seed.SHIFTED,
-            ">=",
-        ),
-        Check("first figure: error of q at t = 60 with nu = 0.1", biased.error(60.0), 1.0, ">="),
+        *first_checks(runs),
         *semiconvergence(excited, LEVELS),
         *_hidden(paper, alone),
     ]
     return Outcome(
         tables=[table, paper_table, excited_table],
         checks=checks,
-        notes=_words(biased, alone),
+        notes=_words(runs, alone),
         dataset=plain.result.to_xarray(),
         figures={
             "figure1": partial(_first, plain),
@@ -413,6 +402,30 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
             "figure2-excited": partial(_second, excited, "band, mu = 1", seed_excited, None),
         },
     )
+
+
+def first_checks(runs: dict[float, Track]) -> list[Check]:
+    """Return the checks of the first figure."""
+    plain = runs[0.0]
+    x, q = _profile(plain)
+    checks = [
+        Check(
+            f"first figure: {what} at t = 60, nu = {nu:g}",
+            value,
+            (expected * (1 - seed.TOLERANCE), expected * (1 + seed.TOLERANCE)),
+            "in",
+        )
+        for nu, pair in FIGURE1.items()
+        for what, value, expected in zip(
+            ("error of q", "relative error of u"),
+            (runs[nu].error(60.0), runs[nu].u_error),
+            pair,
+            strict=True,
+        )
+    ]
+    centre = float((x * q).sum() / q.sum())
+    name = "first figure: centre of gravity of q at t = 60 (exact 0.5)"
+    return [*checks, Check(name, centre, seed.SHIFTED, ">=")]
 
 
 def _hidden(runs: Runs, alone: dict[float, float]) -> list[Check]:
@@ -442,8 +455,8 @@ def _hidden(runs: Runs, alone: dict[float, float]) -> list[Check]:
             ">=",
         ),
         Check(
-            "paper's example, 10 % band noise: error of q at t = 75, mu = 10",
-            error("band, mu = 10", worst),
+            "paper's example, 1 % band noise: error of q at t = 75, mu = 10",
+            error("band, mu = 10", LEVELS[0]),
             (0.9, 1.1),
             "in",
         ),
@@ -461,7 +474,11 @@ def _profile(found: Track) -> tuple[Array, Array]:
     return data["x"].values, data["q"].values[-1]
 
 
-def _words(biased: Track, alone: dict[float, float]) -> list[str]:
+def _words(runs: dict[float, Track], alone: dict[float, float]) -> list[str]:
+    drawn = "; ".join(
+        f"with {nu:g} the error of q is {run.error(60.0):.2g} and that of u {run.u_error:.2g}"
+        for nu, run in runs.items()
+    )
     made = ", ".join(f"{size:.2g} at {level:.0%}" for level, size in alone.items())
     return [
         "Energy is ||e||_Q^2 + ||r||_X^2 with the plain inner product of Q (H1), e = q^ - q*, "
@@ -470,12 +487,15 @@ def _words(biased: Track, alone: dict[float, float]) -> list[str]:
         "nodal noise is independent in every coefficient, slopes included.",
         "mu, nu and the gain are chosen with the truth in sight, as in the paper (there: the mu "
         "and nu of least ||R u^ - R u*||): no online rule gives them.",
-        "nu stays 0. nu = 0.1, the least of the paper's range, draws P u^ down, most of all where "
-        f"it jumps at the ends of omega: the error of u is {biased.u_error:.1%} at t = 60, while "
-        "all of q* moves u by 0.06 %, and the first figure is lost.",
+        "The first figure rests on two things that the paper does not name: a gain of 100 and data "
+        "of the same discretisation. With gain 1 the error of q is 0.84; data of the exact u* hide "
+        "q behind the truncation error of the time step (`livepde reproduce seed`).",
+        f"nu: {drawn}. P u^ is drawn to zero and not to P u*; all of q* moves u by 0.06 % only. At "
+        "nu > 0 a step can have several solutions, all with residuals at rounding level; taken is "
+        "the one that continues the step before, here and in reference.py.",
         "On the paper's example semiconvergence does not show at 1, 5 and 10 %, because q* moves "
         "u by 0.06 % at most, less than any of these noises. Either the pull mu/||r||_V~ is so "
-        "stiff that q^ stays at 0 (error 1: mu = 10, and mu = 1 at 1 %), or q^ follows the noise: "
+        "stiff that q^ stays near 0 (mu = 10: error 1.0, 1.1 and 1.2), or q^ follows the noise: "
         f"where q* = 0 the same noise makes a q^ of {made} times ||q*||. At a hundredth of the "
         "levels the law of the first figure finds q* (0.01 %) or loses it (0.1 %).",
         "Nodal noise (alpha = 0, as the paper allows) is differentiated by B(w) in the state "
@@ -548,8 +568,9 @@ BOIGER2016 = Experiment(
 )
 
 # What it must show.
-CLOSE = 0.15  # relative L2 error of q, first figure
-TRACKED = 1e-3  # relative error of u in X, first figure
+# First figure: nu -> relative errors of q and of u at t = 60. The dense implementation in
+# reference.py gives the same, Setting(..., gain=100, c1=1, nu=nu) with the space of `seed`.
+FIGURE1 = {0.0: (0.1333, 2.45e-4), 0.01: (0.534, 6.54e-3), 0.1: (3.08, 0.0463)}
 EARLIER = 5.0  # how much earlier the least error comes at the next noise level, mean of five seeds
 FALLEN = 0.3  # 1 %: the error at the end over that at the start
 LEAST = 0.8  # 10 %: it falls to less than this share,

@@ -10,8 +10,10 @@ with q* and u* of the excited twin, Q = H^1, q^(0) = 0 and the operators M and N
   the unobserved part grow, the faster the shorter they are. So it cannot be simulated, and the data
   come from the manufactured state u*, which a discrete source makes an exact discrete solution.
 
-For D >= 0 the dynamics themselves damp the unobserved error p, and nu = 0 is best: nu > 0 damps P u
-itself and biases it. For D < 0 only nu P N P u holds p, for nu > 1, since N has |D|.
+Each is run with nu = 0, 0.1 and 2. nu P N P u draws P u to zero and not to P u*, so p grows with nu
+where D >= 0: there the dynamics damp p by themselves. The error of q does not follow p: for the
+varying D nu = 0.1 improves it and nu = 2 spoils it; where D vanishes nu = 2 is the best of the
+three. For D < 0 only nu P N P u holds p, and for nu > 1 only, since N has |D|.
 """
 
 from __future__ import annotations
@@ -164,12 +166,19 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     )
     held, lost = courses["antidiffusion", NU], courses["antidiffusion", 0.0]
     checks = [
-        Check(f"error of q, {name}, nu = 0", float(courses[name, 0.0].errors[-1]), bound, "<=")
-        for name, bound in EXPECTED.items()
+        Check(
+            f"error of q, {name}, nu = {nu:g}",
+            float(courses[name, nu].errors[-1]),
+            (expected * (1 - TOLERANCE), expected * (1 + TOLERANCE)),
+            "in",
+        )
+        for (name, nu), expected in EXPECTED.items()
     ]
+    plain, better = (float(courses["varying", nu].errors[-1]) for nu in (0.0, 0.1))
+    checks.append(Check("error of q, varying: nu = 0.1 over nu = 0", better / plain, HELPS, "<="))
     checks += [
         Check(f"largest |p|, {name}, nu = 0", float(courses[name, 0.0].hidden.max()), BOUNDED, "<=")
-        for name in EXPECTED
+        for name in ("varying", "degenerate")
     ]
     checks += [
         Check("largest |p|, antidiffusion, nu = 0", float(lost.hidden.max()), FAILED, ">="),
@@ -188,8 +197,10 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         notes=[
             f"Antidiffusion, nu = 0: p grows until the method fails, at t = {lost.times[-1]:.2f}. "
             f"With nu = {NU:g} it stays below {held.hidden.max():.2f}, to t = {held.times[-1]:g}; "
-            "it does not vanish, since nu P N P u pulls P u to zero and not to P u*. Where D >= 0 "
-            "that bias is all that nu > 0 does, and the error of q shows it.",
+            "it does not vanish, since nu P N P u pulls P u to zero and not to P u*.",
+            "Where D >= 0 the process damps p itself and nu > 0 makes p larger; q need not suffer: "
+            f"varying, its error is {plain:.3f} with nu = 0, {better:.3f} with nu = 0.1 and "
+            f"{courses['varying', NU].errors[-1]:.2f} with nu = {NU:g}.",
             "The part outside of omega is not observed: there the law only extends q smoothly.",
         ],
         dataset=held.result.to_xarray(),
@@ -212,8 +223,20 @@ DEGENERATE = Experiment(
     conduct=run,
 )
 
-# What it must show: relative L2 error of q at the end with nu = 0; bounds on |p|.
+# What it must show: (D, nu) -> relative L2 error of q at the end, bounds on |p|. "varying" was also
+# measured with the dense implementation in reference.py, its error against the interpolant of q*:
+# 0.1963 with nu = 0, 0.1160 with nu = 0.1.
 NUS = (0.0, 0.1, 2.0)
 NU = 2.0
-EXPECTED = {"varying": 0.15, "degenerate": 0.25}
+EXPECTED = {
+    ("varying", 0.0): 0.198,
+    ("varying", 0.1): 0.117,
+    ("varying", 2.0): 0.812,
+    ("degenerate", 0.0): 0.213,
+    ("degenerate", 0.1): 0.210,
+    ("degenerate", 2.0): 0.179,
+    ("antidiffusion", 2.0): 0.799,
+}
+TOLERANCE = 0.02
+HELPS = 0.65
 BOUNDED = 1.0

@@ -20,10 +20,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from livepde import plots
+from livepde import paper, plots
 from livepde.errors import ConfigurationError
-from livepde.identifier import Identifier, Sample
-from livepde.laws import GradientLaw, ResidualDamping
+from livepde.identifier import Sample
+from livepde.laws import ResidualDamping
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Discrepancy, Full, Pseudoinverse, Tikhonov
@@ -138,11 +138,14 @@ def noisy_run(
         left = level * smoother.noise_factor(float(twin.times[1] - twin.times[0]))
         full = Full(reconstruction=Tikhonov("V", Discrepancy(TAU, level=left)))
         stream = smoothed = smoother(stream)
-    law = GradientLaw(
-        gain=GAIN if gain is None else gain, damping=ResidualDamping(C1 if c1 is None else c1)
+    identifier = paper.identifier(
+        model,
+        full,
+        gain=GAIN if gain is None else gain,
+        damping=ResidualDamping(C1 if c1 is None else c1),
+        D=seed_excited.D,
+        u0=lambda x: seed_excited.u_true(x, 0.0),
     )
-    start = lambda x: seed_excited.u_true(x, 0.0)  # noqa: E731
-    identifier = Identifier(model, full, law, q0=0.0, u0=start)
     label = f"{level:.0%}, seed {seed}, {'smoothed' if smoothing else 'raw'}"
     errors, rates = [], []
     for sample in watched(stream, len(twin), label) if progress else stream:

@@ -2,7 +2,8 @@
 
 The paper's example and the excited twin, exact discrete data, all of the state and a part of it
 observed; the laws of Boiger and Kaltenbacher (2016), Baumeister et al. (1997) and Kügler (2010)
-through the same model, observation and coupled stage, each with one gain and three pulls.
+through the same model, observation and coupled stage, each with one gain and three pulls, all with
+the strict steps of `livepde.paper`. The slopes at the ends are kept.
 """
 
 from __future__ import annotations
@@ -11,10 +12,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from livepde import plots
+from livepde import paper, plots
 from livepde.errors import LawError
 from livepde.identifier import Identifier
-from livepde.laws import AnyLaw, BaumeisterLaw, GradientLaw, KueglerLaw, ResidualDamping
+from livepde.laws import AnyLaw, BaumeisterLaw, KueglerLaw, ResidualDamping
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Experiment, Track, track
@@ -36,8 +37,8 @@ Key = tuple[str, str, str, float]
 def law(name: str, gain: float, pull: float) -> AnyLaw:
     """Return a law by its name: the pull is c_1 of the paper's rule, or mu."""
     if name == LAWS[0]:
-        return GradientLaw(gain, ResidualDamping(pull))
-    return (BaumeisterLaw if name == LAWS[1] else KueglerLaw)(gain, pull)
+        return paper.law(gain, ResidualDamping(pull))
+    return (BaumeisterLaw if name == LAWS[1] else KueglerLaw)(gain, pull, paper.STRICT)
 
 
 def observations() -> dict[str, Observation]:
@@ -67,7 +68,12 @@ def compare(progress: bool = False) -> tuple[dict[Key, Track], list[list[Any]], 
                     head = [problem, seen, name, gain, pull, twin.baseline(0.0)]
                     try:
                         identifier = Identifier(
-                            model, observation, law(name, gain, pull), q0=0.0, u0=start
+                            model,
+                            observation,
+                            law(name, gain, pull),
+                            q0=0.0,
+                            u0=start,
+                            halvings=0,
                         )
                     except LawError as error:
                         refusal = str(error)

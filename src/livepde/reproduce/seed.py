@@ -116,8 +116,9 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         other = twin_of(clamped=False)
         kept = {case: identify(other, *case, progress) for case in WITH_SLOPES}
         auto = _auto(other, progress)
-        tables.append(_table("the same, slopes at the ends kept", other, kept, WITH_SLOPES))
-        tables[1].rows.append(_row(other, "auto", None, auto, None))
+        tables.append(
+            _table("the same, slopes at the ends kept", other, kept, WITH_SLOPES, auto=auto)
+        )
         checks, notes = _learned(tracks, kept, _distance(nothing, twin))
         checks.append(Check("error of q at t = 60, gradient, auto", auto.error(60.0), AUTO, "<="))
     else:
@@ -140,9 +141,12 @@ def _table(
     twin: Twin,
     tracks: dict[tuple[float, float], Track],
     known: dict[tuple[float, float], float],
+    auto: Track | None = None,
 ) -> Table:
     columns = ["gain", "c1", "q = 0", "t = 6", "t = 60", "expected", "error of u", "divided steps"]
     rows = [_row(twin, *case, found, known.get(case)) for case, found in tracks.items()]
+    if auto is not None:
+        rows.append(_row(twin, "auto", None, auto, None))
     return Table(title, columns, rows)
 
 
@@ -219,20 +223,21 @@ def _learned(
 
 def _hidden(twin: Twin, tracks: dict[tuple[float, float], Track], effect: float) -> tuple[Any, Any]:
     """Checks and words for data of the exact solution: the scheme's own error hides q."""
-    errors = [found.error(60.0) for found in tracks.values()]
+    early, late = ([found.error(t) for found in tracks.values()] for t in (6.0, 60.0))
     truncation = _distance(twin_of(clamped=False), twin)
     source = "the exact u*" if twin.truth == "analytic" else "a run with 20 times smaller steps"
     checks = [
-        Check("smallest error of q at t = 60, any gain", min(errors), HIDDEN, ">="),
+        Check("smallest error of q at t = 6, any gain", min(early), HIDDEN, ">="),
         Check("truncation error over effect of q* on u", truncation / effect, 10.0, ">="),
     ]
     notes = [
         f"These data are those of {source}. The truncation error of implicit Euler with h = 0.6 "
         f"hides q: it moves u by up to {truncation:.1%}, while q* against q = 0 moves it by at "
         f"most {effect:.2%}. The method explains that difference by q, so the relative error of q "
-        f"at t = 60 is {min(errors):.1f} to {max(errors):.1f} whatever the gain, against 1.0 for "
-        "q = 0. This is a limit of the time step, not of the method: with --truth discrete, where "
-        "data and estimator share the scheme, it finds q.",
+        f"at t = 6 is {min(early):.1f} to {max(early):.1f}, whatever the gain, against 1.0 for "
+        f"q = 0; at t = 60, where the state hardly moves any more, {min(late):.1f} to "
+        f"{max(late):.1f}. This is a limit of the time step, not of the method: with --truth "
+        "discrete, where data and estimator share the scheme, it finds q.",
     ]
     return checks, notes
 
@@ -296,4 +301,4 @@ SETTLED = ((1e4, 0.1), (1e4, 1.0))
 SETTLED_FROM = 6.0
 SMALL = 0.071
 SHIFTED = 0.51  # the paper's figure: shifted to the right
-HIDDEN = 0.5  # with analytic truth the error of q stays above this for every gain
+HIDDEN = 2.0  # with another truth the error of q at t = 6 is above this for every gain
