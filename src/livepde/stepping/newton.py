@@ -206,8 +206,11 @@ class _Iteration(Generic[Point]):
                 factor, factors = self._factor(at, last), factors - 1
             new, update = self._updated(at, factor)
             if fresh and not new.size < at.size:
-                if self.equation.limited(at, allowed):
-                    break
+                # A line at rounding hides what the update did to the other one.
+                limited = (p for p in (at, new) if self.equation.limited(p, allowed))
+                done = next(limited, None)
+                if done is not None:
+                    return Solution(done, self.updates, self.made)
                 new = self._damped(at, update)
             refresh = near.refresh if factor is near.factor else newton.refresh
             slow = not new.size <= refresh * at.size
