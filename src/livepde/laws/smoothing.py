@@ -19,8 +19,7 @@ none, and there from products of successive differences in time,
 
 noise turns back, what moves goes on. It is not more than the observation states. Exact data turn
 back nowhere, so alpha is zero. Noise is independent from sensor to sensor with the deviations that
-the observation states, or white in Z if it states none. Nothing is learned from the first samples,
-which cannot tell the level.
+the observation states, or white in Z if it states none.
 """
 
 from __future__ import annotations
@@ -40,7 +39,6 @@ ORDER = 4  # of the iterated Tikhonov method
 GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
 LARGEST = 3000  # sensors: the modes are those of a dense matrix
 FEWEST = 8  # modes below which their rougher half says nothing about noise
-WAIT = 4  # samples before the level is believed: two products
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,10 +152,6 @@ class Smoother:
             z=np.stack([balance.z[1], z]),
             boundary=np.stack([balance.boundary[1], boundary]),
         )
-
-    def waits(self, balance: Balance) -> bool:
-        """Return true while the samples cannot tell the level: nothing is learned from them."""
-        return self.size >= FEWEST and balance.samples < WAIT
 
     def alpha(self, balance: Balance) -> float:
         """Return the first alpha where smoothing takes as much as noise has brought."""
