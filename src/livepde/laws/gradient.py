@@ -187,8 +187,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
         r = R(u) - u_alpha
         learned = state.metric
         if not frozen:
-            error = stages.equation_error()
-            after = Transition(forms, end[n:], u - r, error, moment, length)
+            change, error = end[n:] - state.q, stages.equation_error()
+            after = Transition(forms, end[n:], u - r, change, error, moment, length)
             learned = work.metric.learn(state.metric, after)
         if doubt := work.metric.doubt(learned, q):
             predicted = work.problem.predict(state.u, state.q, moment)

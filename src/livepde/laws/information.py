@@ -45,8 +45,8 @@ data, with tests within omega, fade slowly: the first samples are the least smoo
 hold fluxes of P u, which was wrong at first, and fade faster; since P u goes on to be wrong by what
 the data cannot tell, S is not taken below a small share of their J.
 
-H is renewed when S, the trace or an entry of the diagonal of J have changed by a factor of
-1 + `RENEWED`. In between a step is one of quasi-Newton's, and factors serve on.
+H is renewed when S or the trace of J have changed by more than `AGED`, or J along the last step has
+grown by more than `STEEPER`. In between a step is one of quasi-Newton's, and factors serve on.
 
 Every number above is a ratio of quantities with the same units: scaling u, q (with `std`), x or t
 scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
@@ -97,7 +97,8 @@ COARSE = 1e-3  # relative accuracy of those modes
 ROUNDING = 1e-12  # relative: what is smaller is zero
 FORGETS = 4.0  # power of time that weighs a sample in the mean of S
 FADES = np.array([1.0, 4.0])  # power of time that weighs a sample in J: its rows of both kinds
-RENEWED = 0.5  # relative change of J or S, or of the curvature in a direction, that renews H
+AGED = 1.0  # relative change of S, or of the trace of J, that renews H
+STEEPER = 0.25  # relative growth of J along a step that renews H: at 1 steps would go to and fro
 MOST_NORMAL = 8  # sets of sensors of which normal equations are kept
 MOST_DENSE = 4000  # unknowns of which J may be dense
 CHANCE = 1e-6  # that a right model leaves its prior
@@ -318,22 +319,27 @@ class InformationMetric(MetricRule[Information]):
             elapsed=elapsed,
             samples=state.samples + 1,
         )
-        return self._renewed(learned)
+        return self._renewed(learned, after.change)
 
-    def _renewed(self, state: Information) -> Information:
-        """Return the state with an H that is new if the last one has aged."""
+    def _renewed(self, state: Information, change: Array) -> Information:
+        """Return the state with an H that is new if the last one has aged.
+
+        Parameters
+        ----------
+        change
+            The last change of q, shape (m,).
+        """
         if not np.all(state.seen > 0.0):
             return state
         least = float((state.total / RESOLUTION).sum())
         S, total = max(float((state.power / state.seen).max()), least), float(state.total.sum())
-        J, most = state.matrix.sum(axis=0), 1.0 + RENEWED
-        prior = state.spread * self.diagonal
-        if (
-            S / most <= state.spread <= S * most
-            and total / most <= state.weighed <= total * most
-            and np.all(prior + J[self.on_diagonal] <= most * (prior + state.held[self.on_diagonal]))
-        ):
-            return state
+        J = state.matrix.sum(axis=0)
+        old, most = (state.spread, state.weighed), 1.0 + AGED
+        if all(new / most <= last <= new * most for new, last in zip((S, total), old, strict=True)):
+            prior = state.spread * float(change @ self.model.Q.dual(change))
+            held, now = (self.pattern.compact(data) @ change @ change for data in (state.held, J))
+            if prior + now <= (1.0 + STEEPER) * (prior + held):
+                return state
         return replace(state, spread=S, held=J, weighed=total)
 
     def departure(self, state: Information, q: Array) -> float:

@@ -60,6 +60,8 @@ class Transition:
         The forms of the stage.
     q, w
         Parameter as the stage has found it, and w = u_alpha + P u, at its end.
+    change
+        By how much q has changed, shape (m,).
     error
         Equation error of the data at its end, R^T eps = -theta R^T M_op r - R^T M r', shape (n,).
     moment, length
@@ -69,6 +71,7 @@ class Transition:
     forms: StageForms
     q: Array
     w: Array
+    change: Array
     error: Array
     moment: Moment
     length: float
