@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["STATUS_CODES", "Layout", "Record", "Records", "Snapshot", "bare"]
 
-STATUS_CODES = ("ok", "not_converged", "not_finite", "singular")
+STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,8 @@ REMEDIES = {
     "ok": "",
     "not_converged": "Take a smaller dt_max, a smaller gain, or less damping.",
     "not_finite": "Check the sample, the bounds of the unknowns, and the gain.",
+    "departed": "Check the model and the sensors, give the unknowns a std= that allows for such "
+    "values, or give a number for gain.",
     "singular": "Check the model's forms at the current estimate, or take a smaller dt_max.",
 }
 
@@ -33,7 +35,7 @@ class Status:
     Attributes
     ----------
     code
-        "ok", "not_converged", "not_finite" or "singular".
+        "ok", "not_converged", "not_finite", "singular" or "departed".
     detail
         What happened, empty if all is well.
     """

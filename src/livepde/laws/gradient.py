@@ -14,7 +14,7 @@ from livepde.laws.coupled import KeptFactor
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.excitation import Excitation, ExcitationGate
 from livepde.laws.gradient_parts import GradientParts, StageSequence, constant_parts, tuned_parts
-from livepde.laws.metrics import Transition
+from livepde.laws.metrics import StepBegin, Transition
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance
@@ -169,10 +169,10 @@ class GradientLaw(Law[GradientParts, GradientState]):
         u_alpha = path.at(interval.t1).u
         w = u_alpha + state.u - R(state.u)
         same = np.array_equal(interval.present, state.present)
-        before = Transition(forms, state.q, np.zeros(n), w, moment, length, same)
-        frozen = not path.ready or work.closed(state.excitation)
+        begin = StepBegin(state.q, w, moment, length)
+        frozen = work.closed(state.excitation)
         rule = work.metric.frozen if frozen else work.metric.step
-        metric = rule(state.metric, forms, before)
+        metric = rule(state.metric, forms, begin)
 
         # u and q together, by coupled stages
         predicts = same and frozen == state.frozen
@@ -187,8 +187,12 @@ class GradientLaw(Law[GradientParts, GradientState]):
         r = R(u) - u_alpha
         learned = state.metric
         if not frozen:
-            after = Transition(forms, q, r, u - r, moment, length, same)
+            change, error = end[n:] - state.q, stages.equation_error()
+            after = Transition(forms, end[n:], u - r, change, error, moment, length)
             learned = work.metric.learn(state.metric, after)
+        if doubt := work.metric.doubt(learned, q):
+            predicted = work.problem.predict(state.u, state.q, moment)
+            return state, Report(Status("departed", doubt), predicted)
         new = GradientState(
             u=u,
             q=q,
@@ -204,7 +208,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
         notes: dict[str, Any] = {"residual": lambda: model.X.norm(r), **path.notes()}
         notes |= work.metric.notes(learned, q, length)
         if frozen:
-            notes["at_rest" if path.ready else "waits"] = 1.0
+            notes["at_rest"] = 1.0
         return new, Report(Status(), work.problem.predict(u, q, moment), steps, Notes(notes))
 
     def belief(self, work: GradientParts, state: GradientState) -> Belief:

@@ -14,13 +14,13 @@ from livepde.laws.coupled import (
     CoupledStage,
     KeptFactor,
     StageForms,
+    StageIterate,
     StageProblem,
     StageTerms,
 )
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.excitation import Excitation, ExcitationGate, Probes
 from livepde.laws.information import InformationMetric
-from livepde.laws.memory import Learning
 from livepde.laws.metrics import ConstantMetric, MetricRule, MetricStep
 from livepde.laws.observed_part import (
     GeneralizedInverse,
@@ -132,6 +132,7 @@ class StageSequence:
         self.metric = metric
         self.slope = rate
         self.kept = kept if rate is not None else KeptFactor.none()
+        self._last: tuple[StageProblem, float, StageIterate] | None = None
 
     def __call__(self, c: Array, t: float, h: float) -> Array:
         """Return y = (u, q) at t of the stage that begins at c; raises `StepFailed`."""
@@ -150,8 +151,24 @@ class StageSequence:
             return moved
 
         predicted = None if self.slope is None else follows + h * self.slope
-        y, self.kept = self.coupled.solve(problem, start, predicted, self.kept)
-        return y
+        at, self.kept = self.coupled.solve(problem, start, predicted, self.kept)
+        self._last = problem, t, at
+        return at.y
+
+    def equation_error(self) -> Array:
+        """Return R^T eps at the end, the equation error of the data, a dual vector, shape (n,).
+
+        That is what r stands up to in the last stage, -theta R^T M_op r - R^T M r', and what the
+        iteration has left.
+        """
+        if self._last is None:
+            return np.zeros(self.coupled.terms.n)
+        (problem, t, at), forms = self._last, self.coupled.terms.forms
+        n, begin = self.coupled.terms.n, max(t - problem.h, self.path.interval.t0)
+        before = forms.split.project(problem.c[:n]) - self.path.at(begin).u
+        change = at.mass_r - forms.mass @ before
+        error: Array = at.residual[:n] - at.theta * at.Mr - change / problem.h
+        return error
 
     def rate(self, begin: Array, end: Array) -> Array:
         """Return the change of (u - u_alpha, q) over the interval, per unit of time."""
@@ -202,7 +219,7 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
             "GradientLaw: gain='auto' accumulates what is known of constant unknowns, and here "
             "one moves (evolution=): give a number for gain, or use SensitivityLaw."
         )
-    learning = Learning(model, observation.nodal)
+    metric = InformationMetric(model, observation.nodal)
     observed: ObservedPart[Any] = GeneralizedInverse(problem)
     if observation.reconstruction.regularises:
         observed = RegularizedInverse(problem)
@@ -216,8 +233,8 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         N_op=N_op,
         nu=nu,
         observed=observed,
-        metric=InformationMetric(learning),
-        memory=learning.pattern,
+        metric=metric,
+        memory=metric.pattern,
     ).prepared()
 
 

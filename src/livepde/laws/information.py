@@ -1,57 +1,370 @@
-"""The metric of `GradientLaw(gain="auto")`: the information that the data have given."""
+"""Metric of the information that the data have given: how `GradientLaw(gain="auto")` tunes itself.
+
+The first line of the method says, on the observed part, that q leaves the equation error
+
+    eps(q) = M u_alpha' + B(w) + A(w) q - F,        eps(q) - eps(q*) = A(w) (q - q*).
+
+Let eps(q*) be noise, white in time, with spectral density S D in X*, and q - q0 ~ N(0, G_Q^{-1})
+the prior (G_Q is divided by the square of `std`). Then the best q given all data so far minimises
+
+    S ||q - q0||_Q^2 + int ||R^T eps(q)||^2_{D^{-1}} dt.
+
+Its recursion, recursive least squares for a field, is the second line of the method in the metric
+of the information, H = S G_Q + J in the place of G_Q/gain, J = int A^T R D^{-1} R^T A dt: the gain
+H^{-1} falls like 1/t where the data excite q, stays that of the prior where they do not, and what
+early data taught stays when the excitation dies out. With M_op = M and theta = PULL/h all of r
+comes from the step itself, about -h M^{-1} eps/PULL, and the stage solves
+
+    H (q - c)/PULL = A(w)^T r + (b - J c - S G_Q (c - q0))/PULL
+
+from c, q before the step, with the normal equations J q = b of the data so far. These are kept
+exactly: the equation error eps that a step has left is told by its r, and y = A q - eps is what the
+data say that A q should be,
+
+    J <- J + h A^T R D^{-1} R^T A,        b <- b + h A^T R D^{-1} R^T y.
+
+So a step need not be exact: what filter, pull and iteration leave undone, and what a change of S
+asks for, is in b - J c - S G_Q (c - q0), and the next step does it. Without b, by the drive A^T r
+alone, q and J disagree on rough functions by the ratio of D to M, and when S falls q jumps by that.
+
+S is the power of the equation error that is left, as far as q sees it, all of it:
+
+    S = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
+
+or the same with the diagonal of G_Q in the place of G_Q, whichever is larger: the first is what
+smooth functions see of the error, the second what rough ones do, where derivatives of noisy data
+are far larger. (With the first alone 1 % of noise moved q by 1.3 times what the prior allows.) So
+what mesh, time step, smoothing and a wrong P u leave in the equation counts as noise as well, as
+long as q cannot take it up. S is positive by construction. (Noise alone is what turns back between
+samples, -(eps_k - eps_{k-1}, eps_{k-1} - eps_{k-2}); but any error that goes on makes that
+negative, and S zero.) The mean weighs a sample at time t by t^FORGETS: it forgets the start, and of
+exact data S vanishes. The first sample moves nothing: it tells S.
+
+Samples in J and b are weighed by t^FADES, in two kinds of rows. Those that see nothing but the
+data, with tests within omega, fade slowly: the first samples are the least smoothed. The others
+hold fluxes of P u, which was wrong at first, and fade faster; since P u goes on to be wrong by what
+the data cannot tell, S is not taken below a small share of their J.
+
+H is renewed when S or the trace of J have changed by more than `AGED`, or J along the last step has
+grown by more than `STEEPER`. In between a step is one of quasi-Newton's, and factors serve on.
+
+Every number above is a ratio of quantities with the same units: scaling u, q (with `std`), x or t
+scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
+itself.
+
+Whether q may be where it is says the prior. If all of this holds, q - q0 is Gaussian with the
+covariance that the data have taken from that of the prior, so that ||q - q0||_Q^2 is a sum of
+chi-squares with weights of at most 1, whose sum k is at most m and at most trace(G_Q^{-1} J)/S,
+with a J that has not faded. It is more than k + 2 sqrt(k s) + 2 s with a probability below exp(-s)
+only (Laurent and Massart 2000). A q beyond that is not believed: the step fails.
+
+What S does not know is a bias that q takes up without a trace: smoothing that takes too much or too
+little leaves an equation error that moves with w, as a wrong q does. What helps is smoothing
+without it (`livepde.laws.smoothing`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import LinearOperator, eigsh
 
+from livepde.errors import LawError
 from livepde.laws.coupled import Metric
 from livepde.laws.coupled.forms import StageForms
-from livepde.laws.memory import PULL, Learned, Learning
-from livepde.laws.metrics import HOLD, MetricRule, MetricStep, Transition
-from livepde.linalg import Array
+from livepde.laws.metrics import HOLD, MetricRule, MetricStep, StepBegin, Transition
+from livepde.laws.normal_equations import (
+    NormalEquations,
+    ProjectedRows,
+    SelectedRows,
+    diagonal_bound,
+)
+from livepde.linalg import Array, Pattern
+from livepde.model import Model
+from livepde.spaces import HilbertSpace
 
-__all__ = ["InformationMetric"]
+__all__ = ["Information", "InformationMetric"]
+
+PULL = 10.0  # theta h: r forgets within a step
+LEADING, DRAWS = 4, 4  # modes and draws of the prior, for traces: their error is a few per cent
+LANCZOS = 20  # steps for the square root of G_Q^{-1}; the trace is then exact to 1 %
+COARSE = 1e-3  # relative accuracy of those modes
+ROUNDING = 1e-12  # relative: what is smaller is zero
+FORGETS = 4.0  # power of time that weighs a sample in the mean of S
+FADES = np.array([1.0, 4.0])  # power of time that weighs a sample in J: its rows of both kinds
+AGED = 1.0  # relative change of S, or of the trace of J, that renews H
+STEEPER = 0.25  # relative growth of J along a step that renews H: at 1 steps would go to and fro
+MOST_NORMAL = 8  # sets of sensors of which normal equations are kept
+MOST_DENSE = 4000  # unknowns of which J may be dense
+CHANCE = 1e-6  # that a right model leaves its prior
+RESOLUTION = np.array([1e9, 1e5])  # largest ratio of information to prior, rows of both kinds
 
 
 @dataclass(frozen=True, eq=False)
-class InformationMetric(MetricRule[Learned]):
-    """(S G_Q + J)/PULL in the place of G_Q/gain; see `livepde.laws.memory`."""
+class Information:
+    """Sums over the samples so far, and the metric that was made of them last.
 
-    learning: Learning
+    Attributes
+    ----------
+    origin
+        q0, shape (m,).
+    matrix, right
+        Data of J in its pattern, shape (2, entries), and b, shape (2, m), of both kinds of rows.
+    total
+        trace(G_Q^{-1} J) of the same, shape (2,).
+    given
+        trace(G_Q^{-1} J) of all rows without fading.
+    power, seen
+        The means of which S is the quotient: what smooth and what rough functions see, shape (2,).
+    elapsed, samples
+        Time and number of samples.
+    spread, held, weighed
+        S, data of J, and trace(G_Q^{-1} J) in the current H.
+    """
 
-    def init(self, q0: Array) -> Learned:
-        return self.learning.init(q0)
+    origin: Array
+    matrix: Array
+    right: Array
+    total: Array
+    given: float
+    power: Array
+    seen: Array
+    elapsed: float
+    samples: int
+    spread: float
+    held: Array
+    weighed: float
 
-    def step(self, state: Learned, forms: StageForms, before: Transition) -> MetricStep:
-        learning, h, q = self.learning, before.length, before.q
-        seen = learning.coupling(forms, before.w, q, before.moment)
-        spread = learning.spread(state, seen, h)
-        shift = learning.shift(state, spread, q, h)
-        return lambda c, h: Metric(
-            spread / PULL, 0.0, -h * shift / PULL, state.information / PULL, PULL / h
+
+def _diagonal(space: HilbertSpace) -> Array:
+    """Return the diagonal of G, or a bound of it where G is a Schur complement; positive."""
+    diagonal = space.augmented.diagonal()[: space.dim]
+    found: Array = np.where(diagonal > 0.0, diagonal, 1.0)
+    return found
+
+
+def trace_probes(space: HilbertSpace) -> Array:
+    """Return columns V, shape (m, k), with trace(V^T J V) close to trace(G^{-1} J) for every J.
+
+    They are the leading modes of N(0, G^{-1}), in which most of the trace is, and fixed draws from
+    the rest of it. Each coefficient is scaled to a unit of its own.
+    """
+    free, root = np.flatnonzero(space.free), np.sqrt(_diagonal(space))
+    m, count = len(free), min(len(free), LEADING)
+
+    def inverse(x: Array) -> Array:
+        full = np.zeros(space.dim)
+        full[free] = x
+        return np.asarray((root * space.riesz(root * full))[free])
+
+    if m <= LEADING + DRAWS:
+        values, modes = np.linalg.eigh(np.stack([inverse(unit) for unit in np.eye(m)]))
+    else:
+        operator = LinearOperator((m, m), matvec=inverse, dtype=float)
+        values, modes = eigsh(operator, k=count, v0=np.ones(m), tol=COARSE)
+    columns = [modes * np.sqrt(values)]
+    if m > LEADING + DRAWS:
+        signs = 2.0 * np.random.default_rng(0).integers(0, 2, (DRAWS, m)) - 1.0
+        rest = [sign - modes @ (modes.T @ sign) for sign in signs]
+        columns += [_root(inverse, x, modes)[:, None] / math.sqrt(DRAWS) for x in rest]
+    found = np.zeros((space.dim, sum(part.shape[1] for part in columns)))
+    found[free] = np.hstack(columns) / root[free, None]
+    return found
+
+
+def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
+    """Return the square root of an operator times x, on what is orthogonal to some of its modes.
+
+    By Lanczos' method.
+    """
+    size, basis, T = float(np.linalg.norm(x)), [], np.zeros((LANCZOS, LANCZOS))
+    y = x / size
+    for k in range(LANCZOS):
+        basis.append(y)
+        y = inverse(y)
+        for _ in range(2):  # twice is enough against rounding
+            y -= modes @ (modes.T @ y)
+            parts = np.array(basis) @ y
+            y -= parts @ np.array(basis)
+            T[: k + 1, k] += parts
+        left = float(np.linalg.norm(y))
+        if left <= ROUNDING * T[0, 0]:
+            break
+        y /= left
+    k = len(basis)
+    values, vectors = np.linalg.eigh(T[:k, :k], UPLO="U")
+    powers = vectors @ (np.sqrt(np.maximum(values, 0.0)) * vectors[0])
+    root: Array = size * (powers @ np.array(basis))
+    return root
+
+
+def _pattern(model: Model, selects: bool) -> Pattern:
+    """Return the pattern of J; raises `LawError` where it is dense and too large."""
+    if selects:
+        A = model.form_A.pattern("v", "q")
+        ones = A.matrix(np.ones(A.nnz))
+        return Pattern.of(sp.csr_array(ones.T @ ones))
+    if model.Q.dim > MOST_DENSE:
+        raise LawError(
+            "GradientLaw: gain='auto' keeps a dense matrix of all unknowns where sensors read no "
+            f"coefficients; {model.Q.dim} are too many, up to {MOST_DENSE} are possible. Give a "
+            "number for gain, observe a Subdomain, or use SensitivityLaw."
+        )
+    return Pattern.of(sp.csr_array(np.ones((model.Q.dim, model.Q.dim))))
+
+
+class InformationMetric(MetricRule[Information]):
+    """H/PULL in the place of G_Q/gain, with H = S G_Q + J.
+
+    Parameters
+    ----------
+    model
+        With its prior.
+    selects
+        True if sensors select coefficients: then J is sparse.
+
+    Attributes
+    ----------
+    pattern
+        Of J.
+    """
+
+    def __init__(self, model: Model, selects: bool) -> None:
+        self.model = model
+        self.selects = selects
+        self.pattern = _pattern(model, selects)
+        self.probes = trace_probes(model.Q)
+        self.diagonal = _diagonal(model.Q)
+        every = np.arange(model.Q.dim)
+        self.on_diagonal = self.pattern.positions(every, every)
+        self._normal: dict[bytes, NormalEquations] = {}
+
+    def init(self, q0: Array) -> Information:
+        """Return the information before the first sample: none."""
+        J = np.zeros((2, self.pattern.nnz))
+        return Information(
+            origin=q0,
+            matrix=J,
+            right=np.zeros((2, len(q0))),
+            total=np.zeros(2),
+            given=0.0,
+            power=np.zeros(2),
+            seen=np.zeros(2),
+            elapsed=0.0,
+            samples=0,
+            spread=0.0,
+            held=J[0],
+            weighed=0.0,
         )
 
-    def frozen(self, state: Learned, forms: StageForms, before: Transition) -> MetricStep:
-        learning, h = self.learning, before.length
-        seen = learning.coupling(forms, before.w, before.q, before.moment)
-        spread = HOLD * learning.spread(state, seen, h)
-        zero = np.zeros_like(before.q)
-        return lambda c, h: Metric(spread / PULL, 0.0, zero, state.information / PULL, PULL / h)
+    def step(self, state: Information, forms: StageForms, begin: StepBegin) -> MetricStep:
+        if not state.samples:
+            return self.frozen(state, forms, begin)
+        J, held = self.pattern.compact(state.matrix.sum(axis=0)), state.held / PULL
+        prior = state.spread * self.model.Q.dual(begin.q - state.origin)
+        left = state.right.sum(axis=0) - J @ begin.q - prior
+        load = left / (PULL * begin.length)
+        return lambda c, h: Metric(state.spread / PULL, 0.0, h * load, held, PULL / h)
 
-    def learn(self, state: Learned, after: Transition) -> Learned:
-        learning, h = self.learning, after.length
-        seen = learning.coupling(after.forms, after.w, after.q, after.moment)
-        spread = learning.spread(state, seen, h)
-        return learning.learn(state, spread, seen, after.r, h, after.same)
+    def frozen(self, state: Information, forms: StageForms, begin: StepBegin) -> MetricStep:
+        A = forms.A_in.data("v", "q", begin.moment, u=begin.w, q=begin.q)
+        trace = float(self.normal(forms).trace(A, self.probes).sum())
+        spread = HOLD * max(state.spread, begin.length * trace) or 1.0
+        held, load = state.held / PULL, np.zeros_like(begin.q)
+        return lambda c, h: Metric(spread / PULL, 0.0, load, held, PULL / h)
 
-    def notes(self, state: Learned, q: Array, length: float) -> Mapping[str, Any]:
+    def normal(self, forms: StageForms) -> NormalEquations:
+        """Return what samples of the sensors of a stage add to the normal equations."""
+        key = forms.split.present.tobytes()
+        if key not in self._normal:
+            if len(self._normal) >= MOST_NORMAL:
+                self._normal.clear()
+            self._normal[key] = self._made(forms)
+        return self._normal[key]
+
+    def _made(self, forms: StageForms) -> NormalEquations:
+        X, Q, A = self.model.X, self.model.Q, forms.A_in.pattern("v", "q")
+        if not self.selects:
+            return ProjectedRows(A, forms.split.basis, forms.mass, X.free, Q.free)
+        D = diagonal_bound(forms.mass)
+        inverse = np.where(D > 0.0, X.free / np.where(D > 0.0, D, 1.0), 0.0)
+        own = inverse * forms.tests.free if forms.W is None else np.zeros_like(inverse)
+        return SelectedRows(A, np.stack([own, inverse - own]), Q.free, self.pattern)
+
+    def learn(self, state: Information, after: Transition) -> Information:
+        Q, h = self.model.Q, after.length
+        A = after.forms.A_in.data("v", "q", after.moment, u=after.w, q=after.q)
+        gain = self.normal(after.forms).gain(A, after.q, after.error, self.probes)
+        rough = gain.matrix.sum(axis=0)[self.on_diagonal] / self.diagonal
+        power = np.array(
+            [gain.force @ Q.riesz(gain.force), gain.force @ (gain.force / self.diagonal)]
+        )
+        seen = np.array([gain.trace.sum(), rough.sum()])
+        elapsed = state.elapsed + h
+        kept = max(0.0, 1.0 - FORGETS * h / elapsed)
+        faded = np.maximum(0.0, 1.0 - FADES * h / elapsed)
+        learned = replace(
+            state,
+            matrix=faded[:, None] * state.matrix + h * gain.matrix,
+            right=faded[:, None] * state.right + h * gain.right,
+            total=faded * state.total + h * gain.trace,
+            given=state.given + h * float(gain.trace.sum()),
+            power=kept * state.power + h * h * power,
+            seen=kept * state.seen + h * seen,
+            elapsed=elapsed,
+            samples=state.samples + 1,
+        )
+        return self._renewed(learned, after.change)
+
+    def _renewed(self, state: Information, change: Array) -> Information:
+        """Return the state with an H that is new if the last one has aged.
+
+        Parameters
+        ----------
+        change
+            The last change of q, shape (m,).
+        """
+        if not np.all(state.seen > 0.0):
+            return state
+        least = float((state.total / RESOLUTION).sum())
+        S, total = max(float((state.power / state.seen).max()), least), float(state.total.sum())
+        J = state.matrix.sum(axis=0)
+        old, most = (state.spread, state.weighed), 1.0 + AGED
+        if all(new / most <= last <= new * most for new, last in zip((S, total), old, strict=True)):
+            prior = state.spread * float(change @ self.model.Q.dual(change))
+            held, now = (self.pattern.compact(data) @ change @ change for data in (state.held, J))
+            if prior + now <= (1.0 + STEEPER) * (prior + held):
+                return state
+        return replace(state, spread=S, held=J, weighed=total)
+
+    def departure(self, state: Information, q: Array) -> float:
+        """Return ||q - q0||_Q^2 over what a right model exceeds with a chance below `CHANCE`."""
+        away = q - state.origin
+        told = float(self.model.Q.free.sum())
+        if state.given < told * state.spread:
+            told = state.given / state.spread
+        rare = -math.log(CHANCE)
+        most = told + 2.0 * math.sqrt(told * rare) + 2.0 * rare
+        return float(away @ self.model.Q.dual(away)) / most
+
+    def doubt(self, state: Information, q: Array) -> str:
+        ratio = self.departure(state, q) if state.samples else 0.0
+        if not ratio > 1.0:
+            return ""
+        return (
+            f"q is {ratio:.1f} times as far from its prior (in square) as prior and data allow, so "
+            "the model or the noise is not as the law must take it"
+        )
+
+    def notes(self, state: Information, q: Array, length: float) -> Mapping[str, Any]:
         spread = state.spread or 1.0
         return {
             "gain": PULL / (spread * length),
-            "information": state.total / spread,
-            "departure": lambda: self.learning.departure(state, spread, q),
+            "information": float(state.total.sum()) / spread,
+            "departure": self.departure(state, q),
         }

@@ -19,7 +19,7 @@ from livepde.laws.coupled.forms import StageForms
 from livepde.linalg import Array
 from livepde.model import Model
 
-__all__ = ["ConstantMetric", "MetricRule", "MetricStep", "NoState", "Transition"]
+__all__ = ["ConstantMetric", "MetricRule", "MetricStep", "NoState", "StepBegin", "Transition"]
 
 HOLD = 1e12  # times smaller is a gain that keeps q where it is
 
@@ -33,28 +33,48 @@ class NoState:
 
 
 @dataclass(frozen=True, eq=False)
+class StepBegin:
+    """A step before it is taken.
+
+    Attributes
+    ----------
+    q, w
+        Parameter at its beginning, and w = u_alpha + P u with the data at its end.
+    moment, length
+        Time and inputs at its end, and how long it is.
+    """
+
+    q: Array
+    w: Array
+    moment: Moment
+    length: float
+
+
+@dataclass(frozen=True, eq=False)
 class Transition:
-    """What a step has done, for a rule to learn from.
+    """A step that was taken, for a rule to learn from.
 
     Attributes
     ----------
     forms
         The forms of the stage.
-    q, r, w
-        Parameter, observed residual and w = u_alpha + P u at its end.
+    q, w
+        Parameter as the stage has found it, and w = u_alpha + P u, at its end.
+    change
+        By how much q has changed, shape (m,).
+    error
+        Equation error of the data at its end, R^T eps = -theta R^T M_op r - R^T M r', shape (n,).
     moment, length
         Time and inputs at its end, and how long it was.
-    same
-        True if the sensors are those of the sample before.
     """
 
     forms: StageForms
     q: Array
-    r: Array
     w: Array
+    change: Array
+    error: Array
     moment: Moment
     length: float
-    same: bool
 
 
 State = TypeVar("State")
@@ -68,22 +88,20 @@ class MetricRule(ABC, Generic[State]):
         """Return the state before the first sample."""
 
     @abstractmethod
-    def step(self, state: State, forms: StageForms, before: Transition) -> MetricStep:
-        """Return the metric of the stages of a step.
-
-        Parameters
-        ----------
-        before
-            What is known before the step: q and w at its beginning, with the new data in w.
-        """
+    def step(self, state: State, forms: StageForms, begin: StepBegin) -> MetricStep:
+        """Return the metric of the stages of a step."""
 
     @abstractmethod
-    def frozen(self, state: State, forms: StageForms, before: Transition) -> MetricStep:
+    def frozen(self, state: State, forms: StageForms, begin: StepBegin) -> MetricStep:
         """Return the same for a step in which q is held."""
 
     def learn(self, state: State, after: Transition) -> State:
         """Return the state after a step."""
         return state
+
+    def doubt(self, state: State, q: Array) -> str:
+        """Return why an estimate is not to be believed; empty if it may be."""
+        return ""
 
     def notes(self, state: State, q: Array, length: float) -> Mapping[str, Any]:
         """Return numbers worth keeping after a step."""
@@ -104,10 +122,10 @@ class ConstantMetric(MetricRule[NoState]):
     def init(self, q0: Array) -> NoState:
         return NoState()
 
-    def step(self, state: NoState, forms: StageForms, before: Transition) -> MetricStep:
+    def step(self, state: NoState, forms: StageForms, begin: StepBegin) -> MetricStep:
         return lambda c, h: self.stage(c, h, self.gain, self.sigma)
 
-    def frozen(self, state: NoState, forms: StageForms, before: Transition) -> MetricStep:
+    def frozen(self, state: NoState, forms: StageForms, begin: StepBegin) -> MetricStep:
         return lambda c, h: self.stage(c, h, self.gain / HOLD, 0.0)
 
     def stage(self, c: Array, h: float, gain: float, sigma: float) -> Metric:

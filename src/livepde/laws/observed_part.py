@@ -32,9 +32,6 @@ State = TypeVar("State")
 class ObservedPath(ABC):
     """u_alpha at any time of an interval, each found once."""
 
-    #: False while the samples cannot tell how noisy they are: nothing is learned from them.
-    ready = True
-
     def __init__(self, problem: Problem, interval: Interval) -> None:
         self.problem = problem
         self.interval = interval
@@ -142,9 +139,8 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
         for t in times:
             z = interval.z1 if t == interval.t1 else interval.z0
             state = smoother.add(state, z, model.impose(zero, interval.at(t)))
-        path = _SmoothedPath(self.problem, interval, split, smoother, smoother.alpha(state))
-        path.ready = not smoother.waits(state)
-        return state, path
+        alpha = smoother.alpha(state)
+        return state, _SmoothedPath(self.problem, interval, split, smoother, alpha)
 
     def _smoother(self, present: Array) -> Smoother:
         key = present.tobytes()

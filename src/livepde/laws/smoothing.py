@@ -19,8 +19,7 @@ none, and there from products of successive differences in time,
 
 noise turns back, what moves goes on. It is not more than the observation states. Exact data turn
 back nowhere, so alpha is zero. Noise is independent from sensor to sensor with the deviations that
-the observation states, or white in Z if it states none. Nothing is learned from the first samples,
-which cannot tell the level.
+the observation states, or white in Z if it states none.
 """
 
 from __future__ import annotations
@@ -28,6 +27,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from livepde.errors import LawError
 from livepde.linalg import Array
@@ -40,7 +40,6 @@ ORDER = 4  # of the iterated Tikhonov method
 GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
 LARGEST = 3000  # sensors: the modes are those of a dense matrix
 FEWEST = 8  # modes below which their rougher half says nothing about noise
-WAIT = 4  # samples before the level is believed: two products
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +105,10 @@ class Smoother:
         if self.size == 0:
             return
         s, k = filter_.s, filter_.k
+        # Only Dirichlet values are in the boundary, so only their rows are ever asked for.
+        self.fixed = observed.X.fixed
+        self.pulled = np.ascontiguousarray(filter_.pulled[self.fixed].T)
+        self.G = sp.csr_array(filter_.G[:, self.fixed])
         stiff = k > 0.0
         self.inverse = np.where(stiff, 1.0 / np.where(stiff, k, 1.0), 0.0)
         if observed.noise is None:
@@ -114,6 +117,7 @@ class Smoother:
             spread = filter_.fitted * observed.noise[present]
             self.variance = (spread**2).sum(axis=1) / s
         self.removed = self._removed(GRID[:, None] * filter_.rho)
+        self.told = self.removed * (1.0 - self.removed)
         self.weight = np.sqrt(k * s)
         self.noise = (1.0 - self.removed) @ (np.sqrt(k / s) * self.variance)
 
@@ -123,25 +127,27 @@ class Smoother:
         return out
 
     def _rough(self, z: Array, boundary: Array) -> tuple[Array, Array]:
-        """Return the modes of the data, and those without what the boundary alone continues to."""
-        filter_ = self.spectral
-        known = z[filter_.present] - filter_.G @ boundary
-        modes = (filter_.fitted @ known) / filter_.s
-        return modes, modes + (boundary @ filter_.pulled) * self.inverse
+        """Return the modes of the data, and those without what the boundary alone continues to.
+
+        Of samples z of shape (samples, sensors), with boundary values of shape (samples, n).
+        """
+        filter_, held = self.spectral, boundary[:, self.fixed].T
+        known = z[:, filter_.present].T - self.G @ held
+        modes = (filter_.fitted @ known) / filter_.s[:, None]
+        return modes, modes + (self.pulled @ held) * self.inverse[:, None]
 
     def add(self, balance: Balance, z: Array, boundary: Array) -> Balance:
         """Return the means with one more sample, z of shape (sensors,)."""
         if self.size == 0 or not np.isfinite(z[self.spectral.present]).all():
             return balance
-        _, e = self._rough(z, boundary)
-        left = (self.removed * (1.0 - self.removed)) @ (self.weight * e**2)
+        pair = self.size >= FEWEST and np.isfinite(balance.z[:, self.spectral.present]).all()
+        samples = np.vstack([z, balance.z]) if pair else z[None]
+        e = self._rough(samples, np.vstack([boundary, balance.boundary])[: len(samples)])[1].T
+        left = self.told @ (self.weight * e[0] ** 2)
         share = 1.0 / (balance.samples + 1)
         power, pairs = balance.power, balance.pairs
-        if self.size >= FEWEST and np.isfinite(balance.z[:, self.spectral.present]).all():
-            before, last = (
-                self._rough(*pair)[1] for pair in zip(balance.z, balance.boundary, strict=True)
-            )
-            back = -self.spectral.s * (e - last) * (last - before) / self.variance
+        if pair:
+            back = -self.spectral.s * (e[0] - e[2]) * (e[2] - e[1]) / self.variance
             half = slice(0, self.size // 2)  # s ascends: the roughest come first
             pairs += 1
             power += (float(back[half].mean()) - power) / pairs
@@ -154,10 +160,6 @@ class Smoother:
             z=np.stack([balance.z[1], z]),
             boundary=np.stack([balance.boundary[1], boundary]),
         )
-
-    def waits(self, balance: Balance) -> bool:
-        """Return true while the samples cannot tell the level: nothing is learned from them."""
-        return self.size >= FEWEST and balance.samples < WAIT
 
     def alpha(self, balance: Balance) -> float:
         """Return the first alpha where smoothing takes as much as noise has brought."""
@@ -183,6 +185,6 @@ class Smoother:
         """Return u_alpha, shape (n,)."""
         if self.size == 0:
             return np.zeros(len(boundary))
-        modes, rough = self._rough(z, boundary)
+        modes, rough = (part[:, 0] for part in self._rough(z[None], boundary[None]))
         u: Array = self.spectral.phi @ (modes - self._removed(alpha) * rough)
         return u

@@ -118,7 +118,8 @@ class BilinearSolver(MonolithicSolver):
             inside = Inside(self._coupling[0].at(w), products["B_in"] @ w)
         sizes = self.terms.sizes(c, h, known, u_alpha, metric)
         observed = self.terms.observed(u_alpha)
-        return StageData(c, h, moment, u_alpha, metric, known, inside, sizes, observed)
+        J = self.terms.information(metric)
+        return StageData(c, h, moment, u_alpha, metric, known, inside, sizes, observed, J)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
@@ -139,7 +140,7 @@ class BilinearSolver(MonolithicSolver):
         theta = terms.theta(data, norms)
         rate = products["M"] @ ((u - c[:n]) / data.h)
         pull = (theta * terms.free) * Mr
-        change, coupling = self.weighed(data.metric, q - c[n:]), transposed @ r
+        change, coupling = self.weighed(data, q - c[n:]), transposed @ r
         residual = np.empty_like(y)
         residual[:n] = rate + flux + products["B_out"] @ u + driven + pull - data.source
         residual[n:] = change - (coupling + data.metric.load) * terms.free_q
@@ -150,11 +151,11 @@ class BilinearSolver(MonolithicSolver):
             y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r
         )
 
-    def weighed(self, metric: Metric, change: Array) -> Array:
-        if metric.information is not None or metric.drift:
-            return super().weighed(metric, change) * self.terms.free_q
-        weighed: Array = self._products["G"] @ (metric.scale * change)
-        return weighed
+    def weighed(self, data: StageData, change: Array) -> Array:
+        if data.metric.drift:
+            return super().weighed(data, change) * self.terms.free_q
+        weighed: Array = self._products["G"] @ (data.metric.scale * change)
+        return weighed if data.J is None else weighed + (data.J @ change) * self.terms.free_q
 
     def changing(self, data: StageData, at: StageIterate) -> Array:
         n = self.terms.n

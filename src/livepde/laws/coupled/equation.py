@@ -71,6 +71,8 @@ class StageData:
         F and of the load, or of changes by `RESTING` of c if these are larger.
     observed
         Function that returns the squared norms of u_alpha, computed once.
+    J
+        Information in the metric, a matrix of shape (m, m); None: zero.
     """
 
     c: Array
@@ -82,6 +84,7 @@ class StageData:
     inside: Inside | None
     sizes: tuple[float, float, float]
     observed: Callable[[], Residual]
+    J: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,6 +252,12 @@ class StageTerms:
         known = math.sqrt(float(self.lumped @ np.square(u_alpha)))
         return max(own, RESTING * least), max(other, RESTING * least_q), known
 
+    def information(self, metric: Metric) -> Any:
+        """Return J as what multiplies fastest, shape (m, m); None if it is zero."""
+        if metric.information is None or self.memory is None:
+            return None
+        return self.memory.compact(metric.information)
+
     @cached_property
     def observes(self) -> bool:
         """True if a sensor is present."""
@@ -391,7 +400,8 @@ class StageSolver(ABC):
             inside = Inside(A, forms.B_in.vector("v", moment, u=w))
         sizes = self.terms.sizes(c, h, source, u_alpha, metric)
         observed = self.terms.observed(u_alpha)
-        return StageData(c, h, moment, u_alpha, metric, source, inside, sizes, observed)
+        J = self.terms.information(metric)
+        return StageData(c, h, moment, u_alpha, metric, source, inside, sizes, observed, J)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         """Return the stage at y."""
@@ -417,7 +427,7 @@ class StageSolver(ABC):
         theta = terms.theta(data, norms)
         rate = model.mass @ ((u - data.c[:n]) / data.h)
         pull = theta * Mr
-        change = self.weighed(data.metric, q - data.c[n:])
+        change = self.weighed(data, q - data.c[n:])
         coupling = A_in.T @ r
         residual = np.empty_like(y)
         residual[:n] = (rate + flux + driven + pull - data.source) * terms.free
@@ -429,13 +439,11 @@ class StageSolver(ABC):
             y, residual, size, resolved, scales, w, r, A_in, theta, norms, Mr, mass_r
         )
 
-    def weighed(self, metric: Metric, change: Array) -> Array:
+    def weighed(self, data: StageData, change: Array) -> Array:
         """Return H times a change of q, a dual vector."""
-        model = self.terms.forms.model
+        model, metric = self.terms.forms.model, data.metric
         scaled = metric.scale * change
         if metric.drift:
             scaled = scaled - metric.drift * (model.latent.generator @ change)
         weighed = model.Q.dual(scaled)
-        if metric.information is not None and self.terms.memory is not None:
-            weighed = weighed + self.terms.memory.matrix(metric.information) @ change
-        return weighed
+        return weighed if data.J is None else weighed + data.J @ change

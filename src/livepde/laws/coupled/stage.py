@@ -150,8 +150,8 @@ class CoupledStage:
         start: Callable[[], Array],
         predicted: Array | None = None,
         kept: KeptFactor | None = None,
-    ) -> tuple[Array, KeptFactor]:
-        """Return y = (u, q) of one stage, and the factor to keep; raises `StepFailed`.
+    ) -> tuple[StageIterate, KeptFactor]:
+        """Return the solution of one stage, and the factor to keep; raises `StepFailed`.
 
         Parameters
         ----------
@@ -180,7 +180,7 @@ class CoupledStage:
             if data.metric.theta is not None:
                 raise
             solved = self._by_theta(equation, begin())
-        return solved.at.y, self._kept(kept, data, solved)
+        return solved.at, self._kept(kept, data, solved)
 
     def _by_theta(self, equation: _Equation, start: Array) -> Solution[StageIterate]:
         """Return the solution whose theta is nearest to that of the start; raises `StepFailed`.

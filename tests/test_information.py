@@ -10,7 +10,7 @@ from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from livepde.errors import LawError
-from livepde.laws.memory import Learning
+from livepde.laws.information import InformationMetric
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import Twin
 
@@ -135,27 +135,29 @@ def test_sampling_rate_and_mesh_do_not_matter_without_noise() -> None:
 
 def test_what_a_right_model_may_do_is_no_departure() -> None:
     model, _ = rod(cells=40)
-    learning = Learning(model, True)
+    learning = InformationMetric(model, True)
     q0 = np.full(model.Q.dim, 2.0)
     root = np.linalg.inv(np.linalg.cholesky(model.Q.gram.toarray())).T
     shares = np.linspace(0.0, 1.0, model.Q.dim)  # of the prior variance that the data have taken
     known = {
-        1.0: replace(learning.init(q0), given=1e9),
-        0.0: replace(learning.init(q0), given=0.0),
-        0.5: replace(learning.init(q0), given=float((shares[:-1] / (1 - shares[:-1])).sum())),
+        1.0: replace(learning.init(q0), spread=1.0, given=1e9),
+        0.0: replace(learning.init(q0), spread=1.0, given=0.0),
+        0.5: replace(
+            learning.init(q0), spread=1.0, given=float((shares[:-1] / (1 - shares[:-1])).sum())
+        ),
     }
     rng = np.random.default_rng(0)
     for told, learned in known.items():
         weights = np.sqrt(shares) if told == 0.5 else np.full(model.Q.dim, np.sqrt(told))
         moved = (root @ (weights[:, None] * rng.standard_normal((model.Q.dim, 2000)))).T
-        found = [learning.departure(learned, 1.0, q0 + one) for one in moved]
+        found = [learning.departure(learned, q0 + one) for one in moved]
         assert max(found) < 1.0
         once = root @ np.eye(model.Q.dim)[0]  # one deviation in one direction
-        far = learning.departure(learned, 1.0, q0 + 20.0 * once)
+        far = learning.departure(learned, q0 + 20.0 * once)
         assert far > 1.0
         # Twice the information and the noise are the same knowledge.
-        twice = replace(learned, given=2.0 * learned.given)
-        assert learning.departure(twice, 2.0, q0 + 20.0 * once) == pytest.approx(far)
+        twice = replace(learned, spread=2.0, given=2.0 * learned.given)
+        assert learning.departure(twice, q0 + 20.0 * once) == pytest.approx(far)
 
 
 def test_what_has_faded_was_told_all_the_same() -> None:
@@ -164,9 +166,9 @@ def test_what_has_faded_was_told_all_the_same() -> None:
     identifier = lp.Identifier(model, seen, law, q0=0.0, u0=0.0)
     for sample in twin:
         notes = identifier.step(sample.t, sample.z).notes
-    learned = identifier._state.learned
-    assert learned.given == pytest.approx(2.0 * learned.total, rel=0.2)  # J weighs by t/T
-    assert notes["information"] == learned.total / learned.spread
+    learned = identifier._state.metric
+    assert learned.given == pytest.approx(2.0 * learned.total.sum(), rel=0.2)  # J weighs by t/T
+    assert notes["information"] == learned.total.sum() / learned.spread
 
 
 def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:
