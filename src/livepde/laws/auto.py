@@ -241,8 +241,10 @@ class AutoLaw(Law[Bank, AutoState]):
             state = replace(state, due=soon, pause=TRIAL)
         if alarm or state.count >= state.due:
             return self._woken(work, state, alarm), alarm
-        if state.count % CHECKED:
-            return state, False
+        return (state if state.count % CHECKED else self._pruned(work, state)), False
+
+    def _pruned(self, work: Bank, state: AutoState) -> AutoState:
+        """Return the state after those members sleep that have had their time and say nothing."""
         weights = state.weights.copy()
         heavier: list[int] = []
         for k in state.awake:
@@ -258,8 +260,7 @@ class AutoLaw(Law[Bank, AutoState]):
             member if np.isfinite(weight) else asleep(state.start)
             for member, weight in zip(state.members, weights, strict=True)
         )
-        weights = normalised(weights)
-        return replace(state, members=members, weights=weights), False
+        return replace(state, members=members, weights=normalised(weights))
 
     def _woken(self, work: Bank, state: AutoState, alarm: bool) -> AutoState:
         """Return the state with all drifts awake; what slept begins as a copy of the leader.

@@ -176,6 +176,10 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             raise LawError(
                 f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
             )
+        self._check_parts()
+
+    def _check_parts(self) -> None:
+        """Refuse parts that are of another kind, and gates that let nothing through."""
         for name, kind in (("replay", Replay), ("jumps", Jumps), ("guards", Guards)):
             value = getattr(self, name)
             if not (value is None or isinstance(value, kind)):
