@@ -9,6 +9,7 @@ from __future__ import annotations
 from livepde.reproduce.boiger2016 import BOIGER2016
 from livepde.reproduce.degenerate import DEGENERATE
 from livepde.reproduce.dimensions import DIMENSIONS
+from livepde.reproduce.exact import EXACT
 from livepde.reproduce.experiment import Experiment
 from livepde.reproduce.noisy import SEED_EXCITED_NOISE
 from livepde.reproduce.relatives import RELATIVES
@@ -27,6 +28,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         DIMENSIONS,
         BOIGER2016,
         RELATIVES,
+        EXACT,
     )
 }
 """Name -> experiment."""
