@@ -48,6 +48,7 @@ __all__ = ["LARGE", "ApproximateFactor", "BlockJacobian", "BlockSolver"]
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
+CEILING = 5e-3  # of a predicted stage: one more update costs as much as a forward step
 REFRESH = 0.5  # of the residual: an update costs a twentieth of new factors
 SPENT = 12  # updates and iterations: about what new factors cost
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
@@ -81,6 +82,10 @@ class BlockSolver(StageSolver):
     @property
     def refresh(self) -> float:
         return REFRESH
+
+    @property
+    def ceiling(self) -> float:
+        return CEILING
 
     def kept(self, factor: Factor) -> Factor:
         return factor.approximate if isinstance(factor, BlockJacobian) else factor
