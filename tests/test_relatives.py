@@ -97,8 +97,8 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
     metric = ConstantMetric(model, gain, 0.0).stage(c[n:], h, gain, 0.0)
     problem = StageProblem(c, h, lp.Moment(0.2), u_alpha, metric)
-    y, _ = stage.solve(problem, lambda: np.zeros_like(c))
-    u, q = y[:n], y[n:]
+    solved, _ = stage.solve(problem, lambda: np.zeros_like(c))
+    u, q = solved.y[:n], solved.y[n:]
     r = split.R @ u - u_alpha
     omega = model.bilinear(mass_form, split.omega)
     inside, outside = split.omega, np.setdiff1d(np.arange(model.mesh.nelements), split.omega)
