@@ -22,7 +22,7 @@ from skfem import (
 import livepde as lp
 from livepde.diagnostics import Spaces, stopping
 from livepde.fem import Form, FunctionSpace, Moment, forms, measure
-from livepde.laws import memory
+from livepde.laws import information
 from livepde.observation import base, reconstruction
 
 SLOTS = [("v", "u"), ("v", "q"), ("q", "u"), ("q", "v"), ("u", "q"), ("u", "v")]
@@ -292,7 +292,7 @@ def test_estimates_on_large_meshes(law, sensors, pieces, monkeypatch):
 def test_what_would_be_a_dense_matrix_of_a_field_is_refused(monkeypatch):
     model = square()
     averages = lp.Averages({"left": lambda x: x[0] < 0.5, "right": lambda x: x[0] >= 0.5})
-    monkeypatch.setattr(memory, "MOST_DENSE", 100)
+    monkeypatch.setattr(information, "MOST_DENSE", 100)
     with pytest.raises(lp.LawError, match="169 are too many, up to 100"):
         lp.Identifier(model, averages, lp.GradientLaw("auto"))
     lp.Identifier(model, lp.Full(), lp.GradientLaw("auto"))

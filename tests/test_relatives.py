@@ -97,7 +97,7 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
     metric = ConstantMetric(model, gain, 0.0).stage(c[n:], h, gain, 0.0)
     problem = StageProblem(c, h, lp.Moment(0.2), u_alpha, metric)
-    y, _ = stage.solve(problem, lambda: np.zeros_like(c))
+    y = stage.solve(problem, lambda: np.zeros_like(c))[0].y
     u, q = y[:n], y[n:]
     r = split.R @ u - u_alpha
     omega = model.bilinear(mass_form, split.omega)

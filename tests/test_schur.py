@@ -193,26 +193,18 @@ def test_one_update_takes_off_nearly_all_of_the_error(sensors, monkeypatch):
     solver, data, c = first_stage(plane(24), 1.0, monkeypatch, sensors, c1=0.0)
     K = solver.factor(data, solver.evaluate(data, c))
     residual = solver.evaluate(data, c).residual
-    exact, _ = K.iterate(residual, K.own, 1e-12)
-    left = K.own.solve(residual) - exact
+    exact, _ = K.iterate(residual, 1e-12)
+    left = K.approximate.solve(residual) - exact
     n = solver.terms.n
     for part in (slice(0, n), slice(n, None)):
         assert np.linalg.norm(left[part]) < 0.05 * np.linalg.norm(exact[part])
 
 
-def test_factors_of_another_point_precondition_as_long_as_they_serve(monkeypatch):
-    solver, data, c = first_stage(plane(), 1e3, monkeypatch, c1=0.0)
-    at = solver.evaluate(data, c)
-    first = solver.factor(data, at)
-    moved = solver.evaluate(data, 0.99 * c)
-    near = solver.factor(data, moved, first.own)
-    x = near.solve(moved.residual)
-    assert near.approximate is first.own
-    assert np.linalg.norm(near.apply(x) - moved.residual) < 1e-2 * np.linalg.norm(moved.residual)
-    monkeypatch.setattr(blocks, "PATIENCE", 0)
-    far = solver.factor(data, solver.evaluate(data, 3.0 * c), first.own)
-    assert np.isfinite(far.solve(at.residual)).all()
-    assert far.approximate is far.own  # the other was given no time
+def test_a_part_that_hardly_moves_does_not_hold_up_the_other(monkeypatch):
+    """Without a residual in the second line its update is rounding, which GMRES cannot reduce."""
+    model, law = plane(), lp.GradientLaw("auto", newton=EXACT)
+    _, counts = run(model, lp.Full(), law, monkeypatch, large=True, missing=3, samples=4)
+    assert max(counts) < 20
 
 
 def settled(model, sensors, samples, identifier=None):
@@ -258,8 +250,8 @@ def test_a_run_resumed_gives_the_same_numbers(gain, stream, tmp_path):
     again.load(tmp_path / "half.npz")
     one, kept = settled(model, sensors, samples[20:], whole)
     other, made = settled(model, sensors, samples[20:], again)
-    assert kept[0] == 0
-    assert made[0] == 1
+    assert made[0] == kept[0] + 1
+    assert made[1:] == kept[1:]
     for a, b in zip(one, other, strict=True):
         assert np.array_equal(a.u, b.u)
         assert np.array_equal(a.q, b.q)
@@ -301,10 +293,10 @@ def test_a_system_that_does_not_converge_is_a_status(monkeypatch):
     at = solver.evaluate(data, 1.1 * c)
     K = solver.factor(data, at)
     with pytest.raises(LinearAlgebraError, match="smaller gain or a smaller time step"):
-        K.iterate(at.residual, K.own, 0.0, 1)
+        K.iterate(at.residual, 0.0)
 
     def fails(self, b):
-        return K.iterate(at.residual, K.own, 0.0, 1)[0]
+        return K.iterate(at.residual, 0.0)[0]
 
     monkeypatch.setattr(BlockJacobian, "solve", fails)
     model, sensors = plane(), lp.Full()

@@ -114,18 +114,28 @@ def show(
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table."""
+    """Print a table: numbers are never cut; where the terminal is too narrow, words are folded.
+
+    A table whose numbers alone are wider than the terminal is printed as wide as they are.
+    """
     from rich.box import SIMPLE_HEAD
 
     grid = RichTable(
         title=escape(table.title), title_justify="left", box=SIMPLE_HEAD, title_style="bold"
     )
+    needed = 2
     for k, column in enumerate(table.columns):
+        cells = [_cell(row[k]) for row in table.rows]
         numbers = k > 0 and all(_numeric(row[k]) for row in table.rows)
-        grid.add_column(escape(column), justify="right" if numbers else "left")
+        words = [word for cell in cells for word in ([cell] if numbers else cell.split())]
+        width = max((len(word) for word in [*words, *column.split()]), default=1)
+        needed += width + 2
+        grid.add_column(
+            escape(column), justify="right" if numbers else "left", min_width=width, overflow="fold"
+        )
     for row in table.rows:
         grid.add_row(*(escape(_cell(value)) for value in row))
-    console.print(grid)
+    console.print(grid, width=max(console.width, needed), crop=False)
 
 
 def _numeric(value: Any) -> bool:

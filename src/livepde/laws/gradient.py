@@ -80,7 +80,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
     damping
         Rule for theta = mu / ||r||_V~.
     nu
-        Weight of P N P u >= 0. It damps the unobserved part itself, and so biases it.
+        Weight of P N P u >= 0. It draws P u to zero, not to the truth: needed where the process
+        does not damp the unobserved part (D < 0), and it may help or harm where it does.
     sigma
         Stabilising term of (noisy_q), >= 0.
     M_op, N_op

@@ -77,7 +77,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from livepde.errors import LawError
 from livepde.laws.coupled import Metric
 from livepde.laws.coupled.forms import StageForms
-from livepde.laws.metrics import HOLD, MetricRule, MetricStep, StepBegin, Transition
+from livepde.laws.metrics import MetricRule, MetricStep, StepBegin, Transition
 from livepde.laws.normal_equations import (
     NormalEquations,
     ProjectedRows,
@@ -91,6 +91,7 @@ from livepde.spaces import HilbertSpace
 __all__ = ["Information", "InformationMetric"]
 
 PULL = 10.0  # theta h: r forgets within a step
+HELD = 1e6  # times heavier than a sample is a prior that keeps q where it is
 LEADING, DRAWS = 4, 4  # modes and draws of the prior, for traces: their error is a few per cent
 LANCZOS = 20  # steps for the square root of G_Q^{-1}; the trace is then exact to 1 %
 COARSE = 1e-3  # relative accuracy of those modes
@@ -274,7 +275,7 @@ class InformationMetric(MetricRule[Information]):
     def frozen(self, state: Information, forms: StageForms, begin: StepBegin) -> MetricStep:
         A = forms.A_in.data("v", "q", begin.moment, u=begin.w, q=begin.q)
         trace = float(self.normal(forms).trace(A, self.probes).sum())
-        spread = HOLD * max(state.spread, begin.length * trace) or 1.0
+        spread = HELD * max(state.spread, begin.length * trace) or 1.0
         held, load = state.held / PULL, np.zeros_like(begin.q)
         return lambda c, h: Metric(spread / PULL, 0.0, load, held, PULL / h)
 

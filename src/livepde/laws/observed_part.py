@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from livepde.laws.base import Problem
 from livepde.laws.metrics import NoState
-from livepde.laws.smoothing import Balance, Smoother
+from livepde.laws.smoothing import Balance, NoiseDetector, Smoother
 from livepde.linalg import Array
 from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval
@@ -27,6 +28,7 @@ __all__ = [
 LARGEST_MEMO = 8  # smoothers kept for different sets of present sensors
 
 State = TypeVar("State")
+Kept = TypeVar("Kept")
 
 
 class ObservedPath(ABC):
@@ -125,6 +127,7 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
+        self._detectors: dict[bytes, NoiseDetector] = {}
         self._smoothers: dict[bytes, Smoother] = {}
 
     def init(self) -> Balance:
@@ -133,22 +136,34 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
     def over(
         self, state: Balance, split: Split, interval: Interval
     ) -> tuple[Balance, ObservedPath]:
-        smoother, model = self._smoother(split.present), self.problem.model
-        zero = np.zeros(model.X.dim)
-        times = (interval.t1,) if state.samples else (interval.t0, interval.t1)
-        for t in times:
-            z = interval.z1 if t == interval.t1 else interval.z0
-            state = smoother.add(state, z, model.impose(zero, interval.at(t)))
-        alpha = smoother.alpha(state)
+        model, key = self.problem.model, split.present.tobytes()
+        detector = _kept(self._detectors, key, lambda: NoiseDetector(self.problem.observed, split))
+        smoother, alpha = None, 0.0
+        samples = [(interval.t1, interval.z1)]
+        if np.isnan(state.z).all():  # the first interval
+            samples.insert(0, (interval.t0, interval.z0))
+        for t, z in samples:
+            boundary = model.impose(np.zeros(model.X.dim), interval.at(t))
+            state, noisy = detector.add(state, z, boundary)
+            if noisy:
+                make = partial(Smoother, self.problem.observed, split.present)
+                smoother = _kept(self._smoothers, key, make)
+                state = smoother.add(state, z, boundary)
+                alpha = smoother.alpha(state)
+            else:
+                state = state.followed(z, boundary)
+        if smoother is None:
+            return state, _InversePath(self.problem, interval, split)
         return state, _SmoothedPath(self.problem, interval, split, smoother, alpha)
 
-    def _smoother(self, present: Array) -> Smoother:
-        key = present.tobytes()
-        if key not in self._smoothers:
-            if len(self._smoothers) >= LARGEST_MEMO:
-                self._smoothers.clear()
-            self._smoothers[key] = Smoother(self.problem.observed, present)
-        return self._smoothers[key]
+
+def _kept(memo: dict[bytes, Kept], key: bytes, make: Callable[[], Kept]) -> Kept:
+    """Return what is kept for a set of present sensors."""
+    if key not in memo:
+        if len(memo) >= LARGEST_MEMO:
+            memo.clear()
+        memo[key] = make()
+    return memo[key]
 
 
 class _SmoothedPath(_InversePath):

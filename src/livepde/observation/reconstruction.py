@@ -341,7 +341,7 @@ class Spectral(Reconstructor):
         self.weights = weights(observed, present)
         self.level = noise_level(observed, present, self.weights)
         basis = observed.split(present).basis
-        penalty = _penalty(config.norm, observed, basis)
+        penalty = penalty_matrix(config.norm, observed, basis)
         self.size = basis.shape[1]
         if self.size == 0:
             return
@@ -463,7 +463,7 @@ class _Inside:
         return ~touched
 
 
-def _penalty(norm: str | Integrand, observed: BoundSensors, basis: Array) -> sp.csr_array:
+def penalty_matrix(norm: str | Integrand, observed: BoundSensors, basis: Array) -> sp.csr_array:
     """Return the matrix of |v|^2 on all coefficients, shape (n, n)."""
     if norm == "X":
         free = sp.diags_array(observed.X.free)

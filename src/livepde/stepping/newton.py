@@ -131,6 +131,7 @@ class Newton:
     ceiling
         Bound on the relative residual with `share`. The default keeps q and u within 1e-3 of those
         of strict solves (`livepde reproduce exact`): what is left adds up where little damps it.
+        Large coupled stages, solved by blocks, raise it to 5e-3.
     iterations
         At most this many updates.
     refresh

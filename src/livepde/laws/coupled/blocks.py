@@ -48,6 +48,8 @@ __all__ = ["LARGE", "ApproximateFactor", "BlockJacobian", "BlockSolver"]
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
+CEILING = 5e-3  # of a predicted stage: one more update costs as much as a forward step
+RESOLVED = 1e-10  # of u and q: smaller updates by GMRES are as good as none
 REFRESH = 0.5  # of the residual: an update costs a twentieth of new factors
 SPENT = 12  # updates and iterations: about what new factors cost
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
@@ -81,6 +83,10 @@ class BlockSolver(StageSolver):
     @property
     def refresh(self) -> float:
         return REFRESH
+
+    @property
+    def ceiling(self) -> float:
+        return CEILING
 
     def kept(self, factor: Factor) -> Factor:
         return factor.approximate if isinstance(factor, BlockJacobian) else factor
@@ -129,7 +135,8 @@ class BlockSolver(StageSolver):
         row = terms.slope(data, at)
         border = None if row is None else (at.Mr * free, row * free)
         blocks = S, forward, A, self._metric(data), rates
-        return BlockJacobian(self, *blocks, back, curved, border)
+        least = tuple(RESOLVED * float(np.linalg.norm(part)) for part in (u, q))
+        return BlockJacobian(self, *blocks, least, back, curved, border)
 
     def _metric(self, data: StageData) -> sp.csr_array:
         """Return H on the free coefficients, with its auxiliary unknowns."""
@@ -190,6 +197,8 @@ class BlockJacobian:
         only; H with its auxiliary unknowns behind.
     rates
         Lumped mass times the rate of each equation of the state, shape (n,).
+    least
+        Sizes of updates of u and q that are not resolved further.
     back, curved
         Derivatives of A(w)^T r in u and in q; None if they are held or zero.
     border
@@ -202,6 +211,7 @@ class BlockJacobian:
     A: sp.csr_array
     H: sp.csr_array
     rates: Array
+    least: tuple[float, ...]
     back: sp.csr_array | None
     curved: sp.csr_array | None
     border: tuple[Array, Array] | None = None
@@ -258,8 +268,10 @@ class BlockJacobian:
         padded = np.zeros(size + terms.auxiliary)
         padded[:size] = b
         first = approximate.whole(padded)
-        sizes = [float(np.linalg.norm(part)) or 1.0 for part in (first[:n], first[n:size])]
-        scale = np.repeat(1.0 / np.array(sizes), [n, len(first) - n])  # u and q count the same
+        # u and q count the same, unless one of them hardly moves: that is rounding.
+        found = (float(np.linalg.norm(part)) for part in (first[:n], first[n:size]))
+        sizes = [max(pair) or 1.0 for pair in zip(found, self.least, strict=True)]
+        scale = np.repeat(1.0 / np.array(sizes), [n, len(first) - n])
 
         def scaled(r: Array) -> Array:
             return (first if r is padded else approximate.whole(r)) * scale

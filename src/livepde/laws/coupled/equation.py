@@ -364,6 +364,11 @@ class StageSolver(ABC):
         """Share of the residual that an update by a kept factor may leave before a new one pays."""
         return 0.2
 
+    @property
+    def ceiling(self) -> float:
+        """Relative residual up to which a predicted stage is not solved further (`Newton`)."""
+        return 0.0
+
     @abstractmethod
     def factor(self, data: StageData, at: StageIterate) -> Factor:
         """Return the factorised Jacobian at a point."""

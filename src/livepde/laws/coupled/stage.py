@@ -141,7 +141,7 @@ class CoupledStage:
         self.terms = terms
         large = DistributedSolver.of(terms) or BlockSolver.of(terms)
         self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
-        self.newton = newton
+        self.newton = replace(newton, ceiling=max(newton.ceiling, self.solver.ceiling))
         self._last: tuple[Array, Factor] | None = None
 
     def solve(
