@@ -99,8 +99,8 @@ def rod(newton, scheme=None, gain=1e4, given=ROD):
 def test_one_update_is_enough_in_most_steps():
     few, updates = rod(lp.Newton())
     exact, more = rod(EXACT)
-    assert updates[10:].mean() < 1.3 < 2.5 < more[10:].mean()
-    assert np.mean(updates[10:] == 1) > 0.7
+    assert updates[10:].mean() < 1.6 < 2.5 < more[10:].mean()
+    assert np.mean(updates[10:] == 1) > 0.5
     for one, other in zip(few[10:], exact[10:], strict=True):
         assert np.linalg.norm(one.q - other.q) < 5e-4 * np.linalg.norm(other.q)
         assert np.linalg.norm(one.u - other.u) < 2e-5 * np.linalg.norm(other.u)
