@@ -37,6 +37,7 @@ FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
 STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r away
 RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
+OWED = 3e-2  # weight of the second line's residual, where a later step makes up for it
 ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
 
 
@@ -233,11 +234,14 @@ class StageTerms:
         state, *terms = self.duals(first, self.parts[0])
         other, *terms_q = self.duals(second, self.parts[1])
         scales = max(data.sizes[0], *terms), max(data.sizes[1], *terms_q)
-        relative = max(state / max(scales[0], TINY), other / max(scales[1], TINY))
+        own, own_q = state / max(scales[0], TINY), other / max(scales[1], TINY)
+        if data.metric.theta is not None:
+            # Such a metric takes up in the next step what is left of q and r in this one.
+            return max(own, OWED * own_q), True, scales
         # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
         missed = state / (1.0 / data.h + theta)
         r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
-        return relative, missed <= RESOLVED * r or not self.observes, scales
+        return max(own, own_q), missed <= RESOLVED * r or not self.observes, scales
 
     def sizes(
         self, c: Array, h: float, source: Array, u_alpha: Array, metric: Metric

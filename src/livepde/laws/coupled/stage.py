@@ -30,6 +30,7 @@ __all__ = ["CoupledStage", "KeptFactor", "StageProblem", "nearest_root"]
 SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
 STRIDE = 1.5  # factor between two values of theta that are tried
 WIDEST = 1e6  # factor to both sides within which theta is searched
+SAME = 1e-9  # of a step: steps that are the same but for rounding
 ACCURACY = 1e-8  # relative, of theta: Newton goes on from there
 
 
@@ -214,7 +215,7 @@ class CoupledStage:
 
     def _factor(self, kept: KeptFactor, problem: StageProblem) -> Factor | None:
         """Return the factor that is kept, made again if the last one is another."""
-        if not len(kept.y) or kept.h != problem.h:
+        if not len(kept.y) or abs(kept.h - problem.h) > SAME * problem.h:
             return None
         last = self._last
         if last is not None and last[0] is kept.y:
