@@ -96,24 +96,23 @@ def rod(newton, scheme=None, gain=1e4, given=ROD):
     return estimates, np.array(updates)
 
 
-def test_one_update_is_enough_in_most_steps():
+def test_one_update_or_two_are_enough():
     few, updates = rod(lp.Newton())
     exact, more = rod(EXACT)
     assert updates[10:].mean() < 1.6 < 2.5 < more[10:].mean()
     assert np.mean(updates[10:] == 1) > 0.5
     for one, other in zip(few[10:], exact[10:], strict=True):
-        assert np.linalg.norm(one.q - other.q) < 5e-4 * np.linalg.norm(other.q)
-        assert np.linalg.norm(one.u - other.u) < 2e-5 * np.linalg.norm(other.u)
+        assert np.linalg.norm(one.q - other.q) < 4e-4 * np.linalg.norm(other.q)
+        assert np.linalg.norm(one.u - other.u) < 1e-5 * np.linalg.norm(other.u)
 
 
 def test_a_start_that_suddenly_misses_more_is_followed_further():
     """A factor of another theta serves badly then: theta has turned."""
     given = replace(ROD, width=0.55)
-    norm = ROD.model.X.norm
     few, _ = rod(lp.Newton(), gain=1e2, given=given)
     exact, _ = rod(EXACT, gain=1e2, given=given)
     for one, other in zip(few, exact, strict=True):
-        assert norm(one.u - other.u) < 2e-3 * norm(other.u)
+        assert np.linalg.norm(one.u - other.u) < 0.01 * np.linalg.norm(other.u)
 
 
 def test_a_scheme_of_second_order_solves_its_stages_to_the_end():
@@ -128,9 +127,9 @@ def test_most_steps_make_no_factor(plate, monkeypatch):
     made = []
     factor = BilinearSolver.factor
 
-    def counted(self, data, at, last=None):
+    def counted(self, data, at):
         made.append(at)
-        return factor(self, data, at, last)
+        return factor(self, data, at)
 
     monkeypatch.setattr(BilinearSolver, "factor", counted)
     law = lp.GradientLaw(1.0, lp.ResidualDamping(0.1))
