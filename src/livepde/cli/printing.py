@@ -128,7 +128,7 @@ def print_table(console: Console, table: Table) -> None:
         cells = [_cell(row[k]) for row in table.rows]
         numbers = k > 0 and all(_numeric(row[k]) for row in table.rows)
         words = [word for cell in cells for word in ([cell] if numbers else cell.split())]
-        width = max((len(word) for word in [*words, *column.split()]), default=1)
+        width = max((len(word) for word in [*words, *column.split()]), default=0)
         needed += width + 2
         grid.add_column(
             escape(column), justify="right" if numbers else "left", min_width=width, overflow="fold"
