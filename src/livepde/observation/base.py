@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment, Named, Place, Scalars
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, Mask
 from livepde.observation.reconstruction import (
     Pseudoinverse,
     Reconstructed,
@@ -105,6 +105,10 @@ class Observation:
     def nodal(self) -> bool:
         """True if G^+ is taken in coefficients, false if in the inner product of X."""
         return False
+
+    def region(self, state: FunctionSpace) -> Mask | None:
+        """Return which elements of the mesh lie in the part that is observed; None: not known."""
+        return None
 
     @property
     def portable(self) -> bool:
@@ -366,6 +370,9 @@ class Observed:
             if own.any():
                 complete = known[start + block.element_dofs].all(axis=0)
                 inside = inside & complete if len(inside) else complete
+        asked = self.observation.region(self.state)
+        if asked is not None and len(inside):
+            inside = inside & asked
         return None if inside.all() and len(inside) else np.flatnonzero(inside)
 
 

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment, Place
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.observation.base import STEP, Observation, Observed, numbers
 from livepde.spaces import HilbertSpace
 
@@ -56,6 +56,11 @@ class Combined(Observation):
     @property
     def nodal(self) -> bool:
         return all(part.nodal for part in self.parts)
+
+    def region(self, state: FunctionSpace) -> Mask | None:
+        parts = [part.region(state) for part in self.parts]
+        known = [part for part in parts if part is not None]
+        return np.logical_or.reduce(known) if len(known) == len(parts) else None
 
     @property
     def portable(self) -> bool:

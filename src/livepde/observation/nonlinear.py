@@ -26,7 +26,7 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.observation.base import STEP, Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
 
@@ -96,6 +96,9 @@ class Transformed(Observation):
     @property
     def nodal(self) -> bool:
         return self.base.nodal
+
+    def region(self, state: FunctionSpace) -> Mask | None:
+        return self.base.region(state)
 
     @property
     def portable(self) -> bool:

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Predicate
 from livepde.fem.measure import Measure
-from livepde.linalg import IntArray
+from livepde.linalg import IntArray, Mask
 from livepde.observation.base import Observation
 
 __all__ = ["Full", "Subdomain"]
@@ -46,6 +46,12 @@ class Subdomain(Observation):
             found = np.broadcast_to(self.omega(x.reshape(len(x), -1)), x[0].size)
             inside[at] = found.reshape(x.shape[1:]).all(axis=1)
         return np.flatnonzero(inside)
+
+    def region(self, state: FunctionSpace) -> Mask:
+        block, _ = state.component(self.of)
+        inside = np.zeros(block.field.mesh.nelements, dtype=bool)
+        inside[self.elements(block)] = True
+        return inside
 
     def selected(self, state: FieldBlock) -> IntArray:
         """Return the free coefficients of the elements that lie in omega."""

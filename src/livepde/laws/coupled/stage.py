@@ -142,7 +142,9 @@ class CoupledStage:
         self.terms = terms
         large = DistributedSolver.of(terms) or BlockSolver.of(terms)
         self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
-        self.newton = replace(newton, ceiling=max(newton.ceiling, self.solver.ceiling))
+        # What a stage leaves would be learned from where the metric is that of the information.
+        least = self.solver.ceiling if terms.memory is None else 0.0
+        self.newton = replace(newton, ceiling=max(newton.ceiling, least))
         self._last: tuple[Array, Factor] | None = None
 
     def solve(
