@@ -34,7 +34,7 @@ from livepde.stepping import TINY
 __all__ = ["Inside", "StageData", "StageIterate", "StageSolver", "StageTerms"]
 
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
-RESOLVED = 1e-2  # relative accuracy of r, as far as it is above the floor
+RESOLVED = 1e-3  # relative accuracy of r, as far as it is above the floor
 STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r away
 RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
 OWED = 3e-2  # weight of the second line's residual, where a later step makes up for it
