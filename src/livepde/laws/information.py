@@ -98,8 +98,8 @@ COARSE = 1e-3  # relative accuracy of those modes
 ROUNDING = 1e-12  # relative: what is smaller is zero
 FORGETS = 4.0  # power of time that weighs a sample in the mean of S
 FADES = np.array([1.0, 4.0])  # power of time that weighs a sample in J: its rows of both kinds
-AGED = 1.0  # relative change of S, or of the trace of J, that renews H
-STEEPER = 0.25  # relative growth of J along a step that renews H: at 1 steps would go to and fro
+AGED = 2.0  # relative change of S, or of the trace of J, that renews H
+STEEPER = 0.5  # relative growth of J along a step that renews H: at 1 steps would go to and fro
 MOST_NORMAL = 8  # sets of sensors of which normal equations are kept
 MOST_DENSE = 4000  # unknowns of which J may be dense
 CHANCE = 1e-6  # that a right model leaves its prior
@@ -301,7 +301,7 @@ class InformationMetric(MetricRule[Information]):
         Q, h = self.model.Q, after.length
         A = after.forms.A_in.data("v", "q", after.moment, u=after.w, q=after.q)
         gain = self.normal(after.forms).gain(A, after.q, after.error, self.probes)
-        rough = gain.matrix.sum(axis=0)[self.on_diagonal] / self.diagonal
+        rough = gain.matrix[:, self.on_diagonal] @ (1.0 / self.diagonal)
         power = np.array(
             [gain.force @ Q.riesz(gain.force), gain.force @ (gain.force / self.diagonal)]
         )
@@ -309,9 +309,12 @@ class InformationMetric(MetricRule[Information]):
         elapsed = state.elapsed + h
         kept = max(0.0, 1.0 - FORGETS * h / elapsed)
         faded = np.maximum(0.0, 1.0 - FADES * h / elapsed)
+        matrix = h * gain.matrix
+        for new, old, share in zip(matrix, state.matrix, faded, strict=True):
+            new += share * old
         learned = replace(
             state,
-            matrix=faded[:, None] * state.matrix + h * gain.matrix,
+            matrix=matrix,
             right=faded[:, None] * state.right + h * gain.right,
             total=faded * state.total + h * gain.trace,
             given=state.given + h * float(gain.trace.sum()),

@@ -125,12 +125,12 @@ class SelectedRows(NormalEquations):
         y = images[:, 0] - error
         columns = np.column_stack([*(self.inverse * y), self.inverse.sum(axis=0) * error])
         products = (matrix.T @ columns).T * self.free
-        trace = (self.inverse @ images[:, 1:] ** 2).sum(axis=1)
+        trace = self.inverse @ np.square(images[:, 1:]).sum(axis=1)
         return Gain(self._matrix(A), products[:2], products[2], trace)
 
     def trace(self, A: Array, probes: Array) -> Array:
         images = self.pattern.compact(A) @ probes
-        trace: Array = (self.inverse @ images**2).sum(axis=1)
+        trace: Array = self.inverse @ np.square(images).sum(axis=1)
         return trace
 
 
