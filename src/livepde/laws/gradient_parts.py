@@ -174,7 +174,10 @@ class StageSequence:
         """Return the change of (u - u_alpha, q) over the interval, per unit of time."""
         n, interval = self.coupled.terms.n, self.path.interval
         change = end - begin
-        change[:n] -= self.path.at(interval.t1).u - self.path.at(interval.t0).u
+        if self.slope is None:  # the data at the beginning are not those of these sensors
+            change[:n] -= self.coupled.terms.forms.split.project(change[:n])
+        else:
+            change[:n] -= self.path.at(interval.t1).u - self.path.at(interval.t0).u
         return change / (interval.t1 - interval.t0)
 
 

@@ -220,7 +220,12 @@ class StageTerms:
         return found
 
     def measured(
-        self, data: StageData, first: list[Array], second: list[Array], X: float, theta: float
+        self,
+        data: StageData,
+        first: list[Array],
+        second: list[Array],
+        X: float,
+        theta: float,
     ) -> tuple[float, bool, tuple[float, float]]:
         """Return the relative size of a residual, whether it resolves r, and the scales of both.
 
@@ -239,9 +244,9 @@ class StageTerms:
             # Such a metric takes up in the next step what is left of q and r in this one.
             return max(own, OWED * own_q), True, scales
         # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
-        missed = state / (1.0 / data.h + theta)
+        least = 1.0 / data.h + theta
         r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
-        return max(own, own_q), missed <= RESOLVED * r or not self.observes, scales
+        return max(own, own_q), state <= RESOLVED * r * least or not self.observes, scales
 
     def sizes(
         self, c: Array, h: float, source: Array, u_alpha: Array, metric: Metric
