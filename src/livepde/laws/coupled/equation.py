@@ -37,7 +37,7 @@ FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-3  # relative accuracy of r, as far as it is above the floor
 STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r away
 RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
-OWED = 3e-2  # weight of the second line's residual, where a later step makes up for it
+OWED = 0.1  # weight of the second line's residual, where a later step makes up for it
 ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
 
 
