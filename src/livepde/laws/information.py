@@ -27,18 +27,21 @@ So a step need not be exact: what filter, pull and iteration leave undone, and w
 asks for, is in b - J c - S G_Q (c - q0), and the next step does it. Without b, by the drive A^T r
 alone, q and J disagree on rough functions by the ratio of D to M, and when S falls q jumps by that.
 
-S is the power of the equation error that is left, as far as q sees it, all of it:
+S is the power of the equation error that is left, as far as q sees it,
 
-    S = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
+    power(eps) = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
+    S          = (power(eps_k) power(eps_k - eps_{k-1})/2)^{1/2}.
 
-or the same with the diagonal of G_Q in the place of G_Q, whichever is larger: the first is what
-smooth functions see of the error, the second what rough ones do, where derivatives of noisy data
-are far larger. (With the first alone 1 % of noise moved q by 1.3 times what the prior allows.) So
-what mesh, time step, smoothing and a wrong P u leave in the equation counts as noise as well, as
-long as q cannot take it up. S is positive by construction. (Noise alone is what turns back between
-samples, -(eps_k - eps_{k-1}, eps_{k-1} - eps_{k-2}); but any error that goes on makes that
-negative, and S zero.) The mean weighs a sample at time t by t^FORGETS: it forgets the start, and of
-exact data S vanishes. The first sample moves nothing: it tells S.
+Of white noise both powers are S. An error that goes on counts, too, the less the slower it changes:
+so what mesh, time step, smoothing and a wrong P u leave in the equation holds q back as noise does,
+and a wrong q hardly. (By the first alone, a q far from its prior was never learned: its own error
+is all noise. By the second alone, q left its prior for some samples at first. By what turns back,
+-(eps_k - eps_{k-1}, eps_{k-1} - eps_{k-2}), which is noise alone but of either sign, S was zero as
+soon as errors went on.) The same is done with the diagonal of G_Q in the place of G_Q, and the
+larger S is taken: the first is what smooth functions see of the error, the second what rough ones
+do, where derivatives of noisy data are far larger. (With the first alone 1 % of noise moved q by
+1.3 times what the prior allows.) Means weigh a sample at time t by t^FORGETS: they forget the
+start, and of exact data S vanishes. The first sample moves nothing: it tells S.
 
 Samples in J and b are weighed by t^FADES, in two kinds of rows. Those that see nothing but the
 data, with tests within omega, fade slowly: the first samples are the least smoothed. The others
@@ -120,8 +123,13 @@ class Information:
         trace(G_Q^{-1} J) of the same, shape (2,).
     given
         trace(G_Q^{-1} J) of all rows without fading.
-    power, seen
-        The means of which S is the quotient: what smooth and what rough functions see, shape (2,).
+    force
+        A^T D^{-1} eps of the last sample, and its representative in Q, shape (2, m).
+    power
+        Means of the power of forces and of half that of their changes, of what smooth functions see
+        and of what rough ones do, shape (2, 2).
+    seen
+        Means of the traces that they are relative to, shape (2,).
     elapsed, samples
         Time and number of samples.
     spread, held, weighed
@@ -133,6 +141,7 @@ class Information:
     right: Array
     total: Array
     given: float
+    force: Array
     power: Array
     seen: Array
     elapsed: float
@@ -254,7 +263,8 @@ class InformationMetric(MetricRule[Information]):
             right=np.zeros((2, len(q0))),
             total=np.zeros(2),
             given=0.0,
-            power=np.zeros(2),
+            force=np.zeros((2, len(q0))),
+            power=np.zeros((2, 2)),
             seen=np.zeros(2),
             elapsed=0.0,
             samples=0,
@@ -302,9 +312,9 @@ class InformationMetric(MetricRule[Information]):
         A = after.forms.A_in.data("v", "q", after.moment, u=after.w, q=after.q)
         gain = self.normal(after.forms).gain(A, after.q, after.error, self.probes)
         rough = gain.matrix[:, self.on_diagonal] @ (1.0 / self.diagonal)
-        power = np.array(
-            [gain.force @ Q.riesz(gain.force), gain.force @ (gain.force / self.diagonal)]
-        )
+        force = np.stack([gain.force, Q.riesz(gain.force)])
+        change = force - state.force if state.samples else math.sqrt(2.0) * force
+        power = np.stack([self._powers(force), self._powers(change) / 2.0])
         seen = np.array([gain.trace.sum(), rough.sum()])
         elapsed = state.elapsed + h
         kept = max(0.0, 1.0 - FORGETS * h / elapsed)
@@ -318,12 +328,18 @@ class InformationMetric(MetricRule[Information]):
             right=faded[:, None] * state.right + h * gain.right,
             total=faded * state.total + h * gain.trace,
             given=state.given + h * float(gain.trace.sum()),
+            force=force,
             power=kept * state.power + h * h * power,
             seen=kept * state.seen + h * seen,
             elapsed=elapsed,
             samples=state.samples + 1,
         )
         return self._renewed(learned, after.change)
+
+    def _powers(self, force: Array) -> Array:
+        """Return the squared norms of a force, in Q* and by the diagonal of G_Q."""
+        dual, own = force
+        return np.array([dual @ own, dual @ (dual / self.diagonal)])
 
     def _renewed(self, state: Information, change: Array) -> Information:
         """Return the state with an H that is new if the last one has aged.
@@ -336,7 +352,8 @@ class InformationMetric(MetricRule[Information]):
         if not np.all(state.seen > 0.0):
             return state
         least = float((state.total / RESOLUTION).sum())
-        S, total = max(float((state.power / state.seen).max()), least), float(state.total.sum())
+        powers = np.sqrt(np.maximum(state.power, 0.0).prod(axis=0)) / state.seen
+        S, total = max(float(powers.max()), least), float(state.total.sum())
         J = state.matrix.sum(axis=0)
         old, most = (state.spread, state.weighed), 1.0 + AGED
         if all(new / most <= last <= new * most for new, last in zip((S, total), old, strict=True)):

@@ -28,6 +28,7 @@ and a sample costs a few products with a sparse one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +44,7 @@ __all__ = ["Balance", "NoiseDetector", "Smoother", "smooths"]
 ORDER = 4  # of the iterated Tikhonov method
 GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
 LARGEST = 3000  # sensors: the modes are those of a dense matrix
+ROUNDING = 1e-14  # of second derivatives, relative to the sum of their terms
 FEWEST = 8  # modes below which their rougher half says nothing about noise
 
 
@@ -63,7 +65,7 @@ class Balance:
     z, boundary
         The last two samples and the boundary values at their times, shapes (2, sensors), (2, n).
     turned
-        By how much samples have turned back so far; exact data have not.
+        Sum of the cosines by which samples have turned back so far; those of exact data go on.
     """
 
     left: Array
@@ -136,8 +138,12 @@ class NoiseDetector:
             pairs = zip(samples, known, strict=True)
             u = np.stack([self.split.reconstruct(*pair) + pair[1] for pair in pairs])
             before, now = np.diff(self.rows @ u.T, axis=1).T
-            turned = balance.turned - float(before @ (self.scale * now))
-            balance = replace(balance, turned=turned)
+            size = math.sqrt(float((before**2 @ self.scale) * (now**2 @ self.scale)))
+            rounding = abs(self.rows) @ np.abs(u).max(axis=0) * ROUNDING
+            if size > float(rounding**2 @ self.scale):
+                # The cosine: each pair of changes counts the same, however large a start was.
+                turned = balance.turned - float(before @ (self.scale * now)) / size
+                balance = replace(balance, turned=turned)
         return balance, self.small or balance.turned > 0.0
 
 
