@@ -134,14 +134,14 @@ def reaction(cells: int) -> lp.Model:
     )
 
 
-@pytest.mark.parametrize(("cells", "said"), [(60, True), (180, False)])
-def test_a_field_that_has_left_its_prior_is_said(cells: int, said: bool):
-    """Data of 180 cells: 60 leave an equation error that is no noise."""
+@pytest.mark.parametrize("cells", [60, 180])
+def test_an_equation_error_that_is_no_noise_does_not_drive_a_field_out_of_its_prior(cells: int):
+    """Data of 180 cells: 60 leave an error of the mesh in the equation, and q does not take it up."""
     fine, model, times = reaction(180), reaction(cells), 0.05 * np.arange(101)
     root = np.linalg.inv(np.linalg.cholesky(fine.Q.gram.toarray())).T
     true = 3.0 + root @ np.random.default_rng(0).standard_normal(fine.Q.dim)
     nodes = np.sort(model.mesh.p[0])
-    G = lp.Points(nodes[(nodes > 0.3) & (nodes < 0.87)].tolist()).matrix(fine.state_space)
+    G = lp.Points(nodes[(nodes > 0.299) & (nodes < 0.87)].tolist()).matrix(fine.state_space)
     control = Advance(lp.Alexander2(), dt_max=0.025)
     samples = [(t, G @ u) for t, u in simulate(fine, true, 0.0, times.tolist(), control)]
     identifier = lp.Identifier(
@@ -156,12 +156,9 @@ def test_a_field_that_has_left_its_prior_is_said(cells: int, said: bool):
     found = np.interp(np.sort(fine.mesh.p[0]), nodes, data["q"].values[-1])
     right = true[np.argsort(fine.mesh.p[0])]
     wrong = np.linalg.norm(found - right) / np.linalg.norm(right)
-    assert wrong > 100 if said else wrong < 0.2
-    sentences = doubts(data)
-    assert len(sentences) == said
-    if said:
-        assert "have left their prior" in sentences[0]
-        assert "sensitivity" in sentences[0]
+    assert wrong < 0.2
+    assert data["departure"].values[-1] < 1.0
+    assert not doubts(data)
 
 
 @pytest.mark.parametrize(("last", "said"), [(0.9, False), (1.1, True)])
