@@ -136,7 +136,7 @@ def reaction(cells: int) -> lp.Model:
 
 @pytest.mark.parametrize("cells", [60, 180])
 def test_an_equation_error_that_is_no_noise_does_not_drive_a_field_out_of_its_prior(cells: int):
-    """Data of 180 cells: 60 leave an error of the mesh in the equation, and q does not take it up."""
+    """Data of 180 cells: 60 leave an error of the mesh, and q does not take it up."""
     fine, model, times = reaction(180), reaction(cells), 0.05 * np.arange(101)
     root = np.linalg.inv(np.linalg.cholesky(fine.Q.gram.toarray())).T
     true = 3.0 + root @ np.random.default_rng(0).standard_normal(fine.Q.dim)
