@@ -196,7 +196,8 @@ class Identifier:
         """Take one sample and return the estimate at its time.
 
         A step that fails numerically changes nothing and says so in `status`; the next sample
-        tries again from the last good state. Bad input raises and changes nothing.
+        tries again from the last good state. One with the status "departed" takes the sample and
+        holds the unknowns. Bad input raises and changes nothing.
 
         Raises
         ------
@@ -233,7 +234,7 @@ class Identifier:
             interval = Interval(self._t, t, self._inputs, values, self._z, used)
             self._state, report = self.law.step(self._work, self._state, interval)
         self._samples += 1
-        if report.status.ok:
+        if report.status.taken:
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held)
 

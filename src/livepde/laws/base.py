@@ -45,8 +45,13 @@ class Status:
 
     @property
     def ok(self) -> bool:
-        """True if the step was taken."""
+        """True if the step was taken and nothing is wrong."""
         return self.code == "ok"
+
+    @property
+    def taken(self) -> bool:
+        """True if the sample was taken: unknowns that would have departed are held meanwhile."""
+        return self.code in ("ok", "departed")
 
     @property
     def remedy(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -159,8 +159,19 @@ class GradientLaw(Law[GradientParts, GradientState]):
     def step(
         self, work: GradientParts, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
-        model, n = work.problem.model, len(state.u)
         interval = work.problem.linear_readings(interval, state.u)
+        new, report = self._advanced(work, state, interval, work.closed(state.excitation))
+        if report.status.ok and (doubt := work.metric.doubt(new.metric, new.q)):
+            new, report = self._advanced(work, state, interval, frozen=True)
+            if report.status.ok:
+                report = replace(report, status=Status("departed", doubt))
+        return new, report
+
+    def _advanced(
+        self, work: GradientParts, state: GradientState, interval: Interval, frozen: bool
+    ) -> tuple[GradientState, Report]:
+        """Return the state at the end of an interval; with `frozen`, q is held."""
+        model, n = work.problem.model, len(state.u)
         coupled = work.stage(interval.present)
         forms, moment, length = coupled.terms.forms, interval.end, interval.t1 - interval.t0
         R = forms.split.project
@@ -171,7 +182,6 @@ class GradientLaw(Law[GradientParts, GradientState]):
         w = u_alpha + state.u - R(state.u)
         same = np.array_equal(interval.present, state.present)
         begin = StepBegin(state.q, w, moment, length)
-        frozen = work.closed(state.excitation)
         rule = work.metric.frozen if frozen else work.metric.step
         metric = rule(state.metric, forms, begin)
 
@@ -185,15 +195,9 @@ class GradientLaw(Law[GradientParts, GradientState]):
             return state, Report(Status.of(failure), predicted)
 
         u, q = end[:n], model.latent.clipped(end[n:])
-        r = R(u) - u_alpha
-        learned = state.metric
-        if not frozen:
-            change, error = end[n:] - state.q, stages.equation_error()
-            after = Transition(forms, end[n:], u - r, change, error, moment, length)
-            learned = work.metric.learn(state.metric, after)
-        if doubt := work.metric.doubt(learned, q):
-            predicted = work.problem.predict(state.u, state.q, moment)
-            return state, Report(Status("departed", doubt), predicted)
+        r, error = R(u) - u_alpha, stages.equation_error()
+        after = Transition(forms, end[n:], u - r, end[n:] - state.q, error, moment, length)
+        learned = work.metric.learn(state.metric, after)
         new = GradientState(
             u=u,
             q=q,

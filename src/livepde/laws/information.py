@@ -43,10 +43,11 @@ do, where derivatives of noisy data are far larger. (With the first alone 1 % of
 1.3 times what the prior allows.) Means weigh a sample at time t by t^FORGETS: they forget the
 start, and of exact data S vanishes. The first sample moves nothing: it tells S.
 
-Samples in J and b are weighed by t^FADES, in two kinds of rows. Those that see nothing but the
-data, with tests within omega, fade slowly: the first samples are the least smoothed. The others
-hold fluxes of P u, which was wrong at first, and fade faster; since P u goes on to be wrong by what
-the data cannot tell, S is not taken below a small share of their J.
+J and b fade in two kinds of rows. Those that see nothing but the data, with tests within omega, are
+weighed by the information that had been given up to a sample: the first ones, least smoothed, count
+less and less, and where nothing is excited nothing fades. The others hold fluxes of P u, which was
+wrong at first, and are weighed by t^4; since P u goes on to be wrong by what the data cannot tell,
+S is not taken below a small share of their J.
 
 H is renewed when S or the trace of J have changed by more than `AGED`, or J along the last step has
 grown by more than `STEEPER`. In between a step is one of quasi-Newton's, and factors serve on.
@@ -59,7 +60,8 @@ Whether q may be where it is says the prior. If all of this holds, q - q0 is Gau
 covariance that the data have taken from that of the prior, so that ||q - q0||_Q^2 is a sum of
 chi-squares with weights of at most 1, whose sum k is at most m and at most trace(G_Q^{-1} J)/S,
 with a J that has not faded. It is more than k + 2 sqrt(k s) + 2 s with a probability below exp(-s)
-only (Laurent and Massart 2000). A q beyond that is not believed: the step fails.
+only (Laurent and Massart 2000). A q beyond that is not believed: the step holds q, which is a
+failed status, and the data go on to tell J, b and S.
 
 What S does not know is a bias that q takes up without a trace: smoothing that takes too much or too
 little leaves an equation error that moves with w, as a wrong q does. What helps is smoothing
@@ -99,8 +101,8 @@ LEADING, DRAWS = 4, 4  # modes and draws of the prior, for traces: their error i
 LANCZOS = 20  # steps for the square root of G_Q^{-1}; the trace is then exact to 1 %
 COARSE = 1e-3  # relative accuracy of those modes
 ROUNDING = 1e-12  # relative: what is smaller is zero
-FORGETS = 4.0  # power of time that weighs a sample in the mean of S
-FADES = np.array([1.0, 4.0])  # power of time that weighs a sample in J: its rows of both kinds
+FORGETS = 2.0  # power of time that weighs a sample in the means of S
+FADES = np.array([1.0, 4.0])  # powers of information and of time that weigh rows of both kinds
 AGED = 2.0  # relative change of S, or of the trace of J, that renews H
 STEEPER = 0.5  # relative growth of J along a step that renews H: at 1 steps would go to and fro
 MOST_NORMAL = 8  # sets of sensors of which normal equations are kept
@@ -316,18 +318,20 @@ class InformationMetric(MetricRule[Information]):
         change = force - state.force if state.samples else math.sqrt(2.0) * force
         power = np.stack([self._powers(force), self._powers(change) / 2.0])
         seen = np.array([gain.trace.sum(), rough.sum()])
-        elapsed = state.elapsed + h
+        elapsed, told = state.elapsed + h, h * float(gain.trace.sum())
+        given = state.given + told
+        share = told / given if given > 0.0 else 0.0
         kept = max(0.0, 1.0 - FORGETS * h / elapsed)
-        faded = np.maximum(0.0, 1.0 - FADES * h / elapsed)
+        faded = np.maximum(0.0, 1.0 - FADES * np.array([share, h / elapsed]))
         matrix = h * gain.matrix
-        for new, old, share in zip(matrix, state.matrix, faded, strict=True):
-            new += share * old
+        for new, old, left in zip(matrix, state.matrix, faded, strict=True):
+            new += left * old
         learned = replace(
             state,
             matrix=matrix,
             right=faded[:, None] * state.right + h * gain.right,
             total=faded * state.total + h * gain.trace,
-            given=state.given + h * float(gain.trace.sum()),
+            given=given,
             force=force,
             power=kept * state.power + h * h * power,
             seen=kept * state.seen + h * seen,
@@ -378,8 +382,8 @@ class InformationMetric(MetricRule[Information]):
         if not ratio > 1.0:
             return ""
         return (
-            f"q is {ratio:.1f} times as far from its prior (in square) as prior and data allow, so "
-            "the model or the noise is not as the law must take it"
+            f"q was held: it would be {ratio:.1f} times as far from its prior (in square) as prior "
+            "and data allow, so the model or the noise is not as the law must take it"
         )
 
     def notes(self, state: Information, q: Array, length: float) -> Mapping[str, Any]:
