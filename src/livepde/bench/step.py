@@ -157,7 +157,7 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
                 checks.append(
                     Check(f"{size} nodes, {name}: step / forward step", middle, bound, "<=")
                 )
-    columns = ("nodes", "law", "min", "median", "max", "mean", "bound of the median")
+    columns = ("nodes", "law", "min", "median", "max", "mean", "bound")
     table = Table("One step over one forward step", columns, rows)
     note = (
         "Ratios of processor times taken in one process; the forward step is livepde.simulate with "
