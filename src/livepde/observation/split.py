@@ -72,11 +72,6 @@ class Split:
         projected: Array = self.R @ u if self._diagonal is None else self._diagonal * u
         return projected
 
-    def project_transposed(self, f: Array) -> Array:
-        """Return R^T f."""
-        projected: Array = self.R.T @ f if self._diagonal is None else self._diagonal * f
-        return projected
-
     def reconstruct(self, z: Array, boundary: Array | None) -> Array:
         """Return the observed part R u* = G^+ z of the state in X, shape (n,).
 
