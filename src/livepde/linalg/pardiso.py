@@ -18,6 +18,7 @@ __all__ = ["PardisoSolver"]
 
 POSITIVE_DEFINITE, GENERAL = 2, 11  # Pardiso's types of a matrix
 FACTORISE, REFACTORISE, SOLVE = 12, 22, 33  # its phases
+REPRODUCIBLE = 2  # MKL_CBWR_AUTO: the last digit does not follow where arrays lie in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +92,7 @@ class PardisoSolver:
         known = bool(self._idle)
         kind = POSITIVE_DEFINITE if self.symmetric else GENERAL
         handle = self._idle.pop() if known else PyPardisoSolver(mtype=kind)
+        handle.libmkl.MKL_CBWR_Set(REPRODUCIBLE)
         handle.set_phase(REFACTORISE if known and self.symmetric else FACTORISE)
         try:
             handle._call_pardiso(matrix, np.zeros(len(matrix.indptr) - 1))
