@@ -28,7 +28,9 @@ import numpy as np
 from livepde.fem import Field, Sobolev, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, GradientLaw, Problem, Replay, SensitivityLaw
-from livepde.laws.filter import Filter
+from livepde.laws.reduction import Reduction
+from livepde.laws.sensitivity import SensitivityWork
+from livepde.laws.sensors import MemberSensors
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Discrepancy, Points, Subdomain, Tikhonov
@@ -143,11 +145,13 @@ class Informed(SensitivityLaw):
 
     directions: Any = None
 
-    def prepare(self, problem: Problem) -> Filter:
+    def prepare(self, problem: Problem) -> SensitivityWork:
         work, k = super().prepare(problem), self.directions.shape[1]
-        (motion,) = work.motions
-        motions = (replace(motion, part=slice(0, k)),)
-        return replace(work, Phi=self.directions, motions=motions, rank=k)
+        (motion,) = work.filter.reduction.motions
+        reduction = Reduction(problem, self.directions, (replace(motion, part=slice(0, k)),))
+        sensors = MemberSensors(problem, reduction)
+        filter_ = replace(work.filter, reduction=reduction, sensors=sensors, rank=k)
+        return replace(work, filter=filter_)
 
 
 def informed(belief: Belief, model: Model, count: int) -> Array:

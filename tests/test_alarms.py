@@ -19,7 +19,7 @@ from livepde.bench import alarms
 from livepde.cases.template import NOISE, TRUE_ALPHA, write_template
 from livepde.cli import app
 from livepde.diagnostics import identifiability
-from livepde.laws.consistency import Consistency
+from livepde.laws.innovations import Innovations
 from livepde.models import heat
 from livepde.runs import doubts, measures, tables
 
@@ -146,14 +146,14 @@ def test_what_settles_is_not_looked_at():
     watch = jumps.start()
     for k in range(200):
         e = (10.0 if k < 50 else 1.0) * rng.standard_normal(2)
-        watch, alarm = jumps.add(watch, e, Consistency.start(2))
+        watch, alarm = jumps.add(watch, e, Innovations.start(2))
         assert not alarm
-    _, alarm = jumps.add(watch, np.full(2, 10.0), Consistency.start(2))
+    _, alarm = jumps.add(watch, np.full(2, 10.0), Innovations.start(2))
     assert alarm
 
 
 def test_slow_errors_below_the_noise_hide_no_jump():
-    rng, usual = np.random.default_rng(0), Consistency.start(2)
+    rng, usual = np.random.default_rng(0), Innovations.start(2)
     for k in range(2000):
         usual = usual.add(rng.standard_normal(2) + 0.3 * np.sin(0.01 * k))
     assert usual.inflation > 1.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from livepde.laws.consistency import Consistency
+from livepde.laws.innovations import Innovations
 from livepde.linalg import Array
 
 
@@ -15,7 +15,7 @@ def inflations(
     """Return the factors for innovations that follow a first-order autoregression."""
     rng, found = np.random.default_rng(1), []
     for _ in range(repeats):
-        value, e = Consistency.start(sensors), rng.standard_normal(sensors)
+        value, e = Innovations.start(sensors), rng.standard_normal(sensors)
         for _ in range(samples):
             value = value.add(size * e)
             e = rho * e + np.sqrt(1 - rho**2) * rng.standard_normal(sensors)
@@ -43,7 +43,7 @@ def test_innovations_that_are_too_large_count_by_their_size():
 
 def test_an_error_below_the_noise_that_does_not_average_out_is_found():
     rng = np.random.default_rng(0)
-    value = Consistency.start(2)
+    value = Innovations.start(2)
     for _ in range(500):
         value = value.add(rng.standard_normal(2) + 0.4)
     # Averages over 50 samples have the mean 0.4 beside a variance of 1/99.
@@ -55,7 +55,7 @@ def test_the_expected_size_of_averages_holds_from_the_first_sample():
     for samples in (1, 5, 20):
         found = []
         for _ in range(400):
-            value = Consistency.start(1)
+            value = Innovations.start(1)
             for e in rng.standard_normal((samples, 1)):
                 value = value.add(e)
             found.append(value.persistence)
@@ -63,5 +63,5 @@ def test_the_expected_size_of_averages_holds_from_the_first_sample():
 
 
 def test_nothing_measured_says_nothing():
-    value = Consistency.start(2)
+    value = Innovations.start(2)
     assert value.inflation == value.add(np.full(2, np.nan)).inflation == 1.0

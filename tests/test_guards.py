@@ -13,10 +13,10 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.laws.excitation import Excitation, Probes, pairs
 from livepde.laws.guards import Scale
-from livepde.laws.past import Past, Samples
+from livepde.laws.history import added, empty_log, opened
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
-from livepde.stepping import ForwardStage, Interval
+from livepde.stepping import ForwardStage, Interval, Span
 from livepde.streams import Twin
 
 MESH = lp.interval(0.0, 1.0, 16)
@@ -182,37 +182,40 @@ def test_nothing_winds_up_while_nothing_is_excited():
     assert stds[-1] / found[-1].belief.inflation == pytest.approx(0.2, rel=0.01)
 
 
-def test_the_past_reaches_back_far_enough_and_stays_short():
-    point = (
-        lp.SensitivityLaw()
-        .init(  # any point will do
-            lp.SensitivityLaw().prepare(lp.Identifier(rod(), POINTS, lp.SensitivityLaw()).problem),
-            np.zeros(1),
-            np.zeros(17),
-        )
-        .now
-    )
-    past = Past.start(point, Samples.empty(3, 0))
-    for k in range(50):
-        marked = replace(point, evidence=k + 1.0)
-        interval = Interval(k, k + 1.0, {}, {}, np.zeros(3), np.full(3, float(k + 1)))
-        past = past.add(marked, interval, (), 8)
-        assert past.older.evidence == k + 1 - past.count == past.samples.t[0]
-        assert min(k + 1, 8) <= past.count < 16
-        again = past.samples.intervals(())
-        assert [item.t1 for item in again] == list(range(k + 2 - past.count, k + 2))
-        assert again[-1].z1[0] == k + 1
+def test_the_log_reaches_back_far_enough_and_stays_short():
+    law = lp.SensitivityLaw(guards=lp.Guards(past=8))
+    identifier = lp.Identifier(rod(), POINTS, law, u0=0.0)
+    for k in range(200):
+        identifier.step(0.1 * (k + 1), np.zeros(3))
+        state = identifier._state
+        times = state.log[0, state.since_older[0] :, 0]
+        taken = len(times) - 1
+        assert min(k + 1, 8) <= taken < 16
+        expected = 0.1 * np.arange(k + 1 - taken, k + 2)
+        assert times == pytest.approx(expected)
+        assert state.log.shape[1] < 120
+
+
+def test_a_log_that_is_continued_twice_keeps_both_apart():
+    span = Span.of(Interval(0.0, 1.0, {}, {}, np.zeros(1), np.ones(1)), ())
+    other = Span.of(Interval(0.0, 1.0, {}, {}, np.zeros(1), np.full(1, 2.0)), ())
+    taken = np.ones(1, dtype=bool)
+    log = added(opened(empty_log(1, 1, 0), span), span, taken)
+    one, two = added(log, span, taken), added(log, other, taken)
+    assert one[0, -1, 1] == 1.0
+    assert two[0, -1, 1] == 2.0
+    assert log.shape[1] == 2
 
 
 def test_a_prediction_runs_away_beyond_all_that_was_seen():
-    noise = np.array([0.1, 0.1])
-    scale = Scale.start(2).add(np.array([5.0, np.nan]), np.array([4.0, np.nan]))
-    assert scale.beyond(np.array([4.0, 100.0]), noise) == 1.0  # the second is not known yet
-    scale = scale.add(np.array([13.0, 1.0]), np.array([0.1, 0.0]))
-    assert scale.beyond(np.array([80.0, 0.0]), noise) == 10.0
+    noise = np.array([[0.1, 0.1]])
+    scale = Scale.start(2).add(np.array([[5.0, np.nan]]), np.array([[4.0, np.nan]]))
+    assert scale.beyond(np.array([[4.0, 100.0]]), noise) == 1.0  # the second is not known yet
+    scale = scale.add(np.array([[13.0, 1.0]]), np.array([[0.1, 0.0]]))
+    assert scale.beyond(np.array([[80.0, 0.0]]), noise) == 10.0
     # What reaches a sensor that has been quiet so far is nothing unheard of.
-    assert scale.beyond(np.array([np.nan, 2.0]), noise) == 0.25
-    assert scale.beyond(np.array([np.nan, 2.0]), np.array([0.1, 0.001])) == 25.0
+    assert scale.beyond(np.array([[np.nan, 2.0]]), noise) == 0.25
+    assert scale.beyond(np.array([[np.nan, 2.0]]), np.array([[0.1, 0.001]])) == 25.0
 
 
 @pytest.mark.parametrize("gain", [1.0, 1e4])

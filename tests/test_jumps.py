@@ -10,9 +10,8 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.consistency import Consistency
+from livepde.laws.innovations import Innovations
 from livepde.laws.jumps import Jumps
-from livepde.laws.level import NoiseLevel
 from livepde.stepping import ForwardStage
 
 MESH = lp.interval(0.0, 1.0, 16)
@@ -88,7 +87,7 @@ def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
     rng, jumps, hits = np.random.default_rng(0), Jumps(), 0
     for length in (1, 3, 10, 30):
         for _ in range(20):
-            watch, usual = jumps.start(), Consistency.start(2)
+            watch, usual = jumps.start(), Innovations.start(2)
             for k in range(60):
                 e = rng.standard_normal(2) * (5.0 if k >= 60 - length else 1.0)
                 e[rng.random(2) < 0.1] = np.nan
@@ -100,7 +99,7 @@ def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
 
 def test_white_innovations_raise_no_alarm():
     rng, jumps = np.random.default_rng(0), Jumps(probability=1e-5)
-    watch, usual, alarms = jumps.start(), Consistency.start(3), 0
+    watch, usual, alarms = jumps.start(), Innovations.start(3), 0
     for _ in range(20_000):
         e = rng.standard_normal(3)
         e[rng.random(3) < 0.1] = np.nan
@@ -111,7 +110,7 @@ def test_white_innovations_raise_no_alarm():
 
 def test_the_rate_of_false_alarms_is_about_the_stated_one():
     rng, jumps = np.random.default_rng(1), Jumps(probability=2e-3, settle=0)
-    watch, usual, alarms = jumps.start(), Consistency.start(2), 0
+    watch, usual, alarms = jumps.start(), Innovations.start(2), 0
     for _ in range(20_000):
         watch, alarm = jumps.add(watch, rng.standard_normal(2), usual)
         alarms += alarm
@@ -131,13 +130,6 @@ def test_the_noise_is_found_from_any_first_guess(guess: float):
     assert found[-1].notes["noise_level"] * guess == pytest.approx(NOISE, rel=0.2)
     value, std = found[-1].parameters["a"]
     assert abs(value - 0.3) < 4 * std < 0.01
-
-
-def test_the_level_of_white_residuals_is_their_size():
-    rng, level = np.random.default_rng(0), NoiseLevel()
-    for z in 3.0 * rng.standard_normal((2000, 4)):
-        level = level.add(float((z**2).mean()) / level.square)
-    assert level.scale == pytest.approx(3.0, rel=0.05)
 
 
 def test_what_noise_cannot_be_is_one_sentence():

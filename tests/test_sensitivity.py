@@ -9,7 +9,7 @@ from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from livepde.diagnostics import check_law
-from livepde.laws.consistency import Consistency
+from livepde.laws.innovations import Innovations
 
 
 def source_model(**options):
@@ -106,7 +106,8 @@ def test_a_full_window_goes_on_from_the_estimate():
     stored = []
     for t, z, inputs in samples:
         estimate = ident.step(t, z, inputs)
-        stored.append(len(ident._state.samples.t))
+        state = ident._state
+        stored.append(state.log.shape[1] - int(state.window[0]))
     assert max(stored) <= 20
     assert estimate.q[0] == pytest.approx(2.0, abs=0.03)
 
@@ -190,7 +191,7 @@ def test_a_field_beside_a_number():
     ident = lp.Identifier(model, lp.Full(), law)
     for t, u in zip(times[1:], states[1:], strict=True):
         estimate = ident.step(t, ident.observed.G @ u)
-    assert ident._work.Phi.shape == (14, 7)
+    assert ident._work.filter.reduction.Phi.shape == (14, 7)
     predicted = truth(model, estimate.q, 0.0, times)[-1]
     np.testing.assert_allclose(predicted, states[-1], atol=2e-3)
 
@@ -286,7 +287,7 @@ class TestRefusals:
 
 class TestConsistency:
     def fed(self, innovations):
-        value = Consistency.start(1)
+        value = Innovations.start(1)
         for e in innovations:
             value = value.add(np.array([e]))
         return value
@@ -310,7 +311,7 @@ class TestConsistency:
         assert self.fed(found).inflation == pytest.approx(np.sqrt(1.9 / 0.1), rel=0.4)
 
     def test_before_any_innovation(self):
-        assert Consistency.start(2).inflation == 1.0
+        assert Innovations.start(2).inflation == 1.0
 
 
 @pytest.mark.parametrize("name", ["replay", "jumps", "guards"])

@@ -52,8 +52,8 @@ def rebuild(
 ) -> Any:
     """Return a value shaped like `template` with the leaves given.
 
-    One axis of an array may have another length: the first one (stored samples), or what the
-    metadata of its dataclass field say, as in field(metadata={"grows": 1}).
+    The first axis of an array may have another length (stored samples, members that are awake), and
+    what the metadata of its dataclass field say, as in field(metadata={"grows": 1}).
     """
     if isinstance(template, tuple):
         return tuple(
@@ -79,8 +79,8 @@ def rebuild(
 
 
 def _others(array: Array, axis: int) -> list[int]:
-    """Return the lengths of all axes but one."""
-    return [length for k, length in enumerate(array.shape) if k != axis]
+    """Return the lengths of all axes but the first and one more."""
+    return [length for k, length in enumerate(array.shape) if k not in (0, axis)]
 
 
 def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:

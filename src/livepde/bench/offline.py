@@ -21,7 +21,8 @@ from scipy.optimize import least_squares
 
 from livepde.bench.problems import Data
 from livepde.fem import Inputs
-from livepde.laws import Problem, SensitivityLaw
+from livepde.laws import Problem
+from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.stepping import Advance, ForwardStage, Interval, StepFailed, advance
 
@@ -79,12 +80,12 @@ class Trajectory:
         self.model = process.model
         problem = Problem(self.model, data.observed, Advance(process.scheme, process.dt_max))
         self.control = problem.control
-        work = SensitivityLaw(modes=data.modes).prepare(problem)
-        self.Phi = work.Phi
-        self.rest = work.rest(0.0)
+        reduction = Reduction.of(problem, data.modes)
+        self.Phi = reduction.Phi
+        self.rest = reduction.rest(0.0, 0.0)
         widths = np.diff(process.times)
         growth = [
-            np.sqrt(np.concatenate([m.growth(float(h)) for m in work.motions])) for h in widths
+            np.sqrt(np.concatenate([m.growth(float(h)) for m in reduction.motions])) for h in widths
         ]
         self.moving = np.flatnonzero(growth[0] > 0.0)
         self.growth = np.array(growth)[:, self.moving]

@@ -3,64 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from livepde.fem import Moment
-from livepde.fleet.span import Span
-from livepde.laws import Belief, Report, Status
+from livepde.laws import Belief, MemberReports, Report, Status
 from livepde.linalg import Array
+from livepde.stepping import Span
 
-__all__ = ["Beliefs", "Engine", "Factors", "FleetReport", "State", "reported"]
+__all__ = ["Beliefs", "Engine", "Factors", "State", "reported"]
 
 State: TypeAlias = Any
 """What evolves: the arrays or values of an engine."""
 
-OK = Status()
-
-
-@dataclass(frozen=True, eq=False)
-class FleetReport:
-    """What a step tells beside the new state.
-
-    Attributes
-    ----------
-    statuses
-        How it went for each member.
-    predicted
-        What was expected of each sensor, shape (members, sensors).
-    steps
-        Substeps taken, shape (members,).
-    notes
-        Numbers worth keeping, each of shape (members,); NaN for members without.
-    """
-
-    statuses: tuple[Status, ...]
-    predicted: Array
-    steps: Array
-    notes: Mapping[str, Array] = field(default_factory=dict)
-
-    def with_members(self, reports: Mapping[int, Report]) -> FleetReport:
-        """Return the report with those of some members exchanged."""
-        if not reports:
-            return self
-        statuses, predicted, steps = list(self.statuses), self.predicted.copy(), self.steps.copy()
-        notes = {name: values.copy() for name, values in self.notes.items()}
-        for name in dict.fromkeys(name for one in reports.values() for name in one.notes):
-            notes.setdefault(name, np.full(len(statuses), np.nan))
-        for k, one in reports.items():
-            statuses[k], predicted[k], steps[k] = one.status, one.predicted, one.steps
-            for name, values in notes.items():
-                values[k] = one.notes.get(name, np.nan)
-        return FleetReport(tuple(statuses), predicted, steps, notes)
-
-
-def reported(reports: Sequence[Report]) -> FleetReport:
+def reported(reports: Sequence[Report]) -> MemberReports:
     """Return the report of members of which each has its own."""
     members, sensors = len(reports), len(reports[0].predicted)
-    blank = FleetReport((OK,) * members, np.zeros((members, sensors)), np.zeros(members, dtype=int))
+    blank = MemberReports((Status(),) * members, np.zeros((members, sensors)), np.zeros(members, dtype=int))
     return blank.with_members(dict(enumerate(reports)))
 
 
@@ -113,7 +74,7 @@ class Engine(Protocol):
         """Return the state after a sample at the initial time."""
         ...
 
-    def step(self, state: State, span: Span) -> tuple[State, FleetReport]:
+    def step(self, state: State, span: Span) -> tuple[State, MemberReports]:
         """Return the state at the end of a span; that of a failed member is the old one."""
         ...
 

@@ -19,18 +19,17 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engine import OK, Engine, FleetReport
+from livepde.fleet.engine import Engine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.fleet.separately import Separately
-from livepde.fleet.span import Span
 from livepde.fleet.together import Together
 from livepde.identifier import MOST_SUBSTEPS, Identifier
-from livepde.laws import AnyLaw, Belief, SensitivityLaw
+from livepde.laws import AnyLaw, Belief, MemberReports, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import layout_of
-from livepde.stepping import Scheme
+from livepde.stepping import Scheme, Span
 
 __all__ = ["Fleet"]
 
@@ -114,8 +113,8 @@ class Fleet:
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
         self._engine: Engine = Separately(law, self._work, self.problem)
-        self.note = Together.refuses(law, self._work)
-        if isinstance(law, SensitivityLaw) and not self.note:
+        self.note = law.stepped_alone(self._work)
+        if not self.note:
             self._engine = Together(law, self._work)
         count = len(names)
         self._state: Any = None
@@ -238,15 +237,15 @@ class Fleet:
         self._inputs = np.where(good[:, None], values, self._inputs)
         return self._estimate(span, measured, withheld, report, held)
 
-    def _expected(self, span: Span) -> FleetReport:
+    def _expected(self, span: Span) -> MemberReports:
         """Return what the sensors are expected to show at the start."""
         members = range(len(self))
         beliefs = [self._believed(self._state, k) for k in members]
         predicted = [
-            self.observed.predict(belief.u, belief.q, span.end(k))
+            self.observed.predict(belief.u, belief.q, span.end.member(k))
             for k, belief in zip(members, beliefs, strict=True)
         ]
-        return FleetReport((OK,) * len(self), np.array(predicted), np.zeros(len(self), dtype=int))
+        return MemberReports((Status(),) * len(self), np.array(predicted), np.zeros(len(self), dtype=int))
 
     def _believed(self, state: Any, k: int) -> Belief:
         return self.problem.physical(self._engine.believed(state, k))
@@ -256,7 +255,7 @@ class Fleet:
         span: Span,
         measured: Array,
         withheld: Array,
-        report: FleetReport,
+        report: MemberReports,
         held: dict[str, Array],
     ) -> FleetEstimate:
         state = self._state
@@ -284,7 +283,7 @@ class Fleet:
         if type(observed) is Observed and observed.linear:
             shown: Array = (observed.G @ u.T).T
             return shown
-        rows = [observed.predict(u[k], q[k], span.end(k)) for k in range(len(span))]
+        rows = [observed.predict(u[k], q[k], span.end.member(k)) for k in range(len(span))]
         return np.array(rows)
 
     def identifier(self, member: str | int) -> Identifier:

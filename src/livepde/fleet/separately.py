@@ -9,10 +9,10 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.fem import Moment
-from livepde.fleet.engine import Beliefs, FleetReport, reported
-from livepde.fleet.span import Span
-from livepde.laws import AnyLaw, Belief, Problem
+from livepde.fleet.engine import Beliefs, reported
+from livepde.laws import AnyLaw, Belief, MemberReports, Problem
 from livepde.linalg import Array
+from livepde.stepping import Span
 
 __all__ = ["Separately"]
 
@@ -34,7 +34,7 @@ class Separately:
     def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
         return tuple(self.law.begin(self.work, one, span.member(k)) for k, one in enumerate(state))
 
-    def step(self, state: tuple[Any, ...], span: Span) -> tuple[tuple[Any, ...], FleetReport]:
+    def step(self, state: tuple[Any, ...], span: Span) -> tuple[tuple[Any, ...], MemberReports]:
         taken = [self.law.step(self.work, one, span.member(k)) for k, one in enumerate(state)]
         return tuple(new for new, _ in taken), reported([report for _, report in taken])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from livepde.laws.assimilation import MemberReports
 from livepde.laws.auto import AutoLaw
 from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.laws.bounds import (
@@ -19,7 +20,8 @@ from livepde.laws.guards import Guards
 from livepde.laws.jumps import Jumps
 from livepde.laws.operators import diffusion_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
-from livepde.laws.sensitivity import Replay, SensitivityLaw
+from livepde.laws.replay import Replay
+from livepde.laws.sensitivity import SensitivityLaw
 
 __all__ = [
     "AnyLaw",
@@ -37,6 +39,7 @@ __all__ = [
     "KueglerLaw",
     "Law",
     "NoisyBound",
+    "MemberReports",
     "Norms",
     "Problem",
     "Replay",

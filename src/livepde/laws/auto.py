@@ -9,24 +9,33 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
+from livepde.laws.assimilation import OK, MemberReports
 from livepde.laws.bank import (
     CANDIDATES,
     STAYS,
     WIDE,
     AutoState,
     Bank,
-    asleep,
     normalised,
+    numbered,
     say_the_same,
     scaled,
 )
-from livepde.laws.base import Belief, Law, Problem, Report, Status
+from livepde.laws.base import Belief, Law, Problem, Report
 from livepde.laws.guess import first_guess
+from livepde.laws.history import added, first_interval, intervals_since, opened
 from livepde.laws.jumps import Jumps
-from livepde.laws.past import Past
-from livepde.laws.sensitivity import Replay, SensitivityLaw, SensitivityState
-from livepde.linalg import Array
-from livepde.stepping import ForwardStage, Interval
+from livepde.laws.members import join, take
+from livepde.laws.replay import Replay
+from livepde.laws.sensitivity import (
+    NEVER,
+    SensitivityLaw,
+    SensitivityState,
+    SensitivityWork,
+    from_now,
+)
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import Interval
 
 __all__ = ["AutoLaw"]
 
@@ -110,36 +119,51 @@ class AutoLaw(Law[Bank, AutoState]):
     def prepare(self, problem: Problem) -> Bank:
         stated = self.noise is not None or problem.observed.noise is not None
         law = self.member if stated else replace(self.member, noise=1.0)  # until it is guessed
-        filter_ = law.prepare(problem)
+        work = law.prepare(problem)
+        reduction = work.filter.reduction
         # A factor costs in proportion to its columns, and a field that drifts is the exception.
-        rank = 2 * filter_.Phi.shape[1] + 4
-        filter_ = replace(filter_, rank=max(rank, filter_.rank), adaptive=True)
-        drifts = any(not motion.evolution.moves for motion in filter_.motions)
+        rank = max(2 * reduction.size + 4, work.filter.rank)
+        drifts = bool(reduction.still.any())
         candidates = tuple(c for c in CANDIDATES if drifts or not c.drift)
-        filters = tuple(replace(filter_, forward=ForwardStage(problem.model)) for _ in candidates)
         # What moves far has no use for a reference that stays.
-        walks = any(motion.growth(1.0).any() for motion in filter_.motions)
-        plain = replace(self.member, replay=None)
-        laws = tuple(plain if walks or c.drift else self.member for c in candidates)
-        return Bank(candidates, laws, filters, stated)
+        walks = reduction.moving(0.0) > 0
+        replays = np.array([not (walks or c.drift) for c in candidates])
+        work = SensitivityWork(
+            replace(work.filter, rank=rank, drift=np.zeros(len(candidates))),
+            replace(work.choices, adaptive=True),
+        )
+        return Bank(candidates, work, replays, stated)
 
     def init(self, work: Bank, q0: Array, u0: Array) -> AutoState:
-        return self._initial(work, self.member.init(work.filters[0], q0, u0))
+        return self._initial(work, self.member.init(work.work, q0, u0))
 
     def start(self, work: Bank, q0: Array, u0: Array, moment: Moment) -> AutoState:
-        return self._initial(work, self.member.start(work.filters[0], q0, u0, moment))
+        return self._initial(work, self.member.start(work.work, q0, u0, moment))
 
-    def _initial(self, work: Bank, start: SensitivityState) -> AutoState:
-        noise = work.filters[0].noise
-        members = len(work.candidates)
+    def _initial(
+        self, work: Bank, start: SensitivityState, noise: Array | None = None
+    ) -> AutoState:
+        """Return the bank before the first sample; one member until the noise is known."""
+        if noise is None:
+            stated = work.work.filter.noise
+            noise = stated if work.stated else np.full_like(stated, np.nan)
+        members = start
+        if np.isfinite(noise).all():
+            each = zip(work.candidates, work.replays, strict=True)
+            members = join(
+                *(
+                    numbered(scaled(start, c.scale), k, self.replay.first if replays else NEVER)
+                    for k, (c, replays) in enumerate(each)
+                )
+            )
         return AutoState(
-            noise if work.stated else np.full_like(noise, np.nan),
+            noise,
             0.0,
-            start.samples,
+            start.log,
             start,
-            tuple(scaled(start, candidate.scale) for candidate in work.candidates),
+            members,
             work.chances,
-            np.full(members, 2 * TRIAL),
+            np.full(len(work.candidates), 2 * TRIAL),
             0,
             2 * TRIAL,
             2 * TRIAL,
@@ -147,38 +171,36 @@ class AutoLaw(Law[Bank, AutoState]):
         )
 
     def begin(self, work: Bank, state: AutoState, interval: Interval) -> AutoState:
+        span = work.work.filter.span(interval)
         if not state.known:
-            return replace(state, waiting=state.waiting.add(interval, work.channels))
-        members = tuple(
-            work.laws[k].begin(work.filter(k, 0.0, state.noise), member, interval)
-            for k, member in enumerate(state.members)
-        )
-        return replace(state, members=members)
+            return replace(state, waiting=added(state.waiting, span, np.ones(1, dtype=bool)))
+        filters = work.filters(0.0, state.noise)
+        return replace(state, members=self.member.begin_members(filters, state.members, span))
 
     def step(self, work: Bank, state: AutoState, interval: Interval) -> tuple[AutoState, Report]:
         if state.known:
             return self._assimilated(work, state, interval)
-        # Until the noise is guessed the bank runs free.
-        free, report = self.member.step(
-            work.filter(0, 0.0, np.ones_like(state.noise)), state.members[0], interval.silent
-        )
+        # Until the noise is guessed one member runs free.
+        filters = work.filters(0.0, np.ones_like(state.noise))
+        free, report = self.member.step(filters, state.members, interval.silent)
         if not report.status.ok:
             return state, report
-        waiting = state.waiting.add(interval, work.channels)
-        noise = first_guess(waiting.z)
-        if noise is None and len(waiting.t) > SILENCE:
-            here = self.member.renewed(work.filters[0].recentred(free.now), free)
-            here = replace(here, past=Past.start(here.now, here.samples))
-            members = (here, *state.members[1:])
-            return replace(state, waiting=here.samples, start=here, members=members), report
+        span = work.work.filter.span(interval)
+        one = np.ones(1, dtype=bool)
+        waiting = added(opened(state.waiting, span), span, one)
+        noise = first_guess(waiting[0, :, 1 : 1 + len(state.noise)])
+        if noise is None and waiting.shape[1] > SILENCE:
+            here = self.member.renewed(filters.filter.recentred(free.now), free)
+            here = from_now(here)
+            return replace(state, waiting=state.start.log, start=here, members=here), report
         if noise is None:
-            return replace(state, waiting=waiting, members=(free, *state.members[1:])), report
-        begun = replace(self._initial(work, state.start), noise=noise)
+            return replace(state, waiting=waiting, members=free), report
+        begun = self._initial(work, state.start, noise)
         notes: Mapping[str, float] = {}
-        first = waiting.first(work.channels)
+        first = first_interval(waiting, work.channels)
         if first.present.any():
             begun = self.begin(work, begun, first)
-        for part in waiting.intervals(work.channels):
+        for part in intervals_since(waiting, work.channels):
             begun, taken = self._assimilated(work, begun, part)
             if not taken.status.ok:
                 return state, taken
@@ -189,52 +211,48 @@ class AutoLaw(Law[Bank, AutoState]):
         self, work: Bank, state: AutoState, interval: Interval
     ) -> tuple[AutoState, Report]:
         """Let all members that are awake take a sample, and weigh them anew."""
-        tick = _tick(state, interval)
-        members, gained = list(state.members), np.full(len(state.members), -np.inf)
-        reports: dict[int, Report] = {}
-        for k in state.awake:
-            filter_ = work.filter(k, tick, state.noise)
-            new, report = work.laws[k].step(filter_, members[k], interval)
-            reports[k] = report
-            change = new.now.evidence - members[k].now.evidence
-            if new.due != members[k].due:
-                # A replay mends the evidence of all samples in its window: what is left of them.
-                # The window may begin anew with this sample.
-                change *= min(1.0, MEMORY / (members[k].assimilated + 1))
-            if work.stated and new.now.level.square < 1.0:
-                least = replace(new.now.level, square=1.0)
-                new = replace(new, now=replace(new.now, level=least))
-            if report.status.ok and np.isfinite(change):
-                members[k], gained[k] = new, change
-        if not np.isfinite(gained).any():
-            return state, reports[state.leader]
+        tick, members = _tick(state, interval), state.members
+        filters = work.filters(tick, state.noise)
+        new, reports = self.member.step_members(filters, members, filters.filter.span(interval))
+        change = new.now.evidence - members.now.evidence
+        # A replay mends the evidence of all samples in its window: what is left of them. The window
+        # may begin anew with this sample.
+        share = np.minimum(1.0, MEMORY / (members.assimilated + 1.0))
+        change = np.where(new.due != members.due, change * share, change)
+        if work.stated:
+            new = replace(new, now=replace(new.now, level=np.maximum(new.now.level, 1.0)))
+        ok = np.array([status.ok for status in reports.statuses])
+        good: Mask = ok & np.isfinite(change)
+        if not good.any():
+            return state, reports.member(state.at(state.leader))
+        gained = np.full(len(work.candidates), -np.inf)
+        gained[members.now.member[good]] = change[good]
         before = np.exp(state.weights)
-        weights = state.weights.copy()
+        weights = state.weights
         if interval.present.any():
             weights = work.chances + (1.0 - 1.0 / MEMORY) * (weights - work.chances) + gained
-        weights = np.where(np.isfinite(gained), weights, -np.inf)
-        weights = normalised(weights)
+        weights = normalised(np.where(np.isfinite(gained), weights, -np.inf))
         now = replace(
             state,
             tick=tick,
-            members=tuple(members),
+            members=new if good.all() else take(new, good),
             weights=weights,
             count=state.count + bool(interval.present.any()),
         )
         rested, alarm = self._rested(work, state, now)
-        report = self._report(work, now, reports, before)
-        notes = {**report.notes, "jump": float(alarm)}
+        report = self._report(work, now, members.now.member, good, reports, before)
+        notes = {**report.notes, "jump": float(alarm), "awake": float(len(rested.members))}
         return rested, replace(report, notes=notes)
 
     def _rested(self, work: Bank, before: AutoState, state: AutoState) -> tuple[AutoState, bool]:
         """Return the state after those that are not needed sleep, or all wake; was it an alarm."""
         if state.count == before.count:
             return state, False
-        leader = state.leader
-        innovations = state.members[leader].now.consistency.newest
-        usual = before.members[leader].now.consistency
-        watch, alarm = JUMPS.add(state.watch, innovations, usual)
-        state = replace(state, watch=watch)
+        at = state.at(state.leader)
+        innovations = take(state.members.now.innovations, at).newest
+        usual = take(before.members.now.innovations, before.at(state.leader))
+        watch, alarms = JUMPS.add(state.watch, innovations, usual)
+        alarm, state = bool(alarms[0]), replace(state, watch=watch)
         stayed, stays = (work.candidates[s.leader].drift == 0.0 for s in (before, state))
         if stayed and not stays and state.count >= 2 * TRIAL:
             soon = min(state.due, state.count + TRIAL)
@@ -245,21 +263,22 @@ class AutoLaw(Law[Bank, AutoState]):
 
     def _pruned(self, work: Bank, state: AutoState) -> AutoState:
         """Return the state after those members sleep that have had their time and say nothing."""
-        weights = state.weights.copy()
+        weights, numbers = state.weights.copy(), state.members.now.member
         heavier: list[int] = []
-        for k in state.awake:
+        for at in state.awake:
+            k = int(numbers[at])
             if state.count >= state.until[k] and heavier:
-                twin = next((j for j in heavier if say_the_same(work, state, j, k)), None)
+                twin = next((j for j in heavier if say_the_same(work, state, j, at)), None)
                 if twin is not None:
-                    weights[twin] = np.logaddexp(weights[twin], weights[k])
+                    other = numbers[twin]
+                    weights[other] = np.logaddexp(weights[other], weights[k])
                 if twin is not None or weights[k] < np.log(PRUNED):
                     weights[k] = -np.inf
                     continue
-            heavier.append(k)
-        members = tuple(
-            member if np.isfinite(weight) else asleep(state.start)
-            for member, weight in zip(state.members, weights, strict=True)
-        )
+            heavier.append(at)
+        members = state.members
+        if len(heavier) < len(members):
+            members = take(members, np.sort(heavier))
         return replace(state, members=members, weights=normalised(weights))
 
     def _woken(self, work: Bank, state: AutoState, alarm: bool) -> AutoState:
@@ -268,31 +287,34 @@ class AutoLaw(Law[Bank, AutoState]):
         After an alarm what was measured before tells of other unknowns: no replay goes back beyond
         it, and the member with the wide prior, as it were anew, allows for a jump.
         """
-        members, weights, until = list(state.members), state.weights.copy(), state.until.copy()
-        leader = state.leader
-        if leader == WIDE and not np.isfinite(weights[STAYS]):
-            members[STAYS], weights[STAYS], weights[WIDE] = members[WIDE], weights[WIDE], -np.inf
+        filter_, law = work.filters(state.tick, state.noise).filter, self.member
+        weights, until, leader = state.weights.copy(), state.until.copy(), state.leader
+        best = take(state.members, state.at(leader))
+        awake = {int(k): take(state.members, state.at(int(k))) for k in state.members.now.member}
+        if leader == WIDE and STAYS not in awake:
+            best = numbered(awake.pop(WIDE), STAYS, int(best.due[0]))
+            awake[STAYS] = best
+            weights[STAYS], weights[WIDE] = weights[WIDE], -np.inf
             leader = STAYS
         pause = TRIAL if alarm else state.pause
-        awake = np.isfinite(weights)
-        best = members[leader]
-        now = work.filters[leader].recentred(best.now)
-        for k, law in enumerate(work.laws):
-            if awake[k]:
-                if alarm:
-                    recent = work.filters[k].recentred(members[k].now)
-                    members[k] = law.renewed(recent, members[k])
+        now = filter_.recentred(best.now)
+        members: list[SensitivityState] = []
+        for k in range(len(work.candidates)):
+            if k in awake:
+                one = awake[k]
+                members.append(law.renewed(filter_.recentred(one.now), one) if alarm else one)
                 continue
             if k == WIDE and not alarm:
                 continue
-            begun = work.filters[WIDE].loosened(now, JUMPS.size) if k == WIDE else now
-            copied = law.renewed(begun, best)
-            members[k] = replace(copied, past=Past.start(begun, copied.samples))
+            begun = filter_.loosened(now, JUMPS.size) if k == WIDE else now
+            due = self.replay.first if work.replays[k] else NEVER
+            copied = from_now(law.renewed(begun, best))
+            members.append(numbered(copied, k, due))
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)
         return replace(
             state,
-            members=tuple(members),
+            members=join(*members),
             weights=normalised(weights),
             until=until,
             due=state.count + pause,
@@ -300,35 +322,38 @@ class AutoLaw(Law[Bank, AutoState]):
         )
 
     def _report(
-        self, work: Bank, state: AutoState, reports: dict[int, Report], before: Array
+        self,
+        work: Bank,
+        state: AutoState,
+        numbers: IntArray,
+        good: Mask,
+        reports: MemberReports,
+        before: Array,
     ) -> Report:
         """Return the report of the mixture: predictions by the weights before the sample."""
-        used = [k for k in reports if reports[k].status.ok]
-        share = before[used] / before[used].sum()
-        predicted = sum(w * reports[k].predicted for w, k in zip(share, used, strict=True))
+        share = before[numbers] * good
+        predicted = np.where(good[:, None], reports.predicted, 0.0)
+        predicted = (share / share.sum()) @ predicted
         weights = np.exp(state.weights)
-        leading = reports.get(state.leader, reports[used[0]])
-        drifts = np.array([c.drift for c in work.candidates]) / state.tick
+        leading = reports.member(int(np.flatnonzero(numbers == state.leader)[0]))
+        drifts = work.drifts / state.tick
         scales = np.log([c.scale for c in work.candidates])
-        levels = [member.now.level.scale for member in state.members]
+        now = state.members.now
         notes = dict(leading.notes)
-        notes["noise_level"] = float(weights @ levels)
+        notes["noise_level"] = float(weights[now.member] @ np.sqrt(now.level))
         notes["drift"] = float(weights @ drifts)
         notes["drifting"] = float(weights @ (drifts > 0.0))
         notes["prior_scale"] = float(np.exp(weights @ scales))
-        notes["awake"] = float(len(state.awake))
-        return Report(Status(), np.asarray(predicted), leading.steps, notes)
+        return Report(OK, predicted, leading.steps, notes)
 
     def belief(self, work: Bank, state: AutoState) -> Belief:
-        used = state.awake if state.known else [0]
-        weights = np.exp(state.weights[used])
-        kept = weights >= 1e-4 * weights.max()
-        used = [k for k, keep in zip(used, kept, strict=True) if keep]
-        weights = weights[kept] / weights[kept].sum()
         noise = state.noise if state.known else np.ones_like(state.noise)
-        each = [
-            self.member.belief(work.filter(k, state.tick, noise), state.members[k]) for k in used
-        ]
+        filters = work.filters(state.tick, noise)
+        used = np.array(state.awake)
+        weights = np.exp(state.weights[state.members.now.member[used]])
+        kept = weights >= 1e-4 * weights.max()
+        weights = weights[kept] / weights[kept].sum()
+        each = [self.member.member_belief(filters, state.members, k) for k in used[kept].tolist()]
         if len(each) == 1:
             return each[0]
         q = sum((w * b.q for w, b in zip(weights, each, strict=True)), np.zeros_like(each[0].q))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
 from scipy.linalg import cho_factor, cho_solve
 
-from livepde.laws.filter import Filter
 from livepde.laws.jumps import Watch
-from livepde.laws.past import Past, Samples
-from livepde.laws.sensitivity import SensitivityLaw, SensitivityState
-from livepde.linalg import Array, IntArray
+from livepde.laws.sensitivity import SensitivityState, SensitivityWork
+from livepde.linalg import Array, IntArray, Mask
 
 __all__ = [
     "CANDIDATES",
@@ -21,8 +20,8 @@ __all__ = [
     "AutoState",
     "Bank",
     "Candidate",
-    "asleep",
     "normalised",
+    "numbered",
     "say_the_same",
     "scaled",
 ]
@@ -59,42 +58,44 @@ CANDIDATES = (
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """What is computed once: a filter for each candidate, each with factors of its own."""
+    """What is computed once: the filter of all members, and what each candidate assumes.
+
+    Attributes
+    ----------
+    candidates
+        One for each member number.
+    work
+        The filter of all, without drift.
+    replays
+        Candidates that keep one reference and replay, shape (candidates,).
+    stated
+        True if law or sensors state the noise.
+    """
 
     candidates: tuple[Candidate, ...]
-    laws: tuple[SensitivityLaw, ...]
-    filters: tuple[Filter, ...]
+    work: SensitivityWork
+    replays: Mask
     stated: bool
-    _made: dict[tuple[int, float, bytes], Filter] = field(default_factory=dict)
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of all input channels."""
-        return self.filters[0].problem.channels
+        return self.work.filter.problem.channels
 
-    @property
+    @cached_property
     def chances(self) -> Array:
         """Logarithms of the weights before the first sample."""
         return normalised(np.log([candidate.chance for candidate in self.candidates]))
 
-    def filter(self, k: int, tick: float, noise: Array) -> Filter:
-        """Return the filter of a candidate, for samples a time `tick` apart.
+    @cached_property
+    def drifts(self) -> Array:
+        """Variance that each candidate gains from one sample to the next, shape (candidates,)."""
+        return np.array([candidate.drift for candidate in self.candidates])
 
-        Made once: it keeps what it has computed.
-        """
-        key = (k, tick, noise.tobytes())
-        if key not in self._made:
-            if len(self._made) > 3 * len(self.candidates):
-                self._made.clear()
-            self._made[key] = self._filter(k, tick, noise)
-        return self._made[key]
-
-    def _filter(self, k: int, tick: float, noise: Array) -> Filter:
-        drift, filter_ = self.candidates[k].drift, self.filters[k]
-        if drift and tick:
-            motions = tuple(motion.drifting(drift / tick) for motion in filter_.motions)
-            filter_ = replace(filter_, motions=motions)
-        return replace(filter_, noise=noise)
+    def filters(self, tick: float, noise: Array) -> SensitivityWork:
+        """Return the filter of all members, for samples a time `tick` apart."""
+        drift = self.drifts / tick if tick else 0.0 * self.drifts
+        return replace(self.work, filter=replace(self.work.filter, drift=drift, noise=noise))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +109,11 @@ class AutoState:
     tick
         Usual time from one sample to the next, which drifts refer to; 0 before there is one.
     waiting
-        Samples that wait for a first guess of the noise.
+        Log of the samples that wait for a first guess of the noise.
     start
         A filter before the first of them.
     members
-        Filters; of one that sleeps nothing is kept.
+        Filters of the members that are awake; `members.now.member` are their numbers.
     weights
         Logarithms of the weights, shape (members,); -inf for one that sleeps.
     until
@@ -125,9 +126,9 @@ class AutoState:
 
     noise: Array
     tick: float
-    waiting: Samples
+    waiting: Array = field(metadata={"grows": 1})
     start: SensitivityState
-    members: tuple[SensitivityState, ...]
+    members: SensitivityState
     weights: Array
     until: IntArray
     count: int
@@ -147,9 +148,13 @@ class AutoState:
 
     @property
     def awake(self) -> list[int]:
-        """Members that run, the heaviest first."""
-        order = np.argsort(-self.weights, kind="stable")
-        return [int(k) for k in order if np.isfinite(self.weights[k])]
+        """Positions among `members`, the heaviest first."""
+        order = np.argsort(-self.weights[self.members.now.member], kind="stable")
+        return [int(k) for k in order]
+
+    def at(self, number: int) -> int:
+        """Return the position of a member that is awake among `members`."""
+        return int(np.flatnonzero(self.members.now.member == number)[0])
 
 
 def normalised(weights: Array) -> Array:
@@ -157,24 +162,26 @@ def normalised(weights: Array) -> Array:
     return np.asarray(weights - scipy.special.logsumexp(weights))
 
 
+def numbered(state: SensitivityState, number: int, due: int) -> SensitivityState:
+    """Return one member with another number, whose next replay is due at so many samples."""
+    member = np.array([number])
+    parts = ("now", "start", "older", "newer")
+    filters = {part: replace(getattr(state, part), member=member) for part in parts}
+    return replace(state, due=np.array([due]), **filters)
+
+
 def scaled(state: SensitivityState, scale: float) -> SensitivityState:
     """Return a filter before the first sample with another prior deviation."""
-    start = replace(state.start, U=scale * state.start.U, C=scale * state.start.C)
-    return replace(state, start=start, now=start, past=Past.start(start, state.samples))
-
-
-def asleep(state: SensitivityState) -> SensitivityState:
-    """Return what is kept of a member that sleeps: nothing that takes room."""
-    start = replace(state.start, U=state.start.U[:, :0], C=state.start.C[:, :0])
-    return replace(state, start=start, now=start, past=Past.start(start, state.samples))
+    x = replace(state.start, U=scale * state.start.U, C=scale * state.start.C)
+    return replace(state, start=x, now=x, older=x, newer=x)
 
 
 def say_the_same(work: Bank, state: AutoState, j: int, k: int) -> bool:
-    """True if two members say the same of the unknowns: symmetric divergence of two Gaussians."""
-    filter_ = work.filters[j]
-    one, other = state.members[j].now, state.members[k].now
-    shift = filter_.reduced(filter_.latent(one) - filter_.latent(other))
-    covariances = [point.C @ point.C.T for point in (one, other)]
+    """True if members at two positions say the same: symmetric divergence of two Gaussians."""
+    filter_, now = work.work.filter, state.members.now
+    estimate = filter_.estimate(now)
+    shift = filter_.reduction.reduced(estimate[j] - estimate[k])
+    covariances = [now.C[i].T @ now.C[i] for i in (j, k)]
     try:
         factors = [cho_factor(covariance) for covariance in covariances]
     except np.linalg.LinAlgError:

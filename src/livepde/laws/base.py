@@ -274,6 +274,13 @@ class Law(ABC, Generic[Work, State]):
     def step(self, work: Work, state: State, interval: Interval) -> tuple[State, Report]:
         """Return the state at the end of the interval; the old one if the step failed."""
 
+    def stepped_alone(self, work: Work) -> str:
+        """Return why the members of a fleet are stepped one by one; empty if as arrays.
+
+        A law that steps them as arrays has `begin_members`, `step_members` and `member_belief`.
+        """
+        return f"{type(self).__name__} steps one at a time"
+
     @abstractmethod
     def belief(self, work: Work, state: State) -> Belief:
         """Return estimates and, if the law has them, covariances."""

@@ -1,486 +1,376 @@
-"""A filter that is linear about a reference: state and reduced parameter with a joint factor."""
+"""The filter: state and reduced unknowns with a joint square root, about a linearisation point.
+
+Reduced-order filter of Moireau, Chapelle and Le Tallec (2008), written for several members at once:
+the leading axis of every array is the members. One is an identifier, six a bank, any number a
+fleet. With a ~ N(0, I) the reduced unknowns, S the Jacobian of a step, A the derivative of A(u) q
+in q and P = [U C]^T [U C] the joint covariance of u and a,
+
+    predict   one implicit step for u;   U+ S^T = U M/h - C Phi^T A(u+)^T
+    update    d = z - h(u, q),  Y = U H_u^T + C Phi^T H_q^T,  W W^T = (I + Y N^-1 Y^T)^-1
+              [u; a] += [U C]^T W W^T Y N^-1 d,   [U C] <- W^T [U C]
+
+For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag, lapack
+from scipy.linalg import lapack
 
-from livepde.errors import LawError
-from livepde.fem import Evolution, FieldBlock, Moment, RandomWalk
 from livepde.laws.base import Problem
-from livepde.laws.consistency import Consistency
-from livepde.laws.level import NoiseLevel
-from livepde.linalg import Array
-from livepde.stepping import ForwardStage, Interval, Kept, StepFailed, advance
+from livepde.laws.innovations import Innovations
+from livepde.laws.members import changed
+from livepde.laws.reduction import Reduction
+from livepde.laws.sensors import MemberSensors
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import (
+    Interval,
+    KeptFactors,
+    MemberStage,
+    Moments,
+    Span,
+    StepFailed,
+    advance,
+)
 
-__all__ = ["Filter", "Motion", "Point", "reduction"]
+__all__ = ["Filter", "FilterState", "Update", "along"]
 
-LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
-MOST_MODES = 60  # of a field with modes="auto"
 GAIN = 1e-4  # relative error of a square root of the covariance: it steers the gain only
 ESTIMATE = 1e-8  # of the estimated deviation of the state
+FEW = 8  # members up to which LAPACK is called for each
+NOTHING = np.zeros(0)
 BLOCK = 32  # columns that LAPACK's QR takes at once
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
-    """A reference (u, q) and the linear filter about it.
+class FilterState:
+    """What a filter knows of each member after the samples so far.
 
     Attributes
     ----------
+    member
+        Numbers of the members, shape (members,).
     u, q
-        Reference state and parameter, shapes (n,) and (m,).
+        Linearisation point: state and latent parameter, shapes (members, n) and (members, m).
     du, da
-        Estimated deviations of u and of the reduced parameter a, shapes (n,) and (k,).
+        Estimated deviations of u and of the reduced unknowns a, (members, n) and (members, k).
     U, C
-        Square root of the joint covariance of u and a, [U; C] [U; C]^T, shapes (n, r) and (k, r).
-        As long as nothing moves, r = k and U = L C with the sensitivity L = du/da.
-    consistency
+        Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k).
+        As long as nothing moves, r = k.
+    age
+        Time for which the unknowns have moved, shape (members,).
+    innovations
         Statistics of the innovations.
     refused
-        How many values in a row of each sensor the gate has refused, shape (sensors,).
-    level
-        Estimated noise as a multiple of the stated one; 1 unless the law finds it.
+        How many values in a row of each sensor the gate has refused, shape (members, sensors).
+    level, samples
+        Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
+        many samples that stands for, shapes (members,).
     evidence
-        Logarithm of the likelihood of all samples so far, each given those before.
-    age
-        Time for which the unknowns have moved.
+        Logarithm of the likelihood of all samples so far, each given those before, (members,).
     kept
         What the last stage has left to the next.
     """
 
+    member: IntArray
     u: Array
     q: Array
     du: Array
     da: Array
     U: Array = field(metadata={"grows": 1})
     C: Array = field(metadata={"grows": 1})
-    consistency: Consistency
-    refused: Array
-    level: NoiseLevel
-    evidence: float
-    age: float = 0.0
-    kept: Kept = field(default_factory=Kept.none)
+    age: Array
+    innovations: Innovations
+    refused: IntArray
+    level: Array
+    samples: Array
+    evidence: Array
+    kept: KeptFactors
 
-    @cached_property
-    def deviates(self) -> bool:
-        """True if the estimate is not the reference."""
-        return bool(self.du.any() or self.da.any())
+    def __len__(self) -> int:
+        return len(self.member)
 
-    def along(self, shift: Array) -> Array:
-        """Return by how much the state is expected to move with a shift of a, shape (n,)."""
-        if not shift.any():
-            return np.zeros(len(self.u))
-        weights = np.linalg.lstsq(self.C, shift, rcond=None)[0]
-        along: Array = self.U @ weights
-        return along
+    @property
+    def off_centre(self) -> Mask:
+        """Members whose estimate is not the linearisation point, shape (members,)."""
+        return np.asarray(self.da.any(axis=1) | self.du.any(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """How one unknown moves by itself, in reduced coordinates.
+class Update(NamedTuple):
+    """What an update was made of, with W as above.
 
     Attributes
     ----------
-    part
-        Where its reduced coordinates stand: copies times modes.
-    evolution, std
-        Its model, and the prior deviation of its latent coefficients.
-    saturates
-        True if it gains the less the closer its variance is to that of the prior: it may move, but
-        without data it is not less certain than at first.
+    left, half
+        W^T Y, shape (members, r, sensors), and W^T Y d, shape (members, r).
+    spread
+        log det (I + Y^T Y)/2, shape (members,).
     """
 
-    part: slice
-    evolution: Evolution
-    std: float
-    saturates: bool = False
-
-    def drifting(self, rate: float) -> Motion:
-        """Return it with a drift of `rate` prior variances per unit of time.
-
-        The same if it moves by itself.
-        """
-        if not rate or self.evolution.moves:
-            return self
-        return replace(self, evolution=RandomWalk(float(np.sqrt(rate)) * self.std), saturates=True)
-
-    def transition(self, h: float) -> Array:
-        """Return the transition of its coordinates in a time h."""
-        F = self.evolution.transition(h)
-        return np.asarray(np.kron(F, np.eye((self.part.stop - self.part.start) // len(F))))
-
-    def growth(self, h: float) -> Array:
-        """Return the variance its coordinates gain in a time h."""
-        gained = self.evolution.growth(h, self.std)
-        return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
-
-    def gained(self, h: float, variance: Array) -> Array:
-        """Return what its coordinates gain in a time h, given variances of shape (..., k)."""
-        growth = self.growth(h)
-        if not self.saturates:
-            return growth
-        room: Array = np.maximum(1.0 - variance[..., self.part], 0.0)
-        return -np.expm1(-growth) * room  # V' = growth (1 - V)/h, whatever the length of the step
-
-    def backward(self, h: float) -> Array:
-        """Return what the coordinates are expected to have been a time h before: matrix on them."""
-        F = self.transition(h)
-        return np.asarray(np.linalg.solve(F @ F.T + np.diag(self.growth(h)), F).T)
+    left: Array
+    half: Array
+    spread: Array
 
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """A filter for a problem, linear about the reference of a `Point`.
+    """Predicts and updates, linear about the point of a `FilterState`.
+
+    Overflow is no error here: callers look at what is not finite.
 
     Attributes
     ----------
-    problem, forward
-        What is filtered, and the forward stage of its steps.
-    Phi, motions
-        The reduction a_latent = prior + Phi a, shape (m, k), and how its coordinates move.
+    problem, stage, sensors, reduction
+        Model and sensors; the implicit stage of all members; what sensors see; the unknowns.
     noise
         Standard deviation of each sensor, shape (sensors,).
-    scale, rank
-        A factor of more than `rank` columns is compressed; `scale`, shape (n,), weighs the
+    rank, scale
+        A square root of more than `rank` rows is compressed; `scale`, shape (n,), weighs the
         coefficients of the state then: the square root of the mass of each.
-    gate, patience
-        Innovations beyond `gate` expected deviations are refused, `patience` times in a row.
-    adaptive
-        True if the noise is a first guess whose multiple is found from the samples.
+    drift
+        Prior variances gained per unit of time by unknowns that stay else, one for each member
+        number, shape (numbers,), or (1,) for all.
+    fading
+        Time after which what the state knows of the unknowns has faded to 1/e.
     """
 
     problem: Problem
-    forward: ForwardStage
-    Phi: Array
-    motions: tuple[Motion, ...]
+    stage: MemberStage
+    sensors: MemberSensors
+    reduction: Reduction
     noise: Array
-    scale: Array
     rank: int
-    gate: float
-    patience: int
-    adaptive: bool
+    scale: Array
+    drift: Array
+    fading: float = np.inf
 
-    @cached_property
+    def drifts(self, member: IntArray) -> Array:
+        """Return the drift of some members."""
+        return self.drift[member] if len(self.drift) > 1 else np.repeat(self.drift, len(member))
+
+    @property
     def moves(self) -> bool:
-        """True if an unknown moves by itself."""
-        return any(motion.evolution.moves for motion in self.motions)
+        """True if an unknown moves."""
+        return self.reduction.moves or bool(self.drift.any())
 
-    def transition(self, h: float) -> Array:
-        """Return the transition of all reduced coordinates in a time h, shape (k, k)."""
-        return _transition(self.motions, h)
+    def span(self, interval: Interval) -> Span:
+        """Return the interval of one process as that of its one member."""
+        return Span.of(self.problem.control.over(interval), self.problem.channels)
 
-    def moved(self, point: Point, h: float) -> Point:
-        """Return a point whose unknowns have moved for a time h; those of its state have not.
-
-        What they gain is in new columns of the factor, in the same order for every h.
-        """
-        if not self.moves or h == 0.0:
-            return point
-        F = self.transition(h)
-        variance = (point.C**2).sum(axis=1)
-        gained = np.sqrt(np.concatenate([m.gained(h, variance) for m in self.motions]))
-        new = np.diag(gained)[:, gained > 0.0]
-        q = self.problem.model.latent.moved(point.q, h)
-        U = np.hstack([point.U, np.zeros((len(point.u), new.shape[1]))])
-        C, age = np.hstack([F @ point.C, new]), point.age + h
-        return replace(point, q=q, da=F @ point.da, U=U, C=C, age=age)
-
-    @cached_property
-    def _left_out(self) -> Array:
-        """Prior variance of each latent coefficient in the modes that are left out, shape (m,)."""
-        model = self.problem.model
-        left = np.zeros(len(self.Phi))
-        for item in model.latent.parts.values():
-            if isinstance(item.block, FieldBlock):
-                first = slice(item.part.start, item.part.start + item.size)
-                space = model.Q.restricted(first, item.block.fixed)
-                left[item.part] = np.tile(space.beyond(self.Phi[first]), item.evolution.copies)
-        return left
-
-    @cached_property
-    def _still(self) -> Array:
-        return np.asarray(np.sqrt(self._left_out))
-
-    def rest(self, age: float) -> Array:
-        """Return the deviation of each latent coefficient in the modes that are left out, (m,).
-
-        They are as the prior has them, and have moved for a time `age`.
-        """
-        if age == 0.0 or not self._left_out.any():
-            return self._still
-        parts = self.problem.model.latent.parts.values()
-        grown = [
-            np.repeat(
-                (motion.evolution.transition(age) ** 2).sum(axis=1)
-                + motion.evolution.growth(age, motion.std),
-                item.size,
-            )
-            for motion, item in zip(self.motions, parts, strict=True)
-        ]
-        return np.asarray(np.sqrt(self._left_out * np.concatenate(grown)))
-
-    def traced(self, q: Array, start: Array, h: float) -> Array:
-        """Return the latent parameter that is expected to have become q in a time h.
-
-        Parameters
-        ----------
-        start
-            One at that time; what no mode sees is taken from it.
-        """
-        if not self.moves:
-            return q
-        prior = self.problem.model.latent.prior
-        back = block_diag(*(motion.backward(h) for motion in self.motions))
-        return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
-
-    def latent(self, point: Point) -> Array:
-        """Return the estimated latent parameter, not yet bounded."""
-        q: Array = point.q + self.Phi @ point.da
+    def estimate(self, x: FilterState) -> Array:
+        """Return the estimated latent parameters, not yet bounded, shape (members, m)."""
+        q: Array = x.q + x.da @ self.reduction.Phi.T
         return q
 
-    def predict(self, point: Point, moment: Moment) -> Array:
-        """Return what the sensors are expected to show, linear about the reference."""
-        predicted = self.problem.predict(point.u, point.q, moment)
-        if not point.deviates:
-            return predicted
-        return predicted + self._seen(point, point.du[:, None], point.da[:, None], moment)[:, 0]
+    def moved(self, x: FilterState, h: float) -> FilterState:
+        """Return the state whose unknowns have moved for a time h; those of u have not.
 
-    def output(self, point: Point, moment: Moment) -> Array:
-        """Return the derivative of the prediction along the columns of the factor, H [U; C]."""
-        return self._seen(point, point.U, point.C, moment)
+        What they gain is in new rows of the square root, in the same order for every h.
+        """
+        if not self.moves or h == 0.0:
+            return x
+        F = self.reduction.transition(h)
+        variance = np.einsum("brk,brk->bk", x.C, x.C)
+        gained = self.reduction.gained(h, variance, self.drifts(x.member))
+        grows = np.flatnonzero((gained > 0.0).any(axis=0))
+        members, _, k = x.C.shape
+        new = np.zeros((members, len(grows), k))
+        new[:, np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
+        return changed(
+            x,
+            q=self.reduction.moved(x.q, h),
+            da=x.da @ F.T,
+            U=np.concatenate([x.U, np.zeros((members, len(grows), x.U.shape[2]))], axis=1),
+            C=np.concatenate([x.C @ F.T, new], axis=1),
+            age=x.age + h,
+        )
 
-    def _seen(self, point: Point, du: Array, da: Array, moment: Moment) -> Array:
-        """Return by how much the sensors see a change of state and reduced parameter."""
-        latent = self.problem.model.latent
-        H_u, H_q = self.problem.observed.jacobian(point.u, latent.value(point.q), moment)
-        seen: Array = H_u @ du
-        return seen if H_q is None else seen + H_q @ latent.tangent(point.q, self.Phi @ da)
+    def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+        """Return the state at the end of a span, substeps, and why it failed or None.
 
-    def reduced(self, dq: Array) -> Array:
-        """Return a with Phi a = dq: the columns of Phi are orthonormal in Q."""
-        a: Array = self.Phi.T @ self.problem.model.Q.dual(dq)
-        return a
+        What unknowns gain in one substep is independent of what they gain in the next.
+        """
+        count = self.problem.control.count(_between(span.start, span.t1)) if self.moves else 1
+        at = [span.start + k / count * (span.t1 - span.start) for k in range(count)] + [span.t1]
+        taken = 0
+        for start, stop in zip(at, at[1:], strict=False):
+            x, steps, failure = self._advanced(x, span, start, stop)
+            taken += steps
+            if failure is not None:
+                return x, taken, failure
+        if np.isfinite(self.fading):
+            x = changed(x, U=np.exp(-(span.t1 - span.start) / self.fading) * x.U)
+        return x, taken, None
 
-    def bounded(self, q: Array) -> Array:
-        """Return the latent parameter within its bounds."""
-        return self.problem.model.latent.clipped(q)
+    def _advanced(
+        self, x: FilterState, span: Span, start: float, stop: float
+    ) -> tuple[FilterState, int, StepFailed | None]:
+        """Return the state at the end of a part of a span."""
+        end, kept, off = self.moved(x, stop - start), x.kept, x.off_centre
+        deviates = bool(off.any())
+        tolerance = np.where(off, ESTIMATE, GAIN)
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
-    def advanced(self, point: Point, interval: Interval) -> tuple[Point, int, StepFailed | None]:
-        """Return the filter at the end of an interval, substeps, and why it failed or None."""
-        end = self.moved(point, interval.t1 - interval.t0)
-        deviates = end.deviates
-        kept, tolerance = point.kept, ESTIMATE if deviates else GAIN
-
-        def directions(at: Point) -> Array:
-            C = np.column_stack([at.C, at.da]) if deviates else at.C
-            return self.problem.model.latent.tangent(at.q, self.Phi @ C)
+        def directions(at: FilterState) -> Array:
+            C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C
+            return self.reduction.directions(at.q, C)
 
         at_end = directions(end)
 
-        def stage(c: Array, t: float, h: float) -> Array:
+        def stage(columns: Array, t: float, h: float) -> Array:
             nonlocal kept
             q, along = end.q, at_end
-            if self.moves and t != interval.t1:
-                now = self.moved(point, t - interval.t0)
+            if self.moves and t != stop:
+                now = self.moved(x, t - start)
                 q, along = now.q, directions(now)
-            y, kept = self.forward.advance(c, q, along, h, interval.at(t), kept, tolerance)
+            y, kept = self.stage.advance(
+                columns, q, along, h, span.at(t), kept, tolerance, x.member
+            )
             return y
 
-        deviation = [end.du] if deviates else []
-        columns = np.column_stack([end.u, end.U, *deviation])
-        y, steps, failure = advance(self.problem.control, stage, columns, interval)
-        if failure is None and not np.isfinite(y).all():
-            failure = StepFailed("not_finite", "the prediction is not finite")
+        last = [end.du[None]] if deviates else []
+        columns = np.concatenate([end.u[None], end.U.transpose(1, 0, 2), *last])
+        part = _between(start, stop)
+        columns, steps, failure = advance(self.problem.control, stage, columns, part)
         if failure is not None:
-            return point, steps, failure
-        r = end.U.shape[1]
-        U, C, du = y[:, 1 : 1 + r], end.C, y[:, 1 + r] if deviates else end.du
-        if C.shape[1] > self.rank:
-            U, C = _compressed(U, C, self.scale, self.rank)
-        return replace(end, u=y[:, 0], U=U, C=C, du=du, kept=kept), steps, None
+            return x, steps, failure
+        rows = end.U.shape[1]
+        U, C, du = columns[1 : 1 + rows].transpose(1, 0, 2), end.C, end.du
+        du = columns[-1] if deviates else du
+        if rows > self.rank:
+            U, C = self._compressed(U, C)
+        return changed(end, u=columns[0], U=U, C=C, du=du, kept=kept), steps, None
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
-    def updated(self, point: Point, interval: Interval, predicted: Array) -> tuple[Point, int]:
-        """Return the filter after the sample, and how many values the gate refused."""
-        d = interval.z1 - predicted
-        present = np.isfinite(d)
-        if not present.any():
-            return point, 0
-        noise = point.level.scale * self.noise
-        Y = self.output(point, interval.end) / noise[:, None]
-        e = d / (noise * np.sqrt(1.0 + (Y**2).sum(axis=1)))
-        used, count = present, 0
-        if np.isfinite(self.gate):
-            far = present & ~(np.abs(e) <= self.gate)
-            refused = np.where(far, point.refused + 1, np.where(present, 0, point.refused))
-            used = present & ~(far & (refused <= self.patience))
-            count = int(present.sum() - used.sum())
-            point = replace(point, refused=refused)
-            e = np.where(used, e, np.nan)
-        consistency = point.consistency.add(e)
-        if not used.any():
-            return replace(point, consistency=consistency), count
-        d /= noise
-        if not used.all():
-            Y, d, noise = Y[used], d[used], noise[used]
+    def observe(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
+        """Return predicted readings, (members, sensors), and Y = [U C] H^T, (members, r, sensors).
+
+        Linear about the linearisation point.
+        """
+        return self.sensors.seen(x, at)
+
+    @staticmethod
+    def update(x: FilterState, Y: Array, d: Array) -> tuple[FilterState, Update]:
+        """Return the state after a sample, and what it tells of the noise.
+
+        Parameters
+        ----------
+        Y, d
+            Observed square root, (members, r, sensors), and innovations, (members, sensors), in
+            units of the noise; zero where no value is.
+        """
         W, spread = _contraction(Y)
-        half = W.T @ (Y.T @ d)
-        U, C = point.U @ W, point.C @ W
-        spread += float(np.log(noise).sum())
-        evidence = point.evidence - 0.5 * float(d @ d - half @ half) - spread
-        new = replace(
-            point,
-            da=point.da + C @ half,
-            du=point.du + U @ half,
-            C=C,
-            U=U,
-            consistency=consistency,
-            evidence=evidence,
-        )
-        if self.adaptive:
-            # What the update leaves of the sample, and what is left of its variance.
-            seen = Y @ W
-            left = float(((d - seen @ half) ** 2).mean() + (seen**2).sum(axis=1).mean())
-            new = replace(new, level=point.level.add(left))
-        return new, count
+        Wt = W.transpose(0, 2, 1)
+        left = Wt @ Y
+        half = (left @ d[:, :, None])[:, :, 0]
+        U, C, row = Wt @ x.U, Wt @ x.C, half[:, None]
+        new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
+        return new, Update(left, half, spread)
 
-    def loosened(self, point: Point, size: float) -> Point:
-        """Return the filter with `size` prior deviations added to the uncertainty of each unknown.
+    def recentred(self, x: FilterState) -> FilterState:
+        """Return the state with its linearisation point at the estimate, within the bounds.
 
-        Independent of what the state remembers: the state is as well known as before.
+        Bounds hold for linearisation points and for what is reported, not for the linear filter:
+        what lies beyond them stays in da and du, so that nothing the data said is lost.
         """
-        k = len(point.da)
-        C = np.hstack([point.C, size * np.eye(k)])
-        U = np.hstack([point.U, np.zeros((len(point.u), k))])
+        estimate = self.estimate(x)
+        within = self.reduction.bounded(estimate)
+        da, du, u = np.zeros_like(x.da), np.zeros_like(x.du), x.u + x.du
+        if within is not estimate:
+            beyond = (within != estimate).any(axis=1)
+            for k in np.flatnonzero(beyond).tolist():
+                shift = self.reduction.reduced(within[k] - x.q[k])
+                da[k] = x.da[k] - shift
+                du[k] = along(x, k, da[k])
+                u[k] -= du[k]
+                estimate[k] = x.q[k] + self.reduction.Phi @ shift
+        return changed(x, u=u, q=estimate, du=du, da=da)
+
+    def loosened(self, x: FilterState, size: float) -> FilterState:
+        """Return the state with `size` prior deviations added to the uncertainty of each unknown.
+
+        Independent of what is known of u: that is as well known as before.
+        """
+        members, _, k = x.C.shape
+        unit = np.broadcast_to(size * np.eye(k), (members, k, k))
+        C = np.concatenate([x.C, unit], axis=1)
+        U = np.concatenate([x.U, np.zeros((members, k, x.U.shape[2]))], axis=1)
         if C.shape[1] > self.rank:
-            U, C = _compressed(U, C, self.scale, self.rank)
-        return replace(point, U=U, C=C)
+            U, C = self._compressed(U, C)
+        return changed(x, U=U, C=C)
 
-    def fresh(self, point: Point) -> Point:
-        """Return the filter with the prior of the unknowns, and the state as it is estimated."""
-        k = len(point.da)
-        prior = self.problem.model.latent.prior
-        state, U = point.u + point.du, np.zeros((len(point.u), k))
-        zero = np.zeros(k)
-        return replace(point, u=state, q=prior, du=0.0 * point.du, da=zero, U=U, C=np.eye(k))
+    def prior_again(self, x: FilterState) -> FilterState:
+        """Return the state with the prior of the unknowns, and u as it is estimated."""
+        members, k = x.da.shape
+        prior = np.broadcast_to(self.problem.model.latent.prior, x.q.shape)
+        C = np.broadcast_to(np.eye(k), (members, k, k))
+        U, du, da = np.zeros((members, k, x.u.shape[1])), np.zeros_like(x.du), np.zeros_like(x.da)
+        return changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C)
 
-    def recentred(self, point: Point) -> Point:
-        """Return the filter with its reference at the estimate, within the bounds.
+    def _compressed(self, U: Array, C: Array) -> tuple[Array, Array]:
+        """Return a square root of `rank` rows.
 
-        Bounds hold for references and for what is reported, not for the linear filter: what lies
-        beyond them stays in da and du, so that nothing the data said is lost.
+        A rotation gathers all that is uncertain about the unknowns, and the state with them, in the
+        first rows: they stay as they are. Of the rest, which is the state's alone, the leading
+        directions are kept, measured by `scale`.
         """
-        estimate = self.latent(point)
-        within = self.bounded(estimate)
-        if within is estimate or np.array_equal(within, estimate):
-            zero = np.zeros(len(point.da))
-            return replace(point, u=point.u + point.du, q=estimate, du=0.0 * point.du, da=zero)
-        shift = self.reduced(within - point.q)
-        beyond = point.along(point.da - shift)
-        return replace(
-            point,
-            u=point.u + point.du - beyond,
-            q=point.q + self.Phi @ shift,
-            du=beyond,
-            da=point.da - shift,
-        )
+        k = C.shape[2]
+        rotation, root = np.linalg.qr(C, mode="complete")
+        rotated = rotation.transpose(0, 2, 1) @ U
+        alone = rotated[:, k:]
+        weighted = alone * self.scale
+        square = weighted @ weighted.transpose(0, 2, 1)
+        square[~np.isfinite(square).all(axis=(1, 2))] = 0.0  # reported by the caller
+        _, vectors = np.linalg.eigh(square)
+        kept = vectors[:, :, ::-1][:, :, : self.rank - k].transpose(0, 2, 1) @ alone
+        small = np.zeros((len(C), k + kept.shape[1], k))
+        small[:, :k] = root[:, :k]
+        return np.concatenate([rotated[:, :k], kept], axis=1), small
 
 
-def reduction(
-    problem: Problem, modes: int | str | dict[str, int], drift: float
-) -> tuple[Array, tuple[Motion, ...]]:
-    """Return Phi, shape (m, k), and how its coordinates move.
+def _between(start: float, stop: float) -> Interval:
+    """Return the interval between two times, without samples."""
+    return Interval(start, stop, {}, {}, NOTHING, NOTHING)
 
-    Parameters
-    ----------
-    modes, drift
-        As for `SensitivityLaw`.
+
+def along(x: FilterState, k: int, shift: Array) -> Array:
+    """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
+    if not shift.any():
+        return np.zeros(x.u.shape[1])
+    weights = np.linalg.lstsq(x.C[k].T, shift, rcond=None)[0]
+    moved: Array = weights @ x.U[k]
+    return moved
+
+
+def _contraction(Y: Array) -> tuple[Array, Array]:
+    """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), and the logarithm of 1/|det W|.
+
+    W = R^-1 from a QR factorisation of [I; Y^T]: nothing is squared.
     """
-    model = problem.model
-    fields = model.parameter_space.fields
-    if isinstance(modes, str) and modes != "auto":
-        raise LawError(
-            f"SensitivityLaw: modes must be a number, 'auto', or a number for each field; got "
-            f"{modes!r}."
-        )
-    most = MOST_MODES if isinstance(modes, str) else modes
-    counts = most if isinstance(most, dict) else dict.fromkeys(fields, most)
-    if set(counts) != set(fields):
-        raise LawError(
-            f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(fields)}."
-        )
-    if any(count < 1 or count % 1 for count in counts.values()):
-        raise LawError(f"SensitivityLaw: modes must be whole numbers of at least 1; got {modes!r}.")
-    blocks, motions, start = [], [], 0
-    for name, item in model.latent.parts.items():
-        first = slice(item.part.start, item.part.start + item.size)
-        if isinstance(item.block, FieldBlock):
-            part = model.parameter_space.part(name)
-            inner = model.Q.restricted(first, item.block.fixed)
-            count = min(counts[name], int(inner.free.sum()))
-            mass = model.parameter_mass[part, part]
-            phi, _ = inner.modes(count, mass)
-            if modes == "auto":
-                weights = mass.diagonal()
-                phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
-        else:
-            phi = np.eye(item.size) * item.unknown.latent_std
-        blocks.append(np.kron(np.eye(item.evolution.copies), phi))
-        stop = start + blocks[-1].shape[1]
-        motion = Motion(slice(start, stop), item.evolution, item.unknown.latent_std)
-        motions.append(motion.drifting(drift))
-        start = stop
-    Phi: Array = np.asarray(block_diag(*blocks))
-    return Phi, tuple(motions)
+    members, r, sensors = Y.shape
+    stacked = np.zeros((members, r, r + sensors))  # transposed: LAPACK counts down the columns
+    stacked[:, :, r:] = Y
+    stacked.reshape(members, -1)[:, :: r + sensors + 1] = 1.0
+    if members > FEW:
+        root: Array = np.asarray(np.linalg.qr(stacked.transpose(0, 2, 1), mode="r"))
+        good = np.isfinite(root).all(axis=(1, 2))
+        inverse = np.full_like(root, np.nan)
+        inverse[good] = np.linalg.inv(root[good])
+    else:  # a call of NumPy for stacks of matrices takes ten times longer than LAPACK for one
+        root, inverse = np.empty((members, r, r)), np.empty((members, r, r))
+        for k in range(members):
+            factored, _, _, _ = lapack.dgeqrf(stacked[k].T, lwork=BLOCK * r, overwrite_a=1)
+            root[k] = factored[:r]
+            inverse[k], _ = lapack.dtrtri(factored[:r])
+        inverse *= _upper(r)
+    diagonal = root.reshape(members, -1)[:, :: r + 1]
+    return inverse, np.log(np.abs(diagonal)).sum(axis=1)
 
 
-def _enough(phi: Array, mass: Array, variance: float) -> int:
-    """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
-    held = np.cumsum(mass @ phi**2)
-    short = int((held < (1.0 - LEFT_OUT) * variance).sum())
-    return min(short + 1, len(held))
-
-
-@lru_cache(maxsize=64)
-def _transition(motions: tuple[Motion, ...], h: float) -> Array:
-    return np.asarray(block_diag(*(motion.transition(h) for motion in motions)))
-
-
-def _contraction(Y: Array) -> tuple[Array, float]:
-    """Return W with W W^T = (I + Y^T Y)^-1, shape (r, r), and the logarithm of 1/|det W|.
-
-    W = R^-1 from a QR factorisation of [I; Y]: nothing is squared.
-    """
-    count, r = Y.shape
-    stacked = np.zeros((r, r + count))  # transposed: LAPACK counts down the columns
-    stacked[:, r:] = Y.T
-    stacked.flat[:: r + count + 1] = 1.0
-    factored, _, _, _ = lapack.dgeqrf(stacked.T, lwork=BLOCK * r, overwrite_a=1)
-    root = np.triu(factored[:r])
-    # SciPy's triangular solve would start threads for this small matrix; this one does not.
-    W: Array = np.asarray(np.linalg.inv(root), dtype=float)
-    return W, float(np.log(np.abs(root.diagonal())).sum())
-
-
-def _compressed(U: Array, C: Array, scale: Array, rank: int) -> tuple[Array, Array]:
-    """Return the factor with `rank` columns.
-
-    A rotation gathers all that is uncertain about the parameters, and the state with them, in the
-    first columns: they stay as they are. Of the rest, which is the state's alone, the leading
-    directions are kept, measured by `scale`.
-    """
-    k = len(C)
-    rotation, root = np.linalg.qr(C.T, mode="complete")
-    rotated = U @ rotation
-    alone = rotated[:, k:]
-    weighted = scale[:, None] * alone
-    _, vectors = np.linalg.eigh(weighted.T @ weighted)
-    kept = alone @ vectors[:, ::-1][:, : rank - k]
-    square: Array = np.zeros((k, rank))
-    square[:, :k] = root[:k].T
-    return np.hstack([rotated[:, :k], kept]), square
+@lru_cache(maxsize=16)
+def _upper(r: int) -> Array:
+    """Return ones in the upper triangle of an r by r matrix."""
+    return np.triu(np.ones((r, r)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 
 __all__ = ["Guards", "Scale"]
 
@@ -61,9 +61,10 @@ class Guards:
             if value < least:
                 raise LawError(f"Guards: {name} must be at least {least}; got {value}.")
 
-    def within_reach(self, change: Array) -> bool:
-        """Return whether a sample moves the unknowns by so little, in prior deviations (k,)."""
-        return bool(np.abs(change).max(initial=0.0) <= self.reach)
+    def within_reach(self, change: Array) -> Mask:
+        """Return which members a sample moves by so little, in prior deviations (members, k)."""
+        near: Mask = np.abs(change).max(axis=1, initial=0.0) <= self.reach
+        return near
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,8 @@ class Scale:
     Attributes
     ----------
     low, high, first
-        Least and largest value, and size of the first innovation, shapes (sensors,); NaN before.
+        Least and largest value, and size of the first innovation, shapes (members, sensors); NaN
+        before.
     """
 
     low: Array
@@ -81,23 +83,24 @@ class Scale:
     first: Array
 
     @classmethod
-    def start(cls, sensors: int) -> Scale:
+    def start(cls, sensors: int, members: int = 1) -> Scale:
         """Return the value before any sample."""
-        never = np.full(sensors, np.nan)
+        never = np.full((members, sensors), np.nan)
         return cls(never, never, never)
 
     def add(self, z: Array, d: Array) -> Scale:
-        """Return the value after a sample z with innovations d, shapes (sensors,), NaN missing."""
+        """Return the value after a sample z with innovations d, NaN where missing."""
         first = np.where(np.isnan(self.first), np.abs(d), self.first)
         return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
 
-    def beyond(self, d: Array, noise: Array) -> float:
+    def beyond(self, d: Array, noise: Array) -> Array:
         """Return the largest innovation as a multiple of what was there before, or of the noise.
 
         Counted in the noise of each sensor, against the sensor that has varied most: one that a
-        wave has not reached yet knows nothing of its size.
+        wave has not reached yet knows nothing of its size. Shape (members,).
         """
-        largest = np.maximum(np.maximum(self.high - self.low, self.first), noise) / noise
-        seen = ~np.isnan(largest)
-        missed = np.abs(d / noise)[seen & ~np.isnan(d)]
-        return float(missed.max() / largest[seen].max()) if len(missed) else 0.0
+        ranges = np.fmax(np.fmax(self.high - self.low, self.first), noise) / noise
+        missed = np.fmax.reduce(np.abs(d) / noise, axis=1)
+        unseen = np.isnan(self.first) | np.isnan(self.low)
+        largest = np.where(unseen, 0.0, ranges).max(axis=1)
+        return np.where(np.isnan(missed), 0.0, missed / np.where(largest > 0.0, largest, np.inf))

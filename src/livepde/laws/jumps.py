@@ -2,40 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy
 
 from livepde.errors import LawError
-from livepde.laws.consistency import Consistency
-from livepde.linalg import Array, IntArray
+from livepde.laws.innovations import Innovations
+from livepde.linalg import Array, IntArray, Mask
 
 __all__ = ["Jumps", "Watch"]
 
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """Innovations of the last samples.
+    """Innovations of the last samples of each member.
 
     Attributes
     ----------
     squares, counts
-        Sum of e^2 and number of innovations e of each of the last samples, newest first.
+        Sum of e^2 and number of innovations e of each of the last samples, newest first, shapes
+        (members, samples).
     seen
-        Samples since the start or the last alarm.
+        Samples since the start or the last alarm, shape (members,).
     """
 
     squares: Array
     counts: Array
-    seen: int
+    seen: IntArray
 
     def add(self, e: Array) -> Watch:
-        """Return the value after a sample of normalised innovations, NaN where missing."""
+        """Return the value after normalised innovations (members, sensors), NaN where missing."""
         seen = np.isfinite(e)
-        squares = np.concatenate([[float((e[seen] ** 2).sum())], self.squares[:-1]])
-        counts = np.concatenate([[float(seen.sum())], self.counts[:-1]])
+        square = (np.where(seen, e, 0.0) ** 2).sum(axis=1)
+        squares = np.concatenate([square[:, None], self.squares[:, :-1]], axis=1)
+        count = seen.sum(axis=1).astype(float)
+        counts = np.concatenate([count[:, None], self.counts[:, :-1]], axis=1)
         return Watch(squares, counts, self.seen + 1)
 
 
@@ -81,40 +84,56 @@ class Jumps:
         """Numbers of samples that are looked at, less one."""
         return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
 
-    def start(self) -> Watch:
+    def start(self, members: int = 1) -> Watch:
         """Return the value before any innovation."""
-        return Watch(np.zeros(self.window), np.zeros(self.window), 0)
+        zero = np.zeros((members, self.window))
+        return Watch(zero, zero, np.zeros(members, dtype=np.int64))
 
-    def add(self, watch: Watch, e: Array, usual: Consistency) -> tuple[Watch, bool]:
-        """Return the value after a sample, and whether there is an alarm.
+    def add(self, watch: Watch, e: Array, usual: Innovations) -> tuple[Watch, Mask]:
+        """Return the value after a sample, and for which members there is an alarm.
 
         Parameters
         ----------
         e
-            Normalised innovations, shape (sensors,), NaN where missing.
+            Normalised innovations, shape (members, sensors), NaN where missing.
         usual
             Their statistics before this sample.
         """
-        if watch.seen < self.settle:  # the first linearisations are poor: what they miss is no jump
-            return replace(watch, seen=watch.seen + 1), False
-        new = watch.add(e)
-        if not new.counts[0]:
-            return new, False
+        early = watch.seen < self.settle  # the first linearisations are poor: what they miss
+        new = watch.add(e)  # is no jump
+        if early.any():
+            kept = early[:, None]
+            squares = np.where(kept, watch.squares, new.squares)
+            counts = np.where(kept, watch.counts, new.counts)
+            new = Watch(squares, counts, new.seen)
+            if early.all():
+                return new, np.zeros(len(e), dtype=bool)
         lengths = self._lengths
-        sums, freedom = np.cumsum(new.squares)[lengths], np.cumsum(new.counts)[lengths]
-        chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums / usual.scatter**2)
-        if float(chance.min()) * len(lengths) >= self.probability:
-            return new, False
-        return self.start(), True
+        sums = np.cumsum(new.squares, axis=1)[:, lengths]
+        freedom = np.cumsum(new.counts, axis=1)[:, lengths]
+        scatter = usual.scatter[:, None]
+        with np.errstate(invalid="ignore"):  # no freedom, no chance
+            chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums / scatter**2)
+        chance = np.where(freedom > 0.0, chance, 1.0).min(axis=1)
+        unlikely = chance * len(lengths) < self.probability
+        alarm: Mask = ~early & (new.counts[:, 0] > 0.0) & unlikely
+        if alarm.any():
+            again, clear = self.start(len(e)), alarm[:, None]
+            new = Watch(
+                np.where(clear, again.squares, new.squares),
+                np.where(clear, again.counts, new.counts),
+                np.where(alarm, again.seen, new.seen),
+            )
+        return new, alarm
 
-    def onset(self, watch: Watch, e: Array, usual: Consistency) -> int:
-        """Return of how many samples, up to this one, the innovations are most likely too large.
+    def onset(self, watch: Watch, e: Array, usual: Innovations) -> int:
+        """Return of how many samples, up to this one, innovations are most likely too large.
 
         The number n that maximises the likelihood ratio n (r - 1 - log r)/2 of innovations of mean
-        square r > 1 since n samples against 1. Parameters as for `add`.
+        square r > 1 since n samples against 1. Parameters as for `add`, of one member.
         """
         new = watch.add(e)
-        freedom = np.cumsum(new.counts)
-        ratio = np.cumsum(new.squares) / usual.scatter**2 / np.maximum(freedom, 1.0)
+        freedom = np.cumsum(new.counts[0])
+        ratio = np.cumsum(new.squares[0]) / usual.scatter[0] ** 2 / np.maximum(freedom, 1.0)
         ratio = np.maximum(ratio, 1.0)
         return 1 + int(np.argmax(freedom * (ratio - 1.0 - np.log(ratio))))

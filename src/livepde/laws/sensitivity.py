@@ -2,105 +2,119 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
+from livepde.laws.assimilation import (
+    OK,
+    Assimilation,
+    Assimilator,
+    MemberReports,
+    assimilate,
+    assimilate_at_once,
+)
 from livepde.laws.base import Belief, Law, Problem, Report, Status
-from livepde.laws.consistency import Consistency
-from livepde.laws.filter import Filter, Point, reduction
+from livepde.laws.filter import Filter, FilterState
 from livepde.laws.guards import Guards, Scale
+from livepde.laws.history import (
+    added,
+    empty_log,
+    first_interval,
+    intervals_since,
+    opened,
+    trimmed,
+)
+from livepde.laws.innovations import Innovations
 from livepde.laws.jumps import Jumps, Watch
-from livepde.laws.level import NoiseLevel
-from livepde.laws.past import Past, Samples
-from livepde.linalg import Array
-from livepde.stepping import ForwardStage, Interval
+from livepde.laws.members import changed, join, put, take, where
+from livepde.laws.reduction import Reduction
+from livepde.laws.replay import (
+    CONVERGED,
+    Replay,
+    Window,
+    distance,
+    missed_most,
+    next_reference,
+    placed,
+    replayed,
+)
+from livepde.laws.sensors import MemberSensors
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import BandedStage, Interval, Span, member_stage
 
-__all__ = ["Replay", "SensitivityLaw", "SensitivityState"]
+__all__ = ["NEVER", "SensitivityLaw", "SensitivityState", "SensitivityWork", "from_now"]
 
-CONVERGED = 0.5  # standard deviations between reference and estimate at which replays stop
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
 TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
-STRIDE = 1.0  # prior deviations that a replay moves its reference at most: a trust region
+GUESS = 2.0  # samples that the first guess of the noise counts for
+NEVER = np.iinfo(np.int64).max  # number of samples at which a filter without replay is replayed
 
 
-@dataclass(frozen=True)
-class Replay:
-    """Keep one reference trajectory and replay the stored samples from a better one.
+@dataclass(frozen=True, eq=False)
+class SensitivityWork:
+    """What the law computes once: the filter, and how it takes a sample."""
 
-    Each plain update u += L K d leaves a second-order error that a state with long memory never
-    forgets. With a replay the filter stays linear about one reference, and whenever the number of
-    assimilated samples has doubled, the reference is moved to the estimate and the stored samples
-    are run through again, until reference and estimate agree within half a standard deviation: a
-    Gauss-Newton iteration, whose steps are at most one prior deviation long. One replay for each
-    doubling makes less than four times the steps in all; more than one is needed mostly while the
-    store is short.
-
-    Parameters
-    ----------
-    window
-        At most this many samples are stored. When it is full, the estimate of that moment becomes
-        the new start and the store is emptied.
-    first
-        Number of assimilated samples before the first replay.
-    iterations
-        At most this many replays for each doubling.
-    """
-
-    window: int = 4096
-    first: int = 8
-    iterations: int = 4
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.first <= self.window:
-            raise LawError("Replay: needs 1 <= first <= window.")
-        if self.iterations < 1:
-            raise LawError(f"Replay: iterations must be at least 1; got {self.iterations}.")
+    filter: Filter
+    choices: Assimilator
 
 
 @dataclass(frozen=True, eq=False)
 class SensitivityState:
-    """Now, and for a replay where the window began and what was measured since.
+    """What the law knows of each member; the leading axis of every array is the members.
 
     Attributes
     ----------
-    now, start
-        The filter now and at the start of the window.
-    samples
-        What was measured in between; empty without replay.
+    now
+        The filter now.
+    start, window, opening, initial, reference
+        Where the window of a replay begins: the filter, the row of the log, whether that row holds
+        a sample that the filter has not seen, whether it is the initial state that the model says
+        (`Model.initial`), and the latent parameter from which the reference of `now` comes.
     assimilated, due
-        Samples used since the start of the window, and at how many the next replay is due.
-    initial
-        True while the window begins with the initial state that the model says (`Model.initial`).
-    reference
-        Latent parameter at the start of the window from which the reference of `now` comes.
+        Samples used since, and at how many the next replay is due: `NEVER` without replay.
+    older, newer, since_older, since_newer
+        Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
+    log
+        Samples since the earliest of them, see `livepde.laws.history`.
     watch
         Innovations of the last samples, for `Jumps`.
-    past, scale
-        What the law can go back to, and what the sensors have shown, for `Guards`.
+    scale
+        What the sensors have shown, for `Guards`.
     """
 
-    now: Point
-    start: Point
-    samples: Samples
-    assimilated: int
-    due: int
-    initial: bool
+    now: FilterState
+    start: FilterState
+    window: IntArray
+    opening: Mask
+    initial: Mask
     reference: Array
+    assimilated: IntArray
+    due: IntArray
+    older: FilterState
+    newer: FilterState
+    since_older: IntArray
+    since_newer: IntArray
+    log: Array = field(metadata={"grows": 1})
     watch: Watch
-    past: Past
     scale: Scale
 
+    def __len__(self) -> int:
+        return len(self.now)
+
     @property
-    def span(self) -> float:
-        """Time since the start of the window."""
-        return float(self.samples.t[-1] - self.samples.t[0]) if len(self.samples.t) else 0.0
+    def replays(self) -> Mask:
+        """Members that keep one reference and replay, shape (members,)."""
+        replays: Mask = self.due != NEVER
+        return replays
 
 
 @dataclass(frozen=True)
-class SensitivityLaw(Law[Filter, SensitivityState]):
+class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     """State and parameter from sparse, noisy sensors, with a covariance.
 
     Reduced-order filter of Moireau, Chapelle and Le Tallec (2008); Zhang's adaptive observer;
@@ -191,7 +205,7 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         if self.gate_patience < 1:
             raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
 
-    def prepare(self, problem: Problem) -> Filter:
+    def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
         noise = observed.noise
         if isinstance(self.noise, int | float):
@@ -201,92 +215,275 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
                 "SensitivityLaw needs the noise level of the sensors: give noise= to the "
                 "observation (one number, or one for each sensor) or to the law."
             )
-        Phi, motions = reduction(problem, self.modes, self.drift)
-        moving = sum(m.part.stop - m.part.start for m in motions if m.growth(1.0).any())
-        moving = Phi.shape[1] if self.jumps is not None else moving
-        rank = self.rank if self.rank is not None else Phi.shape[1] + 5 * moving
-        if rank < Phi.shape[1]:
+        reduction = Reduction.of(problem, self.modes)
+        moving = reduction.size if self.jumps is not None else reduction.moving(self.drift)
+        rank = self.rank if self.rank is not None else reduction.size + 5 * moving
+        if rank < reduction.size:
             raise LawError(
-                f"SensitivityLaw: rank must be at least the {Phi.shape[1]} reduced coordinates; "
+                f"SensitivityLaw: rank must be at least the {reduction.size} reduced coordinates; "
                 f"got {rank}."
             )
         mass = np.maximum(model.mass.diagonal(), 0.0)
-        scale = np.sqrt(mass / mass.sum())
-        forward = ForwardStage(model)
-        return Filter(
+        filter_ = Filter(
             problem,
-            forward,
-            Phi,
-            motions,
+            member_stage(model),
+            MemberSensors(problem, reduction),
+            reduction,
             noise,
-            scale,
             rank,
-            self.gate,
-            self.gate_patience,
-            self.noise == "auto",
+            np.sqrt(mass / mass.sum()),
+            np.array([self.drift]),
+            self.memory,
+        )
+        return SensitivityWork(
+            filter_, Assimilator(self.gate, self.gate_patience, self.noise == "auto")
         )
 
-    def init(self, work: Filter, q0: Array, u0: Array) -> SensitivityState:
-        k = work.Phi.shape[1]
-        sensors, channels = work.problem.observed.size, work.problem.channels
-        start = Point(
-            u0,
-            q0,
-            np.zeros(len(u0)),
-            np.zeros(k),
-            np.zeros((len(u0), k)),
-            np.eye(k),
-            Consistency.start(sensors),
-            np.zeros(sensors, dtype=np.int64),
-            NoiseLevel(),
-            0.0,
+    def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
+        filter_, problem = work.filter, work.filter.problem
+        k, n, sensors = filter_.reduction.size, len(u0), problem.observed.size
+        one, zero = np.ones(1), np.zeros(1, dtype=np.int64)
+        x = FilterState(
+            member=zero,
+            u=u0[None],
+            q=q0[None],
+            du=np.zeros((1, n)),
+            da=np.zeros((1, k)),
+            U=np.zeros((1, k, n)),
+            C=np.eye(k)[None],
+            age=0.0 * one,
+            innovations=Innovations.start(sensors),
+            refused=np.zeros((1, sensors), dtype=np.int64),
+            level=one,
+            samples=GUESS * one,
+            evidence=0.0 * one,
+            kept=filter_.stage.kept(1),
         )
-        empty = Samples.empty(sensors, len(channels))
-        due = self.replay.first if self.replay else 0
-        watch = (self.jumps or Jumps()).start()
-        past, scale = Past.start(start, empty), Scale.start(sensors)
-        return SensitivityState(start, start, empty, 0, due, False, q0, watch, past, scale)
+        no = np.zeros(1, dtype=bool)
+        return SensitivityState(
+            now=x,
+            start=x,
+            window=zero,
+            opening=no,
+            initial=no,
+            reference=x.q,
+            assimilated=zero,
+            due=np.array([self.replay.first if self.replay else NEVER]),
+            older=x,
+            newer=x,
+            since_older=zero,
+            since_newer=zero,
+            log=empty_log(1, sensors, len(problem.channels)),
+            watch=(self.jumps or Jumps()).start(),
+            scale=Scale.start(sensors),
+        )
 
-    def start(self, work: Filter, q0: Array, u0: Array, moment: Moment) -> SensitivityState:
-        state, model = self.init(work, q0, u0), work.problem.model
+    def start(
+        self, work: SensitivityWork, q0: Array, u0: Array, moment: Moment
+    ) -> SensitivityState:
+        state, model = self.init(work, q0, u0), work.filter.problem.model
         if model.form_initial is None:
             return state
-        point = replace(state.start, U=model.initial_directions(q0, work.Phi, moment))
-        return replace(state, start=point, now=point, initial=True)
+        U = model.initial_directions(q0, work.filter.reduction.Phi, moment).T[None]
+        x = changed(state.start, U=U)
+        return changed(state, start=x, now=x, older=x, newer=x, initial=np.ones(1, dtype=bool))
 
-    def begin(self, work: Filter, state: SensitivityState, interval: Interval) -> SensitivityState:
-        point = state.now
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such a sample is not used
+    def begin(
+        self, work: SensitivityWork, state: SensitivityState, interval: Interval
+    ) -> SensitivityState:
+        filter_, x, span = work.filter, state.now, work.filter.span(interval)
+        state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool)))
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
-        if not work.output(point, interval.end).any():
+        if not filter_.observe(x, span.end)[1].any():
             return state
-        form, begun = work.problem.model.form_initial, state
+        problem, replays = filter_.problem, bool(state.replays[0])
+        form = problem.model.form_initial
         iterates = form is not None and not form.linear_in_parameter
-        if self.guards is not None and self.replay is None:
-            iterates = iterates or not work.problem.observed.linear
+        if self.guards is not None and not replays:
+            iterates = iterates or not problem.observed.linear
         for _ in range(FIRST):
-            new, _ = work.updated(point, interval, work.predict(point, interval.end))
-            if not np.isfinite(new.da).all():
+            now = assimilate_at_once(filter_, x, span, work.choices)
+            if not np.isfinite(now.da).all():
                 return state
-            begun = replace(state, now=new, reference=point.q)
-            if not iterates or _left(work, begun) <= CONVERGED:
+            begun = Window(
+                state.start, now, interval, [], x.q[0], bool(state.initial[0]), interval.end
+            )
+            if not iterates or distance(filter_, begun) <= CONVERGED:
                 break
-            point = _placed(work, state, _next(work, begun), interval.end)
-        if self.replay is None:
-            now = work.recentred(new)
-            return replace(begun, now=now, past=Past.start(now, begun.samples))
-        begun = self._store(work, begun, new, interval)
-        return replace(begun, past=Past.start(new, begun.samples))
+            x = placed(filter_, begun, next_reference(filter_, begun))
+        state = changed(state, reference=x.q)
+        if not replays:
+            now = filter_.recentred(now)
+            return changed(state, now=now, older=now, newer=now)
+        return changed(
+            state,
+            now=now,
+            older=now,
+            newer=now,
+            opening=np.ones(1, dtype=bool),
+            assimilated=state.assimilated + span.present,
+        )
 
-    def _far(self, work: Filter, state: SensitivityState) -> bool:
-        """Return whether a law without replay moved an unknown too far by one linearisation."""
-        if self.guards is None or self.replay is not None:
-            return False
-        far = np.abs(_missed(work, state)).max(initial=0.0) > self.guards.reach
-        return bool(far) and _left(work, state) > CONVERGED
+    def stepped_alone(self, work: SensitivityWork) -> str:
+        if type(self) is not SensitivityLaw:  # a subclass may step in a way of its own
+            return super().stepped_alone(work)
+        stage = work.filter.stage
+        if not isinstance(stage, BandedStage):
+            return BandedStage.refuses(work.filter.problem.model)
+        if not work.filter.sensors.fixed:
+            return "the sensors do not see a fixed linear part of the state alone"
+        return stage.refusal
+
+    def begin_members(
+        self, work: SensitivityWork, state: SensitivityState, span: Span
+    ) -> SensitivityState:
+        """Return all members after a sample at the initial time."""
+        each = (self.begin(work, take(state, k), span.member(k)) for k in range(len(state)))
+        return join(*each)
 
     def step(
-        self, work: Filter, state: SensitivityState, interval: Interval
+        self, work: SensitivityWork, state: SensitivityState, interval: Interval
     ) -> tuple[SensitivityState, Report]:
+        state, reports = self.step_members(work, state, work.filter.span(interval))
+        return state, reports.member(0)
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
+    def step_members(
+        self, work: SensitivityWork, state: SensitivityState, span: Span
+    ) -> tuple[SensitivityState, MemberReports]:
+        """Return state and reports of all members after a sample of each.
+
+        They step as arrays; whoever meets something out of the ordinary, a replay, a safeguard, an
+        alarm, a failure, or is late, steps alone.
+        """
+        before = changed(state, log=opened(state.log, span))
+        new, told, usual = self._together(work, before, span)
+        reports = self._reports(work, new.now, told)
+        if usual.all():
+            return self._trimmed(new), reports
+        alone: dict[int, Report] = {}
+        for k in np.flatnonzero(~usual).tolist():
+            one, alone[k] = self._alone(work, take(before, k), span.member(k))
+            if not alone[k].status.ok and len(state) == 1:
+                return state, reports.with_members(alone)
+            missing = np.zeros(1, dtype=bool)
+            if one.log.shape[1] < new.log.shape[1]:
+                one = changed(one, log=added(one.log, span, missing))
+            new = one if len(state) == 1 else put(new, k, one)
+        return self._trimmed(new), reports.with_members(alone)
+
+    def _together(
+        self, work: SensitivityWork, state: SensitivityState, span: Span
+    ) -> tuple[SensitivityState, Assimilation, Mask]:
+        """Return all members after a sample, and for whom nothing was out of the ordinary."""
+        filter_, before = work.filter, state.now
+        x, told = assimilate(filter_, before, span, work.choices)
+        if not told.status.ok:
+            return state, told, told.finite
+        usual, replays = told.finite & span.together, state.replays
+        present = span.present
+        if replays.any():
+            usual = usual & ~(replays & (state.assimilated + present >= state.due))
+            full = state.log.shape[1] + 1 - state.window > self._most
+            usual = usual & ~(replays & full)
+        scale, watch = state.scale, state.watch
+        if (guards := self.guards) is not None:
+            usual = usual & (replays | guards.within_reach(x.da - before.da))
+            d = span.z1 - told.predicted
+            scale = scale.add(span.z1, d)
+            if (told.largest > guards.runaway).any():
+                noise = np.sqrt(before.level)[:, None] * filter_.noise
+                usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
+        if (jumps := self.jumps) is not None and present.any():
+            e = x.innovations.newest
+            seen, alarm = jumps.add(watch, e, before.innovations)
+            watch = where(np.broadcast_to(present, alarm.shape), seen, watch)
+            usual = usual & ~(alarm & present)
+        if not replays.all():
+            centred = filter_.recentred(x)
+            x = where(~replays, centred, x)
+        if not usual.all():
+            if not usual.any():
+                return state, told, usual
+            x = where(usual, x, before)
+            scale, watch = where(usual, scale, state.scale), where(usual, watch, state.watch)
+        state = changed(state, scale=scale, watch=watch)
+        return self._stored(state, x, span, usual), told, usual
+
+    @cached_property
+    def _most(self) -> int:
+        """Largest number of samples in a window of a replay."""
+        return self.replay.window if self.replay is not None else 0
+
+    @cached_property
+    def _back(self) -> int:
+        """Least number of samples by which the law can go back; 0: it never does."""
+        guards, jumps = self.guards, self.jumps
+        return max(guards.past if guards else 0, jumps.window if jumps else 0)
+
+    def _stored(
+        self, state: SensitivityState, now: FilterState, span: Span, taken: Mask
+    ) -> SensitivityState:
+        """Return a state with the filter after a sample, which the members `taken` took."""
+        if not (self._back or self.replay):
+            return changed(state, now=now)
+        log = added(state.log, span, taken)
+        assimilated = state.assimilated
+        if self.replay:
+            assimilated = assimilated + (taken & span.present)
+        last, parts = log.shape[1] - 1, {}
+        if self._back:
+            due = taken & (last - state.since_newer >= self._back)
+            if due.any():
+                parts = {
+                    "older": where(due, state.newer, state.older),
+                    "newer": where(due, now, state.newer),
+                    "since_older": np.where(due, state.since_newer, state.since_older),
+                    "since_newer": np.where(due, last, state.since_newer),
+                }
+        return changed(state, now=now, log=log, assimilated=assimilated, **parts)
+
+    def _trimmed(self, state: SensitivityState) -> SensitivityState:
+        """Return a state without the rows of the log that nobody goes back to."""
+        rows = state.log.shape[1]
+        if rows < 3 * max(self._back, 32):
+            return state
+        older = state.since_older if self._back else np.full(len(state), rows - 1)
+        first = int(np.where(state.replays, np.minimum(older, state.window), older).min())
+        if first < rows // 2:
+            return state
+        return changed(
+            state,
+            log=trimmed(state.log, first),
+            window=np.maximum(state.window - first, 0),
+            since_older=state.since_older - first,
+            since_newer=state.since_newer - first,
+        )
+
+    def _reports(
+        self, work: SensitivityWork, now: FilterState, told: Assimilation
+    ) -> MemberReports:
+        """Return what the members report after a sample."""
+        notes: dict[str, Array] = {
+            "innovation_ratio": now.innovations.ratio,
+            "innovation_correlation": now.innovations.correlation,
+        }
+        if self.noise == "auto":
+            notes["noise_level"] = np.sqrt(now.level)
+        if np.isfinite(self.gate):
+            notes["refused"] = told.refused
+        if self.jumps is not None:
+            notes["jump"] = np.zeros(len(now))
+        steps = np.full(len(now), told.steps)
+        return MemberReports((OK,) * len(now), told.predicted, steps, notes)
+
+    # From here on a state has one member.
+
+    def _alone(
+        self, work: SensitivityWork, state: SensitivityState, interval: Interval
+    ) -> tuple[SensitivityState, Report]:
+        """Return one member after a sample, with replays, safeguards and alarms."""
         new, report = self._assimilated(work, state, interval)
         if (guards := self.guards) is not None:
             new, report = self._rescued(work, guards, state, interval, new, report)
@@ -294,138 +491,205 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
             new, report = self._watched(work, jumps, state, interval, new, report)
         return new, report
 
+    def _filtered(
+        self, work: SensitivityWork, x: FilterState, interval: Interval
+    ) -> tuple[FilterState, Report]:
+        """Return the filter after a sample, linear about its reference."""
+        span = work.filter.span(interval)
+        new, told = assimilate(work.filter, x, span, work.choices)
+        status = told.status
+        if status.ok and not told.finite[0]:
+            what = "prediction" if not np.isfinite(told.predicted).all() else "update"
+            status = Status("not_finite", f"the {what} is not finite")
+        if not status.ok:
+            predicted, _ = work.filter.observe(x, span.end)
+            return x, Report(status, predicted[0])
+        return new, changed(self._reports(work, new, told).member(0), status=status)
+
     def _assimilated(
-        self, work: Filter, state: SensitivityState, interval: Interval
+        self, work: SensitivityWork, state: SensitivityState, interval: Interval
     ) -> tuple[SensitivityState, Report]:
-        """Return the state after a sample."""
-        point, report = self._filter(work, state.now, interval)
+        """Return one member after a sample, iterated or replayed where that is due."""
+        x, report = self._filtered(work, state.now, interval)
         if not report.status.ok:
             return state, report
-        if self.replay is None:
+        span = work.filter.span(interval)
+        state = changed(state, log=opened(state.log, span))
+        one = np.ones(1, dtype=bool)
+        if not state.replays[0]:
             if (guards := self.guards) is not None:
-                point, notes = self._iterated(work, guards, state, interval, point)
+                x, notes = self._iterated(work, guards, state, interval, x)
                 if notes:
-                    notes = {**report.notes, **_consistent(point), **notes}
-                    report = replace(report, notes=notes)
-            return self._remember(work, state, work.recentred(point), interval), report
-        state = self._store(work, state, point, interval)
-        if state.assimilated >= state.due:
-            for _ in range(self.replay.iterations):
-                state, status = self._replayed(work, state)
-                state = replace(state, due=2 * state.assimilated)
-                left = _left(work, state)
-                notes = {**report.notes, "replay_left": left}
-                if not status.ok:  # keep the linear estimate, say so, and try again when doubled
-                    notes["replay_failed"] = 1.0
-                report = replace(report, notes=notes)
-                if not status.ok or left <= CONVERGED:
-                    break
-        if len(state.samples.t) > self.replay.window:
-            state = self.renewed(work.recentred(state.now), state)
-        return self._remember(work, state, state.now, interval), report
+                    told = self._noted(work, x)
+                    report = replace(report, notes={**report.notes, **told, **notes})
+            return self._stored(state, work.filter.recentred(x), span, one), report
+        state = self._stored(state, x, span, one)
+        if self.replay is not None and state.assimilated[0] >= state.due[0]:
+            state, notes = self._replayed(work, self.replay, state)
+            report = replace(report, notes={**report.notes, **notes})
+        if state.log.shape[1] - state.window[0] > self._most:
+            state = self.renewed(work.filter.recentred(state.now), state)
+        return state, report
 
-    def _remember(
-        self, work: Filter, state: SensitivityState, now: Point, interval: Interval
-    ) -> SensitivityState:
-        """Return a state that stands at a filter, and whose past holds the sample."""
-        if self.guards is None and self.jumps is None:
-            return replace(state, now=now)
-        length = max(
-            self.guards.past if self.guards is not None else 0,
-            self.jumps.window if self.jumps is not None else 0,
+    @staticmethod
+    def _noted(work: SensitivityWork, x: FilterState) -> dict[str, float]:
+        """Return the notes on the innovations of one member."""
+        return {
+            "innovation_ratio": float(x.innovations.ratio[0]),
+            "innovation_correlation": float(x.innovations.correlation[0]),
+        }
+
+    def window(self, work: SensitivityWork, state: SensitivityState) -> Window:
+        """Return the stored samples of one member, for a replay."""
+        channels, log = work.filter.problem.channels, state.log[:, int(state.window[0]) :]
+        first = first_interval(log, channels)
+        return Window(
+            state.start,
+            state.now,
+            first if state.opening[0] else None,
+            intervals_since(log, channels),
+            state.reference[0],
+            bool(state.initial[0]),
+            first.end,
         )
-        past = state.past.add(now, interval, work.problem.channels, length)
-        return replace(state, now=now, past=past)
 
-    def renewed(self, start: Point, state: SensitivityState) -> SensitivityState:
-        """Return a state whose window begins at a filter, with no samples yet."""
-        empty = state.samples.since(len(state.samples.t))
-        first = self.replay.first if self.replay else 0
-        return replace(
+    def _replayed(
+        self, work: SensitivityWork, replay: Replay, state: SensitivityState
+    ) -> tuple[SensitivityState, dict[str, float]]:
+        """Return one member after replays about better references, and notes."""
+        window, notes = self.window(work, state), {}
+        for _ in range(replay.iterations):
+            window, status = replayed(work.filter, window, work.choices)
+            left = distance(work.filter, window)
+            notes["replay_left"] = left
+            if not status.ok:  # keep the linear estimate, say so, and try again when doubled
+                notes["replay_failed"] = 1.0
+            if not status.ok or left <= CONVERGED:
+                break
+        due, reference = 2 * state.assimilated, window.reference[None]
+        return changed(state, now=window.now, reference=reference, due=due), notes
+
+    def renewed(
+        self, start: FilterState, state: SensitivityState, row: int | None = None
+    ) -> SensitivityState:
+        """Return one member whose window begins at a filter, with no samples yet.
+
+        Parameters
+        ----------
+        row
+            Of the log, to which the filter belongs; later ones are forgotten. Default the last.
+        """
+        log = state.log if row is None else state.log[:, : row + 1]
+        zero = np.zeros(1, dtype=np.int64)
+        first = self.replay.first if self.replay is not None and state.replays[0] else NEVER
+        no = np.zeros(1, dtype=bool)
+        return changed(
             state,
             now=start,
             start=start,
-            samples=empty,
-            assimilated=0,
-            due=first,
-            initial=False,
+            log=log,
+            window=zero + max(log.shape[1] - 1, 0),
+            opening=no,
+            initial=no,
             reference=start.q,
+            assimilated=zero,
+            due=zero + first,
         )
 
     def _iterated(
         self,
-        work: Filter,
+        work: SensitivityWork,
         guards: Guards,
         state: SensitivityState,
         interval: Interval,
-        point: Point,
-    ) -> tuple[Point, dict[str, float]]:
+        x: FilterState,
+    ) -> tuple[FilterState, dict[str, float]]:
         """Return the filter after a sample that may have moved it too far, and notes.
 
         Too far is cured by a replay of this one sample from where the interval began.
         """
-        if guards.within_reach(point.da - state.now.da):  # cheaper to see than how far it is
-            return point, {}
-        level = state.now.level
+        before = state.now
+        if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is
+            return x, {}
+        filter_, kept = work.filter, x.kept
+
+        def levelled(x: FilterState, tempered: int) -> FilterState:
+            if not tempered:  # a tempered sample tells nothing about the noise
+                return x
+            return changed(x, level=before.level, samples=before.samples)
+
         for temper in range(guards.temperings + 1):
             tempered = {"tempered": 1.0} if temper else {}
-            begin = replace(state.now, level=level.times(TEMPER**temper), kept=point.kept)
+            begin = changed(before, level=before.level * TEMPER ** (2 * temper), kept=kept)
             if temper:
-                point, _ = self._filter(work, begin, interval)
-                if guards.within_reach(point.da - begin.da):
-                    return _levelled(point, level, temper), tempered
-            window = self._store(work, self.renewed(begin, state), point, interval)
-            if not self._far(work, window):
-                return _levelled(point, level, temper), tempered
+                x, _ = self._filtered(work, begin, interval)
+                if guards.within_reach(x.da - begin.da)[0]:
+                    return levelled(x, temper), tempered
+            reference, moment = begin.q[0], interval.end
+            window = Window(begin, x, None, [interval], reference, False, moment)
+            far = missed_most(filter_, window) > guards.reach
+            if not (far and distance(filter_, window) > CONVERGED):
+                return levelled(x, temper), tempered
             for _ in range(guards.iterations):
-                window, status = self._replayed(work, window)
+                window, status = replayed(filter_, window, work.choices)
                 if not status.ok:
                     break
-                if _left(work, window) <= CONVERGED:
-                    return _levelled(window.now, level, temper), {"iterated": 1.0, **tempered}
-        return self._filter(work, state.now, interval.silent)[0], {"held": 1.0}
+                if distance(filter_, window) <= CONVERGED:
+                    return levelled(window.now, temper), {"iterated": 1.0, **tempered}
+        return self._filtered(work, before, interval.silent)[0], {"held": 1.0}
 
     def _rescued(
         self,
-        work: Filter,
+        work: SensitivityWork,
         guards: Guards,
         state: SensitivityState,
         interval: Interval,
         new: SensitivityState,
         report: Report,
     ) -> tuple[SensitivityState, Report]:
-        """Return state and report after a sample that may have failed or be far off.
+        """Return one member and report after a sample that may have failed or be far off.
 
         Whatever led there is not used again: the state is only carried on from the past.
         """
-        noise = state.now.level.scale * work.noise
-        scale = state.scale.add(interval.z1, interval.z1 - report.predicted)
+        noise = np.sqrt(state.now.level)[:, None] * work.filter.noise
+        z = interval.z1[None]
+        scale = state.scale.add(z, z - report.predicted)
 
         def astray(report: Report) -> bool:
-            d = interval.z1 - report.predicted
-            return not report.status.ok or scale.beyond(d, noise) > guards.runaway
+            beyond = scale.beyond(z - report.predicted, noise)
+            return not report.status.ok or bool(beyond[0] > guards.runaway)
 
         if not astray(report):
-            return replace(new, scale=scale), report
-        older = replace(work.recentred(state.past.older), kept=new.now.kept)
-        known = [*state.past.samples.intervals(work.problem.channels), interval]
-        silent = [item.silent for item in known]
-        for start in (work.loosened(older, 1.0), work.fresh(older)):
-            again, found = self._retaken(work, state, start, silent)
+            return changed(new, scale=scale), report
+        older = changed(work.filter.recentred(state.older), kept=new.now.kept)
+        row = int(state.since_older[0])
+        silent = [item.silent for item in [*self._since(work, state, row), interval]]
+        for start in (work.filter.loosened(older, 1.0), work.filter.prior_again(older)):
+            again, found = self._retaken(work, state, start, row, silent)
             if not astray(found):
                 notes = {**found.notes, "restarted": 1.0}
-                again = replace(again, scale=scale, past=Past.start(again.now, again.samples))
-                return again, replace(found, notes=notes)
+                return changed(from_now(again), scale=scale), replace(found, notes=notes)
         if not report.status.ok:
             return state, report
-        return replace(new, scale=scale), replace(report, notes={**report.notes, "runaway": 1.0})
+        return changed(new, scale=scale), replace(report, notes={**report.notes, "runaway": 1.0})
+
+    @staticmethod
+    def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Interval]:
+        """Return the intervals that one member has taken since a row of the log."""
+        if not state.log.shape[1]:
+            return []
+        return intervals_since(state.log[:, row:], work.filter.problem.channels)
 
     def _retaken(
-        self, work: Filter, state: SensitivityState, start: Point, intervals: list[Interval]
+        self,
+        work: SensitivityWork,
+        state: SensitivityState,
+        start: FilterState,
+        row: int,
+        intervals: Sequence[Interval],
     ) -> tuple[SensitivityState, Report]:
-        """Return state and report after some samples, taken again from another start."""
-        state = self.renewed(start, state)
-        state = replace(state, past=Past.start(start, state.samples))
+        """Return one member after some samples, taken again from a filter at a row of the log."""
+        state = from_now(self.renewed(start, state, row))
         for interval in intervals:
             state, report = self._assimilated(work, state, interval)
             if not report.status.ok:
@@ -434,146 +698,64 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
 
     def _watched(
         self,
-        work: Filter,
+        work: SensitivityWork,
         jumps: Jumps,
         state: SensitivityState,
         interval: Interval,
         new: SensitivityState,
         report: Report,
     ) -> tuple[SensitivityState, Report]:
-        """Return state and report after the test for a jump.
+        """Return one member and report after the test for a jump.
 
         After an alarm the samples since the jump are taken again, from before it: the state has
         gone astray with them, and what was measured before does not belong to the unknowns of now.
         """
         if not interval.present.any():  # there is no innovation, and `newest` is that of before
             return new, replace(report, notes={**report.notes, "jump": 0.0})
-        usual, e = state.now.consistency, new.now.consistency.newest
-        watch, alarm = jumps.add(state.watch, e, usual)
-        new = replace(new, watch=watch)
+        usual, e = state.now.innovations, new.now.innovations.newest
+        watch, alarms = jumps.add(state.watch, e, usual)
+        alarm, new = bool(alarms[0]), changed(new, watch=watch)
         if alarm:
-            past = state.past
-            known = [*past.samples.intervals(work.problem.channels), interval]
+            row = int(state.since_older[0])
+            known = [*self._since(work, state, row), interval]
             before = max(len(known) - jumps.onset(state.watch, e, usual), 0)
-            point, status = replace(work.recentred(past.older), kept=new.now.kept), Status()
+            x, status = changed(work.filter.recentred(state.older), kept=new.now.kept), Status()
             for earlier in known[:before]:
-                point, found = self._filter(work, point, earlier)
-                point, status = work.recentred(point), found.status
+                x, found = self._filtered(work, x, earlier)
+                x, status = work.filter.recentred(x), found.status
                 if not status.ok:
                     break
-            start = work.loosened(point, jumps.size)
-            again, found = self._retaken(work, new, start, known[before:])
+            start = work.filter.loosened(x, jumps.size)
+            again, found = self._retaken(work, new, start, row + before, known[before:])
             if status.ok and found.status.ok:
                 new = again
             else:
-                new = self.renewed(work.loosened(work.recentred(new.now), jumps.size), new)
+                now = work.filter.recentred(new.now)
+                new = self.renewed(work.filter.loosened(now, jumps.size), new)
         return new, replace(report, notes={**report.notes, "jump": float(alarm)})
 
-    def _store(
-        self, work: Filter, state: SensitivityState, now: Point, interval: Interval
-    ) -> SensitivityState:
-        samples = state.samples.add(interval, work.problem.channels)
-        used = state.assimilated + bool(interval.present.any())
-        return replace(state, now=now, samples=samples, assimilated=used)
+    def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
+        return self.member_belief(work, state, 0)
 
-    def _replayed(self, work: Filter, state: SensitivityState) -> tuple[SensitivityState, Status]:
-        """Run the stored samples again about a reference at the estimate, or on the way to it."""
-        samples, q = state.samples, _next(work, state)
-        channels = work.problem.channels
-        first = samples.first(channels)
-        point = _placed(work, state, q, first.end)
-        if first.present.any():
-            point, _ = work.updated(point, first, work.predict(point, first.end))
-        for interval in samples.intervals(channels):
-            point, report = self._filter(work, point, interval)
-            if not report.status.ok:
-                return state, report.status
-        return replace(state, now=point, reference=q), Status()
-
-    def _filter(self, work: Filter, point: Point, interval: Interval) -> tuple[Point, Report]:
-        """Predict over an interval and update at its end, linear about the reference."""
-
-        def failed(status: Status) -> tuple[Point, Report]:
-            return point, Report(status, work.predict(point, interval.end))
-
-        interval = work.problem.control.over(interval)
-        # What unknowns gain in one substep is independent of what they gain in the next.
-        count = work.problem.control.count(interval) if work.moves else 1
-        moved, steps = point, 0
-        for part in interval.divided(count):
-            moved, taken, failure = work.advanced(moved, part)
-            steps += taken
-            if failure is not None:
-                return failed(Status.of(failure))
-        if np.isfinite(self.memory):
-            fade = np.exp(-(interval.t1 - interval.t0) / self.memory)
-            moved = replace(moved, U=fade * moved.U)
-        predicted = work.predict(moved, interval.end)
-        new, refused = work.updated(moved, interval, predicted)
-        if not np.isfinite(new.da).all():
-            return failed(Status("not_finite", "the update is not finite"))
-        notes = _consistent(new)
-        if self.noise == "auto":
-            notes["noise_level"] = new.level.scale
-        if np.isfinite(self.gate):
-            notes["refused"] = float(refused)
-        return new, Report(Status(), predicted, steps, notes)
-
-    def belief(self, work: Filter, state: SensitivityState) -> Belief:
-        now = state.now
+    @staticmethod
+    def member_belief(work: SensitivityWork, state: SensitivityState, k: int) -> Belief:
+        """Return what is believed of one member, in latent coefficients."""
+        filter_, now = work.filter, state.now
+        reduction = filter_.reduction
+        drift = float(filter_.drifts(now.member[k : k + 1])[0])
         return Belief(
-            work.bounded(work.latent(now)),
-            now.u + now.du,
-            work.Phi @ now.C,
-            now.U,
-            now.consistency.inflation,
-            work.Phi,
-            work.rest(now.age),
+            reduction.bounded(now.q[k] + reduction.Phi @ now.da[k]),
+            now.u[k] + now.du[k],
+            reduction.Phi @ now.C[k].T,
+            now.U[k].T,
+            float(now.innovations.inflation[k]),
+            reduction.Phi,
+            reduction.rest(float(now.age[k]), drift),
         )
 
 
-def _missed(work: Filter, state: SensitivityState) -> Array:
-    """Return by how much the reference misses the estimate at the window's start, reduced (k,)."""
-    estimate = work.bounded(work.latent(state.now))
-    return work.reduced(work.traced(estimate, state.start.q, state.span) - state.reference)
-
-
-def _next(work: Filter, state: SensitivityState) -> Array:
-    """Return the reference at the window's start that is next: towards the estimate, (m,)."""
-    step = _missed(work, state)
-    step = step * min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
-    q: Array = state.reference + work.Phi @ step
-    return q
-
-
-def _placed(work: Filter, state: SensitivityState, q: Array, first: Moment) -> Point:
-    """Return the filter at the start of the window, linear about q."""
-    start = replace(state.start, level=state.now.level, kept=state.now.kept)
-    model = work.problem.model
-    shift = work.reduced(q - start.q)
-    if state.initial:
-        initial = model.initial_directions(q, work.Phi, first)
-        u, du = model.initial_state(q, first), -initial @ shift
-        return replace(start, q=q, u=u, du=du, da=-shift, U=initial @ start.C)
-    along = start.along(shift)
-    return replace(start, q=q, u=start.u + along, du=start.du - along, da=start.da - shift)
-
-
-def _left(work: Filter, state: SensitivityState) -> float:
-    """Return the distance between estimate and reference, in standard deviations."""
-    point, shift = state.now, work.transition(state.span) @ _missed(work, state)
-    deviations = np.linalg.lstsq(point.C, shift, rcond=None)[0]
-    return float(np.linalg.norm(deviations)) / point.consistency.inflation
-
-
-def _levelled(point: Point, level: NoiseLevel, tempered: int) -> Point:
-    """Return a filter after a sample; a tempered one tells nothing about the noise."""
-    return replace(point, level=level) if tempered else point
-
-
-def _consistent(point: Point) -> dict[str, float]:
-    """Return the notes on the innovations."""
-    return {
-        "innovation_ratio": point.consistency.ratio,
-        "innovation_correlation": point.consistency.correlation,
-    }
+def from_now(state: SensitivityState) -> SensitivityState:
+    """Return one member that goes back to now at most."""
+    last = np.array([max(state.log.shape[1] - 1, 0)])
+    now = state.now
+    return changed(state, older=now, newer=now, since_older=last, since_newer=last)

@@ -74,10 +74,19 @@ class BandedSolver:
 
     @cached_property
     def order(self) -> IntArray:
-        """Reverse Cuthill–McKee order of the unknowns."""
+        """Reverse Cuthill–McKee order of the unknowns; the natural one if its band is no wider."""
         structure = self.pattern.matrix(np.ones(self.pattern.nnz))
         found: IntArray = reverse_cuthill_mckee(structure + structure.T, symmetric_mode=True)
+        rows, cols, place = self.pattern.rows, self.pattern.indices, np.argsort(found)
+        natural = np.abs(rows - cols).max(initial=0)
+        if natural <= np.abs(place[rows] - place[cols]).max(initial=0):
+            return np.arange(len(found))
         return found
+
+    @cached_property
+    def natural(self) -> bool:
+        """True if unknowns are not reordered."""
+        return bool(np.array_equal(self.order, np.arange(len(self.order))))
 
     @cached_property
     def inverse(self) -> IntArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,15 +35,20 @@ class BlockFactor:
         NaN for blocks whose matrix is singular, or whose b is not finite. Where a solution
         overflows, other blocks may be NaN with it; what is finite is right.
         """
-        columns, blocks, n = b.shape
-        good: Mask = self.good & np.isfinite(b).all(axis=(0, 2))
-        x = np.take(b, self.solver.order, axis=2)
-        x[:, ~good] = 0.0
+        columns, count, n = b.shape
+        x = b.copy() if self.solver.natural else np.take(b, self.solver.order, axis=2)
+        bad = None
+        if not (math.isfinite(x.sum()) and self.good.all()):
+            bad = ~(self.good & np.isfinite(b).all(axis=(0, 2)))
+            x[:, bad] = 0.0
         lower, upper = self.solver.band
-        flat = x.reshape(columns, blocks * n).T
+        flat = x.reshape(columns, count * n).T
         flat, _ = lapack.dgbtrs(self.lu, lower, upper, flat, self.pivots, overwrite_b=1)
-        x = np.take(flat.T.reshape(b.shape), self.solver.inverse, axis=2)
-        x[:, ~good] = np.nan
+        x = flat.T.reshape(b.shape)
+        if not self.solver.natural:
+            x = np.take(x, self.solver.inverse, axis=2)
+        if bad is not None:
+            x[:, bad] = np.nan
         return x
 
 
@@ -56,16 +62,21 @@ class BandedBlocks:
 
     solver: BandedSolver
 
-    def factorise(self, data: Array) -> BlockFactor:
-        """Factorise the matrices `pattern.matrix(data[k])`, data of shape (blocks, nnz)."""
+    def band(self, data: Array) -> Array:
+        """Return matrices of shape (..., nnz) in band storage, shape (..., size)."""
         shape, position = self.solver.storage
-        blocks, (n, height) = len(data), shape
-        good: Mask = np.asarray(np.isfinite(data).all(axis=1))
-        storage = np.zeros((blocks, n * height))
-        storage[:, position] = data
+        storage = np.zeros((*data.shape[:-1], shape[0] * shape[1]))
+        storage[..., position] = data
+        return storage
+
+    def factorise(self, storage: Array) -> BlockFactor:
+        """Factorise matrices in band storage, shape (blocks, size), which is overwritten."""
+        (n, height), blocks = self.solver.storage[0], len(storage)
         lower, upper = self.solver.band
         middle = lower + upper
-        if not good.all():
+        good: Mask = np.ones(blocks, dtype=bool)
+        if not math.isfinite(storage.sum()):
+            good = np.asarray(np.isfinite(storage).all(axis=1))
             storage[~good] = 0.0
             storage.reshape(blocks, n, height)[~good, :, middle] = 1.0
         banded = storage.reshape(blocks * n, height).T
@@ -73,5 +84,5 @@ class BandedBlocks:
         if info > 0:  # a pivot is zero: mark its block, and go on without dividing by it
             zero = lu[middle] == 0.0
             lu[middle, zero] = 1.0
-            good &= ~zero.reshape(blocks, n).any(axis=1)
+            good = good & ~zero.reshape(blocks, n).any(axis=1)
         return BlockFactor(self.solver, lu, pivots, good)

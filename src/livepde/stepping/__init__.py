@@ -4,25 +4,33 @@ from __future__ import annotations
 
 from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import Advance, Interval, advance
+from livepde.stepping.members import BandedStage, KeptFactors, MemberStage, member_stage
 from livepde.stepping.newton import TINY, Near, Newton, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.simulation import simulate
+from livepde.stepping.span import Moments, Span
 from livepde.stepping.state import ForwardStage
 
 __all__ = [
     "TINY",
     "Advance",
     "Alexander2",
+    "BandedStage",
     "ForwardStage",
     "ImplicitEuler",
     "Interval",
     "Kept",
+    "KeptFactors",
+    "MemberStage",
+    "Moments",
     "Near",
     "Newton",
     "Scheme",
     "Solution",
+    "Span",
     "Stage",
     "StepFailed",
     "advance",
+    "member_stage",
     "simulate",
 ]

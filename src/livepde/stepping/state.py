@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -50,6 +51,13 @@ class ForwardStage:
         self._made: tuple[At, Factor] | None = None
         self._last: tuple[At, _System] | None = None
         self._rate: tuple[float, Array] | None = None
+
+    def twin(self) -> ForwardStage:
+        """Return a stage with the same analysis and factors of its own."""
+        _ = self._dual_weights, self.engine  # common to both
+        other = copy.copy(self)
+        other._made = other._last = other._rate = None
+        return other
 
     @cached_property
     def _rows(self) -> tuple[Pattern, dict[str, sp.csr_array]]:

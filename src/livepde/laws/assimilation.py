@@ -1,0 +1,185 @@
+"""One sample of every member: predict, refuse what is implausible, update, keep the statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from livepde.laws.base import Report, Status
+from livepde.laws.filter import Filter, FilterState, Update
+from livepde.laws.members import changed
+from livepde.linalg import Array, Mask
+from livepde.stepping import Span
+
+__all__ = ["OK", "Assimilation", "MemberReports", "assimilate", "assimilate_at_once"]
+
+OK = Status()
+MEMORY = 500.0  # samples: older ones fade from the noise level
+LEARN = 0.3  # of a sample each adds to the count: errors of the first guess fade fast
+
+
+@dataclass(frozen=True, eq=False)
+class MemberReports:
+    """What a step tells beside the new state.
+
+    Attributes
+    ----------
+    statuses
+        How it went for each member.
+    predicted
+        What was expected of each sensor, shape (members, sensors).
+    steps
+        Substeps taken, shape (members,).
+    notes
+        Numbers worth keeping, each of shape (members,); NaN for members without.
+    """
+
+    statuses: tuple[Status, ...]
+    predicted: Array
+    steps: Array
+    notes: Mapping[str, Array] = field(default_factory=dict)
+
+    def member(self, k: int) -> Report:
+        """Return the report of one member."""
+        notes = {name: float(values[k]) for name, values in self.notes.items()}
+        return Report(self.statuses[k], self.predicted[k], int(self.steps[k]), notes)
+
+    def with_members(self, reports: Mapping[int, Report]) -> MemberReports:
+        """Return the reports with those of some members exchanged."""
+        if not reports:
+            return self
+        statuses, predicted, steps = list(self.statuses), self.predicted.copy(), self.steps.copy()
+        notes = {name: values.copy() for name, values in self.notes.items()}
+        for name in dict.fromkeys(name for one in reports.values() for name in one.notes):
+            notes.setdefault(name, np.full(len(statuses), np.nan))
+        for k, one in reports.items():
+            statuses[k], predicted[k], steps[k] = one.status, one.predicted, one.steps
+            for name, values in notes.items():
+                values[k] = one.notes.get(name, np.nan)
+        return MemberReports(tuple(statuses), predicted, steps, notes)
+
+
+@dataclass(frozen=True, eq=False)
+class Assimilation:
+    """How a sample was assimilated.
+
+    Attributes
+    ----------
+    predicted
+        What was expected of each sensor, shape (members, sensors).
+    steps
+        Substeps taken.
+    status
+        Why no member could be stepped, or ok.
+    finite
+        Members whose numbers are finite, shape (members,).
+    refused
+        Values that the gate refused, shape (members,).
+    largest
+        Largest innovation in units of the noise, shape (members,); 0 without.
+    """
+
+    predicted: Array
+    steps: int
+    status: Status
+    finite: Mask
+    refused: Array
+    largest: Array
+
+
+@dataclass(frozen=True)
+class Assimilator:
+    """Predict and update with the choices of a law.
+
+    Attributes
+    ----------
+    gate, patience
+        Innovations beyond `gate` expected deviations are refused, `patience` times in a row.
+    adaptive
+        True if the noise is a first guess whose multiple is found from the samples; their
+        likelihood is kept then, too.
+    """
+
+    gate: float = np.inf
+    patience: int = 10
+    adaptive: bool = False
+
+
+def assimilate(
+    filter_: Filter, x: FilterState, span: Span, choices: Assimilator
+) -> tuple[FilterState, Assimilation]:
+    """Predict over a span and update at its end, linear about the linearisation points."""
+    end, steps, failure = filter_.predict(x, span)
+    if failure is not None:
+        predicted, _ = filter_.observe(x, span.end)
+        zero = np.zeros(len(x))
+        return x, Assimilation(predicted, steps, Status.of(failure), zero > 0.0, zero, zero)
+    return _absorbed(filter_, end, span, choices, steps)
+
+
+def assimilate_at_once(
+    filter_: Filter, x: FilterState, span: Span, choices: Assimilator
+) -> FilterState:
+    """Update by what was measured at the end of a span, to which the state belongs."""
+    return _absorbed(filter_, x, span, choices, 0)[0]
+
+
+def _absorbed(
+    filter_: Filter, x: FilterState, span: Span, choices: Assimilator, steps: int
+) -> tuple[FilterState, Assimilation]:
+    predicted, Y = filter_.observe(x, span.end)
+    d = span.z1 - predicted
+    finite: Mask = np.isfinite(x.u.sum(axis=1) + x.U.sum(axis=(1, 2)))
+    used: Mask = np.isfinite(d)
+    measured: Mask = np.asarray(used.any(axis=1))
+    if not measured.any():
+        zero = np.zeros(len(x))
+        return x, Assimilation(predicted, steps, OK, finite, zero, zero)
+    noise = filter_.noise[None]
+    if choices.adaptive or x.level[0] != 1.0:
+        noise = np.sqrt(x.level)[:, None] * noise
+    Y, d = Y / noise[:, None], d / noise
+    largest = np.fmax.reduce(np.abs(d), axis=1)
+    e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
+    refused, count = x.refused, np.zeros(len(x))
+    if np.isfinite(choices.gate):
+        far = used & ~(np.abs(e) <= choices.gate)
+        refused = np.where(far, refused + 1, np.where(used, 0, refused))
+        kept = used & ~(far & (refused <= choices.patience))
+        count = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
+        used = kept
+        e = np.where(used, e, np.nan)
+    if not used.all():  # zeros tell nothing: what is missing takes part as such
+        Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
+    new, made = filter_.update(x, Y, d)
+    parts = {"innovations": x.innovations.add(e, measured), "refused": refused}
+    if choices.adaptive:
+        parts |= _learned(x, used, d, noise, made)
+    finite = finite & np.isfinite(new.da.sum(axis=1))
+    return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
+
+
+def _learned(
+    x: FilterState, used: Mask, d: Array, noise: Array, made: Update
+) -> dict[str, Array]:
+    """Return evidence and noise level after a sample.
+
+    The level is found by expectation maximisation sample by sample: under the right one the mean
+    square of what an update leaves of a sample, with the variance that is left of its prediction,
+    is that of the noise, also while the unknowns are uncertain.
+    """
+    left, half, spread = made
+    misfit = (d * d).sum(axis=1) - (half * half).sum(axis=1)
+    logs = (np.log(noise) * used).sum(axis=1)
+    missed = d - (half[:, None] @ left)[:, 0]
+    count, told = np.maximum(used.sum(axis=1), 1), used.any(axis=1)
+    square = ((missed * missed).sum(axis=1) + (left * left).sum(axis=(1, 2))) / count
+    samples = np.minimum(x.samples + LEARN, MEMORY)
+    level = x.level * (1.0 + (square - 1.0) / samples)
+    return {
+        "evidence": x.evidence - 0.5 * misfit - spread - logs,
+        "level": np.where(told, level, x.level),
+        "samples": np.where(told, samples, x.samples),
+    }

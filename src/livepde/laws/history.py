@@ -1,0 +1,93 @@
+"""The samples since a law may have to begin again, of all members: a log that only grows.
+
+A log has the shape (members, rows, 1 + sensors + channels): time, measurements and inputs. Rows of a
+member that did not take a sample have the time NaN.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from livepde.fem import Inputs
+from livepde.linalg import Array, Mask
+from livepde.stepping import Interval, Span
+
+__all__ = ["added", "empty_log", "first_interval", "intervals_since", "opened"]
+
+SPARE = np.inf  # time of rows that are not in use
+ROWS = 64  # least room of a log
+
+
+def empty_log(members: int, sensors: int, channels: int) -> Array:
+    """Return a log without rows."""
+    return np.zeros((members, 0, 1 + sensors + channels))
+
+
+def opened(log: Array, span: Span) -> Array:
+    """Return a log that begins at the start of a span, unless it has begun."""
+    if log.shape[1]:
+        return log
+    row = np.full((len(log), log.shape[2]), np.nan)
+    row[:, 0] = span.t0
+    row[:, 1 + span.z1.shape[1] :] = span.inputs0
+    return _appended(log, row)
+
+
+def added(log: Array, span: Span, taken: Mask) -> Array:
+    """Return a log with the sample at the end of a span, of those members that took it."""
+    row = np.empty((len(log), log.shape[2]))
+    row[:, 0] = span.t1
+    row[:, 1 : 1 + span.z1.shape[1]] = span.z1
+    row[:, 1 + span.z1.shape[1] :] = span.inputs1
+    if not taken.all():
+        row[~taken] = np.nan
+    return _appended(log, row)
+
+
+def _appended(log: Array, row: Array) -> Array:
+    """Return a log with one more row.
+
+    Logs share a buffer: the row is written where no log has written yet, else into a copy.
+    """
+    rows, buffer = log.shape[1], log.base
+    if (
+        not isinstance(buffer, np.ndarray)
+        or buffer.ndim != 3
+        or buffer.shape[1] <= rows
+        or buffer[0, rows, 0] != SPARE
+    ):
+        room = max(ROWS, 2 * rows)
+        buffer = np.full((log.shape[0], room, log.shape[2]), SPARE)
+        buffer[:, :rows] = log
+    buffer[:, rows] = row
+    return buffer[:, : rows + 1]
+
+
+def trimmed(log: Array, first: int) -> Array:
+    """Return a log from a row on."""
+    return log[:, first:].copy()
+
+
+def _rows(log: Array, sensors: int) -> list[tuple[float, Array, Array]]:
+    """Return time, measurements and inputs of the rows of the one member of a log."""
+    taken = log[0][np.isfinite(log[0, :, 0])]
+    return [(float(row[0]), row[1 : 1 + sensors], row[1 + sensors :]) for row in taken]
+
+
+def first_interval(log: Array, channels: tuple[str, ...]) -> Interval:
+    """Return what one member measured in the first row, as an interval without length."""
+    sensors = log.shape[2] - 1 - len(channels)
+    ((t, z, inputs),) = _rows(log[:, :1], sensors)
+    named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
+    return Interval(t, t, named, named, z, z)
+
+
+def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
+    """Return the intervals between the rows of one member, in time order."""
+    sensors = log.shape[2] - 1 - len(channels)
+    rows = _rows(log, sensors)
+    named = [Inputs(dict(zip(channels, row[2].tolist(), strict=True))) for row in rows]
+    return [
+        Interval(rows[k - 1][0], rows[k][0], named[k - 1], named[k], rows[k - 1][1], rows[k][1])
+        for k in range(1, len(rows))
+    ]

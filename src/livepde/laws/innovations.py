@@ -1,0 +1,147 @@
+"""Whether the innovations are what the filter expects: white, and of the expected size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.linalg import Array, Mask
+
+__all__ = ["Innovations"]
+
+WINDOW = 500  # samples: older innovations fade, so that a poor start is forgotten
+SLOW = 50  # samples over which innovations are averaged to find errors that hide below the noise
+LARGEST_CORRELATION = 0.999
+SIGNIFICANT = 1.645  # standard errors above 1 that a statistic has by chance in 5 of 100 cases
+
+KEPT, GAINED = (1.0 - 1.0 / SLOW) ** 2, 1.0 / SLOW**2  # of the variance of an average
+TINY = 1e-200  # no sum of squares of anything, but no zero
+FADE = 1.0 - 1.0 / WINDOW
+FADES = np.array([FADE, FADE**2, FADE, FADE, FADE, FADE, FADE])  # of the sums
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """Fading moments of the normalised innovations e_k = d_k / sqrt(expected variance).
+
+    Attributes
+    ----------
+    sums
+        Shape (members, 7), fading over `WINDOW` samples: number of e; of squared weights; e^2; number
+        of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
+    last
+        Last e of each sensor, shape (members, sensors), NaN before its first.
+    newest
+        e of the last sample, shape (members, sensors), NaN where missing.
+    slow, slow_variance
+        Exponential average of e over `SLOW` samples, and its variance for white noise of size 1,
+        shapes (members, sensors).
+    """
+
+    sums: Array
+    last: Array
+    newest: Array
+    slow: Array
+    slow_variance: Array
+
+    @classmethod
+    def start(cls, sensors: int, members: int = 1) -> Innovations:
+        """Return the value before any innovation."""
+        shape = (members, sensors)
+        never, zero = np.full(shape, np.nan), np.zeros(shape)
+        return cls(np.zeros((members, len(FADES))), never, never, zero, zero)
+
+    def add(self, e: Array, measured: Mask | None = None) -> Innovations:
+        """Return the value after innovations of shape (members, sensors), NaN where missing.
+
+        Members that were not `measured`, shape (members,), stay as they are; default all were.
+        """
+        seen = np.isfinite(e)
+        whole = bool(seen.all())
+        known = e if whole else np.where(seen, e, 0.0)
+        both = seen & np.isfinite(self.last)
+        slow = self.slow + (known - self.slow) / SLOW
+        slow_variance = KEPT * self.slow_variance + GAINED
+        last = e
+        if not whole:
+            slow = np.where(seen, slow, self.slow)
+            slow_variance = np.where(seen, slow_variance, self.slow_variance)
+            last = np.where(seen, e, self.last)
+        terms = np.empty((len(FADES), *e.shape))
+        terms[0] = terms[1] = seen
+        terms[2], terms[3] = known * known, both
+        terms[4] = known * np.where(both, self.last, 0.0)
+        terms[5], terms[6] = slow_variance * seen, slow * slow * seen
+        sums = FADES * self.sums + terms.sum(axis=2).T
+        newest = e
+        if measured is not None and not measured.all():
+            sums = np.where(measured[:, None], sums, self.sums)
+            newest = np.where(measured[:, None], e, self.newest)
+        return Innovations(sums, last, newest, slow, slow_variance)
+
+    @property
+    def ratio(self) -> Array:
+        """Mean of e^2 of each member, shape (members,); 1 if the noise level is right."""
+        ratio: Array = (self.sums[:, 2] + TINY) / (self.sums[:, 0] + TINY)
+        return ratio
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation of successive innovations, (members,); 0 if the model explains the data."""
+        correlation = self.sums[:, 4] / (self.sums[:, 3] + TINY) / (self.ratio + TINY)
+        return np.minimum(np.maximum(correlation, -LARGEST_CORRELATION), LARGEST_CORRELATION)
+
+    @property
+    def persistence(self) -> Array:
+        """Variance of the averaged innovations over that of an average of white noise of size 1.
+
+        Model errors smaller than the noise hardly correlate one innovation with the next, and yet
+        do not average out. Shape (members,).
+        """
+        persistence: Array = (self.sums[:, 6] + TINY) / (self.sums[:, 5] + TINY)
+        return persistence
+
+    @property
+    def inflation(self) -> Array:
+        """Factor on standard deviations, at least 1, shape (members,).
+
+        By how much a mean of the innovations is less certain than one of white noise of the stated
+        size. The larger of two variances: `persistence`, and ratio (1 + rho)/(1 - rho), of errors
+        that follow a first-order autoregression.
+
+        Both scatter about 1 where the model is right, and the larger one lies above 1 more often
+        than not. So each counts by what it exceeds chance: see `_beyond_chance`. Their standard
+        errors are those for white noise: of N values the mean square has the variance 2/N, the
+        correlation 1/N; and `SLOW` values make one independent value of `slow`, of which each
+        sensor has one from the start.
+        """
+        count, weight = self.sums[:, 0], self.sums[:, 1]
+        sensors = np.isfinite(self.last).sum(axis=1)
+        averages = sensors + count**2 / (weight + TINY) / SLOW + TINY
+        slow = _beyond_chance(self.persistence, np.sqrt(2.0 / averages))
+        return np.maximum(self.scatter, np.sqrt(slow))
+
+    @property
+    def scatter(self) -> Array:
+        """The part of `inflation` that comes from the size of innovations and their correlation.
+
+        Errors that hide below the noise are not: they hardly make the innovations larger.
+        """
+        count, weight = self.sums[:, 0], self.sums[:, 1]
+        rho = np.maximum(self.correlation, 0.0)
+        following = self.ratio * (1.0 + rho) / (1.0 - rho)
+        error = np.sqrt(6.0 * weight + TINY) / (count + TINY)
+        return np.sqrt(_beyond_chance(following, error))
+
+
+def _beyond_chance(variance: Array, error: Array) -> Array:
+    """Return variances, shrunk towards 1 as far as their standard error explains the excess.
+
+    1 + x (1 - (c/x)^2) where the excess x is larger than c = `SIGNIFICANT` standard errors, else 1:
+    nothing is lost of what is far beyond chance.
+    """
+    excess, chance = variance - 1.0, SIGNIFICANT * error
+    beyond = excess > chance
+    share = np.where(beyond, chance, 0.0) / np.where(beyond, excess, 1.0)
+    return np.where(beyond, 1.0 + excess * (1.0 - share**2), 1.0)

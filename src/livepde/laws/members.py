@@ -1,0 +1,88 @@
+"""States of several members: dataclasses of arrays whose leading axis is the members."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from livepde.linalg import Array, Mask
+
+__all__ = ["changed", "join", "put", "take", "where"]
+
+State = TypeVar("State")
+
+
+def changed(state: State, **parts: Any) -> State:
+    """Return a state with some fields exchanged: `dataclasses.replace` in a tenth of its time."""
+    new: State = object.__new__(type(state))
+    new.__dict__.update(state.__dict__)
+    new.__dict__.update(parts)
+    return new
+
+
+def _each(function: Callable[..., Any], first: Any, *others: Any) -> Any:
+    """Return a state whose arrays are a function of those of some states."""
+    if not is_dataclass(first):
+        return function(first, *others)
+    parts = {
+        item.name: _each(function, *(getattr(state, item.name) for state in (first, *others)))
+        for item in fields(first)
+    }
+    return changed(first, **parts)
+
+
+def take(state: State, which: Any) -> State:
+    """Return the state of some members, by an index array; of one for a number, as one member."""
+    index = [which] if isinstance(which, int) else which
+    taken: State = _each(lambda array: array[index], state)
+    return taken
+
+
+def join(*states: State) -> State:
+    """Return the states one after the other."""
+
+    def joined(*arrays: Array) -> Array:
+        return np.concatenate(_widened(arrays))
+
+    whole: State = _each(joined, *states)
+    return whole
+
+
+def put(state: State, which: Any, part: State) -> State:
+    """Return a state with some members exchanged, by an index array or a number."""
+    index = [which] if isinstance(which, int) else which
+
+    def exchanged(array: Array, new: Array) -> Array:
+        array, new = _widened((array, new))
+        result = array.copy()
+        result[index] = new
+        return result
+
+    whole: State = _each(exchanged, state, part)
+    return whole
+
+
+def where(chosen: Mask, state: State, other: State) -> State:
+    """Return one state for the members chosen, another for the rest."""
+    if chosen.all():
+        return state
+    if not chosen.any():
+        return other
+
+    def either(one: Array, two: Array) -> Array:
+        one, two = _widened((one, two))
+        return np.where(chosen.reshape(-1, *(1,) * (one.ndim - 1)), one, two)
+
+    mixed: State = _each(either, state, other)
+    return mixed
+
+
+def _widened(arrays: tuple[Array, ...]) -> list[Array]:
+    """Return arrays of members, those with fewer rows of a square root filled up with zeros."""
+    if arrays[0].ndim < 3 or len({array.shape[1] for array in arrays}) == 1:
+        return list(arrays)
+    rows = max(array.shape[1] for array in arrays)
+    return [np.pad(array, ((0, 0), (0, rows - array.shape[1]), (0, 0))) for array in arrays]

@@ -1,0 +1,275 @@
+"""Reduced coordinates a of the unknowns, q = prior + Phi a, and how they move by themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from livepde.errors import LawError
+from livepde.fem import Evolution, FieldBlock
+from livepde.laws.base import Problem
+from livepde.linalg import Array, Mask
+
+__all__ = ["Motion", "Reduction"]
+
+LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
+MOST_MODES = 60  # of a field with modes="auto"
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How one unknown moves by itself, in reduced coordinates.
+
+    Attributes
+    ----------
+    part
+        Where its reduced coordinates stand: copies times modes.
+    evolution, std
+        Its model, and the prior deviation of its latent coefficients.
+    """
+
+    part: slice
+    evolution: Evolution
+    std: float
+
+    def transition(self, h: float) -> Array:
+        """Return the transition of its coordinates in a time h."""
+        F = self.evolution.transition(h)
+        return np.asarray(np.kron(F, np.eye((self.part.stop - self.part.start) // len(F))))
+
+    def growth(self, h: float) -> Array:
+        """Return the variance its coordinates gain in a time h."""
+        gained = self.evolution.growth(h, self.std)
+        return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
+
+    def backward(self, h: float, drift: float) -> Array:
+        """Return what the coordinates are expected to have been a time h before: matrix on them."""
+        F, growth = self.transition(h), self.growth(h)
+        growth = growth if self.evolution.moves else growth + drift * h
+        return np.asarray(np.linalg.solve(F @ F.T + np.diag(growth), F).T)
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """Reduced coordinates a ~ N(0, I) of all unknowns, q = prior + Phi a.
+
+    Attributes
+    ----------
+    problem
+        Model and sensors.
+    Phi
+        Prior deviations for numbers, leading modes of the prior for fields, shape (m, k).
+    motions
+        How the coordinates of each unknown move by themselves.
+    """
+
+    problem: Problem
+    Phi: Array
+    motions: tuple[Motion, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, modes: int | str | dict[str, int]) -> Reduction:
+        """Return the reduction with so many modes for each field; see `SensitivityLaw`."""
+        model = problem.model
+        counts = _mode_counts(modes, model.parameter_space.fields)
+        blocks, motions, start = [], [], 0
+        for name, item in model.latent.parts.items():
+            first = slice(item.part.start, item.part.start + item.size)
+            if isinstance(item.block, FieldBlock):
+                part = model.parameter_space.part(name)
+                inner = model.Q.restricted(first, item.block.fixed)
+                count = min(counts[name], int(inner.free.sum()))
+                mass = model.parameter_mass[part, part]
+                phi, _ = inner.modes(count, mass)
+                if modes == "auto":
+                    weights = mass.diagonal()
+                    phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
+            else:
+                phi = np.eye(item.size) * item.unknown.latent_std
+            blocks.append(np.kron(np.eye(item.evolution.copies), phi))
+            stop = start + blocks[-1].shape[1]
+            motions.append(Motion(slice(start, stop), item.evolution, item.unknown.latent_std))
+            start = stop
+        return cls(problem, np.asarray(block_diag(*blocks)), tuple(motions))
+
+    @property
+    def size(self) -> int:
+        """Number of reduced coordinates k."""
+        return int(self.Phi.shape[1])
+
+    @cached_property
+    def moves(self) -> bool:
+        """True if an unknown moves by itself."""
+        return any(motion.evolution.moves for motion in self.motions)
+
+    @cached_property
+    def still(self) -> Mask:
+        """Coordinates of unknowns that stay as they are, shape (k,)."""
+        still = np.ones(self.size, dtype=bool)
+        for motion in self.motions:
+            still[motion.part] = not motion.evolution.moves
+        return still
+
+    def moving(self, drift: float) -> int:
+        """Return how many coordinates gain variance."""
+        return sum(
+            motion.part.stop - motion.part.start
+            for motion in self.motions
+            if motion.growth(1.0).any() or (drift and not motion.evolution.moves)
+        )
+
+    def transition(self, h: float) -> Array:
+        """Return the transition of all coordinates in a time h, shape (k, k)."""
+        return _transition(self.motions, h)
+
+    def gained(self, h: float, variance: Array, drift: Array) -> Array:
+        """Return the variance that coordinates gain in a time h, shape (members, k).
+
+        What drifts gains the less the closer its variance is to that of the prior: it may move, but
+        without data it is not less certain than at first.
+
+        Parameters
+        ----------
+        variance
+            Of the coordinates of each member, shape (members, k).
+        drift
+            Prior variances gained per unit of time by unknowns that stay, shape (members,).
+        """
+        gained = np.broadcast_to(_growth(self.motions, h), variance.shape)
+        if not drift.any():
+            return gained
+        # V' = drift (1 - V), whatever the length of the step.
+        more = -np.expm1(-drift * h)[:, None] * np.maximum(1.0 - variance, 0.0)
+        return np.where(self.still, more, gained)
+
+    def moved(self, q: Array, h: float) -> Array:
+        """Return the expected latent parameters a time h later, shape (members, m)."""
+        latent = self.problem.model.latent
+        if not latent.generator.nnz:
+            return q
+        change = q - latent.prior
+        for p in latent.parts.values():
+            copies = change[:, p.part].reshape(len(q), p.evolution.copies, p.size)
+            change[:, p.part] = (p.evolution.transition(h) @ copies).reshape(len(q), -1)
+        return np.asarray(latent.prior + change)
+
+    @cached_property
+    def _dual(self) -> Array:
+        """Phi^T times the Gram matrix of Q, transposed, shape (m, k)."""
+        Q = self.problem.model.Q
+        return np.stack([Q.dual(column) for column in self.Phi.T], axis=1)
+
+    def reduced(self, dq: Array) -> Array:
+        """Return a with Phi a = dq, (..., k) for (..., m): columns of Phi are orthonormal in Q."""
+        a: Array = dq @ self._dual
+        return a
+
+    def bounded(self, q: Array) -> Array:
+        """Return latent parameters within their bounds, shape (..., m)."""
+        return self.problem.model.latent.clipped(q)
+
+    def directions(self, q: Array, C: Array) -> Array:
+        """Return how the physical parameter changes along rows of a, (members, r, m).
+
+        Parameters
+        ----------
+        q, C
+            Latent parameters, (members, dim), and rows, (members, r, k).
+        """
+        latent, along = self.problem.model.latent, C @ self.Phi.T
+        if latent.plain:
+            return along
+        along = latent.slopes(q.T).T[:, None, :] * along
+        if latent.dim == latent.space.dim:
+            return along
+        return np.asarray(latent.V @ along.reshape(-1, latent.dim).T).T.reshape(
+            *along.shape[:2], -1
+        )
+
+    def traced(self, q: Array, start: Array, h: float, drift: float) -> Array:
+        """Return the latent parameter that is expected to have become q in a time h, shape (m,).
+
+        Parameters
+        ----------
+        start
+            One at that time; what no mode sees is taken from it.
+        drift
+            As for `gained`.
+        """
+        if not (self.moves or drift):
+            return q
+        prior = self.problem.model.latent.prior
+        back = block_diag(*(motion.backward(h, drift) for motion in self.motions))
+        return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
+
+    @cached_property
+    def _left_out(self) -> Array:
+        """Prior variance of each latent coefficient in the modes that are left out, shape (m,)."""
+        model = self.problem.model
+        left = np.zeros(len(self.Phi))
+        for item in model.latent.parts.values():
+            if isinstance(item.block, FieldBlock):
+                first = slice(item.part.start, item.part.start + item.size)
+                space = model.Q.restricted(first, item.block.fixed)
+                left[item.part] = np.tile(space.beyond(self.Phi[first]), item.evolution.copies)
+        return left
+
+    @cached_property
+    def _unseen(self) -> Array:
+        return np.asarray(np.sqrt(self._left_out))
+
+    def rest(self, age: float, drift: float) -> Array:
+        """Return the deviation of each latent coefficient in the modes that are left out, (m,).
+
+        They are as the prior has them, and have moved for a time `age`.
+        """
+        if age == 0.0 or not self._left_out.any():
+            return self._unseen
+        grown = []
+        for motion, item in zip(
+            self.motions, self.problem.model.latent.parts.values(), strict=True
+        ):
+            growth = motion.evolution.growth(age, motion.std)
+            growth = growth if motion.evolution.moves else growth + drift * age
+            variance = (motion.evolution.transition(age) ** 2).sum(axis=1) + growth
+            grown.append(np.repeat(variance, item.size))
+        return np.asarray(np.sqrt(self._left_out * np.concatenate(grown)))
+
+
+def _mode_counts(modes: int | str | dict[str, int], fields: object) -> dict[str, int]:
+    """Return the largest number of modes of each field; raises `LawError`."""
+    names = list(fields)  # type: ignore[call-overload]
+    if isinstance(modes, str) and modes != "auto":
+        raise LawError(
+            f"SensitivityLaw: modes must be a number, 'auto', or a number for each field; got "
+            f"{modes!r}."
+        )
+    most = MOST_MODES if isinstance(modes, str) else modes
+    counts = most if isinstance(most, dict) else dict.fromkeys(names, most)
+    if set(counts) != set(names):
+        raise LawError(
+            f"SensitivityLaw: modes names {sorted(counts)}; the fields are {sorted(names)}."
+        )
+    if any(count < 1 or count % 1 for count in counts.values()):
+        raise LawError(f"SensitivityLaw: modes must be whole numbers of at least 1; got {modes!r}.")
+    return counts
+
+
+def _enough(phi: Array, mass: Array, variance: float) -> int:
+    """Return how many modes hold all of the prior variance but a share of `LEFT_OUT`."""
+    held = np.cumsum(mass @ phi**2)
+    short = int((held < (1.0 - LEFT_OUT) * variance).sum())
+    return min(short + 1, len(held))
+
+
+@lru_cache(maxsize=64)
+def _transition(motions: tuple[Motion, ...], h: float) -> Array:
+    return np.asarray(block_diag(*(motion.transition(h) for motion in motions)))
+
+
+@lru_cache(maxsize=64)
+def _growth(motions: tuple[Motion, ...], h: float) -> Array:
+    return np.concatenate([motion.growth(h) for motion in motions])

@@ -1,0 +1,107 @@
+"""Vectors of a model that time and input channels drive: sources and boundary values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+
+from livepde.fem import Inputs, Moment
+from livepde.linalg import Array
+from livepde.stepping.span import Moments
+
+__all__ = ["DrivenVector"]
+
+SCALES = (1e-3, 1.0, 1e3, 1e6)  # of random inputs that tell whether a vector is affine in them
+ROUNDING = 1e-11  # relative: less is no curvature
+LARGE = 2.0**20  # input at which a response is measured: the vector without inputs loses it no digit
+
+
+class DrivenVector:
+    """A vector v(t, inputs) that is mostly affine in the inputs, and mostly does not read the time.
+
+    Then it is assembled once, and a moment costs one small product.
+
+    Parameters
+    ----------
+    vector
+        Moment -> coefficients, shape (n,).
+    channels
+        Names of the inputs.
+    timed
+        () -> whether the vector has read the time so far.
+    """
+
+    def __init__(
+        self,
+        vector: Callable[[Moment], Array],
+        channels: tuple[str, ...],
+        timed: Callable[[], bool],
+    ) -> None:
+        self.vector = vector
+        self.channels = channels
+        self._timed = timed
+
+    def _at(self, t: float, inputs: Array) -> Array:
+        named = dict(zip(self.channels, inputs.tolist(), strict=True))
+        return self.vector(Moment(t, Inputs(named)))
+
+    @cached_property
+    def affine(self) -> bool:
+        """True if the vector is affine in the inputs, probed at several magnitudes."""
+        if not self.channels:
+            return True
+        rng = np.random.default_rng(2)
+        for scale in SCALES:
+            a, b = scale * rng.standard_normal((2, len(self.channels)))
+            with np.errstate(all="ignore"):
+                parts = [self._at(0.3, x) for x in (a, b, a + b, 0.0 * a)]
+            change = parts[0] + parts[1] - parts[2] - parts[3]
+            size = max(np.abs(part).max(initial=0.0) for part in parts)
+            if not np.abs(change).max(initial=0.0) <= ROUNDING * size:
+                return False
+        return True
+
+    @cached_property
+    def responses(self) -> tuple[Array, Array] | None:
+        """The vector without inputs, (1, n), and its change with each, (channels, n).
+
+        None if it reads the time or is not affine.
+        """
+        if not self.affine:
+            return None
+        zero = np.zeros(len(self.channels))
+        base = self._at(0.0, zero)
+        units = LARGE * np.eye(len(zero))
+        changes = [(self._at(0.0, unit) - base) / LARGE for unit in units]
+        if self._timed():
+            return None
+        return base[None], np.reshape(changes, (len(zero), len(base)))
+
+    @cached_property
+    def zero(self) -> bool:
+        """True if the vector is always zero."""
+        return self.responses is not None and not any(part.any() for part in self.responses)
+
+    @cached_property
+    def constant(self) -> bool:
+        """True if neither time nor inputs change the vector."""
+        return self.responses is not None and not self.responses[1].any()
+
+    def __call__(self, at: Moments) -> Array:
+        """Return the vector of each member, shape (members, n); (1, n) if the same for all."""
+        if self.responses is not None:
+            base, changes = self.responses
+            return base if self.constant else base + at.inputs[:, : len(changes)] @ changes
+        if len(at.inputs) == 1:
+            return self.vector(at.member(0))[None]
+        base = self._at(at.t, np.zeros(len(self.channels)))
+        total = base[None]
+        largest_inputs = np.abs(at.inputs[:, : len(self.channels)]).max(axis=0)
+        for c, largest in enumerate(largest_inputs):
+            if largest > 0.0:  # a difference at the size of the values: no digits are lost
+                unit = np.zeros(len(self.channels))
+                unit[c] = largest
+                total = total + (at.inputs[:, c] / largest)[:, None] * (self._at(at.t, unit) - base)
+        return total

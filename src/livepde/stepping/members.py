@@ -1,0 +1,283 @@
+"""The implicit stage of several members of one model: their states, and tangents behind them.
+
+Columns of members have the shape (1 + r, members, n): the state and r tangents of each.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.fem import Channel, Form, Inputs, Moment
+from livepde.linalg import Array, Assembler, BandedBlocks, BandedSolver, IntArray, Pattern, analyse, compact
+from livepde.model import Model
+from livepde.stepping.corrections import Kept
+from livepde.stepping.driven import DrivenVector
+from livepde.stepping.newton import StepFailed
+from livepde.stepping.span import Moments
+from livepde.stepping.state import ForwardStage
+
+MOST_UNKNOWNS = 64  # of which each has a matrix of its own
+
+__all__ = ["BandedStage", "KeptFactors", "MemberStage", "SeparateStages", "member_stage"]
+
+
+@dataclass(frozen=True, eq=False)
+class KeptFactors:
+    """`Kept` of each member: what a stage leaves to the next one.
+
+    Attributes
+    ----------
+    q, h, spent, trend
+        Shapes (members, m), (members,), (members,) and (members, n); h = 0 if nothing is kept. A
+        stage that keeps nothing leaves q and trend without columns.
+    """
+
+    q: Array
+    h: Array
+    spent: Array
+    trend: Array
+
+    @classmethod
+    def none(cls, members: int, m: int = 0, n: int = 0) -> KeptFactors:
+        """Return the value before any stage."""
+        zero = np.zeros(members)
+        return cls(np.zeros((members, m)), zero, zero, np.zeros((members, n)))
+
+    def member(self, k: int) -> Kept:
+        """Return what is kept of one member."""
+        if not self.h[k]:
+            return Kept.none()
+        return Kept(self.q[k], float(self.h[k]), float(self.spent[k]), self.trend[k])
+
+
+class MemberStage(ABC):
+    """Solves M (u - c)/h + B(u) + A(u) q = F for the state u of each member, and its tangents."""
+
+    @abstractmethod
+    def kept(self, members: int) -> KeptFactors:
+        """Return what is kept before any stage."""
+
+    @abstractmethod
+    def advance(
+        self,
+        columns: Array,
+        q: Array,
+        directions: Array,
+        h: float,
+        at: Moments,
+        kept: KeptFactors,
+        tolerance: Array,
+        members: IntArray,
+    ) -> tuple[Array, KeptFactors]:
+        """Return states and tangents at the end of a stage, and what it leaves to the next.
+
+        Parameters
+        ----------
+        columns
+            Where the stage begins, shape (1 + r, members, n).
+        q, directions
+            Latent parameters, (members, dim), and how q changes along each tangent,
+            (members, r, m).
+        at
+            Time and inputs at the end of the stage.
+        tolerance
+            Bound on the relative error of the tangents of each member, shape (members,).
+        members
+            Numbers of the members, by which they find their own factors again.
+
+        Raises
+        ------
+        StepFailed
+            A stage has no solution that is found.
+        """
+
+
+class SeparateStages(MemberStage):
+    """One `ForwardStage` for each member: for any model."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self._stages: list[ForwardStage] = []
+
+    def _stage(self, k: int) -> ForwardStage:
+        """Return the stage of a member: the analysis is common, factors are its own."""
+        if not self._stages:
+            self._stages.append(ForwardStage(self.model))
+        while len(self._stages) <= k:
+            self._stages.append(self._stages[0].twin())
+        return self._stages[k]
+
+    def kept(self, members: int) -> KeptFactors:
+        stage = self._stage(0)
+        if not stage.keeps or not stage.solver.price:
+            return KeptFactors.none(members)
+        return KeptFactors.none(members, self.model.latent.dim, self.model.X.dim)
+
+    def advance(
+        self,
+        columns: Array,
+        q: Array,
+        directions: Array,
+        h: float,
+        at: Moments,
+        kept: KeptFactors,
+        tolerance: Array,
+        members: IntArray,
+    ) -> tuple[Array, KeptFactors]:
+        new, left = np.empty_like(columns), []
+        for k, member in enumerate(members.tolist()):
+            y, after = self._stage(member).advance(
+                columns[:, k].T,
+                q[k],
+                directions[k].T,
+                h,
+                at.member(k),
+                kept.member(k),
+                float(tolerance[k]),
+            )
+            new[:, k] = y.T
+            left.append(after)
+        if not kept.q.shape[1]:
+            return new, kept
+        rows = (np.array([getattr(one, name) for one in left]) for name in vars(left[0]))
+        return new, KeptFactors(*rows)
+
+
+class BandedStage(MemberStage):
+    """Stages of a model whose matrices are banded sums of constant ones, q_j A_j and M/h + B.
+
+    The matrices are assembled once; those of all members are the blocks of one banded matrix.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        form, zero, free = model.physical_A, np.zeros(model.X.dim), model.X.free
+        fields = [block.field for block in model.state_space.fields.values()]
+        values = [value for field in fields for value in field.dirichlet.values()]
+        fixed_in_time = all(isinstance(value, int | float | Channel) for value in values)
+        units = np.eye(model.parameter_space.dim)
+        self.pattern, maps = _analysed(model)
+        rows, cols = self.pattern.rows, self.pattern.indices
+        inner, outer = free[rows] * free[cols], free[rows] * (1.0 - free[cols])
+        # What depends on time or inputs is none of the matrices, but is evaluated with them.
+        some = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
+        mass = maps["M"] @ model.mass.data
+        rest = maps["B"] @ model.form_B.data("v", "u", some, u=zero)
+        slopes = [maps["A"] @ form.data("v", "u", some, u=zero, q=q) for q in units]
+        self._blocks = BandedBlocks(BandedSolver(self.pattern))
+        self._mass = self._product(mass * free[rows])
+        self._slopes = self._product(*(slope * inner for slope in slopes))
+        self._mass_band = self._blocks.band(mass * inner)
+        ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
+        self._rest_band = self._blocks.band(rest * inner + ones)
+        self._slope_bands = self._blocks.band(np.array(slopes) * inner)
+        # What Dirichlet values do to the equations of free coefficients stands in the vectors.
+        mass_edge, rest_edge = self._product(mass * outer), self._product(rest * outer)
+        slope_edge = self._product(*(slope * outer for slope in slopes))
+
+        def boundary(moment: Moment) -> Array:
+            return model.impose(zero, moment)
+
+        def load(moment: Moment) -> Array:
+            known = (model.form_F.vector("v", moment) - model.B(zero, moment)) * free
+            return known - rest_edge @ boundary(moment)
+
+        def offset(moment: Moment) -> Array:
+            at_zero = [form.vector("v", moment, q=q, u=zero) * free for q in units]
+            return np.concatenate(at_zero) + slope_edge @ boundary(moment)
+
+        def driven(vector: Callable[[Moment], Array], *forms: Form) -> DrivenVector:
+            def timed() -> bool:
+                return not fixed_in_time or any("t" in each.uses for each in forms)
+
+            return DrivenVector(vector, model.channels, timed)
+
+        self._boundary = driven(boundary)
+        self._mass_boundary = driven(lambda moment: mass_edge @ boundary(moment))
+        self._load = driven(load, model.form_F, model.form_B)
+        self._offset = driven(offset, form)
+
+    @staticmethod
+    def refuses(model: Model) -> str:
+        """Return why a model cannot be stepped so; empty if it can."""
+        if not (model.physical_A.linear_in_parameter and model.affine):
+            return "the model is not affine in its state and its unknowns"
+        if model.parameter_space.dim > MOST_UNKNOWNS:
+            return f"there are more than {MOST_UNKNOWNS} unknown coefficients"
+        if not model.steady:
+            return "the matrices of the model depend on time or inputs"
+        if not isinstance(analyse(_analysed(model)[0]), BandedSolver):
+            return "the matrices of the model are not banded: the mesh has more than one dimension"
+        return ""
+
+    @property
+    def refusal(self) -> str:
+        """Why members whose inputs differ cannot be stepped together; empty if they can."""
+        if not all(item.affine for item in (self._boundary, self._load, self._offset)):
+            return "the model is not affine in its input channels"
+        return ""
+
+    def _product(self, *parts: Array) -> sp.csr_array | Array:
+        """Return matrices of the pattern one below the other, for products."""
+        blocks = [self.pattern.matrix(part) for part in parts]
+        return compact(sp.csr_array(sp.vstack(blocks, format="csr")))
+
+    def kept(self, members: int) -> KeptFactors:
+        return KeptFactors.none(members)
+
+    def advance(
+        self,
+        columns: Array,
+        q: Array,
+        directions: Array,
+        h: float,
+        at: Moments,
+        kept: KeptFactors,
+        tolerance: Array,
+        members: IntArray,
+    ) -> tuple[Array, KeptFactors]:
+        size, n = columns.shape[1:]
+        unknowns = self.model.latent.value(q.T).T
+        storage = unknowns @ self._slope_bands
+        storage += self._mass_band / h + self._rest_band
+        factor = self._blocks.factorise(storage)
+        if size == 1 and not factor.good[0]:
+            raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
+        known = (self._mass @ (columns.reshape(-1, n).T / h)).T.reshape(columns.shape)
+        state = known[0] + self._load(at)
+        if not self._boundary.zero:
+            state -= self._mass_boundary(at) / h
+        offset = None if self._offset.zero else self._offset(at).reshape(-1, unknowns.shape[1], n)
+        if offset is not None:
+            state -= (unknowns[:, None] @ offset)[:, 0]
+        new = np.empty_like(columns)
+        new[0] = u = factor.solve(state[None])[0]
+        driven = (self._slopes @ u.T).T.reshape(size, -1, n)
+        if offset is not None:
+            driven = driven + offset
+        forcing = directions @ driven
+        new[1:] = factor.solve(known[1:] - forcing.transpose(1, 0, 2))
+        if not self._boundary.zero:
+            new[0] += self._boundary(at)
+        return new, kept
+
+
+def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
+    """Return the pattern of the matrix of a stage, and the maps of its parts."""
+    whole = Assembler(model.X.dim)
+    whole.add("M", model.form_M.pattern("v", "u"))
+    whole.add("B", model.form_B.pattern("v", "u"))
+    whole.add("A", model.physical_A.pattern("v", "u"))
+    return whole.build()
+
+
+def member_stage(model: Model) -> MemberStage:
+    """Return the fastest stage that serves a model: the only place where this is decided."""
+    if BandedStage.refuses(model):
+        return SeparateStages(model)
+    return BandedStage(model)

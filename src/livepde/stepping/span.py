@@ -1,0 +1,134 @@
+"""From one sample to the next, for one process or for many that are stepped together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from livepde.fem import Inputs, Moment
+from livepde.linalg import Array, Mask
+from livepde.stepping.interval import Interval
+
+__all__ = ["Moments", "Span"]
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """One time and the input channels of each member.
+
+    Attributes
+    ----------
+    t
+        The time.
+    channels
+        Names of the channels.
+    inputs
+        Their values, shape (members, channels), or (1, channels) if they are the same for all.
+    """
+
+    t: float
+    channels: tuple[str, ...]
+    inputs: Array
+    moment: Moment | None = None
+
+    def member(self, k: int) -> Moment:
+        """Return time and inputs of one member."""
+        if self.moment is not None:
+            return self.moment
+        row = self.inputs[k if len(self.inputs) > 1 else 0]
+        return Moment(self.t, Inputs(dict(zip(self.channels, row.tolist(), strict=True))))
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """The interval of each member: they end together.
+
+    Attributes
+    ----------
+    t0, t1
+        Time of the last accepted sample of each member, shape (members,), and of this one.
+    channels
+        Names of the input channels.
+    inputs0, inputs1
+        Their values at both ends, shape (members, channels), or (1, channels) if the same for all.
+    z0, z1
+        Measurements at both ends, shape (members, sensors), NaN where missing; or (1, sensors).
+    interval
+        The interval of a single process, None for members of a fleet.
+    """
+
+    t0: Array
+    t1: float
+    channels: tuple[str, ...]
+    inputs0: Array
+    inputs1: Array
+    z0: Array
+    z1: Array
+    interval: Interval | None = None
+
+    @classmethod
+    def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
+        """Return the interval of one process, which all members have in common."""
+        first, last = (
+            np.array([[inputs[name] for name in channels]])
+            for inputs in (interval.inputs0, interval.inputs1)
+        )
+        t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
+        return cls(t0, interval.t1, channels, first, last, z0, z1, interval)
+
+    def __len__(self) -> int:
+        return len(self.t0)
+
+    @cached_property
+    def start(self) -> float:
+        """Time at which most members begin."""
+        if len(self.t0) == 1:
+            return float(self.t0[0])
+        times, counts = np.unique(self.t0, return_counts=True)
+        return float(times[np.argmax(counts)])
+
+    @property
+    def together(self) -> Mask:
+        """Members that begin where most do, shape (members,)."""
+        most: Mask = self.t0 == self.start
+        return most
+
+    @cached_property
+    def present(self) -> Mask:
+        """Whether each member has a measurement at the end, shape (members,) or (1,)."""
+        some: Mask = np.asarray(np.isfinite(self.z1).any(axis=1))
+        return some
+
+    def at(self, t: float) -> Moments:
+        """Return time and inputs at t of members that begin together."""
+        if t == self.t1:
+            return self.end
+        moment = None if self.interval is None else self.interval.at(t)
+        s = (t - self.start) / (self.t1 - self.start)
+        mixed = (1 - s) * self.inputs0 + s * self.inputs1
+        return Moments(t, self.channels, mixed, moment)
+
+    @cached_property
+    def end(self) -> Moments:
+        """Time and inputs at the end."""
+        moment = None if self.interval is None else self.interval.end
+        return Moments(self.t1, self.channels, self.inputs1, moment)
+
+    def member(self, k: int) -> Interval:
+        """Return the interval of one member."""
+        if self.interval is not None:
+            return self.interval
+        first, last = (
+            Inputs(dict(zip(self.channels, inputs[k].tolist(), strict=True)))
+            for inputs in (self.inputs0, self.inputs1)
+        )
+        return Interval(float(self.t0[k]), self.t1, first, last, self.z0[k], self.z1[k])
+
+    def held(self) -> Span:
+        """Return the span with its inputs held at what the end brings."""
+        interval = self.interval
+        if interval is not None:
+            interval = replace(interval, inputs0=interval.inputs1)
+        return replace(self, inputs0=self.inputs1, interval=interval)
