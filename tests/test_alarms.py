@@ -145,23 +145,23 @@ def test_what_settles_is_not_looked_at():
     rng, jumps = np.random.default_rng(0), lp.Jumps(settle=50)
     watch = jumps.start()
     for k in range(200):
-        e = (10.0 if k < 50 else 1.0) * rng.standard_normal(2)
+        e = (10.0 if k < 50 else 1.0) * rng.standard_normal((1, 2))
         watch, alarm = jumps.add(watch, e, Innovations.start(2))
         assert not alarm
-    _, alarm = jumps.add(watch, np.full(2, 10.0), Innovations.start(2))
+    _, alarm = jumps.add(watch, np.full((1, 2), 10.0), Innovations.start(2))
     assert alarm
 
 
 def test_slow_errors_below_the_noise_hide_no_jump():
     rng, usual = np.random.default_rng(0), Innovations.start(2)
     for k in range(2000):
-        usual = usual.add(rng.standard_normal(2) + 0.3 * np.sin(0.01 * k))
+        usual = usual.add(rng.standard_normal((1, 2)) + 0.3 * np.sin(0.01 * k))
     assert usual.inflation > 1.5
     assert usual.scatter < 1.25
     jumps = lp.Jumps(settle=0)
     watch, alarm = jumps.start(), False
     for k in range(30):
-        watch, alarm = jumps.add(watch, rng.standard_normal(2) + 2.0 * np.sin(k), usual)
+        watch, alarm = jumps.add(watch, rng.standard_normal((1, 2)) + 2.0 * np.sin(k), usual)
         if alarm:
             break
     assert alarm

@@ -133,8 +133,9 @@ def _absorbed(
     d = span.z1 - predicted
     finite: Mask = np.isfinite(x.u.sum(axis=1) + x.U.sum(axis=(1, 2)))
     used: Mask = np.isfinite(d)
-    measured: Mask = np.asarray(used.any(axis=1))
-    if not measured.any():
+    whole = bool(used.all())
+    measured = None if whole else np.asarray(used.any(axis=1))
+    if measured is not None and not measured.any():
         zero = np.zeros(len(x))
         return x, Assimilation(predicted, steps, OK, finite, zero, zero)
     noise = filter_.noise[None]
@@ -149,9 +150,9 @@ def _absorbed(
         refused = np.where(far, refused + 1, np.where(used, 0, refused))
         kept = used & ~(far & (refused <= choices.patience))
         count = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
-        used = kept
+        used, whole = kept, bool(kept.all())
         e = np.where(used, e, np.nan)
-    if not used.all():  # zeros tell nothing: what is missing takes part as such
+    if not whole:  # zeros tell nothing: what is missing takes part as such
         Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
     new, made = filter_.update(x, Y, d)
     parts = {"innovations": x.innovations.add(e, measured), "refused": refused}

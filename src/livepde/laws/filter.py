@@ -98,6 +98,8 @@ class FilterState:
     @property
     def off_centre(self) -> Mask:
         """Members whose estimate is not the linearisation point, shape (members,)."""
+        if not (self.da.any() or self.du.any()):
+            return np.zeros(len(self), dtype=bool)
         return np.asarray(self.da.any(axis=1) | self.du.any(axis=1))
 
 
@@ -213,7 +215,7 @@ class Filter:
         """Return the state at the end of a part of a span."""
         end, kept, off = self.moved(x, stop - start), x.kept, x.off_centre
         deviates = bool(off.any())
-        tolerance = np.where(off, ESTIMATE, GAIN)
+        tolerance = ESTIMATE * off + GAIN * ~off
 
         def directions(at: FilterState) -> Array:
             C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C

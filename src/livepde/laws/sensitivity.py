@@ -381,12 +381,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         x, told = assimilate(filter_, before, span, work.choices)
         if not told.status.ok:
             return state, told, told.finite
-        usual, replays = told.finite & span.together, state.replays
-        present = span.present
-        if replays.any():
-            usual = usual & ~(replays & (state.assimilated + present >= state.due))
+        usual, replays, present = told.finite, state.replays, span.present
+        if len(span) > 1:
+            usual = usual & span.together
+        if self.replay is not None:
+            due = state.assimilated + present >= state.due
             full = state.log.shape[1] + 1 - state.window > self._most
-            usual = usual & ~(replays & full)
+            usual = usual & ~(replays & (due | full))
         scale, watch = state.scale, state.watch
         if (guards := self.guards) is not None:
             usual = usual & (replays | guards.within_reach(x.da - before.da))
@@ -400,9 +401,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             seen, alarm = jumps.add(watch, e, before.innovations)
             watch = where(np.broadcast_to(present, alarm.shape), seen, watch)
             usual = usual & ~(alarm & present)
-        if not replays.all():
-            centred = filter_.recentred(x)
-            x = where(~replays, centred, x)
+        if self.replay is None or not replays.any():
+            x = filter_.recentred(x)
+        elif not replays.all():
+            x = where(replays, x, filter_.recentred(x))
         if not usual.all():
             if not usual.any():
                 return state, told, usual

@@ -11,6 +11,8 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array, Mask
 from livepde.stepping.interval import Interval
 
+NO_INPUTS = np.zeros((1, 0))
+
 __all__ = ["Moments", "Span"]
 
 
@@ -71,10 +73,12 @@ class Span:
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
         """Return the interval of one process, which all members have in common."""
-        first, last = (
-            np.array([[inputs[name] for name in channels]])
-            for inputs in (interval.inputs0, interval.inputs1)
-        )
+        first = last = NO_INPUTS
+        if channels:
+            first, last = (
+                np.array([[inputs[name] for name in channels]])
+                for inputs in (interval.inputs0, interval.inputs1)
+            )
         t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
         return cls(t0, interval.t1, channels, first, last, z0, z1, interval)
 

@@ -13,14 +13,12 @@ def inflations(
     samples: int, *, sensors: int = 2, rho: float = 0.0, size: float = 1.0, repeats: int = 60
 ) -> Array:
     """Return the factors for innovations that follow a first-order autoregression."""
-    rng, found = np.random.default_rng(1), []
-    for _ in range(repeats):
-        value, e = Innovations.start(sensors), rng.standard_normal(sensors)
-        for _ in range(samples):
-            value = value.add(size * e)
-            e = rho * e + np.sqrt(1 - rho**2) * rng.standard_normal(sensors)
-        found.append(value.inflation)
-    return np.array(found)
+    rng, shape = np.random.default_rng(1), (repeats, sensors)
+    value, e = Innovations.start(sensors, repeats), rng.standard_normal(shape)
+    for _ in range(samples):
+        value = value.add(size * e)
+        e = rho * e + np.sqrt(1 - rho**2) * rng.standard_normal(shape)
+    return value.inflation
 
 
 @pytest.mark.parametrize("samples", [10, 50, 300])
@@ -45,7 +43,7 @@ def test_an_error_below_the_noise_that_does_not_average_out_is_found():
     rng = np.random.default_rng(0)
     value = Innovations.start(2)
     for _ in range(500):
-        value = value.add(rng.standard_normal(2) + 0.4)
+        value = value.add(rng.standard_normal((1, 2)) + 0.4)
     # Averages over 50 samples have the mean 0.4 beside a variance of 1/99.
     assert value.inflation == pytest.approx(np.sqrt(1 + 99 * 0.16), rel=0.2)
 
@@ -53,15 +51,12 @@ def test_an_error_below_the_noise_that_does_not_average_out_is_found():
 def test_the_expected_size_of_averages_holds_from_the_first_sample():
     rng = np.random.default_rng(0)
     for samples in (1, 5, 20):
-        found = []
-        for _ in range(400):
-            value = Innovations.start(1)
-            for e in rng.standard_normal((samples, 1)):
-                value = value.add(e)
-            found.append(value.persistence)
-        assert np.mean(found) == pytest.approx(1.0, abs=0.2)
+        value = Innovations.start(1, 400)
+        for e in rng.standard_normal((samples, 400, 1)):
+            value = value.add(e)
+        assert value.persistence.mean() == pytest.approx(1.0, abs=0.2)
 
 
 def test_nothing_measured_says_nothing():
     value = Innovations.start(2)
-    assert value.inflation == value.add(np.full(2, np.nan)).inflation == 1.0
+    assert value.inflation == value.add(np.full((1, 2), np.nan)).inflation == 1.0
