@@ -89,6 +89,8 @@ LAWS = {
     "rank": lp.SensitivityLaw(rank=8),
     "plain": lp.SensitivityLaw(),
     "gate, noise": lp.SensitivityLaw(gate=3.0, noise="auto"),
+    "replay": lp.SensitivityLaw(replay=lp.Replay(first=5)),
+    "jumps": lp.SensitivityLaw(jumps=lp.Jumps(settle=5)),
     "no guards, memory": lp.SensitivityLaw(guards=None, memory=2.0),
 }
 
@@ -448,7 +450,7 @@ def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
 
 
 def test_members_that_step_separately_are_not_kept_as_arrays():
-    fleet = lp.Fleet(rod(), SENSORS, lp.SensitivityLaw(replay=lp.Replay()), 2)
+    fleet = lp.Fleet(rod(), SENSORS, lp.GradientLaw(), 2)
     estimate = fleet.step(*samples(fleet, 5)[0])
     with pytest.raises(lp.ConfigurationError, match="separately"):
         Kept(fleet.model).add(estimate)

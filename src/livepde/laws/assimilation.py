@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -44,6 +45,7 @@ class MemberReports:
     def member(self, k: int) -> Report:
         """Return the report of one member."""
         notes = {name: float(values[k]) for name, values in self.notes.items()}
+        notes = {name: value for name, value in notes.items() if not math.isnan(value)}
         return Report(self.statuses[k], self.predicted[k], int(self.steps[k]), notes)
 
     def with_members(self, reports: Mapping[int, Report]) -> MemberReports:

@@ -100,7 +100,7 @@ class Scale:
         wave has not reached yet knows nothing of its size. Shape (members,).
         """
         ranges = np.fmax(np.fmax(self.high - self.low, self.first), noise) / noise
-        missed = np.fmax.reduce(np.abs(d) / noise, axis=1)
         unseen = np.isnan(self.first) | np.isnan(self.low)
+        missed = np.fmax.reduce(np.where(unseen, np.nan, np.abs(d) / noise), axis=1)
         largest = np.where(unseen, 0.0, ranges).max(axis=1)
         return np.where(np.isnan(missed), 0.0, missed / np.where(largest > 0.0, largest, np.inf))

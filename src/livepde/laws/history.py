@@ -12,7 +12,7 @@ from livepde.fem import Inputs
 from livepde.linalg import Array, Mask
 from livepde.stepping import Interval, Span
 
-__all__ = ["added", "empty_log", "first_interval", "intervals_since", "opened"]
+__all__ = ["added", "empty_log", "first_interval", "intervals_since", "opened", "skipped", "trimmed"]
 
 SPARE = np.inf  # time of rows that are not in use
 ROWS = 64  # least room of a log
@@ -42,6 +42,11 @@ def added(log: Array, span: Span, taken: Mask) -> Array:
     if not taken.all():
         row[~taken] = np.nan
     return _appended(log, row)
+
+
+def skipped(log: Array) -> Array:
+    """Return a log with a sample that nobody took."""
+    return _appended(log, np.full((len(log), log.shape[2]), np.nan))
 
 
 def _appended(log: Array, row: Array) -> Array:

@@ -27,6 +27,7 @@ from livepde.laws.history import (
     first_interval,
     intervals_since,
     opened,
+    skipped,
     trimmed,
 )
 from livepde.laws.innovations import Innovations
@@ -367,9 +368,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             one, alone[k] = self._alone(work, take(before, k), span.member(k))
             if not alone[k].status.ok and len(state) == 1:
                 return state, reports.with_members(alone)
-            missing = np.zeros(1, dtype=bool)
             if one.log.shape[1] < new.log.shape[1]:
-                one = changed(one, log=added(one.log, span, missing))
+                one = changed(one, log=skipped(one.log))
             new = one if len(state) == 1 else put(new, k, one)
         return self._trimmed(new), reports.with_members(alone)
 
