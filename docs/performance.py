@@ -30,7 +30,15 @@ BENCHES = ("step", "memory", "scale", "mpi", "fleet", "import")
 SIZED = ("step", "scale")  # take --size
 MEMORY_SIZES = (10_000, 40_000)
 LAWS = ("gradient", "sensitivity")
-KEYS = ("nodes", "dimension", "law", "c1", "gain")  # first columns of a table: what a row is of
+KEYS = (
+    "nodes",
+    "unknowns",
+    "ends",
+    "dimension",
+    "law",
+    "c1",
+    "gain",
+)  # first columns of a table: what a row is of
 PER_UNKNOWN = "kB per unknown"  # columns whose name has this are drawn as memory
 MARKERS = "osD^vP*X"
 

@@ -230,6 +230,8 @@ def rods(
         for row, check in _timed(given, min(runs, 2) if large else runs, first, auto):
             rows.append(row)
             checks += [check] if check is not None else []
+    if not rows:
+        return Outcome()
     columns = ("nodes", "unknowns", "ends", "law", "median", "mean", f"over {COMMIT}", "bound")
     title = f"One sample over one forward step, the first {first} samples"
     return Outcome(tables=[Table(title, columns, rows)], checks=checks, notes=NOTES)
