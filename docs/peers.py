@@ -2,7 +2,8 @@
 
 Runs `livepde bench peers` for each problem, keeps what it prints as JSON in docs/peers/, and puts
 all that is there into the page, between two of its headings. `--draw` measures nothing: so files of
-other runs can be added by hand, as `livepde bench peers --only rod --seeds 16 --json > docs/peers/rod.json`.
+other runs can be added by hand, as
+`livepde bench peers --only rod --seeds 16 --json > docs/peers/rod.json`.
 """
 
 from __future__ import annotations
