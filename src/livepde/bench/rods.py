@@ -221,13 +221,13 @@ def rods(
     runs, first
         How often each is run, and how many samples a run has.
     auto
-        Whether `AutoLaw` is timed, too.
+        Whether `AutoLaw` is timed, too; on a square, where a run takes minutes, it is not.
     """
     rows: list[Row] = []
     checks: list[Check] = []
     for given in only:
         large = given.nodes >= SQUARE
-        for row, check in _timed(given, min(runs, 2) if large else runs, first, auto):
+        for row, check in _timed(given, min(runs, 2) if large else runs, first, auto and not large):
             rows.append(row)
             checks += [check] if check is not None else []
     if not rows:
