@@ -23,11 +23,10 @@ from livepde.bench.peers.filters import ensemble, unscented
 from livepde.bench.peers.horizon import moving_horizon
 from livepde.bench.peers.network import network
 from livepde.bench.problems import PROBLEMS as ALL
-from livepde.bench.problems import Data, Problem
+from livepde.bench.problems import Problem
 from livepde.bench.problems.rod import ROD, ROD_SOURCE
 from livepde.bench.scoring import Contender, Found, Score, scored
 from livepde.errors import LivepdeError
-from livepde.laws import GradientLaw
 from livepde.progress import watched
 from livepde.runs.outcome import Check, Outcome, Table
 
@@ -81,19 +80,15 @@ PEERS: dict[str, Peer] = {
 """Row -> peer. Those as arrays are this project's own lines, as a user would write them."""
 
 
-def _gradient(data: Data) -> Score:
-    """Run the gradient law as it tunes itself, wherever it accepts the sensors."""
-    return accuracy.run_law(data, data.observation, GradientLaw(gain="auto"))
-
-
-OURS: dict[str, Contender] = {
-    **{
-        row: accuracy.ROWS[row]
-        for row in ("prior", "sensitivity", "sensitivity, replay", "sensitivity, auto")
-    },
-    "gradient, auto": _gradient,
-    **{row: accuracy.ROWS[row] for row in (accuracy.ALL_DATA, accuracy.EACH_SAMPLE)},
-}
+OURS = (
+    "prior",
+    "sensitivity",
+    "sensitivity, replay",
+    "sensitivity, auto",
+    "gradient, auto",
+    accuracy.ALL_DATA,
+    accuracy.EACH_SAMPLE,
+)
 ROWS = (*OURS, *PEERS)
 LEVEL = 0.01
 MINE = "sensitivity"  # the row of which the promises below are checked
@@ -139,7 +134,7 @@ def run_row(problem: Problem, level: float | None, seed: int, row: str) -> Score
         for package in peer.packages if peer is not None else ():
             __import__(package)
         before = _peak(reset=True)
-        score = scored(OURS[row] if peer is None else peer.run, data)
+        score = scored(accuracy.ROWS[row] if peer is None else peer.run, data)
     return None if score is None else replace(score, megabytes=_peak() - before)
 
 
