@@ -192,6 +192,8 @@ def peers(
 def _relative(found: Found, at: tuple[str, float | None], row: str) -> list[float]:
     """Return the error of a row over that of the prior, for each data set that has one."""
     scores, priors = found.get((*at, row), []), found.get((*at, "prior"), [])
+    if not scores:
+        return []
     pairs = zip(scores, priors, strict=True)
     shares = [score.error / prior.error for score, prior in pairs]
     return [share for share in shares if math.isfinite(share)]
