@@ -13,6 +13,7 @@ from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.coupled import blocks
 from livepde.laws.coupled.bilinear import BilinearSolver
+from livepde.laws.coupled import StageProblem
 from livepde.laws.coupled.blocks import BlockJacobian, BlockSolver
 from livepde.laws.metrics import ConstantMetric
 from livepde.linalg import choice
@@ -148,7 +149,7 @@ def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
     c = np.concatenate([u, model.initial_parameter(0.5)])
     metric = ConstantMetric(model, gain, 0.0).stage(c[model.X.dim :], 0.05, gain, 0.0)
     u_alpha = stage.terms.forms.split.R @ u
-    data = stage.solver.data(c, 0.05, Moment(0.05), u_alpha, metric)
+    data = stage.solver.data(StageProblem(c, 0.05, Moment(0.05), u_alpha, metric))
     return stage.solver, data, c
 
 

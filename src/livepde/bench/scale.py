@@ -29,7 +29,7 @@ from livepde.errors import ConfigurationError
 from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
-from livepde.laws.coupled import Metric, StageForms, StageTerms
+from livepde.laws.coupled import Metric, StageForms, StageProblem, StageTerms
 from livepde.laws.coupled.blocks import BlockSolver
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
@@ -339,7 +339,7 @@ def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, s
     u = model.initial(_bump)
     c = np.concatenate([u, model.initial_parameter(0.5)])
     metric = Metric(1.0 / (gain * STEP), 0.0, np.zeros(model.Q.dim))
-    data = blocks.data(c, STEP, Moment(STEP), split.project(u), metric)
+    data = blocks.data(StageProblem(c, STEP, Moment(STEP), split.project(u), metric))
     at = blocks.evaluate(data, c)
     _, count = blocks.factor(data, at).iterate(at.residual, TOLERANCE)
     return count, (blocks.engines["S"], blocks.engines["C"])
