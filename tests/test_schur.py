@@ -11,9 +11,8 @@ import livepde as lp
 from livepde.bench import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
-from livepde.laws.coupled import blocks
+from livepde.laws.coupled import StageProblem, blocks
 from livepde.laws.coupled.bilinear import BilinearSolver
-from livepde.laws.coupled import StageProblem
 from livepde.laws.coupled.blocks import BlockJacobian, BlockSolver
 from livepde.laws.metrics import ConstantMetric
 from livepde.linalg import choice
@@ -262,10 +261,10 @@ def test_a_jump_of_the_process_renews_the_factors(stream):
     model, sensors, samples, fresh = stream
     identifier = fresh()
     _, before = settled(model, sensors, samples[:20], identifier)
-    assert sum(before[-5:]) == 0
+    assert sum(before[-10:]) <= 1  # when the patience with one is over
     jumped = [(t, 4.0 * z) for t, z in samples[20:]]
     estimates, after = settled(model, sensors, jumped, identifier)
-    assert sum(after) > 0
+    assert after[0] > 0
     assert all(estimate.status.ok for estimate in estimates)
 
 

@@ -199,8 +199,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
             return state, Report(Status.of(failure), predicted)
 
         u, q = end[:n], model.latent.clipped(end[n:])
-        r, error = R(u) - u_alpha, stages.equation_error()
-        after = Transition(forms, end[n:], u - r, end[n:] - state.q, error, moment, length)
+        r, change = R(u) - u_alpha, end[n:] - state.q
+        after = Transition(forms, end[n:], u - r, change, stages.equation_error, moment, length)
         learned = work.metric.learn(state.metric, after)
         new = GradientState(
             u=u,

@@ -106,7 +106,7 @@ class GradientParts:
         """Return the excitation after a sample, from w and the estimate u."""
         if self.gate is None or self.probes is None:
             return excitation
-        seen = self.probes(np.stack([w, u], axis=1), q, moment)
+        seen = self.probes(np.array([w, u]).T, q, moment)
         return self.gate.add(excitation, seen[:, 0], seen[:, 1])
 
 

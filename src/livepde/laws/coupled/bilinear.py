@@ -125,7 +125,7 @@ class BilinearSolver(MonolithicSolver):
             (A, transposed), flux = coupling_in.at(w), products["B_in"] @ w
         driven = A @ q
         if coupling_out is not None:
-            driven = driven + coupling_out.at(u)[0] @ q
+            driven = driven + coupling_out.matrix(u) @ q
         by_r = products["r"] @ r
         Mr, mass_r = by_r[:n], by_r[n:]
         norms = terms.norms(r, Mr, mass_r, data.observed)
@@ -160,13 +160,17 @@ class _Coupling:
     """A(w) on the free coefficients, as a matrix whose data are linear in w."""
 
     pattern: Pattern
-    data: sp.csr_array
+    data: sp.csr_array | Array
 
     @classmethod
     def of(cls, form: AnyForm, terms: StageTerms) -> _Coupling:
         pattern = form.pattern("v", "q")
         kept = terms.free[pattern.rows] * terms.free_q[pattern.indices]
-        return cls(pattern, sp.csr_array(sp.diags_array(kept) @ _tensors(form)[0]))
+        return cls(pattern, compact(sp.csr_array(sp.diags_array(kept) @ _tensors(form)[0])))
+
+    def matrix(self, w: Array) -> Any:
+        """Return A(w); a small one is dense."""
+        return self.pattern.compact(self.data @ w)
 
     def at(self, w: Array) -> tuple[Any, Any]:
         """Return A(w) and its transpose; small ones are dense."""

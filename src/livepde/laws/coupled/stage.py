@@ -234,5 +234,7 @@ class CoupledStage:
             at, factor = solved.made
             self._last = (at.y, self.solver.kept(factor))
             return KeptFactor.of(data, at.y)
-        spent = kept.spent + max(solved.updates - 1, 0)
+        if solved.updates <= 1:
+            return kept
+        spent = kept.spent + solved.updates - 1
         return KeptFactor.none() if spent > self.solver.patience else replace(kept, spent=spent)
