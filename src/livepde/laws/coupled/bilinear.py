@@ -138,7 +138,8 @@ class BilinearSolver(MonolithicSolver):
         residual[n:] = change - (coupling + data.load) * terms.free_q
         first = [residual[:n], rate, driven, pull]
         second = [residual[n:], change, coupling]
-        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
+        accuracy = self.accuracy(data)
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
         return StageIterate(
             y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r
         )

@@ -49,6 +49,7 @@ LARGE = 4000  # unknowns u and q together, from which a matrix that is not bande
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
 CEILING = 5e-3  # of a predicted stage: one more update costs as much as a forward step
+CARRIED = 3e-2  # relative accuracy of r in one, for the same reason
 RESOLVED = 1e-10  # of u and q: smaller updates by GMRES are as good as none
 REFRESH = 0.5  # of the residual: an update costs a twentieth of new factors
 SPENT = 12  # updates and iterations: about what new factors cost
@@ -87,6 +88,10 @@ class BlockSolver(StageSolver):
     @property
     def ceiling(self) -> float:
         return CEILING
+
+    @property
+    def carried(self) -> float:
+        return CARRIED
 
     def kept(self, factor: Factor) -> Factor:
         return factor.approximate if isinstance(factor, BlockJacobian) else factor

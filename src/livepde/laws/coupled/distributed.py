@@ -116,7 +116,8 @@ class DistributedSolver(StageSolver):
         residual[:n] = (rate + inside.flux + driven + pull - data.source) * terms.free
         residual[n:] = (change - data.load - coupling) * terms.free_q
         first, second = [residual[:n], rate, driven, pull], [residual[n:], change, coupling]
-        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
+        accuracy = self.accuracy(data)
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
         w = y[:n] - r
         return StageIterate(
             y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r

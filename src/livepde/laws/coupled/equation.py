@@ -248,6 +248,7 @@ class StageTerms:
         second: list[Array],
         X: float,
         theta: float,
+        accuracy: float,
     ) -> tuple[float, bool, tuple[float, float]]:
         """Return the relative size of a residual, whether it resolves r, and the scales of both.
 
@@ -257,6 +258,8 @@ class StageTerms:
             Residual and changing terms of the two lines.
         X
             ||r||_X^2.
+        accuracy
+            Of r, relative, as far as it is above the floor.
         """
         state, *terms = self.duals(first, self.parts[0])
         other, *terms_q = self.duals(second, self.parts[1])
@@ -268,7 +271,6 @@ class StageTerms:
         # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
         least = 1.0 / data.problem.h + theta
         r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
-        accuracy = RESOLVED if data.problem.left is None else CARRIED
         return max(own, own_q), state <= accuracy * r * least or not self.observes, scales
 
     def given(self, problem: StageProblem, source: Array, inside: Inside | None) -> StageData:
@@ -407,6 +409,15 @@ class StageSolver(ABC):
         """Relative residual up to which a predicted stage is not solved further (`Newton`)."""
         return 0.0
 
+    @property
+    def carried(self) -> float:
+        """Relative accuracy of r where the next stage makes up for what is left."""
+        return CARRIED
+
+    def accuracy(self, data: StageData) -> float:
+        """Return the relative accuracy of r in a solved stage."""
+        return RESOLVED if data.problem.left is None else self.carried
+
     @abstractmethod
     def factor(self, data: StageData, at: StageIterate) -> Factor:
         """Return the factorised Jacobian at a point."""
@@ -465,7 +476,8 @@ class StageSolver(ABC):
         residual[n:] = (change - data.load - coupling) * terms.free_q
         first = [residual[:n], rate, driven, pull]
         second = [residual[n:], change, coupling]
-        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
+        accuracy = self.accuracy(data)
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
         return StageIterate(
             y, residual, size, resolved, scales, w, r, A_in, theta, norms, Mr, mass_r
         )
