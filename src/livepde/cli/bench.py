@@ -172,6 +172,34 @@ def scale(
 
 
 @bench.command()
+def auto(
+    size: Annotated[
+        list[int] | None,
+        typer.Option(min=25, help="Nodes of the square, default 64 to 10000. Repeat for more."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise.")] = 5,
+    quick: Annotated[
+        bool, typer.Option(help="Only the smallest square, one data set, and the smallest cost.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check what the gradient law that tunes itself promises: its errors and its cost.
+
+    Example:  livepde bench auto --quick
+    """
+    from livepde.bench.auto import COSTS, SIZES
+    from livepde.bench.auto import auto as benchmark
+
+    command = ["livepde", "bench", "auto"]
+    command += [word for nodes in size or () for word in ("--size", str(nodes))]
+    if quick:
+        report_outcome(benchmark(SIZES[:1], 1, (min(COSTS),)), [*command, "--quick"], as_json)
+        return
+    command += ["--seeds", str(seeds)]
+    report_outcome(benchmark(size or SIZES, seeds, tuple(COSTS)), command, as_json)
+
+
+@bench.command()
 def mpi(
     size: Annotated[int, typer.Option(min=2500, help="Number of nodes.")] = 1_000_000,
     ranks: Annotated[

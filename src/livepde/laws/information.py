@@ -312,7 +312,7 @@ class InformationMetric(MetricRule[Information]):
     def learn(self, state: Information, after: Transition) -> Information:
         Q, h = self.model.Q, after.length
         A = after.forms.A_in.data("v", "q", after.moment, u=after.w, q=after.q)
-        gain = self.normal(after.forms).gain(A, after.q, after.error, self.probes)
+        gain = self.normal(after.forms).gain(A, after.q, after.error(), self.probes)
         rough = gain.matrix[:, self.on_diagonal] @ (1.0 / self.diagonal)
         force = np.stack([gain.force, Q.riesz(gain.force)])
         change = force - state.force if state.samples else math.sqrt(2.0) * force
