@@ -74,13 +74,16 @@ class MonolithicSolver(StageSolver):
     def _fixed(self, data: StageData) -> Array:
         """Return the data that depend on the step and the metric's scale only."""
         key = (data.h, data.metric.scale, data.metric.drift)
-        if self._constant is None or self._constant[0] != key:
+        # Copies of an identifier share this, maybe in threads: the pair is read once, and replaced
+        # as a whole, so that the data are those of their key.
+        known = self._constant
+        if known is None or known[0] != key:
             parts = self._parts
             found = parts["M"] / data.h + data.metric.scale * parts["G"] + parts["rest"]
             if "GK" in parts:
                 found = found - data.metric.drift * parts["GK"]
-            self._constant = (key, found)
-        return self._constant[1]
+            self._constant = known = (key, found)
+        return known[1]
 
     @cached_property
     def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:

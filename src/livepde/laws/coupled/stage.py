@@ -145,6 +145,8 @@ class CoupledStage:
         # What a stage leaves would be learned from where the metric is that of the information.
         least = self.solver.ceiling if terms.memory is None else 0.0
         self.newton = replace(newton, ceiling=max(newton.ceiling, least))
+        # The last factor and where it was made. Copies of an identifier share it, maybe in threads:
+        # the pair is read once and replaced as a whole, and a factor made again is the same.
         self._last: tuple[Array, Factor] | None = None
 
     def solve(
