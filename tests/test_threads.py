@@ -28,12 +28,12 @@ from skfem import ElementLineP1, ElementTriP1, MeshTri
 import livepde as lp
 from livepde import laws
 
-TRIALS = int(os.environ.get("LIVEPDE_THREAD_TRIALS", "2"))
+TRIALS = int(os.environ.get("LIVEPDE_THREAD_TRIALS", "1"))
 SWITCH = 1e-6  # seconds until another thread may run: the default of 5e-3 hides most races
 SLEEPS = 0.02  # share of the calls and returns at which a thread sleeps
 PATIENCE = 100.0  # seconds after which a thread counts as stuck
 PERIOD = 0.1  # from one sample to the next
-BEFORE = 4  # samples that an identifier takes before it is copied
+BEFORE = 2  # samples that an identifier takes before it is copied
 
 Numbers = list[tuple[Any, ...]]
 
@@ -153,7 +153,7 @@ class Case:
     model: Callable[[], lp.Model] = rod
     sensors: Callable[[], lp.Observation] = lambda: lp.Points([0.25, 0.5, 0.75], noise=0.05)
     missing: float = 0.0
-    samples: int = 12
+    samples: int = 6
 
     def identifier(self, model: lp.Model) -> lp.Identifier:
         return lp.Identifier(model, self.sensors(), self.law, u0=0.0, halvings=2)
@@ -187,9 +187,9 @@ CASES = {
     "gradient, positive unknown": Case(lp.GradientLaw(gain=10.0), positive_rod, inner),
     "gradient, inputs": Case(lp.GradientLaw(gain=10.0), powered_rod, averages, missing=0.3),
     "gradient, smoothed": Case(lp.GradientLaw(gain=10.0), field_rod, smoothed, missing=0.02),
-    "gradient, square": Case(lp.GradientLaw(gain=10.0), square, inner),
+    "gradient, square": Case(lp.GradientLaw(gain=10.0), square, inner, samples=10),
     "gradient, nonlinear plate": Case(lp.GradientLaw(gain=10.0), plate, inner),
-    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=5),
+    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=4),
     "auto gain": Case(lp.GradientLaw(gain="auto"), field_rod, inner),
     "auto gain, chosen smoothing": Case(
         lp.GradientLaw(gain="auto"), field_rod, lp.Full, missing=0.01
@@ -198,20 +198,20 @@ CASES = {
     "auto gain, square": Case(lp.GradientLaw(gain="auto"), square, inner),
     "Baumeister": Case(lp.BaumeisterLaw(gain=10.0), field_rod, lp.Full),
     "Kuegler": Case(lp.KueglerLaw(gain=10.0), nonlinear_rod, inner),
-    "sensitivity": Case(lp.SensitivityLaw(), samples=30),
+    "sensitivity": Case(lp.SensitivityLaw(), samples=15),
     "sensitivity, inputs": Case(
-        lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=30
+        lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=15
     ),
-    "sensitivity, nonlinear": Case(lp.SensitivityLaw(), nonlinear_rod, samples=30),
-    "sensitivity, positive unknown": Case(lp.SensitivityLaw(), positive_rod, samples=30),
+    "sensitivity, nonlinear": Case(lp.SensitivityLaw(), nonlinear_rod, samples=15),
+    "sensitivity, positive unknown": Case(lp.SensitivityLaw(), positive_rod, samples=15),
     "sensitivity, moving sensor": Case(lp.SensitivityLaw(), powered_rod, probe),
-    "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages),
+    "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages, samples=12),
     "sensitivity, large square": Case(
-        lp.SensitivityLaw(modes=3), large_square, averages, samples=5
+        lp.SensitivityLaw(modes=3), large_square, averages, samples=4
     ),
-    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=30),
-    "guards and jumps": Case(GUARDED, powered_rod, samples=30),
-    "bank": Case(lp.AutoLaw(), powered_rod),
+    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=15),
+    "guards and jumps": Case(GUARDED, powered_rod, samples=15),
+    "bank": Case(lp.AutoLaw(), powered_rod, samples=10),
 }
 
 
