@@ -183,13 +183,13 @@ REPLAYING = lp.SensitivityLaw(replay=lp.Replay(first=4))
 CASES = {
     "gradient": Case(lp.GradientLaw(gain=10.0), rod, inner),
     "gradient, missing readings": Case(lp.GradientLaw(gain=10.0), rod, inner, missing=0.02),
-    "gradient, nonlinear": Case(lp.GradientLaw(gain=10.0), nonlinear_rod, inner),
-    "gradient, positive unknown": Case(lp.GradientLaw(gain=10.0), positive_rod, inner),
+    "gradient, nonlinear": Case(lp.GradientLaw(gain=10.0), nonlinear_rod, inner, samples=4),
+    "gradient, positive unknown": Case(lp.GradientLaw(gain=10.0), positive_rod, inner, samples=4),
     "gradient, inputs": Case(lp.GradientLaw(gain=10.0), powered_rod, averages, missing=0.3),
     "gradient, smoothed": Case(lp.GradientLaw(gain=10.0), field_rod, smoothed, missing=0.02),
     "gradient, square": Case(lp.GradientLaw(gain=10.0), square, inner, samples=10),
     "gradient, nonlinear plate": Case(lp.GradientLaw(gain=10.0), plate, inner),
-    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=4),
+    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=3),
     "auto gain": Case(lp.GradientLaw(gain="auto"), field_rod, inner),
     "auto gain, chosen smoothing": Case(
         lp.GradientLaw(gain="auto"), field_rod, lp.Full, missing=0.01
@@ -197,7 +197,7 @@ CASES = {
     "auto gain, inputs": Case(lp.GradientLaw(gain="auto"), powered_field, inner, missing=0.02),
     "auto gain, square": Case(lp.GradientLaw(gain="auto"), square, inner),
     "Baumeister": Case(lp.BaumeisterLaw(gain=10.0), field_rod, lp.Full),
-    "Kuegler": Case(lp.KueglerLaw(gain=10.0), nonlinear_rod, inner),
+    "Kuegler": Case(lp.KueglerLaw(gain=10.0), nonlinear_rod, inner, samples=4),
     "sensitivity": Case(lp.SensitivityLaw(), samples=15),
     "sensitivity, inputs": Case(
         lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=15
@@ -207,7 +207,7 @@ CASES = {
     "sensitivity, moving sensor": Case(lp.SensitivityLaw(), powered_rod, probe),
     "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages, samples=12),
     "sensitivity, large square": Case(
-        lp.SensitivityLaw(modes=3), large_square, averages, samples=4
+        lp.SensitivityLaw(modes=3), large_square, averages, samples=3
     ),
     "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=15),
     "guards and jumps": Case(GUARDED, powered_rod, samples=15),
