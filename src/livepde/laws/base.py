@@ -245,7 +245,8 @@ class Law(ABC, Generic[Work, State]):
     """An update law: frozen configuration; what evolves is an explicit state value.
 
     A law of your own is one class with these four methods. The state is a frozen dataclass of
-    arrays and numbers: saving it is checkpointing.
+    arrays and numbers: saving it is checkpointing. Identifiers share a law, and copies of an
+    identifier share its work, maybe in threads: neither may change once it is made.
     """
 
     @abstractmethod

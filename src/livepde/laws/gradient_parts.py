@@ -30,7 +30,7 @@ from livepde.laws.observed_part import (
     SelfChosenSmoothing,
 )
 from livepde.laws.smoothing import smooths
-from livepde.linalg import Array, Pattern
+from livepde.linalg import Array, Memo, Pattern
 from livepde.stepping import Newton
 
 __all__ = ["GradientParts", "StageSequence", "constant_parts", "tuned_parts"]
@@ -69,26 +69,22 @@ class GradientParts:
     probes: Probes | None = None
     memory: Pattern | None = None
     at_estimate: bool = False
-    _stages: dict[bytes, CoupledStage] = field(default_factory=dict)
+    _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
     def stage(self, present: Array) -> CoupledStage:
         """Return the coupled stage for the sensors present."""
-        key = present.tobytes()
-        stage = self._stages.get(key)
-        if stage is None:
-            if len(self._stages) >= MOST_STAGES:
-                self._stages.clear()
-            forms = StageForms(
-                self.problem.model,
-                self.problem.observed.split(present),
-                self.M_op,
-                self.N_op,
-                self.nu,
-                self.at_estimate,
-            )
-            terms = StageTerms(forms, self.damping, self.memory)
-            stage = self._stages[key] = CoupledStage(terms, self.newton)
-        return stage
+        return self._stages.get(present.tobytes(), lambda: self._made(present))
+
+    def _made(self, present: Array) -> CoupledStage:
+        forms = StageForms(
+            self.problem.model,
+            self.problem.observed.split(present),
+            self.M_op,
+            self.N_op,
+            self.nu,
+            self.at_estimate,
+        )
+        return CoupledStage(StageTerms(forms, self.damping, self.memory), self.newton)
 
     def prepared(self) -> GradientParts:
         """Return the same with the stage of all sensors prepared, before the first sample comes."""

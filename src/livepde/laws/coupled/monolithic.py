@@ -75,13 +75,16 @@ class MonolithicSolver(StageSolver):
         """Return the data that depend on the step and the metric's scale only."""
         h, metric = data.problem.h, data.problem.metric
         key = (h, metric.scale, metric.drift)
-        if self._constant is None or self._constant[0] != key:
+        # Copies of an identifier share this, maybe in threads: the pair is read once, and replaced
+        # as a whole, so that the data are those of their key.
+        known = self._constant
+        if known is None or known[0] != key:
             parts = self._parts
             found = parts["M"] / h + metric.scale * parts["G"] + parts["rest"]
             if "GK" in parts:
                 found = found - metric.drift * parts["GK"]
-            self._constant = (key, found)
-        return self._constant[1]
+            self._constant = known = (key, found)
+        return known[1]
 
     @cached_property
     def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:

@@ -132,6 +132,8 @@ class CoupledStage:
         least = 0.0 if learns else self.solver.ceiling
         self.newton = replace(newton, ceiling=max(newton.ceiling, least))
         self.carries = newton.share > 0.0 and not learns
+        # The last factor and where it was made. Copies of an identifier share it, maybe in threads:
+        # the pair is read once and replaced as a whole, and a factor made again is the same.
         self._last: tuple[Array, Factor] | None = None
 
     def solve(
