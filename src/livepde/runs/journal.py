@@ -26,10 +26,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from filelock import FileLock
 
 from livepde.errors import RunError
@@ -37,6 +36,9 @@ from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
 from livepde.runs.database import AGAIN, in_memory, locked, reader, released, sound, told, writer
 from livepde.runs.packing import layout_from, packed, unpacked
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["Event", "Journal", "Taken"]
 
