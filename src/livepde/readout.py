@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from statistics import NormalDist
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,7 +15,6 @@ from livepde.linalg import Array
 __all__ = ["ScalarReadout", "unknown_of"]
 
 LEVEL = 0.95
-QUANTILE = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
 
 Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
 
@@ -84,13 +82,16 @@ def _ends(unknown: Any) -> Ends:
         return lambda value, std: ()
     if unknown.transform is not None:
         return lambda value, std: tuple(map(float, unknown.interval(value, std, LEVEL)))
+    from statistics import NormalDist
+
+    quantile = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
     lower, upper = map(float, unknown.bounds)
 
     def clipped(value: float, std: float) -> tuple[float, float]:
-        if not math.isfinite(value + QUANTILE * std):
+        if not math.isfinite(value + quantile * std):
             low, high = unknown.interval(value, std, LEVEL)
             return float(low), float(high)
-        low, high = value - QUANTILE * std, value + QUANTILE * std
+        low, high = value - quantile * std, value + quantile * std
         return min(max(low, lower), upper), min(max(high, lower), upper)
 
     return clipped

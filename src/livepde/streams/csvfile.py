@@ -102,9 +102,7 @@ def read_csv(
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
     if not rows:
         raise DataError(f"{path}: holds no rows beside its header.")
-    times, dates = read_times(
-        cells[clock.name], clock, lambda k: f"{path}, row {rows[k]}, column"
-    )
+    times, dates = read_times(cells[clock.name], clock, lambda k: f"{path}, row {rows[k]}, column")
     decimals = {name: column.decimal for column in columns.values() for name in column.names}
 
     def numbers(name: str, use: Any) -> Array:
