@@ -1,6 +1,8 @@
 """Estimates that are read later, and results that keep numbers instead of objects."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -8,7 +10,9 @@ import pytest
 import livepde as lp
 from livepde.laws import Belief
 from livepde.models import heat
+from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import Record, RecordArrays, Snapshot
+from livepde.result import interval_ends
 
 
 def rod(unknown=None, law=None, withheld=None):
@@ -66,7 +70,62 @@ def test_what_is_not_read_is_not_computed(monkeypatch):
     taken = list(samples(6))
     identifier.step(*taken[0])
     monkeypatch.setattr(Belief, "__init__", counted)
-    axes = {"time", "snapshot"}
+    kept = [identifier.step(*sample) for sample in taken[1:]]
+    assert not made
+    assert [len(estimate.innovation) for estimate in kept] == [5] * 5
+    assert kept[0].parameters["alpha"][0] == kept[0].q[0]
+    assert len(made) == 1
+
+
+def test_an_unread_estimate_holds_no_factor_of_the_stage():
+    """What it keeps until it is read is of the size of the belief that it gives then."""
+    identifier = rod()
+    for sample in samples(5):
+        estimate = identifier.step(*sample)
+    cells = vars(estimate)["_read"].__closure__
+    held = [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, np.ndarray)]
+    belief = estimate.belief
+    given = [belief.q, belief.u, belief.q_factor, belief.u_factor]
+    assert 0 < sum(x.nbytes for x in held) <= 2 * sum(x.nbytes for x in given)
+    assert not hasattr(estimate, "_read")
+
+
+def test_an_estimate_is_copied_with_its_belief():
+    identifier = rod()
+    for sample in samples(3):
+        estimate = identifier.step(*sample)
+    other = copy.deepcopy(estimate)
+    assert other.belief is not estimate.belief
+    np.testing.assert_array_equal(other.q_std, estimate.q_std)
+    belief = pickle.loads(pickle.dumps(estimate.belief))
+    np.testing.assert_array_equal(belief.u, estimate.u)
+    with pytest.raises(AttributeError, match="no attribute 'velocity'"):
+        estimate.velocity  # noqa: B018
+
+
+@pytest.mark.parametrize("unknown", UNKNOWNS)
+@pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.AutoLaw(), lp.GradientLaw()])
+def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
+    """To the bit: value, deviation, ends of the interval and share left, label by label."""
+    identifier = rod(unknown, law)
+    readout = ScalarReadout(identifier.model.parameter_space)
+    for sample in samples(20):
+        estimate = identifier.step(*sample)
+        space = estimate.space
+        left = estimate.belief.left([*space.labels.values()])
+        wanted = []
+        for (label, (value, std)), share in zip(estimate.parameters.items(), left, strict=True):
+            ends = interval_ends(label, unknown_of(space, label), value, std)
+            wanted += [value, std, *map(float, ends.values()), float(share)]
+        np.testing.assert_array_equal(readout(estimate.belief), wanted)
+
+
+def test_a_result_keeps_little_more_than_its_numbers():
+    identifier = rod(withheld=lp.Points({"T_0": 0.4}))
+    count = 3000
+    result = identifier.run(samples(count, ["T_0"]))
+    records, axes = result.records, {"time", "snapshot"}
+    data = result.to_xarray()
     kept = [data[name] for name in data if axes & set(data[name].dims)]
     needed = 8 * count + sum(values.nbytes for values in kept)
     assert data.sizes["snapshot"] == data.sizes["time"] == count

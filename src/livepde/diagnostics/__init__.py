@@ -1,6 +1,58 @@
 """Checks that a user can run on objects of his own, and the paper's theory made computable."""
 
-import lazy_loader
+from __future__ import annotations
 
-# What __init__.pyi names is loaded on first use.
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from livepde.diagnostics.bounds import Errors, TwinTracker, bounds, conditions
+from livepde.diagnostics.constants import Part, Spaces, constants
+from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
+from livepde.diagnostics.identifiability import Direction, Identifiability, Known, identifiability
+from livepde.diagnostics.law import check_law
+from livepde.diagnostics.links import Interpolation, Link, interpolation, link
+from livepde.diagnostics.model import check_model
+from livepde.diagnostics.observation import check_observation
+from livepde.diagnostics.report import CheckLine, CheckReport
+from livepde.diagnostics.space import check_space
+from livepde.diagnostics.stopping import (
+    OnlineStopping,
+    StoppingState,
+    noise_size,
+    reconstruction_matrix,
+    stopping_time,
+)
+from livepde.diagnostics.theory import OnlineTracker, Sheet, TheoryReport, theory_report
+
+__all__ = [
+    "CheckLine",
+    "CheckReport",
+    "Direction",
+    "Errors",
+    "Excitation",
+    "ExcitationState",
+    "Identifiability",
+    "Interpolation",
+    "Known",
+    "Link",
+    "OnlineStopping",
+    "OnlineTracker",
+    "Part",
+    "Sheet",
+    "Spaces",
+    "Spectrum",
+    "StoppingState",
+    "TheoryReport",
+    "TwinTracker",
+    "bounds",
+    "check_law",
+    "check_model",
+    "check_observation",
+    "check_space",
+    "conditions",
+    "constants",
+    "identifiability",
+    "interpolation",
+    "link",
+    "noise_size",
+    "reconstruction_matrix",
+    "stopping_time",
+    "theory_report",
+]

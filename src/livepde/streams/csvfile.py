@@ -215,7 +215,7 @@ def _cells(
     Refuses a name that stands twice, more fields than names, and a quote that does not end.
     """
     with path.open(newline="", encoding=encoding) as file:
-        lines = csv.reader(chain(file, [END]), delimiter=separator, skipinitialspace=True)
+        lines = csv.reader(chain(file, [f"{END}\n"]), delimiter=separator, skipinitialspace=True)
         numbered = _whole(lines)
         header = next((row for _, row in numbered if row), None)
         if header is None:
