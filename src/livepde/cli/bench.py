@@ -88,6 +88,21 @@ def startup(
 
 
 @bench.command()
+def overhead(
+    rounds: Annotated[int, typer.Option(min=1, help="Fresh processes, and pairs of runs.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """Time what the command line adds: to the first estimate, and to each sample of a rod.
+
+    Example:  livepde bench overhead --json
+    """
+    from livepde.bench.overhead import overhead as benchmark
+
+    command = ["livepde", "bench", "overhead", "--rounds", str(rounds)]
+    report_outcome(benchmark(rounds), command, as_json)
+
+
+@bench.command()
 def fleet(
     members: Annotated[int, typer.Option(min=1, help="How many rods step.")] = 1000,
     runs: Annotated[

@@ -279,5 +279,14 @@ class Law(ABC, Generic[Work, State]):
     def belief(self, work: Work, state: State) -> Belief:
         """Return estimates and, if the law has them, covariances."""
 
+    def reader(self, work: Work, state: State) -> Callable[[], Belief]:
+        """Return a function that gives `belief` when an estimate is read; here it is found at once.
+
+        Estimates are kept, and with them what such a function holds: a law overrides this where
+        that is not much more than the belief itself, and never changes afterwards.
+        """
+        belief = self.belief(work, state)
+        return lambda: belief
+
 
 AnyLaw = Law[Any, Any]

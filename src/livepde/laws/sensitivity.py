@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -520,16 +521,19 @@ class SensitivityLaw(Law[Filter, SensitivityState]):
         return new, Report(Status(), predicted, steps, notes)
 
     def belief(self, work: Filter, state: SensitivityState) -> Belief:
-        now = state.now
-        return Belief(
-            work.bounded(work.latent(now)),
-            now.u + now.du,
-            work.Phi @ now.C,
-            now.U,
-            now.consistency.inflation,
-            work.Phi,
-            work.rest(now.age),
-        )
+        return self.reader(work, state)()
+
+    def reader(self, work: Filter, state: SensitivityState) -> Callable[[], Belief]:
+        now = state.now  # not held: it has factors of the last stage
+        q, da, u, du, U, C = now.q, now.da, now.u, now.du, now.U, now.C
+        consistency, age = now.consistency, now.age
+
+        def read() -> Belief:
+            latent = work.bounded(q + work.Phi @ da)
+            spread = consistency.inflation
+            return Belief(latent, u + du, work.Phi @ C, U, spread, work.Phi, work.rest(age))
+
+        return read
 
 
 def _missed(work: Filter, state: SensitivityState) -> Array:
