@@ -30,7 +30,15 @@ BENCHES = ("step", "memory", "scale", "mpi", "fleet", "import")
 SIZED = ("step", "scale")  # take --size
 MEMORY_SIZES = (10_000, 40_000)
 LAWS = ("gradient", "sensitivity")
-KEYS = ("nodes", "dimension", "law", "c1", "gain")  # first columns of a table: what a row is of
+KEYS = (
+    "nodes",
+    "unknowns",
+    "ends",
+    "dimension",
+    "law",
+    "c1",
+    "gain",
+)  # first columns of a table: what a row is of
 PER_UNKNOWN = "kB per unknown"  # columns whose name has this are drawn as memory
 MARKERS = "osD^vP*X"
 
@@ -51,6 +59,16 @@ The page, its figures and the numbers behind them (`docs/performance/*.json`) ar
 
 *Solid: the median of the pairs. Dashed, in the same colour: what was promised. The forward step is
 an implicit Euler step of the same model with a known parameter, its matrix factorised once.*
+
+On rods, and on a square of 10 000 nodes, `livepde bench step` times the laws for a few numbers from
+the first sample on: medians, and beside them means, which have the first sample and replays in
+them. Rows with `source` have constant ends and a constant source, as a forward step of little work;
+rows with `channels` read the temperatures of both ends from the stream, as the rod of the README.
+The *lean reference* is the same filter in thirty lines of NumPy and LAPACK
+(`livepde/bench/lean.py`), without safeguards, missing samples, bounds or substeps: it has the same
+numbers, and a test says so. Bounds mean forward steps of commit 51ef98c, so that a faster forward
+step does not make them harder; `python benchmarks/earlier.py` steps that commit and today's sources
+in turns, in a process each, and prints today's forward step over that one's.
 """
 MEMORY = """\
 ![Memory per state unknown](performance/memory.png)
@@ -70,11 +88,11 @@ def measure(names: Iterable[str], sizes: Sequence[int]) -> None:
         else:
             chosen = [word for size in sizes for word in ("--size", str(size))]
             command = ["bench", name, *(chosen if name in SIZED else []), "--json"]
-            content = _printed(command)
+            content = printed(command)
         (MEASURED / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
 
 
-def _printed(command: Sequence[str]) -> dict[str, Any]:
+def printed(command: Sequence[str]) -> dict[str, Any]:
     """Return what a command of livepde prints; a check that fails is none of our business."""
     words = [sys.executable, "-m", "livepde", *command]
     done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False)

@@ -13,6 +13,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.cases import load
 from livepde.cases.template import write_template
+from livepde.laws import MemberReports
 from livepde.laws.guess import GUESSED, PATIENCE, first_guess
 from livepde.stepping import ForwardStage
 
@@ -249,14 +250,18 @@ def test_missing_samples_are_no_error():
 
 
 def test_a_member_that_fails_leaves_the_others_to_go_on(monkeypatch: pytest.MonkeyPatch):
-    step = lp.SensitivityLaw.step
+    step = lp.SensitivityLaw.step_members
 
-    def fails(self: Any, work: Any, state: Any, interval: Any) -> Any:
-        if work.moves and interval.t1 > 3.0:
-            return state, lp.Report(lp.Status("not_finite", "the prediction is not finite"), 0.0)
-        return step(self, work, state, interval)
+    def fails(self: Any, work: Any, state: Any, span: Any) -> Any:
+        new, reports = step(self, work, state, span)
+        drifts = work.filter.drifts(state.now.member) > 0.0
+        if span.t1 <= 3.0 or not drifts.any():
+            return new, reports
+        status = lp.Status("not_finite", "the prediction is not finite")
+        failed = {int(k): lp.Report(status, np.zeros(3)) for k in np.flatnonzero(drifts)}
+        return new, reports.with_members(failed)
 
-    monkeypatch.setattr(lp.SensitivityLaw, "step", fails)
+    monkeypatch.setattr(lp.SensitivityLaw, "step_members", fails)
     found = run(build(), still()[:100])
     assert found[-1].notes["awake"] <= 2
     assert abs(found[-1].parameters["a"][0] - 0.3) < 0.01
@@ -267,11 +272,13 @@ def test_a_step_that_fails_for_all_changes_nothing(monkeypatch: pytest.MonkeyPat
     run(identifier, still()[:20])
     before = identifier.latent_belief().q
 
-    def fails(self: Any, work: Any, state: Any, interval: Any) -> Any:
-        return state, lp.Report(lp.Status("singular", "no factor"), np.zeros(3))
+    def fails(self: Any, work: Any, state: Any, span: Any) -> Any:
+        count = len(state)
+        statuses = (lp.Status("singular", "no factor"),) * count
+        return state, MemberReports(statuses, np.zeros((count, 3)), np.zeros(count, dtype=int))
 
     with monkeypatch.context() as patched:
-        patched.setattr(lp.SensitivityLaw, "step", fails)
+        patched.setattr(lp.SensitivityLaw, "step_members", fails)
         assert identifier.step(*still()[20]).status.code == "singular"
     np.testing.assert_array_equal(identifier.latent_belief().q, before)
     assert identifier.step(*still()[20]).status.ok

@@ -17,6 +17,7 @@ from livepde import cases
 from livepde.bench import faults, soak
 from livepde.bench.faults import breaks, broken, damage, plants, rod
 from livepde.bench.journal import journal
+from livepde.bench.overhead import overhead
 from livepde.records import Record
 
 MQTT = pytest.mark.skipif(
@@ -145,6 +146,17 @@ def test_the_journal_has_a_price(monkeypatch, tmp_path, data_dir):
     (tmp_path / "other.toml").touch()
     with pytest.raises(lp.ConfigurationError, match="soil_uniform"):
         journal(tmp_path)
+
+
+def test_the_command_line_has_a_price():
+    outcome = overhead(rounds=1, samples=60)
+    (table,) = outcome.tables
+    first, second, loop, run, ratio = (row[2] for row in table.rows)
+    assert 0.0 < first < second
+    assert 0.0 < loop < run
+    assert ratio == pytest.approx(run / loop)
+    assert [check.value for check in outcome.checks] == [second, ratio]
+    assert [check.bound for check in outcome.checks] == [0.8, 1.4]
 
 
 def test_the_commands_print_json(monkeypatch):

@@ -141,17 +141,24 @@ def test_peers_are_given_our_forward_model(data):
 
 
 def test_promises_about_peers_are_checked():
-    def scores(error, step):
-        return [scoring.Score(error=error, step=step)]
+    def scores(error, cost):
+        return [scoring.Score(error=error, whole=cost), scoring.Score(error=3 * error, whole=cost)]
 
     found = {
-        ("rod", 0.01, table.MINE): scores(0.1, 2.0),
-        ("rod", 0.01, "DAPPER: EnKF, 50 members"): scores(0.08, 38.0),
-        ("rod", 0.01, "do-mpc: moving horizon"): [scoring.Score(note="not installed: do_mpc")],
+        ("rod", 0.01, "prior"): scores(1.0, 1.0),
+        ("rod", 0.01, table.MINE): scores(0.1, 4.0),
+        ("rod", 0.01, table.RIVAL): scores(0.1, 5.0),
+        ("rod", 0.01, "do-mpc: moving horizon"): scores(0.08, 160.0),
+        ("flow", 0.01, "prior"): scores(1.0, 1.0),
+        ("flow", 0.01, table.MINE): scores(0.2, 4.0),
+        ("flow", 0.01, table.RIVAL): scores(0.1, 3.0),
+        ("flow", 0.01, "do-mpc: moving horizon"): 2 * [scoring.Score(note="not installed")],
     }
-    error, work = table._checks(found)
+    cheaper, error, work = table._checks(found)
+    assert cheaper.name == f"rod, 1% noise: cost of '{table.MINE}' over '{table.RIVAL}'"
+    assert (cheaper.value, cheaper.bound, cheaper.ok) == (0.8, 1.0, True)
     assert (error.value, error.ok) == (pytest.approx(1.25), False)
-    assert (work.value, work.bound, work.ok) == (19.0, 20.0, False)
+    assert (work.value, work.bound, work.ok) == (40.0, 50.0, False)
 
 
 @pytest.mark.parametrize(

@@ -104,3 +104,54 @@ def test_what_a_benchmark_prints_is_kept(page, tmp_path, monkeypatch):
     assert len({row["law"] for row in page.rows_of(found)}) > 3
     with pytest.raises(SystemExit, match="no JSON"):
         page.measure(["nonsense"], [])
+
+
+# --- the page of peers ---------------------------------------------------------------------------
+
+
+def test_the_page_of_peers_shows_all_that_was_measured(page, tmp_path):
+    del page  # its folder is on the path
+    sys.modules.pop("peers", None)
+    peers = importlib.import_module("peers")
+    folder = tmp_path / "peers"
+    folder.mkdir()
+    (tmp_path / "peers.md").write_text((peers.DOCS / "peers.md").read_text())
+    columns = ["noise", "estimator", "error", "mean"]
+    check = {"name": "cost", "value": 1.5, "bound": 1.0, "sense": "<=", "ok": False}
+    for name, cost in (("rod", 4.25), ("wall", 2.5)):
+        table = {
+            "title": f"{name}, 1 seed",
+            "columns": columns,
+            "rows": [["1%", "lean", 0.5, cost]],
+        }
+        content = {"command": f"livepde bench peers --only {name}", "checks": [check]}
+        (folder / f"{name}.json").write_text(
+            json.dumps(content | {"tables": [table], "notes": ["a note"]})
+        )
+    peers.write(tmp_path)
+    text = (tmp_path / "peers.md").read_text()
+    peers.write(tmp_path)
+    assert (tmp_path / "peers.md").read_text() == text  # what was there is replaced
+    assert text.startswith("# Comparison with peers")
+    assert text.index("### rod") < text.index("| 1% | lean | 0.5 | 4.25 |") < text.index("### wall")
+    assert text.count("livepde bench peers --only wall") == 1
+    assert text.count("FAILED") == 2
+    assert "a note" not in text
+    assert "## What these tables do not say" in text
+
+
+def test_the_page_of_peers_knows_the_problems_of_the_benchmark(page):
+    del page
+    peers = importlib.import_module("peers")
+    assert set(peers.PROBLEMS) == set(importlib.import_module("livepde.bench.peers").PROBLEMS)
+
+
+def test_what_the_benchmark_of_peers_prints_is_kept(page, tmp_path, monkeypatch):
+    del page
+    peers = importlib.import_module("peers")
+    monkeypatch.setattr(peers, "MEASURED", tmp_path / "peers")
+    monkeypatch.setattr(peers, "printed", lambda words: {"command": " ".join(words)})
+    peers.measure(["rod", "wall"])
+    found = json.loads((tmp_path / "peers" / "rod.json").read_text())
+    assert found["command"] == "bench peers --only rod --seeds 16 --json"
+    assert (tmp_path / "peers" / "wall.json").is_file()

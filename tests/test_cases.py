@@ -1221,3 +1221,15 @@ def test_decimal_commas_are_not_cut(rod):
     data.write_text("\n".join([header, *(row.replace(".", ",") for row in rows)]) + "\n")
     with pytest.raises(lp.DataError, match=r"row 2: .* fields, but the header has 6"):
         cases.load(path).prepare()
+
+
+def test_units_of_many_cases_are_those_of_pint():
+    """The table that spares its registry says what it would say."""
+    from livepde.cases import units
+
+    registry = units._registry()
+    for (given, unit), (factor, offset) in units.USUAL.items():
+        zero, one = (registry.Quantity(k, registry.parse_units(given)) for k in (0.0, 1.0))
+        found = [quantity.to(unit).magnitude for quantity in (zero, one)]
+        assert found == pytest.approx([offset, offset + factor], rel=1e-15, abs=0.0)
+        assert units.conversion(given, unit, "here") == units.Affine(factor, offset)

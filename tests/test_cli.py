@@ -401,12 +401,13 @@ class Fake:
 @pytest.fixture
 def fake(monkeypatch):
     from livepde import reproduce
-    from livepde.bench import step
+    from livepde.bench import rods, step
 
     def install(value: float) -> Fake:
         one = Fake(value)
         monkeypatch.setattr(reproduce, "EXPERIMENTS", {"seed": one})
         monkeypatch.setattr(step, "step", lambda sizes, modes: outcome(value))
+        monkeypatch.setattr(rods, "RODS", ())
         return one
 
     return install

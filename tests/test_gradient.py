@@ -266,7 +266,7 @@ def test_a_wrong_factor_is_never_accepted(spoiled):
     stage, problem, dense, given = a_stage(lp.ResidualDamping(1.0), newton=newton)
     other = 10.0 * np.random.default_rng(5).standard_normal(len(problem.c))
     p = problem
-    data = stage.solver.data(p.c, p.h, p.moment, p.u_alpha, p.metric)
+    data = stage.solver.data(p)
     factor = Spoiled(stage.solver.factor(data, stage.solver.evaluate(data, other)))
     equation = stage_module._Equation(stage.solver, data)
     solved = newton.solve(equation, p.c, Near(p.c.copy(), factor))

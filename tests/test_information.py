@@ -359,8 +359,8 @@ def test_missing_sensors_are_no_noise_that_turns_back():
 def square(size: int) -> tuple[lp.Model, list[tuple[float, np.ndarray]], Callable]:
     """Return the problem of `bench scale`, exact samples, and the error of an estimate."""
     model = scale.problem(size)
-    samples = list(scale._samples(model, 80))
-    truth, mass = model.initial_parameter(scale._truth), model.parameter_mass
+    samples = list(scale.readings(model, 80))
+    truth, mass = model.initial_parameter(scale.q_true), model.parameter_mass
 
     def error(q: np.ndarray) -> float:
         miss = q - truth

@@ -59,6 +59,7 @@ ELSEWHERE = {
     "test_cli.py": ["livepde bench step"],
     "test_schur.py": ["livepde bench scale"],
     "test_public.py::test_the_benchmark_of_the_import": ["livepde bench import"],
+    "test_lean.py::test_peers_are_divided_by_the_prior": ["livepde bench peers"],
     "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["livepde bench fleet"],
     "test_benchmarks.py::test_steps_are_ratios": ["python benchmarks/suite/costs.py"],
     "test_cli_fleet.py::test_each_row_is_a_run_of_its_own": ["livepde fleet mycase"],

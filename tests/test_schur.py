@@ -11,7 +11,7 @@ import livepde as lp
 from livepde.bench import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
-from livepde.laws.coupled import blocks
+from livepde.laws.coupled import StageProblem, blocks
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.blocks import BlockJacobian, BlockSolver
 from livepde.laws.metrics import ConstantMetric
@@ -148,7 +148,7 @@ def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
     c = np.concatenate([u, model.initial_parameter(0.5)])
     metric = ConstantMetric(model, gain, 0.0).stage(c[model.X.dim :], 0.05, gain, 0.0)
     u_alpha = stage.terms.forms.split.R @ u
-    data = stage.solver.data(c, 0.05, Moment(0.05), u_alpha, metric)
+    data = stage.solver.data(StageProblem(c, 0.05, Moment(0.05), u_alpha, metric))
     return stage.solver, data, c
 
 
@@ -261,10 +261,10 @@ def test_a_jump_of_the_process_renews_the_factors(stream):
     model, sensors, samples, fresh = stream
     identifier = fresh()
     _, before = settled(model, sensors, samples[:20], identifier)
-    assert sum(before[-5:]) == 0
+    assert sum(before[-10:]) <= 1  # when the patience with one is over
     jumped = [(t, 4.0 * z) for t, z in samples[20:]]
     estimates, after = settled(model, sensors, jumped, identifier)
-    assert sum(after) > 0
+    assert after[0] > 0
     assert all(estimate.status.ok for estimate in estimates)
 
 

@@ -151,6 +151,26 @@ def test_decimal_commas_are_no_fields_beside_an_empty_last_one(csv):
         assert [row.broken for row in source.poll(0.0)] == ["5 fields, the header has 4"] * 2
 
 
+@pytest.mark.parametrize("rest", ['1,1,"x\n2,2,y\n', '1,1,"x', '2,1,1\n"'])
+def test_a_quote_that_does_not_end(csv, rest):
+    """Else all that follows it would be one field, and lost without a word."""
+    with pytest.raises(DataError, match="cannot be read as a CSV file: a quote does not end"):
+        read_csv(csv("t,a,b\n0,1,1\n" + rest), COLUMNS, Clock("t"))
+
+
+def test_quotes_and_what_looks_like_an_end(csv):
+    path = csv('\n"t","a","b"\n0,"1","1"\n\n1,2,"2"\nend,1,1')
+    with pytest.raises(DataError, match="row 6, column 't': got 'end'"):
+        read_csv(path, COLUMNS, Clock("t"))
+    table = read_csv(csv('t,a,"b\nb"\n0,1,"x\ny"\n1,2,3'), {"T": Column(("a",))}, Clock("t"))
+    assert table.values[:, 0].tolist() == [1.0, 2.0]
+
+
+def test_an_empty_file(csv):
+    with pytest.raises(DataError, match="cannot be read as a CSV file: it is empty"):
+        read_csv(csv(""), COLUMNS, Clock("t"))
+
+
 def test_a_point_in_times_is_none_of_decimals(csv):
     with pytest.raises(DataError, match=r"row 3, column 't': got '0\.5'; with decimal = ','"):
         read_csv(csv("t,a,b\n0,1,1\n0.5,1,1\n"), COMMAS, Clock("t", decimal=","))

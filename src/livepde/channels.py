@@ -66,6 +66,10 @@ class Channels:
         return tuple(dict.fromkeys([*self.observed.names, *self.hidden, *self.inputs]))
 
     @cached_property
+    def _known(self) -> frozenset[str]:
+        return frozenset(self.names)
+
+    @cached_property
     def inputs(self) -> tuple[str, ...]:
         """Channels that the model and the sensors read."""
         read = [name for item in self.sensors for name in item.observation.inputs]
@@ -83,22 +87,32 @@ class Channels:
         self, z: ArrayLike | Mapping[str, float], inputs: Mapping[str, float]
     ) -> tuple[Array, Array, dict[str, float]]:
         """Return assimilated values, withheld values, and inputs, all checked."""
-        hidden = self.hidden
-        z = z if isinstance(z, np.ndarray) else labelled(z)
-        if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
-            unknown = [name for name in (*z, *inputs) if name not in self.names]
-            if unknown:
-                raise SampleError(
-                    f"unknown channel '{unknown[0]}'; this identifier has {list(self.names)}."
-                )
-            values = {name: number(value, f"channel '{name}'") for name, value in z.items()}
-            measured = np.array([values.get(name, np.nan) for name in self.observed.names])
-            withheld = np.array([values.get(name, np.nan) for name in hidden])
-            named = {name: values[name] for name in self.inputs if name in values}
+        z = z if isinstance(z, np.ndarray | dict) else labelled(z)
+        if isinstance(z, Mapping):
+            measured, withheld, named = self._by_name(z, inputs)
         else:
             measured = readings(z, self.observed)
-            withheld, named = np.full(len(hidden), np.nan) if hidden else NOTHING, {}
-        return measured, withheld, named | self._named(inputs)
+            withheld, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
+        return measured, withheld, named | self._named(inputs) if inputs else named
+
+    def _by_name(
+        self, z: Mapping[str, float], inputs: Mapping[str, float]
+    ) -> tuple[Array, Array, dict[str, float]]:
+        """Return assimilated values, withheld values, and the inputs among the values by name."""
+        if not (self._known.issuperset(z) and self._known.issuperset(inputs)):
+            unknown = next(name for name in (*z, *inputs) if name not in self._known)
+            raise SampleError(
+                f"unknown channel '{unknown}'; this identifier has {list(self.names)}."
+            )
+        values = {}
+        for name, value in z.items():  # words for a message cost more than the usual value
+            usual = type(value) is float and math.isfinite(value)
+            values[name] = value if usual else number(value, f"channel '{name}'")
+        measured = np.array([values.get(name, math.nan) for name in self.observed.names])
+        withheld = NOTHING
+        if self.hidden:
+            withheld = np.array([values.get(name, math.nan) for name in self.hidden])
+        return measured, withheld, {name: values[name] for name in self.inputs if name in values}
 
     def _named(self, inputs: Mapping[str, float]) -> dict[str, float]:
         """Return inputs, checked."""

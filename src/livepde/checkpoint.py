@@ -8,6 +8,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,21 @@ def _others(array: Array, axis: int) -> list[int]:
 def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
     """Return header and leaves as one archive."""
     archive = io.BytesIO()
-    np.savez(archive, header=json.dumps(dict(header)), **leaves)
+    with zipfile.ZipFile(archive, "w", allowZip64=True) as members:
+        for name, leaf in {"header": json.dumps(dict(header)), **leaves}.items():
+            array = np.asarray(leaf, order="C")
+            content = _array_header(array.dtype.str, array.shape) + array.tobytes()
+            members.writestr(zipfile.ZipInfo(f"{name}.npy"), content)
     return archive.getvalue()
+
+
+@lru_cache(maxsize=4096)
+def _array_header(dtype: str, shape: tuple[int, ...]) -> bytes:
+    """Return the header of an array in NumPy's format: a state has many, and often the same."""
+    header = io.BytesIO()
+    about = {"descr": dtype, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(header, about)
+    return header.getvalue()
 
 
 def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Array]]:

@@ -250,6 +250,11 @@ class Identifier:
         """Return what the law believes, of the physical parameter."""
         return self.problem.physical(self.latent_belief())
 
+    def _reader(self) -> Callable[[], Belief]:
+        """Return a function that gives what the law believes now, of the physical parameter."""
+        read, problem = self.law.reader(self._work, self._state), self.problem
+        return read if self.model.latent.plain else lambda: problem.physical(read())
+
     def _estimate(
         self,
         t: float,
@@ -259,13 +264,14 @@ class Identifier:
         report: Report,
         held: tuple[str, ...],
     ) -> Estimate:
-        belief = self._belief()
-        error = withheld
+        read, error = self._reader(), withheld
         if self.withheld is not None:
+            belief = read()
+            read = lambda: belief  # noqa: E731
             error = withheld - self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
-        return Estimate(
+        return Estimate.deferred(
+            read,
             t=t,
-            belief=belief,
             innovation=measured - report.predicted,
             withheld_error=error,
             status=report.status,

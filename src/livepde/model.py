@@ -158,7 +158,7 @@ class Model:
         sources = f if isinstance(f, Sequence) else [f]
         integrands = [_as_integrand(item, x) for item in sources]
         self.form_F = self._form("f", integrands, {"v": x})
-        self._source: tuple[Mapping[str, float], Array] | None = None  # of the last inputs
+        self._source: tuple[Mapping[str, float] | None, Array] | None = None
         self.form_initial: Form | Composed | None = None
         if initial is not None:
             pair = {"q": q, "v": x}
@@ -336,12 +336,16 @@ class Model:
 
     def F(self, moment: Moment = START) -> Array:
         """Return the source in X*, shape (n,)."""
-        uses, kept = self.form_F.uses, self._source
-        if "t" not in uses and kept is not None and (not uses or kept[0] is moment.inputs):
-            return kept[1]
-        source = self.form_F.vector("v", moment)
-        uses = self.form_F.uses  # with what this evaluation has read
-        if not uses or isinstance(moment.inputs, Inputs):  # which never change
+        # The last source that reads no time, and the inputs it belongs to; None: to all. Threads
+        # share it: the pair is read once and replaced as a whole, so that its parts fit together.
+        known = self._source
+        if known is not None and (known[0] is None or known[0] is moment.inputs):
+            return known[1]
+        source, read = self.form_F.traced("v", moment)
+        source.setflags(write=False)
+        if not read:
+            self._source = (None, source)
+        elif "t" not in read and isinstance(moment.inputs, Inputs):  # which never change
             self._source = (moment.inputs, source)
         return source
 

@@ -6,8 +6,11 @@ layout of plain values. So a run can be read without its model, and while it goe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from array import array
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from sys import getsizeof
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -17,7 +20,7 @@ from livepde.linalg import Array
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["STATUS_CODES", "Layout", "Record", "Records", "Snapshot", "bare"]
+__all__ = ["STATUS_CODES", "Layout", "Record", "RecordArrays", "Records", "Snapshot", "bare"]
 
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 
@@ -68,7 +71,7 @@ class Record:
 
 
 class Records(Protocol):
-    """Where records are kept: a list, or the journal of a run."""
+    """Where records are kept: arrays, or the journal of a run."""
 
     def append(self, record: Record, /) -> None:
         """Keep one more."""
@@ -76,6 +79,192 @@ class Records(Protocol):
     def __iter__(self) -> Iterator[Record]: ...
 
     def __len__(self) -> int: ...
+
+
+class RecordArrays:
+    """Records of a run as arrays that grow by a sixteenth: the numbers themselves, and no objects.
+
+    A note that is NaN counts as missing.
+    """
+
+    def __init__(self) -> None:
+        self._t = array("d")
+        self._numbers, self._innovation, self._error = array("d"), array("d"), array("d")
+        self._status, self._steps = array("b"), array("i")
+        self._notes: dict[str, array[float]] = {}
+        self._snapshots = _SnapshotArrays()
+
+    @classmethod
+    def of(cls, records: Iterable[Record]) -> RecordArrays:
+        """Return records as arrays: themselves if they are."""
+        if isinstance(records, cls):
+            return records
+        found = cls()
+        for record in records:
+            found.append(record)
+        return found
+
+    def __len__(self) -> int:
+        return len(self._t)
+
+    def append(self, record: Record, /) -> None:
+        """Keep one more."""
+        count = len(self._t)
+        for name, value in record.notes.items():
+            column = self._notes.get(name)
+            if column is None:
+                column = self._notes[name] = array("d")
+            if len(column) < count:
+                column.extend([math.nan] * (count - len(column)))
+            column.append(value)
+        self._numbers.frombytes(record.numbers.tobytes())
+        self._innovation.frombytes(record.innovation.tobytes())
+        self._error.frombytes(record.withheld_error.tobytes())
+        self._status.append(record.status)
+        self._steps.append(record.steps)
+        self._t.append(record.t)
+        if record.snapshot is not None:
+            self._snapshots.append(count, record.snapshot)
+
+    def __iter__(self) -> Iterator[Record]:
+        kept = dict(self.snapshots())
+        rows = zip(self.numbers, self.innovation, self.withheld_error, strict=True)
+        notes = self.notes
+        for k, (numbers, innovation, error) in enumerate(rows):
+            said = {name: float(column[k]) for name, column in notes.items()}
+            yield Record(
+                self._t[k],
+                numbers,
+                innovation,
+                error,
+                self._status[k],
+                self._steps[k],
+                {name: value for name, value in said.items() if not math.isnan(value)},
+                kept.get(k),
+            )
+
+    def _table(self, values: array[float]) -> Array:
+        return _array(values).reshape(len(self), -1 if values else 0)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays, with what they have in reserve."""
+        single = (self._t, self._numbers, self._innovation, self._error, self._status, self._steps)
+        return self._snapshots.nbytes + sum(map(getsizeof, (*single, *self._notes.values())))
+
+    @property
+    def t(self) -> Array:
+        """Times, shape (samples,)."""
+        return _array(self._t)
+
+    @property
+    def numbers(self) -> Array:
+        """Values of the variables `Layout.numbers`, shape (samples, numbers)."""
+        return self._table(self._numbers)
+
+    @property
+    def innovation(self) -> Array:
+        """Innovations, shape (samples, sensors)."""
+        return self._table(self._innovation)
+
+    @property
+    def withheld_error(self) -> Array:
+        """Errors of the withheld sensors, shape (samples, withheld)."""
+        return self._table(self._error)
+
+    @property
+    def status(self) -> Array:
+        """Indices in `STATUS_CODES`, shape (samples,)."""
+        return np.array(self._status, dtype=np.int32)
+
+    @property
+    def steps(self) -> Array:
+        """Substeps, shape (samples,)."""
+        return np.array(self._steps, dtype=np.int32)
+
+    @property
+    def notes(self) -> dict[str, Array]:
+        """Name of a note -> its values, shape (samples,); NaN where it is missing."""
+        found = {}
+        for name, values in self._notes.items():
+            found[name] = np.full(len(self), np.nan)
+            found[name][: len(values)] = values
+        return found
+
+    @property
+    def last_snapshot(self) -> int:
+        """Number of the last record with a snapshot, -1 if there is none."""
+        return self._snapshots.last
+
+    def snapshots(self) -> Iterator[tuple[int, Snapshot]]:
+        """Iterate over the snapshots and the numbers of their records."""
+        return iter(self._snapshots)
+
+
+class _SnapshotArrays:
+    """Snapshots as arrays: a group for each structure that they have, which is usually one."""
+
+    def __init__(self) -> None:
+        self._groups: list[tuple[_Structure, array[int], array[float]]] = []
+        self.last = -1
+
+    def append(self, number: int, snapshot: Snapshot) -> None:
+        """Keep the snapshot of a record."""
+        structure = _Structure.of(snapshot)
+        if not self._groups or self._groups[-1][0] != structure:
+            self._groups.append((structure, array("q"), array("d")))
+        _, records, values = self._groups[-1]
+        for profile in snapshot.profiles.values():
+            values.frombytes(profile.tobytes())
+        values.extend(told for told, _ in snapshot.told.values())
+        if snapshot.correlation is not None:
+            values.frombytes(snapshot.correlation.tobytes())
+        records.append(number)
+        self.last = number
+
+    def __iter__(self) -> Iterator[tuple[int, Snapshot]]:
+        for structure, records, values in self._groups:
+            rows = _array(values).reshape(len(records), -1)
+            yield from zip(records, map(structure.snapshot, rows), strict=True)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays, with what they have in reserve."""
+        return sum(getsizeof(part) for _, *parts in self._groups for part in parts)
+
+
+@dataclass(frozen=True)
+class _Structure:
+    """Names and sizes in a snapshot."""
+
+    profiles: tuple[tuple[str, int], ...]
+    told: tuple[tuple[str, int], ...]
+    correlated: int | None
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> _Structure:
+        """Return the structure of a snapshot."""
+        profiles = tuple((name, len(values)) for name, values in snapshot.profiles.items())
+        told = tuple((name, count) for name, (_, count) in snapshot.told.items())
+        correlation = snapshot.correlation
+        return cls(profiles, told, None if correlation is None else len(correlation))
+
+    def snapshot(self, row: Array) -> Snapshot:
+        """Return the snapshot whose numbers are a row."""
+        sizes = [size for _, size in self.profiles]
+        *parts, rest = np.split(row, np.cumsum(sizes, dtype=int))
+        told, correlation = np.split(rest, [len(self.told)])
+        n = self.correlated
+        return Snapshot(
+            {name: values for (name, _), values in zip(self.profiles, parts, strict=True)},
+            {name: (float(x), count) for (name, count), x in zip(self.told, told, strict=True)},
+            None if n is None else correlation.reshape(n, n),
+        )
+
+
+def _array(values: array[float]) -> Array:
+    """Return a copy: an array that is looked at could not grow."""
+    return np.array(values, dtype=float)
 
 
 @dataclass(frozen=True)
@@ -123,12 +312,21 @@ class Layout:
         """Return the layout as JSON can hold it."""
         return asdict(self)
 
-    def dataset(self, records: Sequence[Record]) -> xr.Dataset:
-        """Return records as a dataset; see `Result.to_xarray`."""
+    def dataset(self, records: Iterable[Record], last: Snapshot | None = None) -> xr.Dataset:
+        """Return records as a dataset; see `Result.to_xarray`.
+
+        Parameters
+        ----------
+        last
+            The fields at the last time, if its record holds none.
+        """
         import xarray as xr
 
-        kept = [(row.t, row.snapshot) for row in records if row.snapshot is not None]
-        times = np.array([row.t for row in records], dtype=float)
+        rows = RecordArrays.of(records)
+        times = rows.t
+        kept = [(times[k], snapshot) for k, snapshot in rows.snapshots()]
+        if last is not None:
+            kept.append((times[-1], last))
         coords: dict[str, Any] = {
             "time": ("time", times, {"units": self.time_unit}),
             "snapshot": np.array([t for t, _ in kept]),
@@ -143,23 +341,22 @@ class Layout:
             kind: (("cell", "corner"), np.array(corners, dtype=np.int32))
             for kind, corners in self.cells.items()
         }
-        numbers = np.reshape([row.numbers for row in records], (len(records), len(self.numbers)))
+        numbers = np.reshape(rows.numbers, (len(rows), len(self.numbers)))
         for (name, attrs), values in zip(self.numbers.items(), numbers.T, strict=True):
             data[name] = ("time", values, dict(attrs))
         data |= self._snapshots([snapshot for _, snapshot in kept])
         if "correlation" in data:
             coords["unknown"] = list(self.scalars)
-        data |= self._errors(records)
+        data |= self._errors(rows)
         flags = {
             "flag_values": list(range(len(STATUS_CODES))),
             "flag_meanings": " ".join(STATUS_CODES),
         }
-        data["status"] = ("time", np.array([row.status for row in records], dtype=np.int32), flags)
-        steps = np.array([row.steps for row in records], dtype=np.int32)
-        data["steps"] = ("time", steps, {"long_name": "substeps taken"})
-        for name in dict.fromkeys(key for row in records for key in row.notes):
+        data["status"] = ("time", rows.status, flags)
+        data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
+        for name, values in rows.notes.items():
             key = f"note_{name}" if name in data or name in coords else name  # of an unknown, say
-            data[key] = ("time", np.array([row.notes.get(name, np.nan) for row in records]))
+            data[key] = ("time", values)
         about = {
             **self.attrs,
             "fields": " ".join(self.fields),
@@ -187,15 +384,13 @@ class Layout:
             data["correlation"] = (("unknown", "other"), last)
         return data
 
-    def _errors(self, records: Sequence[Record]) -> dict[str, Any]:
+    def _errors(self, rows: RecordArrays) -> dict[str, Any]:
         """Return the variables of what was measured and not expected."""
         unit = {"units": self.sensor_unit}
-        shape = (len(records), len(self.sensors))
-        innovations = np.reshape([row.innovation for row in records], shape)
+        innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
         data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}
         if self.withheld is not None:
-            shape = (len(records), len(self.withheld))
-            errors = np.reshape([row.withheld_error for row in records], shape)
+            errors = np.reshape(rows.withheld_error, (len(rows), len(self.withheld)))
             data["withheld_error"] = (("time", "withheld"), errors, unit)
         return data
 

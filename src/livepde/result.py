@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from livepde.laws import Belief, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.records import STATUS_CODES, Layout, Record, Records, Snapshot
+from livepde.readout import ScalarReadout, unknown_of
+from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -67,6 +68,57 @@ class Estimate:
     notes: Mapping[str, float]
     held: tuple[str, ...]
     space: FunctionSpace
+
+    @classmethod
+    def deferred(
+        cls,
+        read: Callable[[], Belief],
+        *,
+        t: float,
+        innovation: Array,
+        withheld_error: Array,
+        status: Status,
+        steps: int,
+        notes: Mapping[str, float],
+        held: tuple[str, ...],
+        space: FunctionSpace,
+    ) -> Estimate:
+        """Return an estimate whose belief is computed when it is first read, and kept then.
+
+        Parameters
+        ----------
+        read
+            Returns the belief; it must give the same numbers at any time.
+        """
+        estimate = object.__new__(cls)
+        estimate.__dict__.update(
+            _read=read,
+            t=t,
+            innovation=innovation,
+            withheld_error=withheld_error,
+            status=status,
+            steps=steps,
+            notes=notes,
+            held=held,
+            space=space,
+        )
+        return estimate
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            held = self.__dict__
+            read = held.get("_read") if name == "belief" else None
+            if read is not None:
+                held["belief"] = read()
+                held.pop("_read", None)  # another thread may have been faster
+            if name not in held:
+                raise AttributeError(f"an Estimate has no attribute '{name}'.")
+            return held[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: the belief itself."""
+        return {"belief": self.belief} | {k: v for k, v in vars(self).items() if k != "_read"}
 
     @property
     def q(self) -> Array:
@@ -147,11 +199,6 @@ class Estimate:
         return ends
 
 
-def unknown_of(space: FunctionSpace, label: str) -> Any:
-    """Return the unknown that a label belongs to."""
-    return space.unknowns[label.split("[")[0]]
-
-
 class Result:
     """Estimates of a run, as they are added.
 
@@ -161,7 +208,7 @@ class Result:
     Parameters
     ----------
     records
-        Where to keep them; default a new list.
+        Where to keep them; default in arrays.
     layout
         What the numbers of records mean; default what model and sensors say.
     count
@@ -183,9 +230,10 @@ class Result:
         self.withheld = withheld
         self.fields_every = fields_every
         self.last: Estimate | None = None
-        self.records: Records = [] if records is None else records
+        self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld)
         self._count = len(self.records) if count is None else count
+        self._readout = ScalarReadout(model.parameter_space)
 
     def __len__(self) -> int:
         return self._count
@@ -198,14 +246,9 @@ class Result:
         self.last = estimate
 
     def _record(self, estimate: Estimate, keeps: bool) -> Record:
-        numbers: list[float] = []
-        left = estimate.belief.left([*estimate.space.labels.values()])
-        for (label, (value, std)), share in zip(estimate.parameters.items(), left, strict=True):
-            ends = interval_ends(label, unknown_of(estimate.space, label), value, std)
-            numbers += [value, std, *map(float, ends.values()), float(share)]
         return Record(
             estimate.t,
-            np.array(numbers),
+            np.array(self._readout(estimate.belief)),
             estimate.innovation,
             estimate.withheld_error,
             STATUS_CODES.index(estimate.status.code),
@@ -257,10 +300,10 @@ class Result:
         `_modes`, of how many modes of a field the data have told, over `snapshot`; and
         `correlation` of the last numbers, over (`unknown`, `other`).
         """
-        records = list(self.records)
-        if records and self.last is not None and records[-1].snapshot is None:
-            records[-1] = replace(records[-1], snapshot=self.snapshot(self.last))
-        return self.layout.dataset(records)
+        records, last = RecordArrays.of(self.records), None
+        if self.last is not None and records.last_snapshot < len(records) - 1:
+            last = self.snapshot(self.last)
+        return self.layout.dataset(records, last)
 
     def table(self) -> dict[str, dict[str, float]]:
         """Return the last estimates and the root mean square errors of all sensors.

@@ -145,7 +145,7 @@ def _prior(data: Data) -> Score:
     if data.process.hidden is not None:
         shown = trajectory.run(nothing, sensitivities=False)[1]
         error = _hidden(data, data.process.hidden - shown)
-    return Score(error, covered, 1.0)
+    return Score(error, covered, 1.0, 1.0, 1.0)
 
 
 @lru_cache(maxsize=1)

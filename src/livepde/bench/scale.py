@@ -29,7 +29,7 @@ from livepde.errors import ConfigurationError
 from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
-from livepde.laws.coupled import Metric, StageForms, StageTerms
+from livepde.laws.coupled import Metric, StageForms, StageProblem, StageTerms
 from livepde.laws.coupled.blocks import BlockSolver
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
@@ -40,11 +40,15 @@ from livepde.stepping import Advance, ImplicitEuler, simulate
 __all__ = [
     "GAINS",
     "HUGE",
+    "OMEGA",
     "SIZES",
     "identify",
     "iterations",
     "measure",
     "million",
+    "problem",
+    "q_true",
+    "readings",
     "record",
     "scale",
 ]
@@ -142,15 +146,17 @@ def _moving(x: Any, t: float) -> Any:
     return 2.0 + 0.5 * np.sin(t) * x[0] + 0.5 * np.cos(1.5 * t) * x[1]
 
 
-def _truth(x: Any) -> Any:
+def q_true(x: Any) -> Any:
+    """Return the exact parameter."""
     return 2.0 + 3.0 * np.sin(np.pi * x[0]) ** 2 * np.sin(np.pi * x[1])
 
 
 OMEGA = Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87))
 
 
-def _samples(model: Model, steps: int) -> Iterator[tuple[float, Array]]:
-    G, truth = OMEGA.matrix(model.state_space), model.initial_parameter(_truth)
+def readings(model: Model, steps: int) -> Iterator[tuple[float, Array]]:
+    """Simulate the process, and return its exact samples."""
+    G, truth = OMEGA.matrix(model.state_space), model.initial_parameter(q_true)
     times = (WIDTH * np.arange(steps + 1)).tolist()
     states = simulate(model, truth, 2.0, times, Advance(ImplicitEuler()))
     return ((t, G @ u) for t, u in states)
@@ -159,7 +165,7 @@ def _samples(model: Model, steps: int) -> Iterator[tuple[float, Array]]:
 def measure(size: int, dimension: int, gain: float, steps: int = FINDING + TIMED) -> Cost:
     """Step the forward model and the law in turns, in this process."""
     model = problem(size, dimension)
-    samples = _samples(model, steps)
+    samples = readings(model, steps)
     identifier = _identifier(model, gain)
     identifier.step(*next(samples))
     spent, forward = np.zeros(steps), np.zeros(steps)
@@ -184,8 +190,7 @@ def measure(size: int, dimension: int, gain: float, steps: int = FINDING + TIMED
 def record(size: int, steps: int, path: str) -> None:
     """Write the samples of a square to a file."""
     model = problem(size)
-    readings = [z for _, z in _samples(model, steps)]
-    np.save(path, np.array(readings))
+    np.save(path, np.array([z for _, z in readings(model, steps)]))
 
 
 def identify(size: int, gain: float, path: str) -> Need:
@@ -207,7 +212,7 @@ def _check(estimate: Any) -> None:
 
 
 def _error(model: Model, identifier: Identifier) -> float:
-    truth = model.initial_parameter(_truth)
+    truth = model.initial_parameter(q_true)
     miss, mass = identifier.estimate().q - truth, model.parameter_mass
     return float(np.sqrt((miss @ (mass @ miss)) / (truth @ (mass @ truth))))
 
@@ -339,7 +344,7 @@ def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, s
     u = model.initial(_bump)
     c = np.concatenate([u, model.initial_parameter(0.5)])
     metric = Metric(1.0 / (gain * STEP), 0.0, np.zeros(model.Q.dim))
-    data = blocks.data(c, STEP, Moment(STEP), split.project(u), metric)
+    data = blocks.data(StageProblem(c, STEP, Moment(STEP), split.project(u), metric))
     at = blocks.evaluate(data, c)
     _, count = blocks.factor(data, at).iterate(at.residual, TOLERANCE)
     return count, (blocks.engines["S"], blocks.engines["C"])

@@ -48,7 +48,9 @@ class Score:
     covered
         Share of values whose 95 % interval holds the truth; NaN without intervals or truth.
     step
-        Processor time of a step over that of a forward step.
+        Processor time of a step over that of a forward step, mean without the first samples.
+    whole, median
+        The same as mean over all samples, the first included, and as median.
     failed
         Steps that could not be taken.
     megabytes
@@ -60,6 +62,8 @@ class Score:
     error: float = math.nan
     covered: float = math.nan
     step: float = math.nan
+    whole: float = math.nan
+    median: float = math.nan
     failed: int = 0
     megabytes: float = math.nan
     note: str = ""
@@ -138,33 +142,38 @@ def measured(data: Data, step: Callable[[int], None], known: Callable[[], Known]
     known
         Returns what is known now.
     """
-    judge, seconds, found = Judge(data), 0.0, []
+    judge, found = Judge(data), []
+    seconds: list[float] = []
     for at in range(1, len(data)):
         start = process_time()
         step(at)
-        seconds += process_time() - start
-        if at == WARM_UP:
-            seconds = 0.0
+        seconds.append(process_time() - start)
         if at in judge.scored:
             found.append((at, *known()))
     error, covered = judge.judged(found)
-    return Score(error, covered, seconds / (len(data) - 1 - WARM_UP) / data.forward)
+    costs = np.array(seconds) / data.forward
+    settled, whole, median = costs[WARM_UP:].mean(), costs.mean(), np.median(costs)
+    return Score(error, covered, float(settled), float(whole), float(median))
 
 
 def scored(contender: Contender, data: Data) -> Score | None:
     """Run a contender; one that fails is a score with a reason.
 
-    What is quick is run three times, and the median time counts.
+    What is quick is run three times, and the median times count.
     """
-    start, steps = process_time(), []
+    start = process_time()
     try:
         score = contender(data)
+        runs = [score]
         for _ in range(2 if score is not None and process_time() - start < QUICK else 0):
-            again = contender(data)
-            steps += [] if again is None else [again.step]
+            runs.append(contender(data))
     except (LivepdeError, StepFailed, np.linalg.LinAlgError) as error:
         return Score(note=f"{type(error).__name__}: {error}")
-    return None if score is None else replace(score, step=float(np.median([score.step, *steps])))
+    if score is None:
+        return None
+    times = [(run.step, run.whole, run.median) for run in runs if run is not None]
+    step, whole, median = np.median(times, axis=0).tolist()
+    return replace(score, step=step, whole=whole, median=median)
 
 
 def error_ratio(found: Found, at: tuple[str, float | None], row: str, other: str) -> float:
@@ -183,15 +192,13 @@ def _median(found: Found, key: tuple[str, float | None, str]) -> float:
     return float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.nan
 
 
-def table_of(found: Found, limit: str, memory: bool = False) -> list[Table]:
+def table_of(found: Found, limit: str) -> list[Table]:
     """Return a table for each problem: rows are noise level and contender.
 
     Parameters
     ----------
     limit
         Row by whose error the others are divided.
-    memory
-        Show what was measured of it.
     """
     tables = []
     for name in dict.fromkeys(key[0] for key in found):
@@ -208,7 +215,6 @@ def table_of(found: Found, limit: str, memory: bool = False) -> list[Table]:
                 error_ratio(found, (problem, level), row, limit),
                 _mean([score.covered for score in scores]),
                 _mean([score.step for score in scores]),
-                *([_mean([score.megabytes for score in scores])] if memory else []),
             ]
             rows.append(
                 [
@@ -220,7 +226,7 @@ def table_of(found: Found, limit: str, memory: bool = False) -> list[Table]:
                 ]
             )
         columns = ["noise", "estimator", "error", "least", "largest", "limit", "covered", "step"]
-        columns += [*(["MB"] if memory else []), "failed steps", "note"]
+        columns += ["failed steps", "note"]
         tables.append(Table(f"{name}, {most} seed{'s' if most > 1 else ''}", columns, rows))
     return tables
 

@@ -26,7 +26,7 @@ from livepde.reproduce import seed
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
-__all__ = ["MODES", "SIZES", "step"]
+__all__ = ["MODES", "SIZES", "first_steps", "problem", "step"]
 
 SIZES = (31, 1_000, 10_000, 100_000)  # nodes
 MODES = (1, 10, 50)  # reduced unknowns of the sensitivity law
@@ -139,7 +139,7 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
         given, large = problem(size), size > LONGEST_ROD
         for gain, c1 in GAINS:
             name = f"gradient, gain {gain:g}, c1 {c1:g}"
-            low, middle, high, mean = _first(given, GradientLaw(gain, ResidualDamping(c1)))
+            low, middle, high, mean = first_steps(given, GradientLaw(gain, ResidualDamping(c1)))
             rows.append((size, name, low, middle, high, mean, MEDIAN if large else None))
             if large:
                 label = f"{size} nodes, {name}: step / forward step"
@@ -167,7 +167,7 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
     return Outcome(tables=[table], checks=checks, notes=[note])
 
 
-def _first(given: Problem, law: GradientLaw) -> tuple[float, float, float, float]:
+def first_steps(given: Problem, law: GradientLaw) -> tuple[float, float, float, float]:
     """Return least, median, largest and mean cost of the first steps, in forward steps."""
     G = given.omega.matrix(given.model.state_space)
     samples = [(t, G @ u) for t, u in given.forward(given.q_true, FIRST)]

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from livepde.cli.options import JsonOption, names_in
 from livepde.cli.printing import can_draw, named, report_outcome, terminal
+
+if TYPE_CHECKING:
+    from livepde.runs.outcome import Outcome
 
 __all__ = ["bench"]
 
@@ -56,13 +60,16 @@ def step(
 
     Example:  livepde bench step --size 1000 --json
     """
+    from livepde.bench.rods import RODS, rods
     from livepde.bench.step import MODES, SIZES
     from livepde.bench.step import step as benchmark
 
     command = ["livepde", "bench", "step"]
     command += [word for nodes in size or () for word in ("--size", str(nodes))]
     command += [word for count in modes or () for word in ("--modes", str(count))]
-    report_outcome(benchmark(size or SIZES, modes or MODES), command, as_json)
+    outcome = benchmark(size or SIZES, modes or MODES)
+    filters = rods([rod for rod in RODS if not size or rod.nodes in size])
+    report_outcome(_both(outcome, filters), command, as_json)
 
 
 @bench.command("import")
@@ -81,6 +88,21 @@ def startup(
 
 
 @bench.command()
+def overhead(
+    rounds: Annotated[int, typer.Option(min=1, help="Fresh processes, and pairs of runs.")] = 5,
+    as_json: JsonOption = False,
+) -> None:
+    """Time what the command line adds: to the first estimate, and to each sample of a rod.
+
+    Example:  livepde bench overhead --json
+    """
+    from livepde.bench.overhead import overhead as benchmark
+
+    command = ["livepde", "bench", "overhead", "--rounds", str(rounds)]
+    report_outcome(benchmark(rounds), command, as_json)
+
+
+@bench.command()
 def fleet(
     members: Annotated[int, typer.Option(min=1, help="How many rods step.")] = 1000,
     runs: Annotated[
@@ -93,9 +115,10 @@ def fleet(
     Example:  livepde bench fleet --json
     """
     from livepde.bench.fleet import fleet as benchmark
+    from livepde.bench.rods import fleet as rods
 
     command = ["livepde", "bench", "fleet", "--members", str(members), "--runs", str(runs)]
-    report_outcome(benchmark(members, runs), command, as_json)
+    report_outcome(_both(benchmark(members, runs), rods()), command, as_json)
 
 
 @bench.command()
@@ -161,6 +184,34 @@ def scale(
         return
     outcome = benchmark.scale(size or benchmark.SIZES, gain or benchmark.GAINS, cube or ())
     report_outcome(outcome, command, as_json)
+
+
+@bench.command()
+def auto(
+    size: Annotated[
+        list[int] | None,
+        typer.Option(min=25, help="Nodes of the square, default 64 to 10000. Repeat for more."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise.")] = 5,
+    quick: Annotated[
+        bool, typer.Option(help="Only the smallest square, one data set, and the smallest cost.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Check what the gradient law that tunes itself promises: its errors and its cost.
+
+    Example:  livepde bench auto --quick
+    """
+    from livepde.bench.auto import COSTS, SIZES
+    from livepde.bench.auto import auto as benchmark
+
+    command = ["livepde", "bench", "auto"]
+    command += [word for nodes in size or () for word in ("--size", str(nodes))]
+    if quick:
+        report_outcome(benchmark(SIZES[:1], 1, (min(COSTS),)), [*command, "--quick"], as_json)
+        return
+    command += ["--seeds", str(seeds)]
+    report_outcome(benchmark(size or SIZES, seeds, tuple(COSTS)), command, as_json)
 
 
 @bench.command()
@@ -267,19 +318,39 @@ def accuracy(
 
 @bench.command()
 def peers(
-    only: ProblemsOption = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this problem. Repeat it for more.",
+            autocompletion=names_in("livepde.bench.peers:PROBLEMS"),
+        ),
+    ] = None,
     level: LevelsOption = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 4,
+    row: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this estimator. Repeat it for more.",
+            autocompletion=names_in("livepde.bench.peers:ROWS"),
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Hold our sensitivity law against other packages, where they are installed.
+    """Hold our laws against filters as arrays, and other packages where they are installed.
 
-    Example:  livepde bench peers --only seed
+    Example:  livepde bench peers --only rod --seeds 16
     """
+    from livepde.bench.peers import PROBLEMS, ROWS
     from livepde.bench.peers import peers as benchmark
 
-    outcome = benchmark(_problems(only), seeds, levels=level or [0.01], progress=True)
-    report_outcome(outcome, _command("peers", only, level, seeds), as_json)
+    for name in only or ():
+        named(name, PROBLEMS, "problem")
+    for name in row or ():
+        named(name, dict.fromkeys(ROWS), "row")
+    outcome = benchmark(only or (), seeds, levels=level or [0.01], rows=row or (), progress=True)
+    command = _command("peers", only, level, seeds)
+    command += [word for name in row or () for word in ("--row", name)]
+    report_outcome(outcome, command, as_json)
 
 
 @bench.command()
@@ -336,6 +407,16 @@ def soak(
 
     command = ["livepde", "bench", "soak", "--steps", str(steps)]
     report_outcome(benchmark(steps, progress=True), command, as_json)
+
+
+def _both(one: Outcome, other: Outcome) -> Outcome:
+    """Return tables, checks and notes of two benchmarks as one."""
+    return replace(
+        one,
+        tables=[*one.tables, *other.tables],
+        checks=[*one.checks, *other.checks],
+        notes=[*one.notes, *other.notes],
+    )
 
 
 def _problems(only: Sequence[str] | None) -> list[str]:

@@ -36,7 +36,7 @@ from livepde.fem.place import START, Inputs, Moment, Place
 from livepde.fem.reading import reads
 from livepde.fem.scatter import Scatter, scatter
 from livepde.fem.space import FunctionSpace, LocalSpace
-from livepde.linalg import Array, IntArray, Pattern, PatternOperator
+from livepde.linalg import Array, IntArray, Pattern
 
 __all__ = ["Form", "FormMatrices", "Tensor"]
 
@@ -87,9 +87,6 @@ class _Term:
 class FormMatrices(ABC):
     """Matrices of mixed derivatives with fixed sparsity, from `pattern` and `data`."""
 
-    def __init__(self) -> None:
-        self._operators: dict[tuple[str, str], PatternOperator] = {}
-
     @abstractmethod
     def pattern(self, rows: str, cols: str) -> Pattern:
         """Return the sparsity of the matrices `data(rows, cols)`."""
@@ -107,12 +104,9 @@ class FormMatrices(ABC):
     def product(
         self, rows: str, cols: str, x: Array, moment: Moment = START, **coefficients: Array
     ) -> Array:
-        """Return `matrix(...) @ x` without building the matrix again; x of shape (m,) or (m, k)."""
-        if (rows, cols) not in self._operators:
-            self._operators[rows, cols] = self.pattern(rows, cols).operator()
-        operator = self._operators[rows, cols]
-        operator.set(self.data(rows, cols, moment, **coefficients))
-        return operator.apply(x)
+        """Return `matrix(...) @ x` for x of shape (m,) or (m, k)."""
+        data = self.data(rows, cols, moment, **coefficients)
+        return self.pattern(rows, cols).product(data, x)
 
 
 class Form(FormMatrices):
@@ -152,7 +146,6 @@ class Form(FormMatrices):
         inputs: Sequence[str] = (),
         parameter: str | None = None,
     ) -> None:
-        super().__init__()
         items = integrands if isinstance(integrands, Sequence) else [integrands]
         self.name = name
         self.spaces = dict(spaces)
@@ -200,7 +193,6 @@ class Form(FormMatrices):
         here = [k for k, measure in enumerate(measures) if measure.shape[0]]
         part.terms = [replace(self.terms[k], measure=measures[k]) for k in here]
         part.derivatives = [self.derivatives[k] for k in here]
-        part._operators = {}
         part._forget()
         return part
 
@@ -306,16 +298,29 @@ class Form(FormMatrices):
                 return self._slopes[slot] @ coefficients[others[0]] + self._offset(slot)
             rest = {key: coefficients[key] for key in others if key != linear[0]}
             return self.product(slot, linear[0], coefficients[linear[0]], moment, **rest)
+        return self._vector(slot, moment, coefficients)[0]
+
+    def traced(
+        self, slot: str, moment: Moment = START, **coefficients: Array
+    ) -> tuple[Array, frozenset[str]]:
+        """Return what `vector` does by quadrature, and what of time and inputs it has read.
+
+        A function that reads no more than that gives the same wherever that is the same, on
+        whichever of its branches it is.
+        """
         return self._vector(slot, moment, coefficients)
 
     def _offset(self, slot: str) -> Array:
         """Return the vector of an affine form where its other argument is zero, computed once."""
         if slot not in self._offsets:
             zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
-            self._offsets[slot] = self._vector(slot, START, zero)
+            self._offsets[slot] = self._vector(slot, START, zero)[0]
         return self._offsets[slot]
 
-    def _vector(self, slot: str, moment: Moment, coefficients: Mapping[str, Array]) -> Array:
+    def _vector(
+        self, slot: str, moment: Moment, coefficients: Mapping[str, Array]
+    ) -> tuple[Array, frozenset[str]]:
+        read: set[str] = set()
         result = np.zeros(self.spaces[slot].dim)
         for term in (piece for whole in self.terms for _, piece in whole.pieces()):
             place = term.measure.place(moment)
@@ -326,10 +331,9 @@ class Form(FormMatrices):
                 for key, local in term.spaces.items()
             ]
             density = np.asarray(term.integrand(*jets, place))
-            if not place.used <= self.uses:  # on a branch that the probe did not take
-                self.uses |= place.used
+            read |= place.used
             result += term.spaces[slot].tested(density, term.measure.weights)
-        return result
+        return result, frozenset(read)
 
     def _scatter(self, rows: str, cols: str) -> Scatter:
         if (rows, cols) not in self._scatters:

@@ -234,7 +234,6 @@ class Composed(FormMatrices):
     """A form in which q = V T(a): the same interface, with latent coefficients in the slot q."""
 
     def __init__(self, form: Form, latent: Latent) -> None:
-        super().__init__()
         self.form = form
         self.latent = latent
         self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array | None]] = {}

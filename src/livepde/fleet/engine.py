@@ -18,10 +18,13 @@ __all__ = ["Beliefs", "Engine", "Factors", "State", "reported"]
 State: TypeAlias = Any
 """What evolves: the arrays or values of an engine."""
 
+
 def reported(reports: Sequence[Report]) -> MemberReports:
     """Return the report of members of which each has its own."""
     members, sensors = len(reports), len(reports[0].predicted)
-    blank = MemberReports((Status(),) * members, np.zeros((members, sensors)), np.zeros(members, dtype=int))
+    blank = MemberReports(
+        (Status(),) * members, np.zeros((members, sensors)), np.zeros(members, dtype=int)
+    )
     return blank.with_members(dict(enumerate(reports)))
 
 

@@ -245,7 +245,9 @@ class Fleet:
             self.observed.predict(belief.u, belief.q, span.end.member(k))
             for k, belief in zip(members, beliefs, strict=True)
         ]
-        return MemberReports((Status(),) * len(self), np.array(predicted), np.zeros(len(self), dtype=int))
+        return MemberReports(
+            (Status(),) * len(self), np.array(predicted), np.zeros(len(self), dtype=int)
+        )
 
     def _believed(self, state: Any, k: int) -> Belief:
         return self.problem.physical(self._engine.believed(state, k))

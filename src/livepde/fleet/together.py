@@ -39,9 +39,7 @@ class Together:
         begun: SensitivityState = self.law.begin_members(self.work, state, span)
         return begun
 
-    def step(
-        self, state: SensitivityState, span: Span
-    ) -> tuple[SensitivityState, MemberReports]:
+    def step(self, state: SensitivityState, span: Span) -> tuple[SensitivityState, MemberReports]:
         stepped: tuple[SensitivityState, MemberReports] = self.law.step_members(
             self.work, state, span
         )
@@ -51,7 +49,7 @@ class Together:
         return take(state, k)
 
     def believed(self, state: SensitivityState, k: int) -> Belief:
-        belief: Belief = self.law.member_belief(self.work, state, k)
+        belief: Belief = self.law.member_belief(self.work, state.now, k)
         return belief
 
     def beliefs(self, state: SensitivityState) -> Beliefs:
@@ -70,9 +68,7 @@ class Together:
     def leaves(self, state: SensitivityState) -> dict[str, Any]:
         return checkpoint.flatten(state)
 
-    def restored(
-        self, template: SensitivityState, leaves: Mapping[str, Array]
-    ) -> SensitivityState:
+    def restored(self, template: SensitivityState, leaves: Mapping[str, Array]) -> SensitivityState:
         state: SensitivityState = checkpoint.rebuild(template, leaves)
         if len(state) != len(template):
             raise ValueError(f"{len(state)} members, needs {len(template)}")

@@ -164,9 +164,7 @@ def _absorbed(
     return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
 
 
-def _learned(
-    x: FilterState, used: Mask, d: Array, noise: Array, made: Update
-) -> dict[str, Array]:
+def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -> dict[str, Array]:
     """Return evidence and noise level after a sample.
 
     The level is found by expectation maximisation sample by sample: under the right one the mean

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,10 +22,11 @@ from livepde.laws.bank import (
     scaled,
 )
 from livepde.laws.base import Belief, Law, Problem, Report
+from livepde.laws.filter import FilterState
 from livepde.laws.guess import first_guess
 from livepde.laws.history import added, first_interval, intervals_since, opened
 from livepde.laws.jumps import Jumps
-from livepde.laws.members import join, take
+from livepde.laws.members import changed, join, take
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import (
     NEVER,
@@ -33,6 +34,7 @@ from livepde.laws.sensitivity import (
     SensitivityState,
     SensitivityWork,
     from_now,
+    without_factors,
 )
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Interval
@@ -173,9 +175,9 @@ class AutoLaw(Law[Bank, AutoState]):
     def begin(self, work: Bank, state: AutoState, interval: Interval) -> AutoState:
         span = work.work.filter.span(interval)
         if not state.known:
-            return replace(state, waiting=added(state.waiting, span, np.ones(1, dtype=bool)))
+            return changed(state, waiting=added(state.waiting, span, np.ones(1, dtype=bool)))
         filters = work.filters(0.0, state.noise)
-        return replace(state, members=self.member.begin_members(filters, state.members, span))
+        return changed(state, members=self.member.begin_members(filters, state.members, span))
 
     def step(self, work: Bank, state: AutoState, interval: Interval) -> tuple[AutoState, Report]:
         if state.known:
@@ -192,9 +194,9 @@ class AutoLaw(Law[Bank, AutoState]):
         if noise is None and waiting.shape[1] > SILENCE:
             here = self.member.renewed(filters.filter.recentred(free.now), free)
             here = from_now(here)
-            return replace(state, waiting=state.start.log, start=here, members=here), report
+            return changed(state, waiting=state.start.log, start=here, members=here), report
         if noise is None:
-            return replace(state, waiting=waiting, members=free), report
+            return changed(state, waiting=waiting, members=free), report
         begun = self._initial(work, state.start, noise)
         notes: Mapping[str, float] = {}
         first = first_interval(waiting, work.channels)
@@ -220,7 +222,7 @@ class AutoLaw(Law[Bank, AutoState]):
         share = np.minimum(1.0, MEMORY / (members.assimilated + 1.0))
         change = np.where(new.due != members.due, change * share, change)
         if work.stated:
-            new = replace(new, now=replace(new.now, level=np.maximum(new.now.level, 1.0)))
+            new = changed(new, now=changed(new.now, level=np.maximum(new.now.level, 1.0)))
         ok = np.array([status.ok for status in reports.statuses])
         good: Mask = ok & np.isfinite(change)
         if not good.any():
@@ -232,7 +234,7 @@ class AutoLaw(Law[Bank, AutoState]):
         if interval.present.any():
             weights = work.chances + (1.0 - 1.0 / MEMORY) * (weights - work.chances) + gained
         weights = normalised(np.where(np.isfinite(gained), weights, -np.inf))
-        now = replace(
+        now = changed(
             state,
             tick=tick,
             members=new if good.all() else take(new, good),
@@ -252,11 +254,11 @@ class AutoLaw(Law[Bank, AutoState]):
         innovations = take(state.members.now.innovations, at).newest
         usual = take(before.members.now.innovations, before.at(state.leader))
         watch, alarms = JUMPS.add(state.watch, innovations, usual)
-        alarm, state = bool(alarms[0]), replace(state, watch=watch)
+        alarm, state = bool(alarms[0]), changed(state, watch=watch)
         stayed, stays = (work.candidates[s.leader].drift == 0.0 for s in (before, state))
         if stayed and not stays and state.count >= 2 * TRIAL:
             soon = min(state.due, state.count + TRIAL)
-            state = replace(state, due=soon, pause=TRIAL)
+            state = changed(state, due=soon, pause=TRIAL)
         if alarm or state.count >= state.due:
             return self._woken(work, state, alarm), alarm
         return (state if state.count % CHECKED else self._pruned(work, state)), False
@@ -279,7 +281,7 @@ class AutoLaw(Law[Bank, AutoState]):
         members = state.members
         if len(heavier) < len(members):
             members = take(members, np.sort(heavier))
-        return replace(state, members=members, weights=normalised(weights))
+        return changed(state, members=members, weights=normalised(weights))
 
     def _woken(self, work: Bank, state: AutoState, alarm: bool) -> AutoState:
         """Return the state with all drifts awake; what slept begins as a copy of the leader.
@@ -312,7 +314,7 @@ class AutoLaw(Law[Bank, AutoState]):
             members.append(numbered(copied, k, due))
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)
-        return replace(
+        return changed(
             state,
             members=join(*members),
             weights=normalised(weights),
@@ -347,13 +349,20 @@ class AutoLaw(Law[Bank, AutoState]):
         return Report(OK, predicted, leading.steps, notes)
 
     def belief(self, work: Bank, state: AutoState) -> Belief:
+        return self.reader(work, state)()
+
+    def reader(self, work: Bank, state: AutoState) -> Callable[[], Belief]:
         noise = state.noise if state.known else np.ones_like(state.noise)
-        filters = work.filters(state.tick, noise)
-        used = np.array(state.awake)
-        weights = np.exp(state.weights[state.members.now.member[used]])
-        kept = weights >= 1e-4 * weights.max()
-        weights = weights[kept] / weights[kept].sum()
-        each = [self.member.member_belief(filters, state.members, k) for k in used[kept].tolist()]
+        filters, now = work.filters(state.tick, noise), without_factors(state.members.now)
+        weights = np.exp(state.weights[now.member])
+        return lambda: self._mixture(filters, now, weights)
+
+    def _mixture(self, filters: SensitivityWork, now: FilterState, weights: Array) -> Belief:
+        """Return the mean and covariance of all members."""
+        order = np.argsort(-weights, kind="stable")
+        used = order[weights[order] >= 1e-4 * weights.max()]
+        weights = weights[used] / weights[used].sum()
+        each = [self.member.member_belief(filters, now, k) for k in used.tolist()]
         if len(each) == 1:
             return each[0]
         q = sum((w * b.q for w, b in zip(weights, each, strict=True)), np.zeros_like(each[0].q))

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-import scipy
 from scipy.linalg import cho_factor, cho_solve
 
 from livepde.laws.jumps import Watch
@@ -159,7 +158,9 @@ class AutoState:
 
 def normalised(weights: Array) -> Array:
     """Return logarithms of weights that add up to 1."""
-    return np.asarray(weights - scipy.special.logsumexp(weights))
+    largest = weights.max()
+    normal: Array = weights - largest - np.log(np.exp(weights - largest).sum())
+    return normal
 
 
 def numbered(state: SensitivityState, number: int, due: int) -> SensitivityState:

@@ -245,7 +245,8 @@ class Law(ABC, Generic[Work, State]):
     """An update law: frozen configuration; what evolves is an explicit state value.
 
     A law of your own is one class with these four methods. The state is a frozen dataclass of
-    arrays and numbers: saving it is checkpointing.
+    arrays and numbers: saving it is checkpointing. Identifiers share a law, and copies of an
+    identifier share its work, maybe in threads: neither may change once it is made.
     """
 
     @abstractmethod
@@ -284,6 +285,15 @@ class Law(ABC, Generic[Work, State]):
     @abstractmethod
     def belief(self, work: Work, state: State) -> Belief:
         """Return estimates and, if the law has them, covariances."""
+
+    def reader(self, work: Work, state: State) -> Callable[[], Belief]:
+        """Return a function that gives `belief` when an estimate is read; here it is found at once.
+
+        Estimates are kept, and with them what such a function holds: a law overrides this where
+        that is not much more than the belief itself, and never changes afterwards.
+        """
+        belief = self.belief(work, state)
+        return lambda: belief
 
 
 AnyLaw = Law[Any, Any]

@@ -34,8 +34,9 @@ class GradientState:
         Observed part of the state at the last sample, shape (n,).
     rate
         Last change of (u^ - u_alpha, q^) per unit of time, shape (n + m,).
-    kept
-        Factor of the coupled stage.
+    kept, left
+        Factor of the coupled stage, and what it has left of its residual, times its step, shape
+        (n + m,).
     present, frozen
         Sensors of the last sample, shape (sensors,), and whether q was held.
     observed, metric, excitation
@@ -47,6 +48,7 @@ class GradientState:
     u_alpha: Array
     rate: Array
     kept: KeptFactor
+    left: Array
     present: Array
     frozen: bool
     observed: Any
@@ -140,6 +142,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             u_alpha=np.zeros(len(u0)),
             rate=np.zeros(len(u0) + len(q0)),
             kept=KeptFactor.none(),
+            left=np.zeros(len(u0) + len(q0)),
             present=np.zeros(work.problem.observed.size, dtype=bool),
             frozen=False,
             observed=work.observed.init(),
@@ -187,7 +190,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
 
         # u and q together, by coupled stages
         predicts = same and frozen == state.frozen
-        stages = StageSequence(coupled, path, metric, state.rate if predicts else None, state.kept)
+        rate = state.rate if predicts else None
+        stages = StageSequence(coupled, path, metric, rate, state.kept, state.left)
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stages, y, interval)
         if failure is not None:
@@ -195,8 +199,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
             return state, Report(Status.of(failure), predicted)
 
         u, q = end[:n], model.latent.clipped(end[n:])
-        r, error = R(u) - u_alpha, stages.equation_error()
-        after = Transition(forms, end[n:], u - r, end[n:] - state.q, error, moment, length)
+        r, change = R(u) - u_alpha, end[n:] - state.q
+        after = Transition(forms, end[n:], u - r, change, stages.equation_error, moment, length)
         learned = work.metric.learn(state.metric, after)
         new = GradientState(
             u=u,
@@ -204,6 +208,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             u_alpha=u_alpha,
             rate=stages.rate(y, end),
             kept=stages.kept,
+            left=stages.left,
             present=interval.present,
             frozen=frozen,
             observed=observed,

@@ -30,7 +30,7 @@ from livepde.laws.observed_part import (
     SelfChosenSmoothing,
 )
 from livepde.laws.smoothing import smooths
-from livepde.linalg import Array, Pattern
+from livepde.linalg import Array, Memo, Pattern
 from livepde.stepping import Newton
 
 __all__ = ["GradientParts", "StageSequence", "constant_parts", "tuned_parts"]
@@ -69,26 +69,22 @@ class GradientParts:
     probes: Probes | None = None
     memory: Pattern | None = None
     at_estimate: bool = False
-    _stages: dict[bytes, CoupledStage] = field(default_factory=dict)
+    _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
     def stage(self, present: Array) -> CoupledStage:
         """Return the coupled stage for the sensors present."""
-        key = present.tobytes()
-        stage = self._stages.get(key)
-        if stage is None:
-            if len(self._stages) >= MOST_STAGES:
-                self._stages.clear()
-            forms = StageForms(
-                self.problem.model,
-                self.problem.observed.split(present),
-                self.M_op,
-                self.N_op,
-                self.nu,
-                self.at_estimate,
-            )
-            terms = StageTerms(forms, self.damping, self.memory)
-            stage = self._stages[key] = CoupledStage(terms, self.newton)
-        return stage
+        return self._stages.get(present.tobytes(), lambda: self._made(present))
+
+    def _made(self, present: Array) -> CoupledStage:
+        forms = StageForms(
+            self.problem.model,
+            self.problem.observed.split(present),
+            self.M_op,
+            self.N_op,
+            self.nu,
+            self.at_estimate,
+        )
+        return CoupledStage(StageTerms(forms, self.damping, self.memory), self.newton)
 
     def prepared(self) -> GradientParts:
         """Return the same with the stage of all sensors prepared, before the first sample comes."""
@@ -106,7 +102,7 @@ class GradientParts:
         """Return the excitation after a sample, from w and the estimate u."""
         if self.gate is None or self.probes is None:
             return excitation
-        seen = self.probes(np.stack([w, u], axis=1), q, moment)
+        seen = self.probes(np.array([w, u]).T, q, moment)
         return self.gate.add(excitation, seen[:, 0], seen[:, 1])
 
 
@@ -117,6 +113,9 @@ class StageSequence:
     ----------
     kept
         The factor that the last stage has kept.
+    left
+        What it has left of its residual, times its step, shape (n + m,); zero if the next stage is
+        not to make up for it.
     """
 
     def __init__(
@@ -126,19 +125,23 @@ class StageSequence:
         metric: MetricStep,
         rate: Array | None,
         kept: KeptFactor,
+        left: Array,
     ) -> None:
         self.coupled = coupled
         self.path = path
         self.metric = metric
         self.slope = rate
         self.kept = kept if rate is not None else KeptFactor.none()
+        self.left = left
         self._last: tuple[StageProblem, float, StageIterate] | None = None
 
     def __call__(self, c: Array, t: float, h: float) -> Array:
         """Return y = (u, q) at t of the stage that begins at c; raises `StepFailed`."""
         n, project = self.coupled.terms.n, self.coupled.terms.forms.split.project
         u_alpha = self.path.at(t).u
-        problem = StageProblem(c, h, self.path.interval.at(t), u_alpha, self.metric(c[n:], h))
+        carries, moment = self.coupled.carries, self.path.interval.at(t)
+        left = self.left / h if carries else None
+        problem = StageProblem(c, h, moment, u_alpha, self.metric(c[n:], h), left)
         # The observed part moves with the data, the rest as in the step before.
         follows = c.copy()
         follows[:n] += u_alpha - self.path.at(max(t - h, self.path.interval.t0)).u
@@ -153,6 +156,8 @@ class StageSequence:
         predicted = None if self.slope is None else follows + h * self.slope
         at, self.kept = self.coupled.solve(problem, start, predicted, self.kept)
         self._last = problem, t, at
+        if carries:
+            self.left = h * at.residual
         return at.y
 
     def equation_error(self) -> Array:

@@ -12,7 +12,15 @@ from livepde.fem import Inputs
 from livepde.linalg import Array, Mask
 from livepde.stepping import Interval, Span
 
-__all__ = ["added", "empty_log", "first_interval", "intervals_since", "opened", "skipped", "trimmed"]
+__all__ = [
+    "added",
+    "empty_log",
+    "first_interval",
+    "intervals_since",
+    "opened",
+    "skipped",
+    "trimmed",
+]
 
 SPARE = np.inf  # time of rows that are not in use
 ROWS = 64  # least room of a log

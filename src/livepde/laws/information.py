@@ -89,7 +89,7 @@ from livepde.laws.normal_equations import (
     SelectedRows,
     diagonal_bound,
 )
-from livepde.linalg import Array, Pattern
+from livepde.linalg import Array, Memo, Pattern
 from livepde.model import Model
 from livepde.spaces import HilbertSpace
 
@@ -254,7 +254,7 @@ class InformationMetric(MetricRule[Information]):
         self.diagonal = _diagonal(model.Q)
         every = np.arange(model.Q.dim)
         self.on_diagonal = self.pattern.positions(every, every)
-        self._normal: dict[bytes, NormalEquations] = {}
+        self._normal: Memo[bytes, NormalEquations] = Memo(MOST_NORMAL)
 
     def init(self, q0: Array) -> Information:
         """Return the information before the first sample: none."""
@@ -293,12 +293,7 @@ class InformationMetric(MetricRule[Information]):
 
     def normal(self, forms: StageForms) -> NormalEquations:
         """Return what samples of the sensors of a stage add to the normal equations."""
-        key = forms.split.present.tobytes()
-        if key not in self._normal:
-            if len(self._normal) >= MOST_NORMAL:
-                self._normal.clear()
-            self._normal[key] = self._made(forms)
-        return self._normal[key]
+        return self._normal.get(forms.split.present.tobytes(), lambda: self._made(forms))
 
     def _made(self, forms: StageForms) -> NormalEquations:
         X, Q, A = self.model.X, self.model.Q, forms.A_in.pattern("v", "q")
@@ -312,7 +307,7 @@ class InformationMetric(MetricRule[Information]):
     def learn(self, state: Information, after: Transition) -> Information:
         Q, h = self.model.Q, after.length
         A = after.forms.A_in.data("v", "q", after.moment, u=after.w, q=after.q)
-        gain = self.normal(after.forms).gain(A, after.q, after.error, self.probes)
+        gain = self.normal(after.forms).gain(A, after.q, after.error(), self.probes)
         rough = gain.matrix[:, self.on_diagonal] @ (1.0 / self.diagonal)
         force = np.stack([gain.force, Q.riesz(gain.force)])
         change = force - state.force if state.samples else math.sqrt(2.0) * force

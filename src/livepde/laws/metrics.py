@@ -63,7 +63,8 @@ class Transition:
     change
         By how much q has changed, shape (m,).
     error
-        Equation error of the data at its end, R^T eps = -theta R^T M_op r - R^T M r', shape (n,).
+        Returns the equation error of the data at its end, shape (n,),
+        R^T eps = -theta R^T M_op r - R^T M r'.
     moment, length
         Time and inputs at its end, and how long it was.
     """
@@ -72,7 +73,7 @@ class Transition:
     q: Array
     w: Array
     change: Array
-    error: Array
+    error: Callable[[], Array]
     moment: Moment
     length: float
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
@@ -13,7 +13,7 @@ import numpy as np
 from livepde.laws.base import Problem
 from livepde.laws.metrics import NoState
 from livepde.laws.smoothing import Balance, NoiseDetector, Smoother
-from livepde.linalg import Array
+from livepde.linalg import Array, Memo
 from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval
 
@@ -28,7 +28,6 @@ __all__ = [
 LARGEST_MEMO = 8  # smoothers kept for different sets of present sensors
 
 State = TypeVar("State")
-Kept = TypeVar("Kept")
 
 
 class ObservedPath(ABC):
@@ -127,8 +126,8 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self._detectors: dict[bytes, NoiseDetector] = {}
-        self._smoothers: dict[bytes, Smoother] = {}
+        self._detectors: Memo[bytes, NoiseDetector] = Memo(LARGEST_MEMO)
+        self._smoothers: Memo[bytes, Smoother] = Memo(LARGEST_MEMO)
 
     def init(self) -> Balance:
         return Balance.none(self.problem.observed.size, self.problem.model.X.dim)
@@ -137,7 +136,7 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
         self, state: Balance, split: Split, interval: Interval
     ) -> tuple[Balance, ObservedPath]:
         model, key = self.problem.model, split.present.tobytes()
-        detector = _kept(self._detectors, key, lambda: NoiseDetector(self.problem.observed, split))
+        detector = self._detectors.get(key, lambda: NoiseDetector(self.problem.observed, split))
         smoother, alpha = None, 0.0
         samples = [(interval.t1, interval.z1)]
         if np.isnan(state.z).all():  # the first interval
@@ -147,7 +146,7 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
             state, noisy = detector.add(state, z, boundary)
             if noisy:
                 make = partial(Smoother, self.problem.observed, split.present)
-                smoother = _kept(self._smoothers, key, make)
+                smoother = self._smoothers.get(key, make)
                 state = smoother.add(state, z, boundary)
                 alpha = smoother.alpha(state)
             else:
@@ -155,15 +154,6 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
         if smoother is None:
             return state, _InversePath(self.problem, interval, split)
         return state, _SmoothedPath(self.problem, interval, split, smoother, alpha)
-
-
-def _kept(memo: dict[bytes, Kept], key: bytes, make: Callable[[], Kept]) -> Kept:
-    """Return what is kept for a set of present sensors."""
-    if key not in memo:
-        if len(memo) >= LARGEST_MEMO:
-            memo.clear()
-        memo[key] = make()
-    return memo[key]
 
 
 class _SmoothedPath(_InversePath):

@@ -138,14 +138,10 @@ def placed(filter_: Filter, window: Window, q: Array) -> FilterState:
         U = start.C @ initial.T
         return replace(start, q=q[None], u=u[None], du=du[None], da=-shift[None], U=U)
     moved = along(start, 0, shift)
-    return replace(
-        start, q=q[None], u=start.u + moved, du=start.du - moved, da=start.da - shift
-    )
+    return replace(start, q=q[None], u=start.u + moved, du=start.du - moved, da=start.da - shift)
 
 
-def replayed(
-    filter_: Filter, window: Window, choices: Assimilator
-) -> tuple[Window, Status]:
+def replayed(filter_: Filter, window: Window, choices: Assimilator) -> tuple[Window, Status]:
     """Run the samples again about a reference at the estimate, or on the way to it."""
     q = next_reference(filter_, window)
     x = placed(filter_, window, q)

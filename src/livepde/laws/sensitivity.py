@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -46,9 +46,16 @@ from livepde.laws.replay import (
 )
 from livepde.laws.sensors import MemberSensors
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import BandedStage, Interval, Span, member_stage
+from livepde.stepping import BandedStage, Interval, KeptFactors, Span, member_stage
 
-__all__ = ["NEVER", "SensitivityLaw", "SensitivityState", "SensitivityWork", "from_now"]
+__all__ = [
+    "NEVER",
+    "SensitivityLaw",
+    "SensitivityState",
+    "SensitivityWork",
+    "from_now",
+    "without_factors",
+]
 
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
 TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
@@ -737,12 +744,16 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return new, replace(report, notes={**report.notes, "jump": float(alarm)})
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
-        return self.member_belief(work, state, 0)
+        return self.member_belief(work, state.now, 0)
+
+    def reader(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Belief]:
+        now = without_factors(state.now)
+        return lambda: self.member_belief(work, now, 0)
 
     @staticmethod
-    def member_belief(work: SensitivityWork, state: SensitivityState, k: int) -> Belief:
+    def member_belief(work: SensitivityWork, now: FilterState, k: int) -> Belief:
         """Return what is believed of one member, in latent coefficients."""
-        filter_, now = work.filter, state.now
+        filter_ = work.filter
         reduction = filter_.reduction
         drift = float(filter_.drifts(now.member[k : k + 1])[0])
         return Belief(
@@ -754,6 +765,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             reduction.Phi,
             reduction.rest(float(now.age[k]), drift),
         )
+
+
+def without_factors(x: FilterState) -> FilterState:
+    """Return a filter without what its last stage has left: what estimates hold."""
+    return changed(x, kept=KeptFactors.none(len(x)))
 
 
 def from_now(state: SensitivityState) -> SensitivityState:

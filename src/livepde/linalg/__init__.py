@@ -10,9 +10,10 @@ from livepde.linalg.cholmod import CholmodSolver
 from livepde.linalg.engine import Engine, in_use, using
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
+from livepde.linalg.memo import Memo
 from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
 from livepde.linalg.pardiso import PardisoSolver
-from livepde.linalg.pattern import Pattern, PatternOperator, compact, sandwich
+from livepde.linalg.pattern import Pattern, compact, sandwich
 from livepde.linalg.protocol import Factor, Solver
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
 from livepde.linalg.types import Array, IntArray, Mask, Sparse
@@ -30,10 +31,10 @@ __all__ = [
     "IntArray",
     "Leading",
     "Mask",
+    "Memo",
     "MultigridSolver",
     "PardisoSolver",
     "Pattern",
-    "PatternOperator",
     "Solver",
     "Sparse",
     "SuperLUSolver",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from dataclasses import dataclass, field
 from functools import cached_property
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,15 @@ class PardisoFactor:
     handle: Any
     matrix: sp.csr_array
 
+    # A handle works in memory of its own, and pypardiso lets other threads run meanwhile. A factor
+    # that a model keeps (of X, say) is asked by every thread: one after the other.
+    turn: Lock = field(default_factory=Lock, repr=False)
+
     def solve(self, b: Array) -> Array:
         """Return x with K x = b."""
-        self.handle.set_phase(SOLVE)
-        x: Array = self.handle._call_pardiso(self.matrix, np.array(b, dtype=float, order="F"))
+        with self.turn:
+            self.handle.set_phase(SOLVE)
+            x: Array = self.handle._call_pardiso(self.matrix, np.array(b, dtype=float, order="F"))
         return x
 
 
@@ -89,9 +95,11 @@ class PardisoSolver:
             raise LinearAlgebraError("The matrix holds values that are not finite.")
         kept, pattern = self._stored
         matrix = pattern.matrix(data[kept])
-        known = bool(self._idle)
         kind = POSITIVE_DEFINITE if self.symmetric else GENERAL
-        handle = self._idle.pop() if known else PyPardisoSolver(mtype=kind)
+        try:
+            handle, known = self._idle.pop(), True  # at once: another thread may take the last one
+        except IndexError:
+            handle, known = PyPardisoSolver(mtype=kind), False
         handle.libmkl.MKL_CBWR_Set(REPRODUCIBLE)
         handle.set_phase(REFACTORISE if known and self.symmetric else FACTORISE)
         try:

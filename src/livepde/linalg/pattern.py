@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from livepde.linalg.types import Array, IntArray, Sparse
 
-__all__ = ["Pattern", "PatternOperator", "compact", "sandwich"]
+__all__ = ["Pattern", "compact", "sandwich"]
 
 DENSE = 10_000  # entries up to which a dense product is faster than a sparse one
 
@@ -99,45 +99,17 @@ class Pattern:
         shape = (self.shape[1], self.shape[0])
         return sp.csc_array((data, self.indices, self.indptr), shape=shape, copy=False)
 
-    def operator(self) -> PatternOperator:
-        """Return a matrix with this pattern whose data are set again and again."""
-        return PatternOperator(self)
+    def product(self, data: Array, x: Array) -> Array:
+        """Return `matrix(data) @ x`, for x of shape (columns,) or (columns, k)."""
+        # Nothing is kept between two products: a pattern serves any number of threads at once.
+        product: Array = self.compact(data) @ x
+        return product
 
     def gather(self, rows: IntArray, cols: IntArray) -> sp.csr_array:
         """Return the 0/1 matrix that sums a list of entries into `data`, shape (nnz, entries)."""
         at = self.positions(rows, cols)
         each = np.arange(len(at), dtype=np.int32)
         return sp.csr_array((np.ones(len(at)), (at, each)), shape=(self.nnz, len(at)))
-
-
-class PatternOperator:
-    """Products with a matrix whose data change: nothing is built again, a small one is dense."""
-
-    def __init__(self, pattern: Pattern) -> None:
-        self._places: IntArray | None = None
-        if pattern.small:
-            self._places = pattern.places
-            self._dense = np.zeros(pattern.shape)
-            return
-        empty = np.zeros(pattern.nnz)
-        self._matrix, self._transposed = pattern.matrix(empty), pattern.transposed(empty)
-
-    def set(self, data: Array) -> None:
-        """Use these values from now on."""
-        if self._places is not None:
-            self._dense.put(self._places, data)
-        else:
-            self._matrix.data = self._transposed.data = data
-
-    def apply(self, x: Array) -> Array:
-        """Return the product with x."""
-        product: Array = (self._matrix if self._places is None else self._dense) @ x
-        return product
-
-    def apply_transposed(self, x: Array) -> Array:
-        """Return the product of the transpose with x."""
-        product: Array = self._transposed @ x if self._places is None else x @ self._dense
-        return product
 
 
 def compact(matrix: sp.csr_array) -> sp.csr_array | Array:

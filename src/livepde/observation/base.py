@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment, Named, Place, Scalars
-from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.observation.reconstruction import (
     Pseudoinverse,
     Reconstructed,
@@ -148,8 +148,8 @@ class Observed:
         for name in observation.directs:
             if name not in self.names:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
-        self._splits: dict[bytes, Split] = {}
-        self._reconstructors: dict[bytes, Reconstructor] = {}
+        self._splits: Memo[bytes, Split] = Memo(LARGEST_MEMO)
+        self._reconstructors: Memo[bytes, Reconstructor] = Memo(LARGEST_MEMO)
 
     @property
     def nodal(self) -> bool:
@@ -266,14 +266,8 @@ class Observed:
 
         Sensors that repeat others are allowed: they are averaged, as by the Moore-Penrose inverse.
         """
-        if present is None:
-            present = np.ones(self.size, dtype=bool)
-        key = present.tobytes()
-        if key not in self._splits:
-            if len(self._splits) >= LARGEST_MEMO:
-                self._splits.clear()
-            self._splits[key] = self._split(present)
-        return self._splits[key]
+        asked = np.ones(self.size, dtype=bool) if present is None else present
+        return self._splits.get(asked.tobytes(), lambda: self._split(asked))
 
     def reconstruct(
         self,
@@ -310,16 +304,12 @@ class Observed:
             )
         if delta is not None and not (np.isfinite(delta) and delta > 0):
             raise ObservationError(f"reconstruct: delta must be a positive number; got {delta}.")
-        if present is None:
-            present = np.isfinite(z)
+        asked = np.isfinite(z) if present is None else present
         if boundary is None:
             boundary = np.zeros(self.X.dim)
-        key = present.tobytes()
-        if key not in self._reconstructors:
-            if len(self._reconstructors) >= LARGEST_MEMO:
-                self._reconstructors.clear()
-            self._reconstructors[key] = self.observation.reconstruction.prepare(self, present)
-        return self._reconstructors[key](z, boundary, delta)
+        rule = self.observation.reconstruction
+        prepared = self._reconstructors.get(asked.tobytes(), lambda: rule.prepare(self, asked))
+        return prepared(z, boundary, delta)
 
     def _split(self, present: Array) -> Split:
         n = self.X.dim

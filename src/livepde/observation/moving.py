@@ -87,6 +87,8 @@ class MovingObserved(Observed):
                     f"Moving: sensor '{name}' has position channels {list(channels)}; the mesh "
                     f"has {dimension} coordinates."
                 )
+        # G at the last positions. Copies of an identifier share it, maybe in threads: the three are
+        # read once and replaced as a whole, so that they fit together.
         self._last: tuple[bytes, sp.csr_array, Array] | None = None
 
     def _names(self) -> tuple[str, ...]:
@@ -115,7 +117,8 @@ class MovingObserved(Observed):
             [[given.get(name, np.nan) for name in names] for names in self.observation.channels]
         )
         key = points.tobytes()
-        if self._last is None or self._last[0] != key:
+        last = self._last
+        if last is None or last[0] != key:
             seen = np.array([self.block.contains(point) for point in points])
             rows = np.flatnonzero(seen)
             G = sp.csr_array((len(points), self.state.dim))
@@ -125,5 +128,6 @@ class MovingObserved(Observed):
                     (np.ones(len(rows)), (rows, np.arange(len(rows)))), (len(points), len(rows))
                 )
                 G = sp.csr_array(place @ values)
-            self._last = (key, G, seen)
-        return self._last[1], self._last[2]
+            seen.setflags(write=False)
+            self._last = last = (key, G, seen)
+        return last[1], last[2]

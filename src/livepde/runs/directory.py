@@ -23,15 +23,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
-
-import xarray as xr
+from typing import TYPE_CHECKING, Any
 
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, FigureFactory, Table
 from livepde.runs.summary import arrivals, tables
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = [
     "Run",
@@ -277,6 +278,8 @@ class Run:
         if not path.is_file():
             told = "".join(f" {note}" for note in self.notes)
             raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.{told}")
+        import xarray as xr
+
         try:
             return xr.load_dataset(path, engine="scipy", mmap=False)
         except (OSError, ValueError, TypeError, LookupError, MemoryError) as error:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from livepde.diagnostics.identifiability import FLAT
 from livepde.plots.dataset import scalars
 from livepde.runs.dates import when
 from livepde.runs.summary import digits, jumps, scored
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["doubts", "unexplained"]
 

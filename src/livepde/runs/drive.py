@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,7 +118,10 @@ def drive(
     feed = Samples(
         watched(stream, total) if progress else stream, identifier.observed.names, journal.last
     )
-    live = Live(identifier, feed, journal, fields_every=fields_every, strict=True)
+    at_hand = isinstance(stream, Sized)
+    live = Live(
+        identifier, feed, journal, fields_every=fields_every, strict=True, waits=not at_hand
+    )
     live.resume()
     return conduct(live)
 

@@ -19,22 +19,26 @@ checkpoint can pass over what was lost. What was written before is there, and a 
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 from filelock import FileLock
 
 from livepde.errors import RunError
 from livepde.linalg import Array
-from livepde.records import STATUS_CODES, Layout, Record, Snapshot
+from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
 from livepde.runs.database import AGAIN, in_memory, locked, reader, released, sound, told, writer
 from livepde.runs.packing import layout_from, packed, unpacked
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["Event", "Journal", "Taken"]
 
@@ -205,17 +209,14 @@ class Journal:
         position
             Where its source stands after it, to go on from there.
         """
-        row = np.array([values.get(name, np.nan) for name in self.channels])
-        self._enter(t, row, position)
+        row = array("d", [values.get(name, math.nan) for name in self.channels])
+        self._enter(t, row.tobytes(), position)
         self._write(self._db.commit)
-        return Taken(self._current, t, dict(zip(self.channels, row.tolist(), strict=True)))
+        return Taken(self._current, t, dict(zip(self.channels, row, strict=True)))
 
-    def _enter(self, t: float, row: Array, position: str) -> None:
+    def _enter(self, t: float, channels: bytes, position: str) -> None:
         cursor = self._execute(
-            "INSERT INTO samples (t, channels, position) VALUES (?, ?, ?)",
-            t,
-            row.tobytes(),
-            position,
+            "INSERT INTO samples (t, channels, position) VALUES (?, ?, ?)", t, channels, position
         )
         self._current = int(cursor.lastrowid or 0)
 
@@ -230,7 +231,7 @@ class Journal:
             The identifier's.
         """
         for row, record in rows:
-            self._enter(record.t, row, "")
+            self._enter(record.t, row.tobytes(), "")
             self.append(record)
         self.checkpoint(state)  # commits
 
@@ -245,14 +246,14 @@ class Journal:
 
         One that was kept before a crash is found again, and stays as it is.
         """
-        numbers = np.concatenate([record.numbers, record.innovation, record.withheld_error])
+        found = (record.numbers, record.innovation, record.withheld_error)
         self._execute(
             "INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
             self._current,
             record.t,
             record.status,
             record.steps,
-            numbers.tobytes(),
+            b"".join(values.tobytes() for values in found),
             json.dumps(dict(record.notes)),
         )
         if record.snapshot is not None:
@@ -433,7 +434,7 @@ class Journal:
 
     def dataset(self) -> xr.Dataset:
         """Return the estimates as a dataset; see `Result.to_xarray`."""
-        records = list(self)
+        records = RecordArrays.of(self)
         with sound(self.path):
             return self.layout.dataset(records)
 

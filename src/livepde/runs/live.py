@@ -120,6 +120,9 @@ class Live:
         an event.
     begun, irregular
         Samples that the feed has brought already, and what was worth counting until then.
+    waits
+        The feed may wait for samples: who reads the journal is shown the last estimate before.
+        Else it is shown with the next sample, in one transaction.
     stopping
         Ends the run when it is set; it may be set already.
     clock
@@ -140,6 +143,7 @@ class Live:
         strict: bool = False,
         begun: Iterable[Ready] = (),
         irregular: Iterable[Remark] = (),
+        waits: bool = True,
         stopping: threading.Event | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -151,6 +155,7 @@ class Live:
         self.retention = retention or Retention()
         self.silence = silence
         self.strict = strict
+        self.waits = waits
         self.silent = False
         self.stopping = stopping or threading.Event()
         self.busy = False  # a step is taken
@@ -211,7 +216,7 @@ class Live:
 
     def _run(self) -> None:
         while not self.stopping.is_set():
-            if not self._waiting:
+            if self.waits and not self._waiting:
                 self._settle()  # who reads the journal sees all before it is waited for more
             if self.backlog.has_room(self._waiting):
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))

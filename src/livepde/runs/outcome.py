@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
-
-import xarray as xr
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from livepde.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["Bound", "Check", "FigureFactory", "Outcome", "Sense", "Table"]
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from livepde.diagnostics.identifiability import TRADED, Known
 from livepde.plots.dataset import interval_95, scalars
 from livepde.runs.dates import when
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = [
     "Jump",

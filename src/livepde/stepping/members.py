@@ -13,7 +13,16 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.fem import Channel, Form, Inputs, Moment
-from livepde.linalg import Array, Assembler, BandedBlocks, BandedSolver, IntArray, Pattern, analyse, compact
+from livepde.linalg import (
+    Array,
+    Assembler,
+    BandedBlocks,
+    BandedSolver,
+    IntArray,
+    Pattern,
+    analyse,
+    compact,
+)
 from livepde.model import Model
 from livepde.stepping.corrections import Kept
 from livepde.stepping.driven import DrivenVector

@@ -130,7 +130,7 @@ class Newton:
         Of the residual of a prediction that may be left. 0: always to `tolerance`.
     ceiling
         Bound on the relative residual with `share`. The default keeps q and u within 1e-3 of those
-        of strict solves (`livepde reproduce exact`): what is left adds up where little damps it.
+        of strict solves (`livepde reproduce exact`): the next stage makes up for what one leaves.
         Large coupled stages, solved by blocks, raise it to 5e-3.
     iterations
         At most this many updates.
@@ -140,7 +140,7 @@ class Newton:
 
     tolerance: float = 1e-8
     share: float = 0.1
-    ceiling: float = 2e-4
+    ceiling: float = 1e-3
     iterations: int = 60
     refresh: float = 0.2
 

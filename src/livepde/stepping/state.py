@@ -141,15 +141,16 @@ class ForwardStage:
         """Return the same where they do not depend on u; what does not change is kept."""
         model, maps = self.model, self._rows[1]
         zero = np.zeros(model.X.dim)
-        if self._rate is None or self._rate[0] != h:
+        rate = self._rate  # read once: copies of an identifier may step in other threads
+        if rate is None or rate[0] != h:
             data = maps["M"] @ (model.mass.data / h)
             data += maps["B"] @ model.form_B.data("v", "u", moment, u=zero)
-            self._rate = (h, data)
+            self._rate = rate = (h, data)
         if self._slope is not None:
             changing: Array = self._slope @ q
         else:
             changing = maps["A"] @ self.form.data("v", "u", moment, u=zero, q=q)
-        return changing + self._rate[1]
+        return changing + rate[1]
 
     @cached_property
     def _slope(self) -> sp.csr_array | Array | None:
@@ -217,23 +218,26 @@ class ForwardStage:
 
     def _system(self, q: Array, h: float, moment: Moment) -> _System:
         """Return the matrix, and B(0) + A(0) q if it is constant, for the last (q, h)."""
-        if self._last is None or not self._last[0].same(q, h):
+        last = self._last
+        if last is None or not last[0].same(q, h):
             physical = self.model.latent.value(q)
             data = self._data_at(physical, h, moment)
             offset = self._at_zero(physical, moment) if self.model.constant else None
-            self._last = (At(q, h), _System(data, self._rows[0].compact(data), offset))
-        return self._last[1]
+            last = (At(q, h), _System(data, self._rows[0].compact(data), offset))
+            self._last = last
+        return last[1]
 
     def factor(self, q: Array, h: float, moment: Moment) -> Factor:
         """Return the factor of an affine model for (q, h), made unless it was the last one."""
-        if self._made is None or not self._made[0].same(q, h):
-            self._made = None  # two at once may be more than there is memory
-            if self._last is not None and self._last[0].same(q, h):
-                data = self._last[1].data
+        made, last = self._made, self._last
+        if made is None or not made[0].same(q, h):
+            self._made = made = None  # two at once may be more than there is memory
+            if last is not None and last[0].same(q, h):
+                data = last[1].data
             else:
                 data = self._data_at(self.model.latent.value(q), h, moment)
-            self._made = (At(q, h), self._factorise(data))
-        return self._made[1]
+            self._made = made = (At(q, h), self._factorise(data))
+        return made[1]
 
     def _known(self, c: Array, system: _System, q: Array, h: float, moment: Moment) -> Array:
         """Return the right-hand side of a stage of an affine model."""

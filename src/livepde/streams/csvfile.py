@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import codecs
 import csv
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ __all__ = ["UTF_8", "Written", "how_written", "read_csv", "too_wide"]
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
 SEPARATORS = (",", ";", "\t")
+END = "end"  # of a file that is read
 LOOK = 100_000  # characters that are looked at to say how a file is written
 BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .ods, .xls
 
@@ -85,45 +87,28 @@ def read_csv(
         No such file or column; text or infinity in a channel; times that do not increase. The
         message names file, row (the header is row 1) and column.
     """
-    import pandas as pd
-
     path = Path(path)
-    needed = [clock.name, *(name for column in columns.values() for name in column.names)]
-    how: dict[str, Any] = {"skipinitialspace": True, "sep": separator, "encoding": encoding}
+    needed = list(
+        dict.fromkeys([clock.name, *(n for column in columns.values() for n in column.names)])
+    )
     try:
         _check_text(path)
-        header = list(pd.read_csv(path, nrows=0, **how).columns)
-        _check_separator(path, header, separator, encoding, clock)
-        check_columns(str(path), needed, header)
-        _check_rows(path, needed, separator, encoding)
-        frame = pd.read_csv(
-            path,
-            usecols=sorted(set(needed)),
-            dtype=str,
-            keep_default_na=False,
-            skip_blank_lines=False,
-            index_col=False,  # else a separator at the end of each row would shift all columns
-            **how,
-        )
+        rows, cells = _cells(path, needed, separator, encoding, clock)
     except FileNotFoundError:
         raise no_file(path) from None
     except UnicodeError as error:
         raise _not_text(path, separator, encoding, clock) from error
-    except (OSError, pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+    except (OSError, csv.Error) as error:
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
-    blank = (frame == "").all(axis=1)
-    rows = np.flatnonzero(~blank.to_numpy()) + 2
-    frame = frame.loc[~blank]
-    if not len(frame):
+    if not rows:
         raise DataError(f"{path}: holds no rows beside its header.")
-    times, dates = read_times(
-        frame[clock.name].tolist(), clock, lambda k: f"{path}, row {rows[k]}, column"
-    )
+    times, dates = read_times(cells[clock.name], clock, lambda k: f"{path}, row {rows[k]}, column")
     decimals = {name: column.decimal for column in columns.values() for name in column.names}
 
     def numbers(name: str, use: Any) -> Array:
-        cells = frame[name].to_numpy()[use]
-        return _numbers(cells, rows[use], f"{path}", name, decimals[name])
+        chosen = use.tolist()
+        texts, places = [cells[name][k] for k in chosen], [rows[k] for k in chosen]
+        return _numbers(texts, places, f"{path}", name, decimals[name])
 
     def where(k: int) -> str:
         return f"{path}, row {rows[k]}, column '{clock.name}'"
@@ -222,20 +207,53 @@ def too_wide(cells: list[str], header: list[str]) -> bool:
     return any(cell.strip() for cell in cells[named:])
 
 
-def _check_rows(path: Path, needed: list[str], separator: str, encoding: str) -> None:
-    """Refuse what pandas would read without a word: a name twice, more fields than names."""
+def _cells(
+    path: Path, needed: list[str], separator: str, encoding: str, clock: Clock
+) -> tuple[list[int], dict[str, list[str]]]:
+    """Return the numbers of the rows that are not blank, and the text in the needed columns.
+
+    Refuses a name that stands twice, more fields than names, and a quote that does not end.
+    """
     with path.open(newline="", encoding=encoding) as file:
-        rows = csv.reader(file, delimiter=separator, skipinitialspace=True)
-        header = next((row for row in rows if row), [])
+        lines = csv.reader(chain(file, [f"{END}\n"]), delimiter=separator, skipinitialspace=True)
+        numbered = _whole(lines)
+        header = next((row for _, row in numbered if row), None)
+        if header is None:
+            raise csv.Error("it is empty")
+        _check_separator(path, header, separator, encoding, clock)
+        check_columns(str(path), needed, header)
         for name in needed:
             if header.count(name) > 1:
                 raise SampleError(f"{path}: two columns are called '{name}'; rename one.")
-        for row in rows:
+        places = [header.index(name) for name in needed]
+        rows: list[int] = []
+        columns: list[list[str]] = [[] for _ in needed]
+        for number, row in numbered:
             if too_wide(row, header):
                 raise SampleError(
-                    f"{path}, row {rows.line_num}: {len(row)} fields, but the header has "
+                    f"{path}, row {number}: {len(row)} fields, but the header has "
                     f"{len(header)}; decimals need a point, and fields with a comma in them quotes."
                 )
+            texts = [row[place] if place < len(row) else "" for place in places]
+            if any(texts):
+                rows.append(number)
+                for column, text in zip(columns, texts, strict=True):
+                    column.append(text)
+    return rows, dict(zip(needed, columns, strict=True))
+
+
+def _whole(lines: Iterable[list[str]]) -> Iterator[tuple[int, list[str]]]:
+    """Iterate over rows and their numbers, without the END that follows the last line.
+
+    Where a quote is still open there, END is part of it, and `csv.Error` is raised.
+    """
+    before: tuple[int, list[str]] | None = None
+    for item in enumerate(lines, start=1):
+        if before is not None:
+            yield before
+        before = item
+    if before is None or before[1] != [END]:
+        raise csv.Error("a quote does not end")
 
 
 def _not_text(path: Path, separator: str, encoding: str, clock: Clock) -> DataError:
@@ -253,7 +271,9 @@ def _not_text(path: Path, separator: str, encoding: str, clock: Clock) -> DataEr
     )
 
 
-def _numbers(cells: Any, rows: Any, where: str, name: str, decimal: str) -> Array:
+def _numbers(
+    cells: Sequence[str], rows: Sequence[int], where: str, name: str, decimal: str
+) -> Array:
     """Return a column of text as numbers; its row is looked for only if one is wrong."""
     try:
         plain = cells if decimal == "." else [cell.translate(POINT) for cell in cells]

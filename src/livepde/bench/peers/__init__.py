@@ -1,4 +1,4 @@
-"""The same data and the same model in the packages that users take today.
+"""The same data and the same model in what users write and take today.
 
 Each peer is given the reduced coordinates, the prior, the noise level and the initial state that
 our laws are given, and steps of our forward model. Where it has a knob, the setting that does best
@@ -8,6 +8,6 @@ is a row that says so: `pip install livepde[peers]`.
 
 from __future__ import annotations
 
-from livepde.bench.peers.table import PEERS, Peer, peers
+from livepde.bench.peers.table import PEERS, PROBLEMS, ROWS, Peer, peers
 
-__all__ = ["PEERS", "Peer", "peers"]
+__all__ = ["PEERS", "PROBLEMS", "ROWS", "Peer", "peers"]

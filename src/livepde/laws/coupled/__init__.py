@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from livepde.laws.coupled.equation import StageData, StageIterate, StageSolver, StageTerms
+from livepde.laws.coupled.equation import (
+    StageData,
+    StageIterate,
+    StageProblem,
+    StageSolver,
+    StageTerms,
+)
 from livepde.laws.coupled.forms import StageForms
 from livepde.laws.coupled.metric import Metric
-from livepde.laws.coupled.stage import CoupledStage, KeptFactor, StageProblem
+from livepde.laws.coupled.stage import CoupledStage, KeptFactor
 
 __all__ = [
     "CoupledStage",

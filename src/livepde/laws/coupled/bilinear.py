@@ -9,10 +9,14 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.fem import Moment
-from livepde.laws.coupled.equation import Inside, StageData, StageIterate, StageTerms
+from livepde.laws.coupled.equation import (
+    Inside,
+    StageData,
+    StageIterate,
+    StageProblem,
+    StageTerms,
+)
 from livepde.laws.coupled.forms import AnyForm
-from livepde.laws.coupled.metric import Metric
 from livepde.laws.coupled.monolithic import MonolithicSolver
 from livepde.linalg import Array, Pattern, compact
 
@@ -101,30 +105,18 @@ class BilinearSolver(MonolithicSolver):
             "B_out": compact(self._slopes[1]),
         }
 
-    def data(
-        self,
-        c: Array,
-        h: float,
-        moment: Moment,
-        u_alpha: Array,
-        metric: Metric,
-        w: Array | None = None,
-    ) -> StageData:
-        forms, products = self.terms.forms, self._products
-        known = forms.model.F(moment) * self.terms.free - self._slopes[2]
-        inside = None
+    def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
+        forms, inside = self.terms.forms, None
+        known = forms.model.F(problem.moment) * self.terms.free - self._slopes[2]
         if forms.W is None:
-            w = forms.model.impose(u_alpha, moment) if w is None else w
-            inside = Inside(self._coupling[0].at(w), products["B_in"] @ w)
-        sizes = self.terms.sizes(c, h, known, u_alpha, metric)
-        observed = self.terms.observed(u_alpha)
-        J = self.terms.information(metric)
-        return StageData(c, h, moment, u_alpha, metric, known, inside, sizes, observed, J)
+            w = forms.model.impose(problem.u_alpha, problem.moment) if w is None else w
+            inside = Inside(self._coupling[0].at(w), self._products["B_in"] @ w)
+        return self.terms.given(problem, known, inside)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
-        u, q, c = y[:n], y[n:], data.c
-        r = forms.split.project(u) - data.u_alpha
+        u, q, c = y[:n], y[n:], data.problem.c
+        r = forms.split.project(u) - data.problem.u_alpha
         w = u if forms.at_estimate else u - r
         coupling_in, coupling_out = self._coupling
         if data.inside is not None:
@@ -133,28 +125,29 @@ class BilinearSolver(MonolithicSolver):
             (A, transposed), flux = coupling_in.at(w), products["B_in"] @ w
         driven = A @ q
         if coupling_out is not None:
-            driven = driven + coupling_out.at(u)[0] @ q
+            driven = driven + coupling_out.matrix(u) @ q
         by_r = products["r"] @ r
         Mr, mass_r = by_r[:n], by_r[n:]
         norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
-        rate = products["M"] @ ((u - c[:n]) / data.h)
+        rate = products["M"] @ ((u - c[:n]) / data.problem.h)
         pull = (theta * terms.free) * Mr
         change, coupling = self.weighed(data, q - c[n:]), transposed @ r
         residual = np.empty_like(y)
         residual[:n] = rate + flux + products["B_out"] @ u + driven + pull - data.source
-        residual[n:] = change - (coupling + data.metric.load) * terms.free_q
+        residual[n:] = change - (coupling + data.load) * terms.free_q
         first = [residual[:n], rate, driven, pull]
         second = [residual[n:], change, coupling]
-        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
+        accuracy = self.accuracy(data)
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
         return StageIterate(
             y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r
         )
 
     def weighed(self, data: StageData, change: Array) -> Array:
-        if data.metric.drift:
+        if data.problem.metric.drift:
             return super().weighed(data, change) * self.terms.free_q
-        weighed: Array = self._products["G"] @ (data.metric.scale * change)
+        weighed: Array = self._products["G"] @ (data.problem.metric.scale * change)
         return weighed if data.J is None else weighed + (data.J @ change) * self.terms.free_q
 
     def changing(self, data: StageData, at: StageIterate) -> Array:
@@ -168,13 +161,17 @@ class _Coupling:
     """A(w) on the free coefficients, as a matrix whose data are linear in w."""
 
     pattern: Pattern
-    data: sp.csr_array
+    data: sp.csr_array | Array
 
     @classmethod
     def of(cls, form: AnyForm, terms: StageTerms) -> _Coupling:
         pattern = form.pattern("v", "q")
         kept = terms.free[pattern.rows] * terms.free_q[pattern.indices]
-        return cls(pattern, sp.csr_array(sp.diags_array(kept) @ _tensors(form)[0]))
+        return cls(pattern, compact(sp.csr_array(sp.diags_array(kept) @ _tensors(form)[0])))
+
+    def matrix(self, w: Array) -> Any:
+        """Return A(w); a small one is dense."""
+        return self.pattern.compact(self.data @ w)
 
     def at(self, w: Array) -> tuple[Any, Any]:
         """Return A(w) and its transpose; small ones are dense."""

@@ -49,6 +49,7 @@ LARGE = 4000  # unknowns u and q together, from which a matrix that is not bande
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
 CEILING = 5e-3  # of a predicted stage: one more update costs as much as a forward step
+CARRIED = 3e-2  # relative accuracy of r in one, for the same reason
 RESOLVED = 1e-10  # of u and q: smaller updates by GMRES are as good as none
 REFRESH = 0.5  # of the residual: an update costs a twentieth of new factors
 SPENT = 12  # updates and iterations: about what new factors cost
@@ -88,6 +89,10 @@ class BlockSolver(StageSolver):
     def ceiling(self) -> float:
         return CEILING
 
+    @property
+    def carried(self) -> float:
+        return CARRIED
+
     def kept(self, factor: Factor) -> Factor:
         return factor.approximate if isinstance(factor, BlockJacobian) else factor
 
@@ -108,9 +113,9 @@ class BlockSolver(StageSolver):
 
     def factor(self, data: StageData, at: StageIterate) -> BlockJacobian:
         terms, forms = self.terms, self.terms.forms
-        form, moment, n = forms.A_in, data.moment, terms.n
+        form, moment, h, n = forms.A_in, data.problem.moment, data.problem.h, terms.n
         u, q, free, free_q = at.y[:n], at.y[n:], terms.free, terms.free_q
-        S = masked(sp.csr_array(forms.model.mass / data.h), free, free)
+        S = masked(sp.csr_array(forms.model.mass / h), free, free)
         A_in = at.A_in if at.A_in is not None else form.matrix("v", "q", moment, u=at.w, q=q)
         A = masked(A_in, free, free_q)
         back, curved = None, None
@@ -131,7 +136,7 @@ class BlockSolver(StageSolver):
             forward = sp.csr_array(A + outside)
         S = S + masked(sp.csr_array(at.theta * forms.pull + forms.hidden), free, free)
         S = sp.csr_array(S + sp.diags_array(1.0 - free))
-        rates = self.lumped * (1.0 / data.h + at.theta * np.abs(forms.split.R.diagonal()))
+        rates = self.lumped * (1.0 / h + at.theta * np.abs(forms.split.R.diagonal()))
         row = terms.slope(data, at)
         border = None if row is None else (at.Mr * free, row * free)
         blocks = S, forward, A, self._metric(data), rates
@@ -140,7 +145,7 @@ class BlockSolver(StageSolver):
 
     def _metric(self, data: StageData) -> sp.csr_array:
         """Return H on the free coefficients, with its auxiliary unknowns."""
-        terms, metric = self.terms, data.metric
+        terms, metric = self.terms, data.problem.metric
         rest = np.zeros(terms.auxiliary)
         free = np.concatenate([terms.free_q, 1.0 - rest])
         H = terms.gram * metric.scale

@@ -12,10 +12,16 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LawError
-from livepde.fem import FieldBlock, Moment
+from livepde.fem import FieldBlock
 from livepde.laws.coupled.blocks import LARGE
-from livepde.laws.coupled.equation import Inside, StageData, StageIterate, StageSolver, StageTerms
-from livepde.laws.coupled.metric import Metric
+from livepde.laws.coupled.equation import (
+    Inside,
+    StageData,
+    StageIterate,
+    StageProblem,
+    StageSolver,
+    StageTerms,
+)
 from livepde.linalg import Array, BandedSolver, Factor, Pattern, analyse, in_use
 from livepde.parallel import PetscEngine
 from livepde.parallel.shares import Share, SharedModel
@@ -85,43 +91,33 @@ class DistributedSolver(StageSolver):
     def prepare(self) -> None:
         self.shared("prepare")
 
-    def data(
-        self,
-        c: Array,
-        h: float,
-        moment: Moment,
-        u_alpha: Array,
-        metric: Metric,
-        w: Array | None = None,
-    ) -> StageData:
-        model = self.terms.forms.model
-        w = model.impose(u_alpha, moment) if w is None else w
+    def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
+        model, moment = self.terms.forms.model, problem.moment
+        w = model.impose(problem.u_alpha, moment) if w is None else w
         known = [
             np.concatenate([w[own], values])
-            for own, values in zip(self.model.u.reaches, self.reached(c), strict=True)
+            for own, values in zip(self.model.u.reaches, self.reached(problem.c), strict=True)
         ]
-        sent = (self.shared.key, h, moment.t, dict(moment.inputs), metric.scale)
+        sent = (self.shared.key, problem.h, moment.t, dict(moment.inputs), problem.metric.scale)
         equation = self.shared.team.share(SharedEquation, *sent, here=(known,))
         (flux,) = joined(equation("flux"), self.model.u)
-        inside = Inside(equation, flux)
-        source, observed = model.F(moment), self.terms.observed(u_alpha)
-        sizes = self.terms.sizes(c, h, source, u_alpha, metric)
-        return StageData(c, h, moment, u_alpha, metric, source, inside, sizes, observed)
+        return self.terms.given(problem, model.F(moment), Inside(equation, flux))
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         terms, n, inside = self.terms, self.terms.n, _inside(data)
         u, q = self.model.u, self.model.q
         pieces = inside.A("terms", here=(self.reached(y),))
         rate, driven, Mr, mass_r, change, coupling = joined(pieces, u, u, u, u, q, q)
-        r = terms.forms.split.project(y[:n]) - data.u_alpha
+        r = terms.forms.split.project(y[:n]) - data.problem.u_alpha
         norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
         pull = theta * Mr
         residual = np.empty_like(y)
         residual[:n] = (rate + inside.flux + driven + pull - data.source) * terms.free
-        residual[n:] = (change - data.metric.load - coupling) * terms.free_q
+        residual[n:] = (change - data.load - coupling) * terms.free_q
         first, second = [residual[:n], rate, driven, pull], [residual[n:], change, coupling]
-        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
+        accuracy = self.accuracy(data)
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
         w = y[:n] - r
         return StageIterate(
             y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r

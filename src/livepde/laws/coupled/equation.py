@@ -8,6 +8,9 @@ With w = u_alpha + P u and r = R u - u_alpha, the unknowns y = (u, q) of one imp
 
 together (`Metric` says what H and load are), so that with full data the two terms with A cancel in
 the energy, as in the paper (align:neplusnr). Over omega w is the data, elsewhere the estimate.
+What the stage before has left of its residual, times its step over this one's, is taken from F and
+load: so what is left in a run of stages does not add up.
+
 theta depends on all of r; its derivative is a rank-one term of the Jacobian. Where A is nonlinear
 in q, A(w) in the second line is its derivative.
 """
@@ -31,10 +34,11 @@ from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array, Factor, Pattern
 from livepde.stepping import TINY
 
-__all__ = ["Inside", "StageData", "StageIterate", "StageSolver", "StageTerms"]
+__all__ = ["Inside", "StageData", "StageIterate", "StageProblem", "StageSolver", "StageTerms"]
 
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-3  # relative accuracy of r, as far as it is above the floor
+CARRIED = 1e-2  # the same where the next stage makes up for what is left
 STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r away
 RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
 OWED = 0.1  # weight of the second line's residual, where a later step makes up for it
@@ -50,8 +54,8 @@ class Inside:
 
 
 @dataclass(frozen=True, eq=False)
-class StageData:
-    """What is given of one stage.
+class StageProblem:
+    """One stage to be solved.
 
     Attributes
     ----------
@@ -63,8 +67,29 @@ class StageData:
         Observed part of the state, shape (n,).
     metric
         H and load of the second line.
-    source
-        F, shape (n,).
+    left
+        What the stage before has left of its residual and this one makes up for, a dual vector,
+        shape (n + m,); None: stages do not make up for what is left.
+    """
+
+    c: Array
+    h: float
+    moment: Moment
+    u_alpha: Array
+    metric: Metric
+    left: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StageData:
+    """A stage with all that is computed once for it.
+
+    Attributes
+    ----------
+    problem
+        The stage.
+    source, load
+        F and the load, without what the stage before has left, shapes (n,) and (m,).
     inside
         A and B over omega, where the data give all of w there.
     sizes
@@ -76,12 +101,9 @@ class StageData:
         Information in the metric, a matrix of shape (m, m); None: zero.
     """
 
-    c: Array
-    h: float
-    moment: Moment
-    u_alpha: Array
-    metric: Metric
+    problem: StageProblem
     source: Array
+    load: Array
     inside: Inside | None
     sizes: tuple[float, float, float]
     observed: Callable[[], Residual]
@@ -226,6 +248,7 @@ class StageTerms:
         second: list[Array],
         X: float,
         theta: float,
+        accuracy: float,
     ) -> tuple[float, bool, tuple[float, float]]:
         """Return the relative size of a residual, whether it resolves r, and the scales of both.
 
@@ -235,37 +258,44 @@ class StageTerms:
             Residual and changing terms of the two lines.
         X
             ||r||_X^2.
+        accuracy
+            Of r, relative, as far as it is above the floor.
         """
         state, *terms = self.duals(first, self.parts[0])
         other, *terms_q = self.duals(second, self.parts[1])
         scales = max(data.sizes[0], *terms), max(data.sizes[1], *terms_q)
         own, own_q = state / max(scales[0], TINY), other / max(scales[1], TINY)
-        if data.metric.theta is not None:
+        if data.problem.metric.theta is not None:
             # Such a metric takes up in the next step what is left of q and r in this one.
             return max(own, OWED * own_q), True, scales
         # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
-        least = 1.0 / data.h + theta
+        least = 1.0 / data.problem.h + theta
         r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
-        return max(own, own_q), state <= RESOLVED * r * least or not self.observes, scales
+        return max(own, own_q), state <= accuracy * r * least or not self.observes, scales
+
+    def given(self, problem: StageProblem, source: Array, inside: Inside | None) -> StageData:
+        """Return a stage, from its F on the free coefficients and what the data say over omega."""
+        load, left = problem.metric.load, problem.left
+        if left is not None:
+            source, load = source - left[: self.n], load - left[self.n :]
+        J = None
+        if problem.metric.information is not None and self.memory is not None:
+            J = self.memory.compact(problem.metric.information)
+        sizes, observed = self.sizes(problem, source, load), self.observed(problem.u_alpha)
+        return StageData(problem, source, load, inside, sizes, observed, J)
 
     def sizes(
-        self, c: Array, h: float, source: Array, u_alpha: Array, metric: Metric
+        self, problem: StageProblem, source: Array, load: Array
     ) -> tuple[float, float, float]:
         """Return the sizes of what is given of a stage, see `StageData`."""
         # Where nothing moves, all terms of a line are rounding errors, and none is a scale.
-        unchanged = np.square(c) * self.diagonal
-        least = math.sqrt(float(unchanged[: self.n].sum())) / h
-        least_q = math.sqrt(float(unchanged[self.n :].sum())) * metric.scale
+        unchanged = np.square(problem.c) * self.diagonal
+        least = math.sqrt(float(unchanged[: self.n].sum())) / problem.h
+        least_q = math.sqrt(float(unchanged[self.n :].sum())) * problem.metric.scale
         (own,) = self.duals([source], self.parts[0])
-        (other,) = self.duals([metric.load], self.parts[1]) if metric.load.any() else (0.0,)
-        known = math.sqrt(float(self.lumped @ np.square(u_alpha)))
+        (other,) = self.duals([load], self.parts[1])
+        known = math.sqrt(float(self.lumped @ np.square(problem.u_alpha)))
         return max(own, RESTING * least), max(other, RESTING * least_q), known
-
-    def information(self, metric: Metric) -> Any:
-        """Return J as what multiplies fastest, shape (m, m); None if it is zero."""
-        if metric.information is None or self.memory is None:
-            return None
-        return self.memory.compact(metric.information)
 
     @cached_property
     def observes(self) -> bool:
@@ -305,16 +335,16 @@ class StageTerms:
         A rule with a pull that does not vanish with r has no bound of its own while u_alpha is
         zero, or tiny.
         """
-        return min(self.damping.theta(norms), STIFFEST / data.h)
+        return min(self.damping.theta(norms), STIFFEST / data.problem.h)
 
     def theta(self, data: StageData, norms: Residual) -> float:
         """Return the weight of R^T M_op r."""
-        own = data.metric.theta
+        own = data.problem.metric.theta
         return self.damped(data, norms) if own is None else own
 
     def slope(self, data: StageData, at: StageIterate) -> Array | None:
         """Return the derivative of theta in u, shape (n,); None if it is zero."""
-        if data.metric.theta is not None or at.theta >= STIFFEST / data.h:
+        if data.problem.metric.theta is not None or at.theta >= STIFFEST / data.problem.h:
             return None
         dX, dVX, dV = self.damping.slopes(at.norms)
         row = (2.0 * dX) * at.mass_r + (2.0 * dVX) * at.Mr
@@ -336,17 +366,18 @@ class StageTerms:
         """Return the dual norms of what rounding errors make of both lines at a point."""
         forms, model, n = self.forms, self.forms.model, self.n
         u, q = np.abs(at.y[:n]), np.abs(at.y[n:])
-        c, v = np.abs(data.c), np.abs(at.w) + np.abs(data.u_alpha)
-        moment, w, own = data.moment, {"u": at.w}, {"u": at.y[:n]}
+        problem, moment = data.problem, data.problem.moment
+        c, v = np.abs(problem.c), np.abs(at.w) + np.abs(problem.u_alpha)
+        w, own = {"u": at.w}, {"u": at.y[:n]}
         A = abs(forms.A_in.matrix("v", "q", moment, q=at.y[n:], **w))
-        first = abs(model.mass) @ ((u + c[:n]) / data.h) + A @ q + np.abs(data.source)
+        first = abs(model.mass) @ ((u + c[:n]) / problem.h) + A @ q + np.abs(data.source)
         first += abs(forms.B_in.matrix("v", "u", moment, **w)) @ np.abs(at.w)
         first += at.theta * (abs(forms.pull) @ (u + v)) + abs(forms.hidden) @ u
         if forms.A_out is not None and forms.B_out is not None:
             first += abs(forms.A_out.matrix("v", "q", moment, q=at.y[n:], **own)) @ q
             first += abs(forms.B_out.matrix("v", "u", moment, **own)) @ u
         gram = abs(self.gram)[: len(q), : len(q)]
-        second = data.metric.scale * (gram @ (q + c[n:])) + A.T @ (forms.split.R @ (u + v))
+        second = problem.metric.scale * (gram @ (q + c[n:])) + A.T @ (forms.split.R @ (u + v))
         (state,) = self.duals([first], self.parts[0])
         (other,) = self.duals([second], self.parts[1])
         return ROUNDING * state, ROUNDING * other
@@ -378,6 +409,15 @@ class StageSolver(ABC):
         """Relative residual up to which a predicted stage is not solved further (`Newton`)."""
         return 0.0
 
+    @property
+    def carried(self) -> float:
+        """Relative accuracy of r where the next stage makes up for what is left."""
+        return CARRIED
+
+    def accuracy(self, data: StageData) -> float:
+        """Return the relative accuracy of r in a solved stage."""
+        return RESOLVED if data.problem.left is None else self.carried
+
     @abstractmethod
     def factor(self, data: StageData, at: StageIterate) -> Factor:
         """Return the factorised Jacobian at a point."""
@@ -390,15 +430,7 @@ class StageSolver(ABC):
     def prepare(self) -> None:
         """Compute what does not depend on the samples."""
 
-    def data(
-        self,
-        c: Array,
-        h: float,
-        moment: Moment,
-        u_alpha: Array,
-        metric: Metric,
-        w: Array | None = None,
-    ) -> StageData:
+    def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
         """Return a stage, with what the data alone say over omega.
 
         Parameters
@@ -406,23 +438,19 @@ class StageSolver(ABC):
         w
             u_alpha with the Dirichlet values, shape (n,); default those of the moment.
         """
-        forms, source = self.terms.forms, self.terms.forms.model.F(moment)
-        inside = None
+        forms, moment, inside = self.terms.forms, problem.moment, None
         if forms.W is None and self.terms.linear:
-            w = forms.model.impose(u_alpha, moment) if w is None else w
+            w = forms.model.impose(problem.u_alpha, moment) if w is None else w
             A = forms.A_in.matrix("v", "q", moment, u=w)
             inside = Inside(A, forms.B_in.vector("v", moment, u=w))
-        sizes = self.terms.sizes(c, h, source, u_alpha, metric)
-        observed = self.terms.observed(u_alpha)
-        J = self.terms.information(metric)
-        return StageData(c, h, moment, u_alpha, metric, source, inside, sizes, observed, J)
+        return self.terms.given(problem, forms.model.F(moment), inside)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
         """Return the stage at y."""
         terms, forms, n = self.terms, self.terms.forms, self.terms.n
-        model, moment = forms.model, data.moment
+        model, moment = forms.model, data.problem.moment
         u, q = y[:n], y[n:]
-        r = forms.split.project(u) - data.u_alpha
+        r = forms.split.project(u) - data.problem.u_alpha
         w = u if forms.at_estimate else u - r  # u_alpha + P u, since P = I - R
         if data.inside is not None:
             A_in, flux = data.inside.A, data.inside.flux
@@ -439,23 +467,24 @@ class StageSolver(ABC):
         Mr, mass_r = forms.pull @ r, forms.mass @ r
         norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
-        rate = model.mass @ ((u - data.c[:n]) / data.h)
+        rate = model.mass @ ((u - data.problem.c[:n]) / data.problem.h)
         pull = theta * Mr
-        change = self.weighed(data, q - data.c[n:])
+        change = self.weighed(data, q - data.problem.c[n:])
         coupling = A_in.T @ r
         residual = np.empty_like(y)
         residual[:n] = (rate + flux + driven + pull - data.source) * terms.free
-        residual[n:] = (change - data.metric.load - coupling) * terms.free_q
+        residual[n:] = (change - data.load - coupling) * terms.free_q
         first = [residual[:n], rate, driven, pull]
         second = [residual[n:], change, coupling]
-        size, resolved, scales = terms.measured(data, first, second, norms.X, theta)
+        accuracy = self.accuracy(data)
+        size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
         return StageIterate(
             y, residual, size, resolved, scales, w, r, A_in, theta, norms, Mr, mass_r
         )
 
     def weighed(self, data: StageData, change: Array) -> Array:
         """Return H times a change of q, a dual vector."""
-        model, metric = self.terms.forms.model, data.metric
+        model, metric = self.terms.forms.model, data.problem.metric
         scaled = metric.scale * change
         if metric.drift:
             scaled = scaled - metric.drift * (model.latent.generator @ change)

@@ -33,7 +33,7 @@ class MonolithicSolver(StageSolver):
     def changing(self, data: StageData, at: StageIterate) -> Array:
         """Return the data of the Jacobian that depend on the iterate."""
         terms, forms, maps = self.terms, self.terms.forms, self.maps
-        A, moment, n = forms.A_in, data.moment, self.terms.n
+        A, moment, n = forms.A_in, data.problem.moment, self.terms.n
         u, q = at.y[:n], at.y[n:]
         A_in = at.A_in.data if at.A_in is not None else A.data("v", "q", moment, u=at.w, q=q)
         found: Array = maps["A_in"] @ A_in
@@ -55,7 +55,7 @@ class MonolithicSolver(StageSolver):
         _ = self._parts, self._pull
 
     def factor(self, data: StageData, at: StageIterate) -> Factor:
-        terms, metric = self.terms, data.metric
+        terms, metric = self.terms, data.problem.metric
         found = self.changing(data, at)
         found += self._fixed(data)
         found += at.theta * self._pull
@@ -73,14 +73,18 @@ class MonolithicSolver(StageSolver):
 
     def _fixed(self, data: StageData) -> Array:
         """Return the data that depend on the step and the metric's scale only."""
-        key = (data.h, data.metric.scale, data.metric.drift)
-        if self._constant is None or self._constant[0] != key:
+        h, metric = data.problem.h, data.problem.metric
+        key = (h, metric.scale, metric.drift)
+        # Copies of an identifier share this, maybe in threads: the pair is read once, and replaced
+        # as a whole, so that the data are those of their key.
+        known = self._constant
+        if known is None or known[0] != key:
             parts = self._parts
-            found = parts["M"] / data.h + data.metric.scale * parts["G"] + parts["rest"]
+            found = parts["M"] / h + metric.scale * parts["G"] + parts["rest"]
             if "GK" in parts:
-                found = found - data.metric.drift * parts["GK"]
-            self._constant = (key, found)
-        return self._constant[1]
+                found = found - metric.drift * parts["GK"]
+            self._constant = known = (key, found)
+        return known[1]
 
     @cached_property
     def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:

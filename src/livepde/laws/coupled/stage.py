@@ -17,6 +17,7 @@ from livepde.laws.coupled.distributed import DistributedSolver
 from livepde.laws.coupled.equation import (
     StageData,
     StageIterate,
+    StageProblem,
     StageSolver,
     StageTerms,
 )
@@ -25,7 +26,7 @@ from livepde.laws.coupled.monolithic import MonolithicSolver
 from livepde.linalg import Array, Factor
 from livepde.stepping import Near, Newton, Solution, StepFailed
 
-__all__ = ["CoupledStage", "KeptFactor", "StageProblem", "nearest_root"]
+__all__ = ["CoupledStage", "KeptFactor", "nearest_root"]
 
 SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
 STRIDE = 1.5  # factor between two values of theta that are tried
@@ -68,33 +69,11 @@ class KeptFactor:
     @classmethod
     def of(cls, data: StageData, y: Array) -> KeptFactor:
         """Return the value for a factor made at a point y of a stage."""
-        metric = data.metric
+        problem, metric = data.problem, data.problem.metric
         information = np.zeros(0) if metric.information is None else metric.information
         theta = math.nan if metric.theta is None else metric.theta
-        return cls(y, data.u_alpha, data.h, metric.scale, metric.drift, information, theta, 0)
-
-
-@dataclass(frozen=True, eq=False)
-class StageProblem:
-    """One stage to be solved.
-
-    Attributes
-    ----------
-    c
-        (c_u, c_q), shape (n + m,).
-    h, moment
-        Step, and time and inputs at its end.
-    u_alpha
-        Observed part of the state, shape (n,).
-    metric
-        H and load of the second line.
-    """
-
-    c: Array
-    h: float
-    moment: Moment
-    u_alpha: Array
-    metric: Metric
+        made = y, problem.u_alpha, problem.h
+        return cls(*made, metric.scale, metric.drift, information, theta, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,15 +115,25 @@ def nearest_root(function: Callable[[float], float], start: float) -> float | No
 
 
 class CoupledStage:
-    """Solves coupled stages for one set of sensors; see `livepde.laws.coupled.equation`."""
+    """Solves coupled stages for one set of sensors; see `livepde.laws.coupled.equation`.
+
+    Attributes
+    ----------
+    carries
+        True if the next stage makes up for what one has left of its residual.
+    """
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
         large = DistributedSolver.of(terms) or BlockSolver.of(terms)
         self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
         # What a stage leaves would be learned from where the metric is that of the information.
-        least = self.solver.ceiling if terms.memory is None else 0.0
+        learns = terms.memory is not None
+        least = 0.0 if learns else self.solver.ceiling
         self.newton = replace(newton, ceiling=max(newton.ceiling, least))
+        self.carries = newton.share > 0.0 and not learns
+        # The last factor and where it was made. Copies of an identifier share it, maybe in threads:
+        # the pair is read once and replaced as a whole, and a factor made again is the same.
         self._last: tuple[Array, Factor] | None = None
 
     def solve(
@@ -166,21 +155,20 @@ class CoupledStage:
             The factor that the stage before has kept.
         """
         solver, kept = self.solver, kept or KeptFactor.none()
-        p = problem
-        data = solver.data(p.c, p.h, p.moment, p.u_alpha, p.metric)
+        data = solver.data(problem)
         near = None
         if predicted is not None:
-            y, factor = self._imposed(predicted, p.moment), self._factor(kept, problem)
+            y, factor = self._imposed(predicted, problem.moment), self._factor(kept, problem)
             near = Near(y, factor, solver.refresh)
         equation = _Equation(solver, data)
 
         def begin() -> Array:
-            return self._imposed(start(), p.moment)
+            return self._imposed(start(), problem.moment)
 
         try:
             solved = self.newton.solve(equation, begin, near)
         except StepFailed:
-            if data.metric.theta is not None:
+            if data.problem.metric.theta is not None:
                 raise
             solved = self._by_theta(equation, begin())
         return solved.at, self._kept(kept, data, solved)
@@ -196,7 +184,8 @@ class CoupledStage:
 
         def gap(theta: float) -> float:
             nonlocal y
-            fixed = replace(data, metric=replace(data.metric, theta=theta))
+            metric = replace(data.problem.metric, theta=theta)
+            fixed = replace(data, problem=replace(data.problem, metric=metric))
             at = newton.solve(_Equation(self.solver, fixed), y).at
             y = at.y
             return self.terms.damped(data, at.norms) - theta
@@ -230,7 +219,8 @@ class CoupledStage:
         w = kept.u_alpha.copy()
         fixed = self.terms.forms.model.X.fixed
         w[fixed] = kept.y[:n][fixed]
-        data = self.solver.data(kept.y, kept.h, problem.moment, kept.u_alpha, metric, w)
+        made = StageProblem(kept.y, kept.h, problem.moment, kept.u_alpha, metric)
+        data = self.solver.data(made, w)
         at = self.solver.evaluate(data, kept.y)
         factor = self.solver.kept(self.solver.factor(data, at))
         self._last = (kept.y, factor)
@@ -246,5 +236,7 @@ class CoupledStage:
             at, factor = solved.made
             self._last = (at.y, self.solver.kept(factor))
             return KeptFactor.of(data, at.y)
-        spent = kept.spent + max(solved.updates - 1, 0)
+        if solved.updates <= 1:
+            return kept
+        spent = kept.spent + solved.updates - 1
         return KeptFactor.none() if spent > self.solver.patience else replace(kept, spent=spent)

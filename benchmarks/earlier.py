@@ -1,0 +1,126 @@
+"""Measure the forward step of an earlier version: python benchmarks/earlier.py [COMMIT].
+
+Two processes step the same model in turns, one with the sources of the commit (a worktree of git
+that is removed afterwards), one with those of today. Printed are the forward step of today and that
+of the commit, both in forward steps of the lean reference (`livepde.bench.rods.lean_forward`), and
+today's over the commit's: medians of the turns, of processor times. The second column is what
+`livepde.bench.rods.EARLIER` holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+COMMIT = "51ef98c"
+STEPS, TURNS = 100, 15
+ENDS = ("source", "channels")
+SIZES = ((31, 2), (200, 2), (1_000, 2), (10_000, 4))
+
+
+def main() -> None:
+    """Measure, and print."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("commit", nargs="?", default=COMMIT)
+    options.add_argument("--turns", type=int, default=TURNS)
+    options.add_argument("--serve", help=argparse.SUPPRESS)
+    given = options.parse_args()
+    if given.serve:
+        serve(given.serve == "lean")
+        return
+    with TemporaryDirectory() as folder:
+        tree = Path(folder) / "tree"
+        command = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*command, "add", "--detach", str(tree), given.commit], check=True)
+        try:
+            compare(tree / "src", given.commit, given.turns)
+        finally:
+            subprocess.run([*command, "remove", "--force", str(tree)], check=True)
+
+
+def compare(earlier: Path, commit: str, turns: int) -> None:
+    """Step both versions in turns."""
+    then, now = _worker(earlier, "forward"), _worker(ROOT / "src", "lean")
+    write = sys.stdout.write
+    write(f"| nodes | ends | {commit} / lean | today / lean | today / {commit} |\n")
+    write("|---|---|---|---|---|\n")
+    for nodes, unknowns in SIZES:
+        for ends in ENDS if nodes < SIZES[-1][0] else ENDS[:1]:
+            task = f"{nodes} {unknowns} {ends}"
+            times = np.array([[*_ask(then, task), *_ask(now, task)] for _ in range(turns)])
+            old, new, lean = times.T
+            shares = [np.median(old / lean), np.median(new / lean), np.median(new / old)]
+            cells = " | ".join(f"{share:.3g}" for share in shares)
+            write(f"| {nodes} | {ends} | {cells} |\n")
+            sys.stdout.flush()
+    for worker in (then, now):
+        worker.communicate("")
+
+
+def _worker(source: Path, what: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": str(source), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, __file__, "--serve", what]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, text=True)
+
+
+def _ask(worker: subprocess.Popen[str], task: str) -> list[float]:
+    if worker.stdin is None or worker.stdout is None:
+        raise RuntimeError("the worker has no pipes")
+    worker.stdin.write(f"{task}\n")
+    worker.stdin.flush()
+    return [float(word) for word in worker.stdout.readline().split()]
+
+
+def serve(lean: bool) -> None:
+    """Answer each line of nodes, unknowns and ends with the median of a forward step, in s."""
+    file = ROOT / "src" / "livepde" / "bench" / "problems" / "rod.py"
+    spec = importlib.util.spec_from_file_location("rods_of_today", file)
+    if spec is None or spec.loader is None:
+        raise RuntimeError(f"{file} cannot be loaded")
+    problems = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(problems)
+    models: dict[str, Any] = {}
+    for line in sys.stdin:
+        nodes, unknowns, ends = line.split()
+        if line not in models:
+            size, count = int(nodes), int(unknowns)
+            square = size >= SIZES[-1][0]
+            models[line] = problems.plate(size) if square else problems.rod(size, count, ends)
+        answer = [_forward(problems, models[line], ends)]
+        if lean:
+            from livepde.bench.rods import Rod, lean_forward
+
+            rod = models.setdefault(f"lean {line}", Rod(int(nodes), int(unknowns), ends))
+            answer.append(float(np.median(lean_forward(rod, STEPS))))
+        sys.stdout.write(" ".join(map(repr, answer)) + "\n")
+        sys.stdout.flush()
+
+
+def _forward(problems: Any, model: Any, ends: str) -> float:
+    from livepde.stepping import Advance, ImplicitEuler, simulate
+
+    times = (problems.STEP * np.arange(STEPS + 1)).tolist()
+    inputs = {t: problems.ends_at(ends, t) for t in times}.__getitem__
+    states = simulate(model, model.latent.prior, 0.0, times, Advance(ImplicitEuler()), inputs)
+    next(states)
+    spent = []
+    for _ in range(STEPS):
+        begun = process_time()
+        next(states)
+        spent.append(process_time() - begun)
+    return float(np.median(spent))
+
+
+if __name__ == "__main__":
+    main()

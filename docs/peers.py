@@ -1,0 +1,73 @@
+"""Measure what docs/peers.md shows, with: python docs/peers.py [rod heat2d ...].
+
+Runs `livepde bench peers` for each problem, keeps what it prints as JSON in docs/peers/, and puts
+all that is there into the page, between two of its headings. `--draw` measures nothing: so files of
+other runs can be added by hand, as
+`livepde bench peers --only rod --seeds 16 --json > docs/peers/rod.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from performance import printed, report
+
+DOCS = Path(__file__).resolve().parent
+MEASURED = DOCS / "peers"
+PROBLEMS = ("rod", "rod-source", "seed", "seed-excited", "heat2d", "burgers-varying", "wall")
+SEEDS: Mapping[str, int] = {"rod": 16, "rod-source": 16}
+FEW = 4  # seeds of the others
+
+BEGIN, END = "## What was measured\n", "## What these tables do not say\n"
+MADE = "These tables, and the numbers in `docs/peers/*.json`, are made by `python docs/peers.py`."
+
+
+def measure(names: Iterable[str]) -> None:
+    """Run the benchmark on problems, and keep what it prints."""
+    MEASURED.mkdir(exist_ok=True)
+    for name in names:
+        seeds = str(SEEDS.get(name, FEW))
+        content = printed(["bench", "peers", "--only", name, "--seeds", seeds, "--json"])
+        (MEASURED / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
+def section(name: str, content: Mapping[str, Any]) -> str:
+    """Return what was printed of a problem as a part of the page."""
+    text = report(name, {**content, "notes": []})
+    lines = [f"##{line}" if line.startswith("#") else line for line in text.splitlines()]
+    return "\n".join([lines[0], "", f"```sh\n{content['command']}\n```", *lines[1:]]) + "\n"
+
+
+def write(folder: Path = DOCS) -> None:
+    """Put what was measured into the page."""
+    files = [folder / "peers" / f"{name}.json" for name in PROBLEMS]
+    found = {path.stem: json.loads(path.read_text()) for path in files if path.exists()}
+    parts = ["", MADE, "", *(section(name, content) for name, content in found.items())]
+    page = folder / "peers.md"
+    before, rest = page.read_text().split(BEGIN)
+    _, after = rest.split(END)
+    page.write_text(
+        before + BEGIN + "\n".join([*parts, ""]).replace("\n\n\n", "\n\n") + END + after
+    )
+
+
+def main() -> None:
+    """Measure, and write the page."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("names", nargs="*", help=f"of {', '.join(PROBLEMS)}; default all")
+    options.add_argument("--draw", action="store_true", help="measure nothing")
+    given = options.parse_args()
+    unknown = [name for name in given.names if name not in PROBLEMS]
+    if unknown:
+        options.error(f"there is no problem '{unknown[0]}'; there are {', '.join(PROBLEMS)}")
+    if not given.draw:
+        measure(given.names or PROBLEMS)
+    write()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Scalar unknowns of an estimate as one row of numbers: value, deviation, interval, share left."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from livepde.fem import FunctionSpace
+from livepde.laws import Belief
+from livepde.linalg import Array
+
+__all__ = ["ScalarReadout", "unknown_of"]
+
+LEVEL = 0.95
+
+Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
+
+
+def unknown_of(space: FunctionSpace, label: str) -> Any:
+    """Return the unknown that a label belongs to."""
+    return space.unknowns[label.split("[")[0]]
+
+
+class ScalarReadout:
+    """Numbers of the scalar unknowns, in the order of `Layout.numbers`.
+
+    The arithmetic is that of `Belief` and of `Scalar.interval`, number by number and to the last
+    bit; what does not change between samples is found once.
+    """
+
+    def __init__(self, space: FunctionSpace) -> None:
+        rows = list(space.labels.values())
+        consecutive = bool(rows) and rows == list(range(rows[0], rows[0] + len(rows)))
+        self._rows: Any = slice(rows[0], rows[-1] + 1) if consecutive else rows
+        self._ends = [_ends(unknown_of(space, label)) for label in space.labels]
+        self._prior: tuple[Array | None, list[float]] = (None, [])
+
+    def __call__(self, belief: Belief) -> list[float]:
+        """Return (value, deviation, ends of the interval, share left) of all, one after another."""
+        if not self._ends:
+            return []
+        values = belief.q[self._rows].tolist()
+        deviations, shares = self._deviations(belief)
+        found: list[float] = []
+        for value, std, ends, share in zip(values, deviations, self._ends, shares, strict=True):
+            found += (value, std, *ends(value, std), share)
+        return found
+
+    def _deviations(self, belief: Belief) -> tuple[list[float], list[float]]:
+        """Return standard deviations, and their shares of those of the prior."""
+        factor, nothing = belief.q_factor, [math.nan] * len(self._ends)
+        if factor is None:
+            return nothing, nothing
+        # Rows of a matrix that is stored by columns would be summed in another order.
+        chosen = factor[self._rows]
+        after = belief.inflation * np.sqrt(np.add.reduce(chosen * chosen, axis=1))
+        std = after
+        if not factor.flags.c_contiguous:
+            std = belief.inflation * np.sqrt(np.add.reduce(factor * factor, axis=1))[self._rows]
+        if belief.rest is not None:
+            std = np.hypot(std, belief.rest[self._rows])
+        if belief.prior_factor is None:
+            return std.tolist(), nothing
+        if self._prior[0] is not belief.prior_factor:
+            self._prior = belief.prior_factor, self._before(belief.prior_factor)
+        pairs = zip(after.tolist(), self._prior[1], strict=True)
+        return std.tolist(), [share / before for share, before in pairs]
+
+    def _before(self, prior: Array) -> list[float]:
+        """Return the deviations of the prior; NaN where there is none."""
+        before = np.linalg.norm(prior[self._rows], axis=1)
+        found: list[float] = np.where(before > 0.0, before, np.nan).tolist()
+        return found
+
+
+def _ends(unknown: Any) -> Ends:
+    """Return the function from value and deviation to the ends of the interval; () if symmetric."""
+    if unknown.symmetric:
+        return lambda value, std: ()
+    if unknown.transform is not None:
+        return lambda value, std: tuple(map(float, unknown.interval(value, std, LEVEL)))
+    from statistics import NormalDist
+
+    quantile = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
+    lower, upper = map(float, unknown.bounds)
+
+    def clipped(value: float, std: float) -> tuple[float, float]:
+        if not math.isfinite(value + quantile * std):
+            low, high = unknown.interval(value, std, LEVEL)
+            return float(low), float(high)
+        low, high = value - quantile * std, value + quantile * std
+        return min(max(low, lower), upper), min(max(high, lower), upper)
+
+    return clipped

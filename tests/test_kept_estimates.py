@@ -1,0 +1,168 @@
+"""Estimates that are read later, and results that keep numbers instead of objects."""
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.laws import Belief
+from livepde.models import heat
+from livepde.readout import ScalarReadout, unknown_of
+from livepde.records import Record, RecordArrays, Snapshot
+from livepde.result import interval_ends
+
+
+def rod(unknown=None, law=None, withheld=None):
+    ends = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
+    alpha = unknown or lp.Scalar(0.02, std=0.01, bounds=(1e-3, 1.0))
+    model = heat(lp.interval(0.0, 1.0, 30), alpha, ends, source=lp.Scalar(0.0, std=1.0))
+    sensors = lp.Points({f"T_{k}": k / 6 for k in range(1, 6)}, noise=0.01)
+    law = law or lp.SensitivityLaw()
+    return lp.Identifier(model, sensors, law, withheld=withheld, u0=1.0)
+
+
+def samples(count, extra=()):
+    rng = np.random.default_rng(3)
+    for k in range(1, count + 1):
+        names = [*(f"T_{n}" for n in range(1, 6)), *extra]
+        values = dict(zip(names, (1.0 + 0.1 * rng.normal(size=len(names))).tolist(), strict=True))
+        yield 0.1 * k, values | {"T_left": 1.0 + math.sin(k), "T_right": 1.0}
+
+
+UNKNOWNS = [
+    lp.Scalar(0.02, std=0.01, bounds=(1e-3, 1.0)),
+    lp.Scalar(0.02, std=0.01),
+    lp.Scalar(0.02, std=0.01, transform="log"),
+    lp.Scalar(0.02, std=0.01, bounds=(1e-3, 1.0), transform="logit"),
+]
+
+
+@pytest.mark.parametrize("unknown", UNKNOWNS)
+@pytest.mark.parametrize(
+    "law",
+    [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay()), lp.AutoLaw(), lp.GradientLaw()],
+)
+def test_an_estimate_that_is_read_later_is_the_same(unknown, law):
+    """What `step` returns does not change while the identifier goes on."""
+    one, other = rod(unknown, law), rod(unknown, law)
+    later = [one.step(*sample) for sample in samples(20)]
+    for estimate, sample in zip(later, samples(20), strict=True):
+        at_once = other.step(*sample).belief
+        read = estimate.belief
+        assert read is estimate.belief
+        assert read.inflation == at_once.inflation
+        for name in ("q", "u", "q_factor", "u_factor", "prior_factor", "rest"):
+            np.testing.assert_array_equal(getattr(read, name), getattr(at_once, name))
+
+
+def test_what_is_not_read_is_not_computed(monkeypatch):
+    made = []
+    made_by = Belief.__init__
+
+    def counted(self, *given, **named):
+        made.append(1)
+        made_by(self, *given, **named)
+
+    identifier = rod()
+    taken = list(samples(6))
+    identifier.step(*taken[0])
+    monkeypatch.setattr(Belief, "__init__", counted)
+    kept = [identifier.step(*sample) for sample in taken[1:]]
+    assert not made
+    assert [len(estimate.innovation) for estimate in kept] == [5] * 5
+    assert kept[0].parameters["alpha"][0] == kept[0].q[0]
+    assert len(made) == 1
+
+
+def test_an_unread_estimate_holds_no_factor_of_the_stage():
+    """What it keeps until it is read is of the size of the belief that it gives then."""
+    identifier = rod()
+    for sample in samples(5):
+        estimate = identifier.step(*sample)
+    cells = vars(estimate)["_read"].__closure__
+    held = [cell.cell_contents for cell in cells if isinstance(cell.cell_contents, np.ndarray)]
+    belief = estimate.belief
+    given = [belief.q, belief.u, belief.q_factor, belief.u_factor]
+    assert 0 < sum(x.nbytes for x in held) <= 2 * sum(x.nbytes for x in given)
+    assert not hasattr(estimate, "_read")
+
+
+def test_an_estimate_is_copied_with_its_belief():
+    identifier = rod()
+    for sample in samples(3):
+        estimate = identifier.step(*sample)
+    other = copy.deepcopy(estimate)
+    assert other.belief is not estimate.belief
+    np.testing.assert_array_equal(other.q_std, estimate.q_std)
+    belief = pickle.loads(pickle.dumps(estimate.belief))
+    np.testing.assert_array_equal(belief.u, estimate.u)
+    with pytest.raises(AttributeError, match="no attribute 'velocity'"):
+        estimate.velocity  # noqa: B018
+
+
+@pytest.mark.parametrize("unknown", UNKNOWNS)
+@pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.AutoLaw(), lp.GradientLaw()])
+def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
+    """To the bit: value, deviation, ends of the interval and share left, label by label."""
+    identifier = rod(unknown, law)
+    readout = ScalarReadout(identifier.model.parameter_space)
+    for sample in samples(20):
+        estimate = identifier.step(*sample)
+        space = estimate.space
+        left = estimate.belief.left([*space.labels.values()])
+        wanted = []
+        for (label, (value, std)), share in zip(estimate.parameters.items(), left, strict=True):
+            ends = interval_ends(label, unknown_of(space, label), value, std)
+            wanted += [value, std, *map(float, ends.values()), float(share)]
+        np.testing.assert_array_equal(readout(estimate.belief), wanted)
+
+
+def test_a_result_keeps_little_more_than_its_numbers():
+    identifier = rod(withheld=lp.Points({"T_0": 0.4}))
+    count = 3000
+    result = identifier.run(samples(count, ["T_0"]))
+    records, axes = result.records, {"time", "snapshot"}
+    data = result.to_xarray()
+    kept = [data[name] for name in data if axes & set(data[name].dims)]
+    needed = 8 * count + sum(values.nbytes for values in kept)
+    assert data.sizes["snapshot"] == data.sizes["time"] == count
+    assert needed <= records.nbytes + 4 * 8 * count  # the matrix of correlations is told once
+    assert records.nbytes <= 1.2 * (needed + 4 * 8 * count)
+
+
+def test_arrays_give_back_the_records_that_they_took():
+    rng = np.random.default_rng(1)
+    profile = {"u": rng.normal(size=4), "u_std": rng.normal(size=4)}
+    plain = Snapshot(profile, {})
+    whole = Snapshot(profile, {"q": (1.5, 3)}, rng.normal(size=(2, 2)))
+    nothing = np.zeros(0)
+    given = [
+        Record(0.5, rng.normal(size=3), rng.normal(size=2), nothing, 0, 1, {"a": 1.0}, plain),
+        Record(1.0, rng.normal(size=3), rng.normal(size=2), nothing, 4, 2, {}),
+        Record(1.5, rng.normal(size=3), rng.normal(size=2), nothing, 1, 0, {"b": 2.0}, whole),
+        Record(2.0, rng.normal(size=3), rng.normal(size=2), nothing, 0, 9, {"b": 3.0, "a": 4.0}),
+    ]
+    kept = RecordArrays.of(given)
+    assert RecordArrays.of(kept) is kept
+    assert (len(kept), kept.last_snapshot, list(kept.notes)) == (4, 2, ["a", "b"])
+    np.testing.assert_array_equal(kept.notes["a"], [1.0, np.nan, np.nan, 4.0])
+    for one, other in zip(kept, given, strict=True):
+        assert (one.t, one.status, one.steps, one.notes) == (
+            other.t,
+            other.status,
+            other.steps,
+            other.notes,
+        )
+        np.testing.assert_array_equal(one.numbers, other.numbers)
+        np.testing.assert_array_equal(one.innovation, other.innovation)
+        assert one.withheld_error.shape == (0,)
+        assert (one.snapshot is None) == (other.snapshot is None)
+        if one.snapshot is not None:
+            assert one.snapshot.told == other.snapshot.told
+            np.testing.assert_array_equal(one.snapshot.profiles["u_std"], profile["u_std"])
+            np.testing.assert_array_equal(one.snapshot.correlation, other.snapshot.correlation)
+    kept.append(given[0])  # what was looked at before does not keep it from growing
+    assert len(list(kept)) == 5

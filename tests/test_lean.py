@@ -1,0 +1,280 @@
+"""The lean reference and the filters as arrays, against our law and against naive loops."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import sqrtm
+
+import livepde as lp
+from livepde.bench import lean
+from livepde.bench import rods as costs
+from livepde.bench.peers import arrays, table
+from livepde.bench.peers.augmented import Augmented
+from livepde.bench.problems import PROBLEMS
+from livepde.bench.problems.rod import ENDS, ROD, STEP, rod
+from livepde.errors import LinearAlgebraError
+from livepde.fem import Inputs, Moment, linear
+
+COUNT = 60
+
+
+def moment(sample):
+    return Moment(sample[0], Inputs(sample[2]))
+
+
+def started(given: costs.Rod, members: int):
+    """Return matrices, observation in units of the noise, and the filter at the start."""
+    matrices = given.matrices
+    G = given.sensors.matrix(given.model.state_space).toarray()[:, matrices.order] / costs.NOISE
+    u0 = given.model.initial(0.0, moment(given.samples(1)[0]))
+    return matrices, G, lean.initial(matrices, u0, members, given.unknowns)
+
+
+def latent(given: costs.Rod, state: lean.Filter):
+    own = given.model.latent
+    return own.prior + state.y[:, :, 0] * own.deviations
+
+
+@pytest.mark.parametrize("ends", ENDS)
+@pytest.mark.parametrize(("nodes", "unknowns"), [(31, 2), (31, 10), (60, 3)])
+def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
+    given = costs.Rod(nodes, unknowns, ends)
+    samples = given.samples(COUNT)
+    law = lp.SensitivityLaw(guards=None)
+    identifier = lp.Identifier(given.model, given.sensors, law, u0=0.0)
+    identifier.step(*samples[0])
+    matrices, G, state = started(given, 1)
+    for sample in samples[1:]:
+        estimate = identifier.step(*sample)
+        z = sample[1][None] / costs.NOISE
+        state = lean.step(matrices, G, state, matrices.forcing(moment(sample)), z)
+        np.testing.assert_allclose(latent(given, state)[0], estimate.q, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(state.x[0, matrices.place, 0], estimate.u, atol=1e-10)
+    belief = identifier.latent_belief()
+    root = given.model.latent.deviations[:, None] * state.y[0, :, 1:]
+    np.testing.assert_allclose(root @ root.T, belief.q_factor @ belief.q_factor.T, atol=1e-10)
+    assert abs(estimate.q - 1.0).max() > 0.01  # something was learned
+
+
+@pytest.mark.parametrize("ends", ENDS)
+def test_members_side_by_side_have_the_numbers_of_a_fleet(ends):
+    given, members = costs.Rod(31, 2, ends), 5
+    streams = [given.samples(COUNT, seed) for seed in range(members)]
+    law = lp.SensitivityLaw(guards=None)
+    fleet = lp.Fleet(given.model, given.sensors, law, members, u0=0.0)
+    matrices, G, state = started(given, members)
+    for k in range(COUNT + 1):
+        t, z, inputs = streams[0][k][0], np.array([one[k][1] for one in streams]), streams[0][k][2]
+        estimate = fleet.step(t, z, inputs)
+        if k:
+            f = matrices.forcing(Moment(t, Inputs(inputs)))
+            state = lean.step(matrices, G, state, f, z / costs.NOISE)
+    np.testing.assert_allclose(latent(given, state), estimate.q, rtol=0, atol=1e-10)
+    assert np.ptp(estimate.q[:, 0]) > 0.05
+
+
+def test_a_lean_forward_step_is_one_of_simulate():
+    given = costs.Rod(31, 3, "source")
+    solve, mass = costs._stepper(given)
+    order, place = given.matrices.order, given.matrices.place
+    u, f = np.zeros(31), given.model.F() * given.model.X.free
+    for _, expected in list(given.forward(given.model.latent.prior, 5))[1:]:
+        u = solve(mass @ u + f[order])
+        np.testing.assert_allclose(u[place], expected, atol=1e-13)
+
+
+def test_a_square_is_assembled_as_simulate_does():
+    given = costs.Rod(costs.SQUARE, 4, "source")
+    model = given.model
+    mass, S = lean.assembled(model, model.latent.prior, STEP)
+    (_, before), (_, after) = given.forward(model.latent.prior, 1)
+    known = mass @ before + model.F() * model.X.free
+    np.testing.assert_allclose(S @ after, known, atol=1e-12 * abs(S).max())
+
+
+def test_a_process_without_constant_matrices_is_refused():
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = lp.Model(
+        lp.Field(mesh, linear(mesh)),
+        {"a": lp.Scalar(1.0, 0.1)},
+        A=lambda q, u, v, x: q.a * u * u * v,
+    )
+    with pytest.raises(lean.NotAffineError, match="affine"):
+        lean.Matrices.of(model, np.eye(1), 0.1)
+
+
+def test_unknowns_that_enter_nonlinearly_have_no_slope():
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = lp.Model(
+        lp.Field(mesh, linear(mesh)),
+        {"a": lp.Scalar(1.0, 0.1, transform="log")},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    matrices = lean.Matrices.of(model, np.eye(1), 0.1)
+    with pytest.raises(lean.NotAffineError, match="linear"):
+        matrices.derivative(np.zeros((1, 9)))
+
+
+def test_a_singular_matrix_is_an_error():
+    matrices = lean.Matrices.of(rod(31, 2, "source"), np.eye(2), STEP)
+    matrices = replace(matrices, entries=lambda a: np.zeros((1, len(matrices.where))))
+    with pytest.raises(LinearAlgebraError, match="singular"):
+        matrices.factorise(np.zeros((1, 2)))
+
+
+# --- filters as arrays ---------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["rod", "heat2d"])
+def data(request):
+    problems = {"rod": ROD, "heat2d": PROBLEMS["heat2d"]}
+    return problems[request.param].data(0.01, 0).until(5)
+
+
+def test_an_ensemble_as_arrays_is_a_loop_over_its_members(data):
+    members, inflation = 6, 1.02
+    filter_ = arrays.Ensemble(arrays.Stack(data), members, inflation)
+    augmented = Augmented(data)
+    E = np.hstack([np.tile(augmented.start, (members, 1)), filter_.a])
+    n, R = augmented.n, np.diag(data.noise**2)
+    for at in range(1, len(data)):
+        filter_.step(at)
+        E = np.array([augmented.forecast(x, at) for x in E])
+        seen = np.array([augmented.output(x, at) for x in E])
+        mean, X, Y = E.mean(axis=0), E - E.mean(axis=0), seen - seen.mean(axis=0)
+        P = np.linalg.inv((members - 1) * np.eye(members) + Y @ np.linalg.solve(R, Y.T))
+        weights = P @ Y @ np.linalg.solve(R, data.z[at] - seen.mean(axis=0))
+        root = np.real(sqrtm((members - 1) * P))
+        E = mean + X.T @ weights + inflation * root @ X
+    mean, factor = filter_.known()
+    np.testing.assert_allclose(mean, augmented.latent(E[:, n:].mean(axis=0)), atol=1e-10)
+    a = (E[:, n:] - E[:, n:].mean(axis=0)).T / np.sqrt(members - 1)
+    expected = augmented.trajectory.Phi @ a
+    np.testing.assert_allclose(factor @ factor.T, expected @ expected.T, atol=1e-10)
+
+
+def test_an_unscented_filter_as_arrays_is_a_loop_over_its_points(data):
+    filter_ = arrays.Unscented(arrays.Stack(data))
+    augmented = Augmented(data)
+    n, k = augmented.n, augmented.k
+    mean, root = np.append(augmented.start, np.zeros(k)), np.vstack([np.zeros((n, k)), np.eye(k)])
+    spread = np.sqrt(k + 1.0)
+    for at in range(1, len(data)):
+        filter_.step(at)
+        centre = augmented.forecast(mean, at)
+        above = np.array([augmented.forecast(mean + spread * x, at) for x in root.T])
+        below = np.array([augmented.forecast(mean - spread * x, at) for x in root.T])
+        mean = (centre + 0.5 * (above + below).sum(axis=0)) / (k + 1.0)
+        root = (above - below).T / (2.0 * spread)
+        shown = augmented.output(mean, at)
+        H = np.array([augmented.output(mean + x, at) - shown for x in root.T]).T
+        S = H @ H.T + np.diag(data.noise**2)
+        mean = mean + root @ H.T @ np.linalg.solve(S, data.z[at] - shown)
+        left = np.eye(k) - H.T @ np.linalg.solve(S, H)
+        root = root @ np.linalg.cholesky(left)
+        covariance = root[n:] @ root[n:].T
+        np.testing.assert_allclose(filter_.a, mean[n:], atol=1e-9)
+        np.testing.assert_allclose(filter_.C @ filter_.C.T, covariance, atol=1e-9)
+        # Points at other columns of the same covariance would be other points.
+        filter_.U, filter_.C = (
+            full(augmented, root[:n], filter_.stack.matrices.order),
+            root[n:].copy(),
+        )
+
+
+def full(augmented, columns, order):
+    """Return columns of the state on all coefficients, in the order of the band."""
+    whole = np.zeros((augmented.model.X.dim, columns.shape[1]))
+    whole[augmented.free] = columns
+    return whole[order]
+
+
+@pytest.mark.parametrize("row", ["EnKF as arrays, 20 members", "unscented filter as arrays"])
+def test_filters_as_arrays_find_the_parameter(row):
+    score = table.run_row(ROD, 0.01, 0, row)
+    assert score is not None
+    assert score.error < 0.02
+    assert score.whole > 0.0
+    assert score.median > 0.0
+
+
+def test_what_cannot_be_stepped_as_arrays_says_why():
+    score = table.run_row(PROBLEMS["burgers-varying"], 0.01, 0, "unscented filter as arrays")
+    assert score is not None
+    assert score.note == "not run: constant unknowns and linear sensors only"
+
+
+def test_the_lean_reference_is_a_row_where_it_applies():
+    score = table.run_row(ROD, 0.01, 0, "lean reference")
+    ours = table.run_row(ROD, 0.01, 0, "sensitivity")
+    assert score is not None
+    assert ours is not None
+    assert score.error == pytest.approx(ours.error, rel=0.1)  # ours has safeguards
+    other = table.run_row(PROBLEMS["heat2d"], 0.01, 0, "lean reference")
+    assert other is not None
+    assert "linear unknowns" in other.note
+
+
+# --- the tables, at the smallest size ------------------------------------------------------------
+
+
+def test_costs_of_a_small_rod():
+    given = costs.Rod(31, 2, "source")
+    outcome = costs.rods([given], runs=1, first=4)
+    (found,) = outcome.tables
+    rows = [dict(zip(found.columns, row, strict=True)) for row in found.rows]
+    laws = [row["law"] for row in rows]
+    assert laws == ["SensitivityLaw", "AutoLaw, 6 awake", "lean reference"]
+    assert all(row["median"] > 0.0 and row["mean"] > 0.0 for row in rows)
+    assert [row["bound"] for row in rows] == [5.0, 15.0, None]
+    assert [check.value for check in outcome.checks] == [row["over 51ef98c"] for row in rows[:2]]
+
+
+def test_a_row_without_a_bound_has_no_check():
+    given = costs.Rod(12, 2, "channels")
+    outcome = costs.rods([given], runs=1, first=3, auto=False)
+    assert outcome.checks == []
+    assert [row[6] for row in outcome.tables[0].rows] == [None, None]
+
+
+def test_costs_of_a_fleet():
+    outcome = costs.fleet(members=2, runs=1, first=4)
+    assert [row[0] for row in outcome.tables[0].rows] == list(ENDS)
+    ratios, differences = outcome.checks[::2], outcome.checks[1::2]
+    assert all(check.value > 0.0 for check in ratios)
+    assert all(check.ok for check in differences)
+
+
+def test_every_bound_is_of_a_process_that_is_timed():
+    timed = {(given.nodes, given.unknowns) for given in costs.RODS if given.ends == ENDS[0]}
+    assert {key[1:] for key in costs.BOUNDS} <= timed
+    assert {(given.nodes, given.ends) for given in costs.RODS} == set(costs.EARLIER)
+
+
+def test_the_earlier_forward_step_is_asked_in_turns(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    sys.modules.pop("earlier", None)
+    earlier = importlib.import_module("earlier")
+    monkeypatch.setattr(earlier, "SIZES", ((12, 2), (31, 2)))
+    earlier.compare(earlier.ROOT / "src", "HEAD", 2)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 + 2 + 1
+    assert all(float(cell) > 0.0 for cell in lines[2].split("|")[3:6])
+
+
+def test_peers_are_divided_by_the_prior():
+    outcome = table.peers(["rod"], 2, rows=["lean reference"])
+    (found,) = outcome.tables
+    lines = {row[1]: dict(zip(found.columns, row, strict=True)) for row in found.rows}
+    assert list(lines) == ["prior", "lean reference"]
+    assert lines["prior"]["error"] == 1.0
+    assert lines["prior"]["spread"] == 0.0
+    assert 0.0 < lines["lean reference"]["error"] < 0.5
+    assert lines["lean reference"]["spread"] > 0.0
+    assert found.title == "rod, 2 seeds"

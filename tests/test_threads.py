@@ -1,0 +1,313 @@
+"""Identifiers in threads of their own: the numbers are those of one after the other, to the bit.
+
+Threads take turns as often as the interpreter lets them, and each sleeps now and then where a
+function is called or returns: so it is between any two of them that another one comes in. That
+finds what is shared in a few trials. To look harder, with more trials of each law:
+
+    LIVEPDE_THREAD_TRIALS=100 python -m pytest tests/test_threads.py
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import os
+import random
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1, ElementTriP1, MeshTri
+
+import livepde as lp
+from livepde import laws
+
+TRIALS = int(os.environ.get("LIVEPDE_THREAD_TRIALS", "1"))
+SWITCH = 1e-6  # seconds until another thread may run: the default of 5e-3 hides most races
+SLEEPS = 0.02  # share of the calls and returns at which a thread sleeps
+PATIENCE = 100.0  # seconds after which a thread counts as stuck
+PERIOD = 0.1  # from one sample to the next
+BEFORE = 2  # samples that an identifier takes before it is copied
+
+Numbers = list[tuple[Any, ...]]
+
+
+@pytest.fixture(autouse=True)
+def often() -> Iterator[None]:
+    """Let threads take turns as often as the interpreter can."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH)
+    yield
+    sys.setswitchinterval(before)
+
+
+# --- models --------------------------------------------------------------------------------------
+
+
+def conduction(q: Any, u: Any, v: Any, x: Any) -> Any:
+    return q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.b * u * v
+
+
+def heating(x: Any, t: float) -> Any:
+    return 1.0 + np.sin(3.0 * t) * np.sin(np.pi * x[0])
+
+
+def powered(x: Any, t: float) -> Any:
+    return x.inputs["power"] * x[0]
+
+
+def rod(cells: int = 30, **options: Any) -> lp.Model:
+    """Return a rod with two unknowns, whose left end and source change with time."""
+    ends = {"left": lambda x, t: np.sin(2.0 * t) + 0.0 * x[0], "right": 0.0}
+    unknowns = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
+    field = lp.Field(lp.interval(0.0, 1.0, cells), ElementLineP1(), dirichlet=ends)
+    given = {"parameter": unknowns, "A": conduction, "f": heating, **options}
+    return lp.Model(field, **given)
+
+
+def powered_rod() -> lp.Model:
+    return rod(f=powered, inputs=("power",))
+
+
+def positive_rod() -> lp.Model:
+    """Return a rod with unknowns that stay positive, so that A is not linear in the latent ones."""
+    unknowns = {"a": lp.Scalar(0.2, 0.1, transform="log"), "b": lp.Scalar(1.0, 0.5)}
+    return rod(parameter=unknowns)
+
+
+def nonlinear_rod() -> lp.Model:
+    """Return a rod in which A and B are not linear in u, and B reads the time."""
+    return rod(
+        A=lambda q, u, v, x: conduction(q, u, v, x) + 0.1 * q.b * u**3 * v,
+        B=lambda u, v, x: (0.1 + 0.05 * np.sin(x.t)) * u**2 * v,
+    )
+
+
+def reaction_field(mesh: Any, element: Any, **options: Any) -> lp.Model:
+    """Return a process whose reaction is a field."""
+    return lp.Model(
+        lp.Field(mesh, element, dirichlet={"boundary": 0.0}),
+        lp.Field(mesh, element, inner="H1"),
+        **{
+            "A": lambda q, u, v, x: q * u * v,
+            "B": lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+            "f": heating,
+            **options,
+        },
+    )
+
+
+def field_rod() -> lp.Model:
+    return reaction_field(lp.interval(0.0, 1.0, 30), ElementLineP1())
+
+
+def powered_field() -> lp.Model:
+    return reaction_field(lp.interval(0.0, 1.0, 30), ElementLineP1(), f=powered, inputs=("power",))
+
+
+def square() -> lp.Model:
+    """Return a square of 289 nodes: the products with its A are sparse."""
+    return reaction_field(MeshTri().refined(4), ElementTriP1())
+
+
+def large_square() -> lp.Model:
+    """Return a square of 2601 nodes: its coupled stages are solved by blocks."""
+    axis = np.linspace(0.0, 1.0, 51)
+    return reaction_field(MeshTri.init_tensor(axis, axis), ElementTriP1())
+
+
+def plate() -> lp.Model:
+    """Return a square of 81 nodes with a nonlinear A and two unknown numbers."""
+    field = lp.Field(MeshTri().refined(3), ElementTriP1(), dirichlet={"boundary": 0.0})
+    unknowns = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
+    return lp.Model(
+        field,
+        unknowns,
+        A=lambda q, u, v, x: conduction(q, u, v, x) + 0.1 * q.b * u**3 * v,
+        f=heating,
+    )
+
+
+# --- cases ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """A law with a model and sensors.
+
+    Attributes
+    ----------
+    missing
+        Share of readings that are missing.
+    samples
+        How many are taken.
+    """
+
+    law: lp.Law[Any, Any]
+    model: Callable[[], lp.Model] = rod
+    sensors: Callable[[], lp.Observation] = lambda: lp.Points([0.25, 0.5, 0.75], noise=0.05)
+    missing: float = 0.0
+    samples: int = 6
+
+    def identifier(self, model: lp.Model) -> lp.Identifier:
+        return lp.Identifier(model, self.sensors(), self.law, u0=0.0, halvings=2)
+
+
+def inner() -> lp.Observation:
+    return lp.Subdomain(lambda x: (x[0] > 0.2) & (x[0] < 0.8))
+
+
+def averages() -> lp.Observation:
+    return lp.Averages({"a": lambda x: x[0] < 0.4, "b": lambda x: x[0] > 0.5}, noise=0.02)
+
+
+def smoothed() -> lp.Observation:
+    return lp.Full(noise=0.02, reconstruction=lp.Tikhonov("X"))
+
+
+def probe() -> lp.Observation:
+    return lp.Combined(
+        [lp.Moving({"probe": "at"}, noise=0.05), lp.Points({"fixed": 0.4}, noise=0.05)]
+    )
+
+
+GUARDED = lp.SensitivityLaw(guards=lp.Guards(), jumps=lp.Jumps(settle=4))
+REPLAYING = lp.SensitivityLaw(replay=lp.Replay(first=4))
+
+CASES = {
+    "gradient": Case(lp.GradientLaw(gain=10.0), rod, inner),
+    "gradient, missing readings": Case(lp.GradientLaw(gain=10.0), rod, inner, missing=0.02),
+    "gradient, nonlinear": Case(lp.GradientLaw(gain=10.0), nonlinear_rod, inner, samples=4),
+    "gradient, positive unknown": Case(lp.GradientLaw(gain=10.0), positive_rod, inner, samples=4),
+    "gradient, inputs": Case(lp.GradientLaw(gain=10.0), powered_rod, averages, missing=0.3),
+    "gradient, smoothed": Case(lp.GradientLaw(gain=10.0), field_rod, smoothed, missing=0.02),
+    "gradient, square": Case(lp.GradientLaw(gain=10.0), square, inner, samples=10),
+    "gradient, nonlinear plate": Case(lp.GradientLaw(gain=10.0), plate, inner),
+    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=3),
+    "auto gain": Case(lp.GradientLaw(gain="auto"), field_rod, inner),
+    "auto gain, chosen smoothing": Case(
+        lp.GradientLaw(gain="auto"), field_rod, lp.Full, missing=0.01
+    ),
+    "auto gain, inputs": Case(lp.GradientLaw(gain="auto"), powered_field, inner, missing=0.02),
+    "auto gain, square": Case(lp.GradientLaw(gain="auto"), square, inner),
+    "Baumeister": Case(lp.BaumeisterLaw(gain=10.0), field_rod, lp.Full),
+    "Kuegler": Case(lp.KueglerLaw(gain=10.0), nonlinear_rod, inner, samples=4),
+    "sensitivity": Case(lp.SensitivityLaw(), samples=15),
+    "sensitivity, inputs": Case(
+        lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=15
+    ),
+    "sensitivity, nonlinear": Case(lp.SensitivityLaw(), nonlinear_rod, samples=15),
+    "sensitivity, positive unknown": Case(lp.SensitivityLaw(), positive_rod, samples=15),
+    "sensitivity, moving sensor": Case(lp.SensitivityLaw(), powered_rod, probe),
+    "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages, samples=12),
+    "sensitivity, large square": Case(
+        lp.SensitivityLaw(modes=3), large_square, averages, samples=3
+    ),
+    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=15),
+    "guards and jumps": Case(GUARDED, powered_rod, samples=15),
+    "bank": Case(lp.AutoLaw(), powered_rod, samples=10),
+}
+
+
+def stream(case: Case, identifier: lp.Identifier, seed: int) -> list[tuple[Any, ...]]:
+    """Return samples of noise about a smooth signal; what they say does not matter here."""
+    rng, size, found = np.random.default_rng(seed), identifier.observed.size, []
+    for k in range(1, case.samples + 1):
+        t = PERIOD * k
+        z = 0.2 + 0.1 * (1.0 + seed) * np.sin(t) + 0.01 * rng.standard_normal(size)
+        z[rng.random(size) < case.missing] = np.nan
+        values = {"power": 1.0 + np.sin(3.0 * t + seed), "at": 0.3 + 0.2 * np.sin(4.0 * t + seed)}
+        inputs = {name: values[name] for name in identifier.inputs}
+        found.append((t, z, inputs))
+    return found
+
+
+def taken(identifier: lp.Identifier, samples: list[tuple[Any, ...]]) -> Numbers:
+    """Return all numbers of all estimates, as bytes where they are arrays."""
+    found: Numbers = []
+    for sample in samples:
+        estimate = identifier.step(*sample)
+        belief = identifier.latent_belief()
+        arrays = (estimate.q, estimate.u, estimate.innovation, belief.q_factor, belief.u_factor)
+        seen = tuple(None if array is None else array.tobytes() for array in arrays)
+        notes = {name: float(value).hex() for name, value in estimate.notes.items()}
+        found.append((estimate.status.code, estimate.steps, notes, *seen))
+    return found
+
+
+def together(tasks: list[Callable[[], Numbers]]) -> list[Numbers]:
+    """Return what tasks return that begin at the same time, each in a thread of its own.
+
+    One that raises is a warning of pytest, and so an error; it returns nothing.
+    """
+    barrier = threading.Barrier(len(tasks))
+    found: list[Numbers] = [[] for _ in tasks]
+
+    def run(k: int) -> None:
+        draw = random.Random(k).random
+
+        def sleepy(*event: Any) -> None:
+            if draw() < SLEEPS:
+                time.sleep(1e-6)
+
+        barrier.wait(PATIENCE)
+        sys.setprofile(sleepy)
+        found[k] = tasks[k]()
+
+    threads = [threading.Thread(target=run, args=(k,), daemon=True) for k in range(len(tasks))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert not any(thread.is_alive() for thread in threads)
+    return found
+
+
+def begun(case: Case, model: lp.Model, seed: int) -> Numbers:
+    """Return the numbers of an identifier that is built, and steps, in the same thread."""
+    identifier = case.identifier(model)
+    return taken(identifier, stream(case, identifier, seed))
+
+
+def copies(case: Case) -> tuple[list[lp.Identifier], list[list[tuple[Any, ...]]]]:
+    """Return two copies of an identifier that has begun, and the samples that are left for each."""
+    identifier = case.identifier(case.model())
+    first, second = (stream(case, identifier, seed) for seed in (0, 1))
+    taken(identifier, first[:BEFORE])
+    return [copy.deepcopy(identifier) for _ in range(2)], [first[BEFORE:], second[BEFORE:]]
+
+
+def test_every_law_is_among_the_cases():
+    concrete = {
+        item
+        for item in (getattr(laws, name) for name in laws.__all__)
+        if inspect.isclass(item) and issubclass(item, laws.Law) and not inspect.isabstract(item)
+    }
+    assert {type(case.law) for case in CASES.values()} == concrete
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_identifiers_of_one_model_step_in_threads(name):
+    case = CASES[name]
+    model = case.model()
+    expected = [begun(case, model, seed) for seed in (0, 1)]
+    assert any(sample[0] == "ok" for sample in expected[0])
+    for _ in range(TRIALS):
+        model = case.model()
+        found = together([partial(begun, case, model, seed) for seed in (0, 1)])
+        assert found == expected
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_copies_of_an_identifier_step_in_threads(name):
+    case = CASES[name]
+    expected = [taken(*pair) for pair in zip(*copies(case), strict=True)]
+    for _ in range(TRIALS):
+        found = together([partial(taken, *pair) for pair in zip(*copies(case), strict=True)])
+        assert found == expected
