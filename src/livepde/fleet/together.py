@@ -54,7 +54,7 @@ class Together:
 
     def beliefs(self, state: SensitivityState) -> Beliefs:
         now, reduction = state.now, self.work.filter.reduction
-        latent, Phi = self.work.filter.problem.model.latent, reduction.Phi
+        latent = self.work.filter.problem.model.latent
         a = reduction.bounded(self.work.filter.estimate(now))
         factor = reduction.directions(a, now.C).transpose(0, 2, 1)
         units = np.broadcast_to(np.eye(reduction.size), (len(a), *2 * (reduction.size,)))

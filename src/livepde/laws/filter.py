@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -200,7 +200,7 @@ class Filter:
         count = self.problem.control.count(_between(span.start, span.t1)) if self.moves else 1
         at = [span.start + k / count * (span.t1 - span.start) for k in range(count)] + [span.t1]
         taken = 0
-        for start, stop in zip(at, at[1:], strict=False):
+        for start, stop in pairwise(at):
             x, steps, failure = self._advanced(x, span, start, stop)
             taken += steps
             if failure is not None:

@@ -1,7 +1,7 @@
 """The samples since a law may have to begin again, of all members: a log that only grows.
 
-A log has the shape (members, rows, 1 + sensors + channels): time, measurements and inputs. Rows of a
-member that did not take a sample have the time NaN.
+A log has the shape (members, rows, 1 + sensors + channels): time, measurements and inputs. Rows
+of a member that did not take a sample have the time NaN.
 """
 
 from __future__ import annotations

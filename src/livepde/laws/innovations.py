@@ -28,8 +28,8 @@ class Innovations:
     Attributes
     ----------
     sums
-        Shape (members, 7), fading over `WINDOW` samples: number of e; of squared weights; e^2; number
-        of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
+        Shape (members, 7), fading over `WINDOW` samples: number of e; of squared weights; e^2;
+        number of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
     last
         Last e of each sensor, shape (members, sensors), NaN before its first.
     newest
