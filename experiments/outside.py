@@ -29,7 +29,7 @@ from livepde.fem import Field, Sobolev, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, GradientLaw, Problem, Replay, SensitivityLaw
 from livepde.laws.reduction import Reduction
-from livepde.laws.sensitivity import SensitivityWork
+from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.laws.sensors import MemberSensors
 from livepde.linalg import Array
 from livepde.model import Model

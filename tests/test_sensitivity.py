@@ -252,7 +252,7 @@ def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
     sensors, samples = stream(model, 2.0, 0.1 * np.arange(12))
     ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=4)))
     no_luck = Status("not_converged", "no luck")
-    module = "livepde.laws.sensitivity.replayed"
+    module = "livepde.laws.one_member.replayed"
     monkeypatch.setattr(module, lambda filter_, window, choices: (window, no_luck))
     estimates = [ident.step(*sample) for sample in samples]
     failed = [k for k, estimate in enumerate(estimates) if "replay_failed" in estimate.notes]

@@ -12,7 +12,7 @@ from livepde.fem import Moment
 from livepde.fleet.engine import Beliefs, Factors
 from livepde.laws import Belief, MemberReports
 from livepde.laws.members import join, take
-from livepde.laws.sensitivity import SensitivityState, SensitivityWork
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array
 from livepde.stepping import Span
 

@@ -28,13 +28,13 @@ from livepde.laws.history import added, first_interval, intervals_since, opened
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed, join, take
 from livepde.laws.replay import Replay
-from livepde.laws.sensitivity import (
+from livepde.laws.sensitivity import SensitivityLaw, without_factors
+from livepde.laws.sensitivity_state import (
     NEVER,
-    SensitivityLaw,
     SensitivityState,
     SensitivityWork,
     from_now,
-    without_factors,
+    renewed,
 )
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Interval
@@ -130,9 +130,10 @@ class AutoLaw(Law[Bank, AutoState]):
         # What moves far has no use for a reference that stays.
         walks = reduction.moving(0.0) > 0
         replays = np.array([not (walks or c.drift) for c in candidates])
-        work = SensitivityWork(
-            replace(work.filter, rank=rank, drift=np.zeros(len(candidates))),
-            replace(work.choices, adaptive=True),
+        work = replace(
+            work,
+            filter=replace(work.filter, rank=rank, drift=np.zeros(len(candidates))),
+            choices=replace(work.choices, adaptive=True),
         )
         return Bank(candidates, work, replays, stated)
 
@@ -192,7 +193,7 @@ class AutoLaw(Law[Bank, AutoState]):
         waiting = added(opened(state.waiting, span), span, one)
         noise = first_guess(waiting[0, :, 1 : 1 + len(state.noise)])
         if noise is None and waiting.shape[1] > SILENCE:
-            here = self.member.renewed(filters.filter.recentred(free.now), free)
+            here = renewed(filters, filters.filter.recentred(free.now), free)
             here = from_now(here)
             return changed(state, waiting=state.start.log, start=here, members=here), report
         if noise is None:
@@ -289,7 +290,8 @@ class AutoLaw(Law[Bank, AutoState]):
         After an alarm what was measured before tells of other unknowns: no replay goes back beyond
         it, and the member with the wide prior, as it were anew, allows for a jump.
         """
-        filter_, law = work.filters(state.tick, state.noise).filter, self.member
+        filters = work.filters(state.tick, state.noise)
+        filter_ = filters.filter
         weights, until, leader = state.weights.copy(), state.until.copy(), state.leader
         best = take(state.members, state.at(leader))
         awake = {int(k): take(state.members, state.at(int(k))) for k in state.members.now.member}
@@ -304,13 +306,13 @@ class AutoLaw(Law[Bank, AutoState]):
         for k in range(len(work.candidates)):
             if k in awake:
                 one = awake[k]
-                members.append(law.renewed(filter_.recentred(one.now), one) if alarm else one)
+                members.append(renewed(filters, filter_.recentred(one.now), one) if alarm else one)
                 continue
             if k == WIDE and not alarm:
                 continue
             begun = filter_.loosened(now, JUMPS.size) if k == WIDE else now
             due = self.replay.first if work.replays[k] else NEVER
-            copied = from_now(law.renewed(begun, best))
+            copied = from_now(renewed(filters, begun, best))
             members.append(numbered(copied, k, due))
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)

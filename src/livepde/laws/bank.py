@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from livepde.laws.jumps import Watch
-from livepde.laws.sensitivity import SensitivityState, SensitivityWork
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray, Mask
 
 __all__ = [

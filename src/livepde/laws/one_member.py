@@ -1,0 +1,266 @@
+"""One member of a sensitivity law whose sample is out of the ordinary.
+
+A replay is due, a sample moves an unknown too far, a step fails or runs away, or an alarm tells
+that the process has jumped. States have one member here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from livepde.laws.assimilation import assimilate
+from livepde.laws.base import Report, Status
+from livepde.laws.filter import FilterState
+from livepde.laws.guards import Guards
+from livepde.laws.history import first_interval, intervals_since, opened
+from livepde.laws.jumps import Jumps
+from livepde.laws.members import changed
+from livepde.laws.replay import CONVERGED, Replay, Window, distance, missed_most, replayed
+from livepde.laws.sensitivity_state import (
+    SensitivityState,
+    SensitivityWork,
+    from_now,
+    renewed,
+    reports_of,
+    stored,
+)
+from livepde.stepping import Interval
+
+__all__ = ["step_alone"]
+
+TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
+
+
+def step_alone(
+    work: SensitivityWork, state: SensitivityState, interval: Interval
+) -> tuple[SensitivityState, Report]:
+    """Return one member after a sample, with replays, safeguards and alarms."""
+    new, report = _assimilated(work, state, interval)
+    if (guards := work.guards) is not None:
+        new, report = _rescued(work, guards, state, interval, new, report)
+    if report.status.ok and (jumps := work.jumps) is not None:
+        new, report = _watched(work, jumps, state, interval, new, report)
+    return new, report
+
+
+def _filtered(
+    work: SensitivityWork, x: FilterState, interval: Interval
+) -> tuple[FilterState, Report]:
+    """Return the filter after a sample, linear about its reference."""
+    span = work.filter.span(interval)
+    new, told = assimilate(work.filter, x, span, work.choices)
+    status = told.status
+    if status.ok and not told.finite[0]:
+        what = "prediction" if not np.isfinite(told.predicted).all() else "update"
+        status = Status("not_finite", f"the {what} is not finite")
+    if not status.ok:
+        predicted, _ = work.filter.observe(x, span.end)
+        return x, Report(status, predicted[0])
+    return new, changed(reports_of(work, new, told).member(0), status=status)
+
+
+def _assimilated(
+    work: SensitivityWork, state: SensitivityState, interval: Interval
+) -> tuple[SensitivityState, Report]:
+    """Return one member after a sample, iterated or replayed where that is due."""
+    x, report = _filtered(work, state.now, interval)
+    if not report.status.ok:
+        return state, report
+    span = work.filter.span(interval)
+    state = changed(state, log=opened(state.log, span))
+    one = np.ones(1, dtype=bool)
+    if not state.replays[0]:
+        if (guards := work.guards) is not None:
+            x, notes = _iterated(work, guards, state, interval, x)
+            if notes:
+                told = _noted(work, x)
+                report = replace(report, notes={**report.notes, **told, **notes})
+        return stored(work, state, work.filter.recentred(x), span, one), report
+    state = stored(work, state, x, span, one)
+    if work.replay is not None and state.assimilated[0] >= state.due[0]:
+        state, notes = _replayed(work, work.replay, state)
+        report = replace(report, notes={**report.notes, **notes})
+    if state.log.shape[1] - state.window[0] > work.most:
+        state = renewed(work, work.filter.recentred(state.now), state)
+    return state, report
+
+
+def _noted(work: SensitivityWork, x: FilterState) -> dict[str, float]:
+    """Return the notes on the innovations of one member."""
+    return {
+        "innovation_ratio": float(x.innovations.ratio[0]),
+        "innovation_correlation": float(x.innovations.correlation[0]),
+    }
+
+
+def _window(work: SensitivityWork, state: SensitivityState) -> Window:
+    """Return the stored samples of one member, for a replay."""
+    channels, log = work.filter.problem.channels, state.log[:, int(state.window[0]) :]
+    first = first_interval(log, channels)
+    return Window(
+        state.start,
+        state.now,
+        first if state.opening[0] else None,
+        intervals_since(log, channels),
+        state.reference[0],
+        bool(state.initial[0]),
+        first.end,
+    )
+
+
+def _replayed(
+    work: SensitivityWork, replay: Replay, state: SensitivityState
+) -> tuple[SensitivityState, dict[str, float]]:
+    """Return one member after replays about better references, and notes."""
+    window, notes = _window(work, state), {}
+    for _ in range(replay.iterations):
+        window, status = replayed(work.filter, window, work.choices)
+        left = distance(work.filter, window)
+        notes["replay_left"] = left
+        if not status.ok:  # keep the linear estimate, say so, and try again when doubled
+            notes["replay_failed"] = 1.0
+        if not status.ok or left <= CONVERGED:
+            break
+    due, reference = 2 * state.assimilated, window.reference[None]
+    return changed(state, now=window.now, reference=reference, due=due), notes
+
+
+def _iterated(
+    work: SensitivityWork,
+    guards: Guards,
+    state: SensitivityState,
+    interval: Interval,
+    x: FilterState,
+) -> tuple[FilterState, dict[str, float]]:
+    """Return the filter after a sample that may have moved it too far, and notes.
+
+    Too far is cured by a replay of this one sample from where the interval began.
+    """
+    before = state.now
+    if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is
+        return x, {}
+    filter_, kept = work.filter, x.kept
+
+    def levelled(x: FilterState, tempered: int) -> FilterState:
+        if not tempered:  # a tempered sample tells nothing about the noise
+            return x
+        return changed(x, level=before.level, samples=before.samples)
+
+    for temper in range(guards.temperings + 1):
+        tempered = {"tempered": 1.0} if temper else {}
+        begin = changed(before, level=before.level * TEMPER ** (2 * temper), kept=kept)
+        if temper:
+            x, _ = _filtered(work, begin, interval)
+            if guards.within_reach(x.da - begin.da)[0]:
+                return levelled(x, temper), tempered
+        reference, moment = begin.q[0], interval.end
+        window = Window(begin, x, None, [interval], reference, False, moment)
+        far = missed_most(filter_, window) > guards.reach
+        if not (far and distance(filter_, window) > CONVERGED):
+            return levelled(x, temper), tempered
+        for _ in range(guards.iterations):
+            window, status = replayed(filter_, window, work.choices)
+            if not status.ok:
+                break
+            if distance(filter_, window) <= CONVERGED:
+                return levelled(window.now, temper), {"iterated": 1.0, **tempered}
+    return _filtered(work, before, interval.silent)[0], {"held": 1.0}
+
+
+def _rescued(
+    work: SensitivityWork,
+    guards: Guards,
+    state: SensitivityState,
+    interval: Interval,
+    new: SensitivityState,
+    report: Report,
+) -> tuple[SensitivityState, Report]:
+    """Return one member and report after a sample that may have failed or be far off.
+
+    Whatever led there is not used again: the state is only carried on from the past.
+    """
+    noise = np.sqrt(state.now.level)[:, None] * work.filter.noise
+    z = interval.z1[None]
+    scale = state.scale.add(z, z - report.predicted)
+
+    def astray(report: Report) -> bool:
+        beyond = scale.beyond(z - report.predicted, noise)
+        return not report.status.ok or bool(beyond[0] > guards.runaway)
+
+    if not astray(report):
+        return changed(new, scale=scale), report
+    older = changed(work.filter.recentred(state.older), kept=new.now.kept)
+    row = int(state.since_older[0])
+    silent = [item.silent for item in [*_since(work, state, row), interval]]
+    for start in (work.filter.loosened(older, 1.0), work.filter.prior_again(older)):
+        again, found = _retaken(work, state, start, row, silent)
+        if not astray(found):
+            notes = {**found.notes, "restarted": 1.0}
+            return changed(from_now(again), scale=scale), replace(found, notes=notes)
+    if not report.status.ok:
+        return state, report
+    return changed(new, scale=scale), replace(report, notes={**report.notes, "runaway": 1.0})
+
+
+def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Interval]:
+    """Return the intervals that one member has taken since a row of the log."""
+    if not state.log.shape[1]:
+        return []
+    return intervals_since(state.log[:, row:], work.filter.problem.channels)
+
+
+def _retaken(
+    work: SensitivityWork,
+    state: SensitivityState,
+    start: FilterState,
+    row: int,
+    intervals: Sequence[Interval],
+) -> tuple[SensitivityState, Report]:
+    """Return one member after some samples, taken again from a filter at a row of the log."""
+    state = from_now(renewed(work, start, state, row))
+    for interval in intervals:
+        state, report = _assimilated(work, state, interval)
+        if not report.status.ok:
+            break
+    return state, report
+
+
+def _watched(
+    work: SensitivityWork,
+    jumps: Jumps,
+    state: SensitivityState,
+    interval: Interval,
+    new: SensitivityState,
+    report: Report,
+) -> tuple[SensitivityState, Report]:
+    """Return one member and report after the test for a jump.
+
+    After an alarm the samples since the jump are taken again, from before it: the state has
+    gone astray with them, and what was measured before does not belong to the unknowns of now.
+    """
+    if not interval.present.any():  # there is no innovation, and `newest` is that of before
+        return new, replace(report, notes={**report.notes, "jump": 0.0})
+    usual, e = state.now.innovations, new.now.innovations.newest
+    watch, alarms = jumps.add(state.watch, e, usual)
+    alarm, new = bool(alarms[0]), changed(new, watch=watch)
+    if alarm:
+        row = int(state.since_older[0])
+        known = [*_since(work, state, row), interval]
+        before = max(len(known) - jumps.onset(state.watch, e, usual), 0)
+        x, status = changed(work.filter.recentred(state.older), kept=new.now.kept), Status()
+        for earlier in known[:before]:
+            x, found = _filtered(work, x, earlier)
+            x, status = work.filter.recentred(x), found.status
+            if not status.ok:
+                break
+        start = work.filter.loosened(x, jumps.size)
+        again, found = _retaken(work, new, start, row + before, known[before:])
+        if status.ok and found.status.ok:
+            new = again
+        else:
+            now = work.filter.recentred(new.now)
+            new = renewed(work, work.filter.loosened(now, jumps.size), new)
+    return new, replace(report, notes={**report.notes, "jump": float(alarm)})

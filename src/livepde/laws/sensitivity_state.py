@@ -1,0 +1,203 @@
+"""What the sensitivity law keeps of each member, and how a sample changes it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from livepde.laws.assimilation import OK, Assimilation, Assimilator, MemberReports
+from livepde.laws.filter import Filter, FilterState
+from livepde.laws.guards import Guards, Scale
+from livepde.laws.history import added, trimmed
+from livepde.laws.jumps import Jumps, Watch
+from livepde.laws.members import changed, where
+from livepde.laws.replay import Replay
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import Span
+
+__all__ = [
+    "NEVER",
+    "SensitivityState",
+    "SensitivityWork",
+    "from_now",
+    "renewed",
+    "reports_of",
+    "shortened",
+    "stored",
+]
+
+NEVER = np.iinfo(np.int64).max  # number of samples at which a filter without replay is replayed
+
+
+@dataclass(frozen=True, eq=False)
+class SensitivityWork:
+    """What the law computes once, and its choices.
+
+    Attributes
+    ----------
+    filter, choices
+        The filter, and how it takes a sample.
+    replay, guards, jumps
+        Those of the law.
+    """
+
+    filter: Filter
+    choices: Assimilator
+    replay: Replay | None
+    guards: Guards | None
+    jumps: Jumps | None
+
+    @cached_property
+    def most(self) -> int:
+        """Largest number of samples in a window of a replay."""
+        return self.replay.window if self.replay is not None else 0
+
+    @cached_property
+    def back(self) -> int:
+        """Least number of samples by which the law can go back; 0: it never does."""
+        guards, jumps = self.guards, self.jumps
+        return max(guards.past if guards else 0, jumps.window if jumps else 0)
+
+
+@dataclass(frozen=True, eq=False)
+class SensitivityState:
+    """What the law knows of each member; the leading axis of every array is the members.
+
+    Attributes
+    ----------
+    now
+        The filter now.
+    start, window, opening, initial, reference
+        Where the window of a replay begins: the filter, the row of the log, whether that row holds
+        a sample that the filter has not seen, whether it is the initial state that the model says
+        (`Model.initial`), and the latent parameter from which the reference of `now` comes.
+    assimilated, due
+        Samples used since, and at how many the next replay is due: `NEVER` without replay.
+    older, newer, since_older, since_newer
+        Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
+    log
+        Samples since the earliest of them, see `livepde.laws.history`.
+    watch
+        Innovations of the last samples, for `Jumps`.
+    scale
+        What the sensors have shown, for `Guards`.
+    """
+
+    now: FilterState
+    start: FilterState
+    window: IntArray
+    opening: Mask
+    initial: Mask
+    reference: Array
+    assimilated: IntArray
+    due: IntArray
+    older: FilterState
+    newer: FilterState
+    since_older: IntArray
+    since_newer: IntArray
+    log: Array = field(metadata={"grows": 1})
+    watch: Watch
+    scale: Scale
+
+    def __len__(self) -> int:
+        return len(self.now)
+
+    @property
+    def replays(self) -> Mask:
+        """Members that keep one reference and replay, shape (members,)."""
+        replays: Mask = self.due != NEVER
+        return replays
+
+
+def stored(
+    work: SensitivityWork, state: SensitivityState, now: FilterState, span: Span, taken: Mask
+) -> SensitivityState:
+    """Return a state with the filter after a sample, which the members `taken` took."""
+    if not (work.back or work.replay):
+        return changed(state, now=now)
+    log = added(state.log, span, taken)
+    assimilated = state.assimilated
+    if work.replay:
+        assimilated = assimilated + (taken & span.present)
+    last, parts = log.shape[1] - 1, {}
+    if work.back:
+        due = taken & (last - state.since_newer >= work.back)
+        if due.any():
+            parts = {
+                "older": where(due, state.newer, state.older),
+                "newer": where(due, now, state.newer),
+                "since_older": np.where(due, state.since_newer, state.since_older),
+                "since_newer": np.where(due, last, state.since_newer),
+            }
+    return changed(state, now=now, log=log, assimilated=assimilated, **parts)
+
+
+def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
+    """Return a state without the rows of the log that nobody goes back to."""
+    rows = state.log.shape[1]
+    if rows < 3 * max(work.back, 32):
+        return state
+    older = state.since_older if work.back else np.full(len(state), rows - 1)
+    first = int(np.where(state.replays, np.minimum(older, state.window), older).min())
+    if first < rows // 2:
+        return state
+    return changed(
+        state,
+        log=trimmed(state.log, first),
+        window=np.maximum(state.window - first, 0),
+        since_older=state.since_older - first,
+        since_newer=state.since_newer - first,
+    )
+
+
+def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
+    """Return what the members report after a sample."""
+    notes: dict[str, Array] = {
+        "innovation_ratio": now.innovations.ratio,
+        "innovation_correlation": now.innovations.correlation,
+    }
+    if work.choices.adaptive:
+        notes["noise_level"] = np.sqrt(now.level)
+    if np.isfinite(work.choices.gate):
+        notes["refused"] = told.refused
+    if work.jumps is not None:
+        notes["jump"] = np.zeros(len(now))
+    steps = np.full(len(now), told.steps)
+    return MemberReports((OK,) * len(now), told.predicted, steps, notes)
+
+
+def renewed(
+    work: SensitivityWork, start: FilterState, state: SensitivityState, row: int | None = None
+) -> SensitivityState:
+    """Return one member whose window begins at a filter, with no samples yet.
+
+    Parameters
+    ----------
+    row
+        Of the log, to which the filter belongs; later ones are forgotten. Default the last.
+    """
+    log = state.log if row is None else state.log[:, : row + 1]
+    zero = np.zeros(1, dtype=np.int64)
+    first = work.replay.first if work.replay is not None and state.replays[0] else NEVER
+    no = np.zeros(1, dtype=bool)
+    return changed(
+        state,
+        now=start,
+        start=start,
+        log=log,
+        window=zero + max(log.shape[1] - 1, 0),
+        opening=no,
+        initial=no,
+        reference=start.q,
+        assimilated=zero,
+        due=zero + first,
+    )
+
+
+def from_now(state: SensitivityState) -> SensitivityState:
+    """Return one member that goes back to now at most."""
+    last = np.array([max(state.log.shape[1] - 1, 0)])
+    now = state.now
+    return changed(state, older=now, newer=now, since_older=last, since_newer=last)
