@@ -133,12 +133,12 @@ def _absorbed(
 ) -> tuple[FilterState, Assimilation]:
     predicted, Y = filter_.observe(x, span.end)
     d = span.z1 - predicted
-    finite: Mask = np.isfinite(x.u.sum(axis=1) + x.U.sum(axis=(1, 2)))
     used: Mask = np.isfinite(d)
     whole = bool(used.all())
     measured = None if whole else np.asarray(used.any(axis=1))
     if measured is not None and not measured.any():
         zero = np.zeros(len(x))
+        finite: Mask = np.isfinite(x.u.sum(axis=1) + x.U.sum(axis=(1, 2)))
         return x, Assimilation(predicted, steps, OK, finite, zero, zero)
     noise = filter_.noise[None]
     if choices.adaptive or x.level[0] != 1.0:
@@ -147,7 +147,7 @@ def _absorbed(
     largest = np.fmax.reduce(np.abs(d), axis=1)
     e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
     refused, count = x.refused, np.zeros(len(x))
-    if np.isfinite(choices.gate):
+    if choices.gate < math.inf:
         far = used & ~(np.abs(e) <= choices.gate)
         refused = np.where(far, refused + 1, np.where(used, 0, refused))
         kept = used & ~(far & (refused <= choices.patience))
@@ -160,7 +160,8 @@ def _absorbed(
     parts = {"innovations": x.innovations.add(e, measured), "refused": refused}
     if choices.adaptive:
         parts |= _learned(x, used, d, noise, made)
-    finite = finite & np.isfinite(new.da.sum(axis=1))
+    # What is not finite of U is not finite in du, whatever its weight.
+    finite = np.isfinite((new.u + new.du).sum(axis=1) + new.da.sum(axis=1))
     return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
 
 

@@ -14,8 +14,9 @@ For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -40,8 +41,6 @@ from livepde.stepping import (
 
 __all__ = ["Filter", "FilterState", "Update", "along"]
 
-GAIN = 1e-4  # relative error of a square root of the covariance: it steers the gain only
-ESTIMATE = 1e-8  # of the estimated deviation of the state
 FEW = 8  # members up to which LAPACK is called for each
 NOTHING = np.zeros(0)
 BLOCK = 32  # columns that LAPACK's QR takes at once
@@ -155,7 +154,7 @@ class Filter:
         """Return the drift of some members."""
         return self.drift[member] if len(self.drift) > 1 else np.repeat(self.drift, len(member))
 
-    @property
+    @cached_property
     def moves(self) -> bool:
         """True if an unknown moves."""
         return self.reduction.moves or bool(self.drift.any())
@@ -198,6 +197,9 @@ class Filter:
         What unknowns gain in one substep is independent of what they gain in the next.
         """
         count = self.problem.control.count(_between(span.start, span.t1)) if self.moves else 1
+        if count == 1:
+            x, taken, failure = self._advanced(x, span, span.start, span.t1)
+            return self._faded(x, span), taken, failure
         at = [span.start + k / count * (span.t1 - span.start) for k in range(count)] + [span.t1]
         taken = 0
         for start, stop in pairwise(at):
@@ -205,9 +207,13 @@ class Filter:
             taken += steps
             if failure is not None:
                 return x, taken, failure
-        if np.isfinite(self.fading):
-            x = changed(x, U=np.exp(-(span.t1 - span.start) / self.fading) * x.U)
-        return x, taken, None
+        return self._faded(x, span), taken, None
+
+    def _faded(self, x: FilterState, span: Span) -> FilterState:
+        """Return the state without what has faded of the past in a span."""
+        if math.isinf(self.fading):
+            return x
+        return changed(x, U=np.exp(-(span.t1 - span.start) / self.fading) * x.U)
 
     def _advanced(
         self, x: FilterState, span: Span, start: float, stop: float
@@ -215,7 +221,6 @@ class Filter:
         """Return the state at the end of a part of a span."""
         end, kept, off = self.moved(x, stop - start), x.kept, x.off_centre
         deviates = bool(off.any())
-        tolerance = ESTIMATE * off + GAIN * ~off
 
         def directions(at: FilterState) -> Array:
             C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C
@@ -229,9 +234,7 @@ class Filter:
             if self.moves and t != stop:
                 now = self.moved(x, t - start)
                 q, along = now.q, directions(now)
-            y, kept = self.stage.advance(
-                columns, q, along, h, span.at(t), kept, tolerance, x.member
-            )
+            y, kept = self.stage.advance(columns, q, along, h, span.at(t), kept, off, x.member)
             return y
 
         last = [end.du[None]] if deviates else []
@@ -272,8 +275,10 @@ class Filter:
         new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
         return new, Update(left, half, spread)
 
-    def recentred(self, x: FilterState) -> FilterState:
+    def recentred(self, x: FilterState, kept: Mask | None = None) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
+
+        Members in `kept`, shape (members,), keep theirs.
 
         Bounds hold for linearisation points and for what is reported, not for the linear filter:
         what lies beyond them stays in da and du, so that nothing the data said is lost.
@@ -289,6 +294,10 @@ class Filter:
                 du[k] = along(x, k, da[k])
                 u[k] -= du[k]
                 estimate[k] = x.q[k] + self.reduction.Phi @ shift
+        if kept is not None and kept.any():
+            rows = kept[:, None]
+            u, q = np.where(rows, x.u, u), np.where(rows, x.q, estimate)
+            return changed(x, u=u, q=q, du=np.where(rows, x.du, du), da=np.where(rows, x.da, da))
         return changed(x, u=u, q=estimate, du=du, da=da)
 
     def loosened(self, x: FilterState, size: float) -> FilterState:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -25,11 +24,11 @@ def changed(state: State, **parts: Any) -> State:
 
 def _each(function: Callable[..., Any], first: Any, *others: Any) -> Any:
     """Return a state whose arrays are a function of those of some states."""
-    if not is_dataclass(first):
+    if isinstance(first, np.ndarray):
         return function(first, *others)
     parts = {
-        item.name: _each(function, *(getattr(state, item.name) for state in (first, *others)))
-        for item in fields(first)
+        name: _each(function, value, *(getattr(other, name) for other in others))
+        for name, value in vars(first).items()
     }
     return changed(first, **parts)
 

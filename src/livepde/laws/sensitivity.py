@@ -287,7 +287,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         They step as arrays; whoever meets something out of the ordinary, a replay, a safeguard, an
         alarm, a failure, or is late, steps alone.
         """
-        before = changed(state, log=opened(state.log, span))
+        before = state if state.log.shape[1] else changed(state, log=opened(state.log, span))
         new, told, usual = self._together(work, before, span)
         reports = reports_of(work, new.now, told)
         if usual.all():
@@ -297,7 +297,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             one, alone[k] = step_alone(work, take(before, k), span.member(k))
             if not alone[k].status.ok and len(state) == 1:
                 return state, reports.with_members(alone)
-            if one.log.shape[1] < new.log.shape[1]:
+            if one.log.shape[1] == before.log.shape[1] and work.keeps_log:
                 one = changed(one, log=skipped(one.log))
             new = one if len(state) == 1 else put(new, k, one)
         return shortened(work, new), reports.with_members(alone)
@@ -330,17 +330,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             seen, alarm = jumps.add(watch, e, before.innovations)
             watch = where(np.broadcast_to(present, alarm.shape), seen, watch)
             usual = usual & ~(alarm & present)
-        if self.replay is None or not replays.any():
-            x = filter_.recentred(x)
-        elif not replays.all():
-            x = where(replays, x, filter_.recentred(x))
+        if not replays.all():
+            x = filter_.recentred(x, replays)
         if not usual.all():
             if not usual.any():
                 return state, told, usual
             x = where(usual, x, before)
             scale, watch = where(usual, scale, state.scale), where(usual, watch, state.watch)
-        state = changed(state, scale=scale, watch=watch)
-        return stored(work, state, x, span, usual), told, usual
+        new = stored(work, state, x, span, usual, scale=scale, watch=watch)
+        return new, told, usual
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,11 @@ class SensitivityWork:
     replay: Replay | None
     guards: Guards | None
     jumps: Jumps | None
+
+    @cached_property
+    def keeps_log(self) -> bool:
+        """True if the law ever goes back to earlier samples."""
+        return bool(self.back or self.replay)
 
     @cached_property
     def most(self) -> int:
@@ -112,20 +118,28 @@ class SensitivityState:
 
 
 def stored(
-    work: SensitivityWork, state: SensitivityState, now: FilterState, span: Span, taken: Mask
+    work: SensitivityWork,
+    state: SensitivityState,
+    now: FilterState,
+    span: Span,
+    taken: Mask,
+    **parts: Any,
 ) -> SensitivityState:
-    """Return a state with the filter after a sample, which the members `taken` took."""
-    if not (work.back or work.replay):
-        return changed(state, now=now)
+    """Return a state with the filter after a sample, which the members `taken` took.
+
+    `parts` are other fields to exchange.
+    """
+    if not work.keeps_log:
+        return changed(state, now=now, **parts)
     log = added(state.log, span, taken)
     assimilated = state.assimilated
     if work.replay:
         assimilated = assimilated + (taken & span.present)
-    last, parts = log.shape[1] - 1, {}
+    last = log.shape[1] - 1
     if work.back:
         due = taken & (last - state.since_newer >= work.back)
         if due.any():
-            parts = {
+            parts |= {
                 "older": where(due, state.newer, state.older),
                 "newer": where(due, now, state.newer),
                 "since_older": np.where(due, state.since_newer, state.since_older),
@@ -160,7 +174,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
     }
     if work.choices.adaptive:
         notes["noise_level"] = np.sqrt(now.level)
-    if np.isfinite(work.choices.gate):
+    if work.choices.gate < np.inf:
         notes["refused"] = told.refused
     if work.jumps is not None:
         notes["jump"] = np.zeros(len(now))

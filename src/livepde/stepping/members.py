@@ -19,6 +19,7 @@ from livepde.linalg import (
     BandedBlocks,
     BandedSolver,
     IntArray,
+    Mask,
     Pattern,
     analyse,
     compact,
@@ -30,6 +31,8 @@ from livepde.stepping.newton import StepFailed
 from livepde.stepping.span import Moments
 from livepde.stepping.state import ForwardStage
 
+GAIN = 1e-4  # relative error of a square root of the covariance: it steers the gain only
+ESTIMATE = 1e-8  # of the estimated deviation of the state
 MOST_UNKNOWNS = 64  # of which each has a matrix of its own
 
 __all__ = ["BandedStage", "KeptFactors", "MemberStage", "SeparateStages", "member_stage"]
@@ -80,7 +83,7 @@ class MemberStage(ABC):
         h: float,
         at: Moments,
         kept: KeptFactors,
-        tolerance: Array,
+        off_centre: Mask,
         members: IntArray,
     ) -> tuple[Array, KeptFactors]:
         """Return states and tangents at the end of a stage, and what it leaves to the next.
@@ -94,8 +97,9 @@ class MemberStage(ABC):
             (members, r, m).
         at
             Time and inputs at the end of the stage.
-        tolerance
-            Bound on the relative error of the tangents of each member, shape (members,).
+        off_centre
+            Members whose last tangent is the estimated deviation of the state, which has to be
+            more accurate than a square root of the covariance; shape (members,).
         members
             Numbers of the members, by which they find their own factors again.
 
@@ -135,7 +139,7 @@ class SeparateStages(MemberStage):
         h: float,
         at: Moments,
         kept: KeptFactors,
-        tolerance: Array,
+        off_centre: Mask,
         members: IntArray,
     ) -> tuple[Array, KeptFactors]:
         new, left = np.empty_like(columns), []
@@ -147,7 +151,7 @@ class SeparateStages(MemberStage):
                 h,
                 at.member(k),
                 kept.member(k),
-                float(tolerance[k]),
+                ESTIMATE if off_centre[k] else GAIN,
             )
             new[:, k] = y.T
             left.append(after)
@@ -247,7 +251,7 @@ class BandedStage(MemberStage):
         h: float,
         at: Moments,
         kept: KeptFactors,
-        tolerance: Array,
+        off_centre: Mask,
         members: IntArray,
     ) -> tuple[Array, KeptFactors]:
         size, n = columns.shape[1:]

@@ -1,0 +1,177 @@
+"""Stages and states of several members: the numbers of one after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1, ElementLineP2
+
+import livepde as lp
+from livepde.fem import Inputs, Moment
+from livepde.laws.members import changed, join, put, take, where
+from livepde.linalg import Array
+from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments
+from livepde.stepping.driven import DrivenVector
+from livepde.stepping.members import SeparateStages
+
+MESH = lp.interval(0.0, 1.0, 14)
+
+
+def rod(ends: Any, f: Any = 0.0, A: Any = None, element: Any = None, inputs: Any = ()) -> lp.Model:
+    return lp.Model(
+        lp.Field(MESH, element or ElementLineP1(), dirichlet=ends),
+        {"a": lp.Scalar(0.2, 0.1), "s": lp.Scalar(0.5, 0.2)},
+        A=A or (lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) - q.s * v * x[0]),
+        B=lambda u, v, x: 0.1 * u * v,
+        f=f,
+        inputs=inputs,
+    )
+
+
+MODELS = {
+    "fixed ends": rod({"left": 0.0, "right": 2.0}),
+    "channels": rod({"left": lp.Channel("T_0"), "right": lp.Channel("T_1")}),
+    "ends in time": rod({"left": lambda x, t: np.sin(t) + 0.0 * x[0], "right": 0.0}),
+    "no ends": rod({}),
+    "source in time": rod({"left": 0.0}, lambda x, t: np.cos(3.0 * t) * x[0]),
+    "curved in inputs": rod({"left": 0.0}, lambda x, t: x.inputs["T_0"] ** 2, inputs=["T_0"]),
+    "unknown and input": rod(
+        {"left": 0.0},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.s * (u - x.inputs["T_0"]) * v,
+        inputs=["T_0"],
+    ),
+    "quadratic elements": rod({"left": 1.0, "right": lp.Channel("T_1")}, element=ElementLineP2()),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("many", [False, True], ids=["one moment", "inputs of each"])
+def test_a_banded_stage_gives_the_state_and_tangents_of_each_member(name: str, many: bool):
+    model, rng, members, r = MODELS[name], np.random.default_rng(0), 3, 4
+    assert BandedStage.refuses(model) == ""
+    stage, forward = BandedStage(model), ForwardStage(model)
+    if many and stage.refusal:
+        assert name == "curved in inputs"
+        return
+    channels, n = model.channels, model.X.dim
+    rows = 300.0 + rng.standard_normal((members if many else 1, len(channels)))
+    at = Moments(0.7, channels, rows)
+    columns = rng.standard_normal((1 + r, members, n))
+    columns[1:, :, model.state_space.fixed] = 0.0  # what is given has no tangent
+    q = np.array([0.2, 0.5]) + 0.05 * rng.standard_normal((members, 2))
+    directions = rng.standard_normal((members, r, 2))
+    off, each = np.ones(members, dtype=bool), np.arange(members)
+    new, _ = stage.advance(columns, q, directions, 0.1, at, stage.kept(members), off, each)
+    for k in range(members):
+        row = rows[k if many else 0]
+        moment = Moment(0.7, Inputs(dict(zip(channels, row.tolist(), strict=True))))
+        kept = KeptFactors.none(1).member(0)
+        wanted, _ = forward.advance(columns[:, k].T, q[k], directions[k].T, 0.1, moment, kept)
+        np.testing.assert_allclose(new[:, k].T, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
+
+
+def test_other_stages_step_members_one_by_one():
+    model = lp.Model(
+        lp.Field(MESH, ElementLineP1(), dirichlet={"left": 1.0}),
+        lp.Scalar(0.2, 0.1),
+        A=lambda q, u, v, x: q * (1.0 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    assert "affine" in BandedStage.refuses(model)
+    stage, forward, rng = SeparateStages(model), ForwardStage(model), np.random.default_rng(1)
+    columns, q = rng.random((3, 2, model.X.dim)), np.array([[0.2], [0.3]])
+    columns[1:, :, model.state_space.fixed] = 0.0
+    directions, at = np.ones((2, 2, 1)), Moments(0.1, (), np.zeros((1, 0)))
+    numbers, off = np.array([4, 1]), np.zeros(2, dtype=bool)
+    new, _ = stage.advance(columns, q, directions, 0.1, at, stage.kept(2), off, numbers)
+    for k in range(2):
+        kept = KeptFactors.none(1).member(0)
+        wanted, _ = forward.advance(columns[:, k].T, q[k], directions[k].T, 0.1, at.member(k), kept)
+        np.testing.assert_array_equal(new[:, k].T, wanted)
+
+
+@pytest.mark.parametrize(
+    ("vector", "affine", "assembled"),
+    [
+        (lambda moment: np.array([1.0, 2.0]), True, True),
+        (lambda moment: np.array([1.0, 2.0 + 3.0 * moment.inputs["p"]]), True, True),
+        (lambda moment: np.array([moment.t, moment.inputs["p"]]), True, False),
+        (lambda moment: np.array([1.0, abs(moment.inputs["p"])]), False, False),
+    ],
+    ids=["constant", "affine", "timed", "bent"],
+)
+def test_a_driven_vector_is_what_it_was_made_from(vector: Any, affine: bool, assembled: bool):
+    timed = vector(Moment(1.0, Inputs({"p": 1.0})))[0] != vector(Moment(2.0, Inputs({"p": 1.0})))[0]
+    driven = DrivenVector(vector, ("p",), lambda: bool(timed))
+    assert driven.affine is affine
+    assert (driven.responses is not None) is assembled
+    for p in (-3.0, 0.0, 1e6):
+        one = driven(Moments(0.3, ("p",), np.array([[p]])))
+        wanted = vector(Moment(0.3, Inputs({"p": p})))
+        np.testing.assert_allclose(one, wanted[None], rtol=1e-13)
+    if affine:
+        rows = np.array([[2.0], [5.0], [-1.0]])
+        found = driven(Moments(0.3, ("p",), rows))
+        wanted = np.array([vector(Moment(0.3, Inputs({"p": float(p)}))) for (p,) in rows])
+        np.testing.assert_allclose(np.broadcast_to(found, (3, 2)), wanted, rtol=1e-13)
+
+
+@dataclass(frozen=True, eq=False)
+class Inner:
+    root: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Outer:
+    value: Array
+    inner: Inner
+
+
+def state(members: int, rows: int, at: float) -> Outer:
+    return Outer(np.full(members, at), Inner(np.full((members, rows, 2), at)))
+
+
+def test_members_are_taken_put_and_joined_and_square_roots_widened():
+    whole = join(state(2, 3, 1.0), state(1, 5, 2.0))
+    assert whole.value.tolist() == [1.0, 1.0, 2.0]
+    assert whole.inner.root.shape == (3, 5, 2)
+    assert not whole.inner.root[:2, 3:].any()
+    assert take(whole, 2).value.tolist() == [2.0]
+    assert take(whole, np.array([2, 0])).value.tolist() == [2.0, 1.0]
+    mixed = put(whole, 0, state(1, 1, 7.0))
+    assert mixed.value.tolist() == [7.0, 1.0, 2.0]
+    assert mixed.inner.root[0].tolist() == [[7.0, 7.0]] + 4 * [[0.0, 0.0]]
+    assert whole.value[0] == 1.0
+    chosen = np.array([True, False, False])
+    assert where(chosen, mixed, whole).value.tolist() == [7.0, 1.0, 2.0]
+    assert where(~chosen, mixed, whole).value.tolist() == [1.0, 1.0, 2.0]
+    assert changed(whole, value=np.zeros(3)).inner is whole.inner
+
+
+def test_a_bank_goes_on_where_the_step_of_a_member_fails():
+    """All step alone then: logs of members stay in line, and the others have their sample."""
+    model = lp.Model(
+        lp.Field(MESH, ElementLineP1(), dirichlet={"left": 1.0, "right": 0.0}),
+        {"a": lp.Scalar(0.2, 0.1)},
+        A=lambda q, u, v, x: q.a * (1.0 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), lp.AutoLaw(), u0=0.0)
+    stage, calls = identifier._work.work.filter.stage, []
+    advance = stage.advance
+
+    def fails(columns: Array, *rest: Any) -> Any:
+        calls.append(columns.shape[1])
+        if columns.shape[1] == 6 and len(calls) == 30:
+            raise lp.StepFailed("not_converged", "no luck")
+        return advance(columns, *rest)
+
+    object.__setattr__(stage, "advance", fails)
+    rng = np.random.default_rng(0)
+    for k in range(60):
+        estimate = identifier.step(0.05 * (k + 1), [0.5, 0.3] + 0.01 * rng.standard_normal(2))
+        assert estimate.status.ok
+    times = identifier._state.members.log[:, :, 0]
+    assert np.isfinite(times).all()
+    assert (np.diff(times, axis=1) > 0.0).all()
