@@ -40,7 +40,11 @@ MODELS = {
     "curved in inputs": rod({"left": 0.0}, lambda x, t: x.inputs["T_0"] ** 2, inputs=["T_0"]),
     "unknown and input": rod(
         {"left": 0.0},
-        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.s * (u - x.inputs["T_0"]) * v,
+        A=[
+            lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+            lambda q, u, v, x: q.s * u * v,
+            lambda q, u, v, x: -q.s * x.inputs["T_0"] * v,
+        ],
         inputs=["T_0"],
     ),
     "quadratic elements": rod({"left": 1.0, "right": lp.Channel("T_1")}, element=ElementLineP2()),
@@ -81,7 +85,8 @@ def test_other_stages_step_members_one_by_one():
     )
     assert "affine" in BandedStage.refuses(model)
     stage, forward, rng = SeparateStages(model), ForwardStage(model), np.random.default_rng(1)
-    columns, q = rng.random((3, 2, model.X.dim)), np.array([[0.2], [0.3]])
+    columns = 1.0 + 0.01 * rng.random((3, 2, model.X.dim))
+    q = np.array([[0.2], [0.3]])
     columns[1:, :, model.state_space.fixed] = 0.0
     directions, at = np.ones((2, 2, 1)), Moments(0.1, (), np.zeros((1, 0)))
     numbers, off = np.array([4, 1]), np.zeros(2, dtype=bool)
