@@ -10,7 +10,7 @@ import pytest
 import livepde as lp
 from livepde.checkpoint import flatten
 from livepde.laws import Belief
-from livepde.laws.filter import FilterState
+from livepde.laws.filter_state import FilterState
 from livepde.models import heat
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import Record, RecordArrays, Snapshot

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.laws.base import Report, Status
-from livepde.laws.filter import Filter, FilterState, Update
+from livepde.laws.filter import Filter, Update
+from livepde.laws.filter_state import FilterState
 from livepde.laws.members import changed
 from livepde.linalg import Array, Mask
 from livepde.stepping import Span

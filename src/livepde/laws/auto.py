@@ -22,7 +22,7 @@ from livepde.laws.bank import (
     scaled,
 )
 from livepde.laws.base import Belief, Law, Problem, Report
-from livepde.laws.filter import FilterState
+from livepde.laws.filter_state import FilterState
 from livepde.laws.guess import first_guess
 from livepde.laws.history import added, first_interval, intervals_since, opened
 from livepde.laws.jumps import Jumps

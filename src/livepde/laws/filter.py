@@ -15,7 +15,7 @@ For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -24,14 +24,13 @@ import numpy as np
 from scipy.linalg import lapack
 
 from livepde.laws.base import Problem
-from livepde.laws.innovations import Innovations
+from livepde.laws.filter_state import FilterState, along
 from livepde.laws.members import changed
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensors import MemberSensors
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import (
     Interval,
-    KeptFactors,
     MemberStage,
     Moments,
     Span,
@@ -39,67 +38,11 @@ from livepde.stepping import (
     advance,
 )
 
-__all__ = ["Filter", "FilterState", "Update", "along"]
+__all__ = ["Filter", "Update"]
 
 FEW = 8  # members up to which LAPACK is called for each
 NOTHING = np.zeros(0)
 BLOCK = 32  # columns that LAPACK's QR takes at once
-
-
-@dataclass(frozen=True, eq=False)
-class FilterState:
-    """What a filter knows of each member after the samples so far.
-
-    Attributes
-    ----------
-    member
-        Numbers of the members, shape (members,).
-    u, q
-        Linearisation point: state and latent parameter, shapes (members, n) and (members, m).
-    du, da
-        Estimated deviations of u and of the reduced unknowns a, (members, n) and (members, k).
-    U, C
-        Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k).
-        As long as nothing moves, r = k.
-    age
-        Time for which the unknowns have moved, shape (members,).
-    innovations
-        Statistics of the innovations.
-    refused
-        How many values in a row of each sensor the gate has refused, shape (members, sensors).
-    level, samples
-        Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
-        many samples that stands for, shapes (members,).
-    evidence
-        Logarithm of the likelihood of all samples so far, each given those before, (members,).
-    kept
-        What the last stage has left to the next.
-    """
-
-    member: IntArray
-    u: Array
-    q: Array
-    du: Array
-    da: Array
-    U: Array = field(metadata={"grows": 1})
-    C: Array = field(metadata={"grows": 1})
-    age: Array
-    innovations: Innovations
-    refused: IntArray
-    level: Array
-    samples: Array
-    evidence: Array
-    kept: KeptFactors
-
-    def __len__(self) -> int:
-        return len(self.member)
-
-    @property
-    def off_centre(self) -> Mask:
-        """Members whose estimate is not the linearisation point, shape (members,)."""
-        if not (self.da.any() or self.du.any()):
-            return np.zeros(len(self), dtype=bool)
-        return np.asarray(self.da.any(axis=1) | self.du.any(axis=1))
 
 
 class Update(NamedTuple):
@@ -345,15 +288,6 @@ class Filter:
 def _between(start: float, stop: float) -> Interval:
     """Return the interval between two times, without samples."""
     return Interval(start, stop, {}, {}, NOTHING, NOTHING)
-
-
-def along(x: FilterState, k: int, shift: Array) -> Array:
-    """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
-    if not shift.any():
-        return np.zeros(x.u.shape[1])
-    weights = np.linalg.lstsq(x.C[k].T, shift, rcond=None)[0]
-    moved: Array = weights @ x.U[k]
-    return moved
 
 
 def _contraction(Y: Array) -> tuple[Array, Array]:

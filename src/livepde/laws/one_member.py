@@ -13,7 +13,7 @@ import numpy as np
 
 from livepde.laws.assimilation import assimilate
 from livepde.laws.base import Report, Status
-from livepde.laws.filter import FilterState
+from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards
 from livepde.laws.history import first_interval, intervals_since, opened
 from livepde.laws.jumps import Jumps

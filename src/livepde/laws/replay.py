@@ -10,7 +10,8 @@ from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.assimilation import Assimilator, assimilate, assimilate_at_once
 from livepde.laws.base import Status
-from livepde.laws.filter import Filter, FilterState, along
+from livepde.laws.filter import Filter
+from livepde.laws.filter_state import FilterState, along
 from livepde.linalg import Array
 from livepde.stepping import Interval
 

@@ -17,7 +17,8 @@ from livepde.laws.assimilation import (
     assimilate_at_once,
 )
 from livepde.laws.base import Belief, Law, Problem, Report
-from livepde.laws.filter import Filter, FilterState
+from livepde.laws.filter import Filter
+from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations

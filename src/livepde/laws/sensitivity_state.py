@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, Assimilator, MemberReports
-from livepde.laws.filter import Filter, FilterState
+from livepde.laws.filter import Filter
+from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, trimmed
 from livepde.laws.jumps import Jumps, Watch

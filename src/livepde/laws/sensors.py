@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.laws.base import Problem
+from livepde.laws.filter_state import FilterState
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, compact
 from livepde.observation import Observed
 from livepde.stepping import Moments
-
-if TYPE_CHECKING:
-    from livepde.laws.filter import FilterState
 
 __all__ = ["MemberSensors"]
 

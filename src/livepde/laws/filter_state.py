@@ -1,0 +1,78 @@
+"""What a filter knows of each member: its estimate, and how well it is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from livepde.laws.innovations import Innovations
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import KeptFactors
+
+__all__ = ["FilterState", "along"]
+
+
+@dataclass(frozen=True, eq=False)
+class FilterState:
+    """What a filter knows of each member after the samples so far.
+
+    Attributes
+    ----------
+    member
+        Numbers of the members, shape (members,).
+    u, q
+        Linearisation point: state and latent parameter, shapes (members, n) and (members, m).
+    du, da
+        Estimated deviations of u and of the reduced unknowns a, (members, n) and (members, k).
+    U, C
+        Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k).
+        As long as nothing moves, r = k.
+    age
+        Time for which the unknowns have moved, shape (members,).
+    innovations
+        Statistics of the innovations.
+    refused
+        How many values in a row of each sensor the gate has refused, shape (members, sensors).
+    level, samples
+        Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
+        many samples that stands for, shapes (members,).
+    evidence
+        Logarithm of the likelihood of all samples so far, each given those before, (members,).
+    kept
+        What the last stage has left to the next.
+    """
+
+    member: IntArray
+    u: Array
+    q: Array
+    du: Array
+    da: Array
+    U: Array = field(metadata={"grows": 1})
+    C: Array = field(metadata={"grows": 1})
+    age: Array
+    innovations: Innovations
+    refused: IntArray
+    level: Array
+    samples: Array
+    evidence: Array
+    kept: KeptFactors
+
+    def __len__(self) -> int:
+        return len(self.member)
+
+    @property
+    def off_centre(self) -> Mask:
+        """Members whose estimate is not the linearisation point, shape (members,)."""
+        if not (self.da.any() or self.du.any()):
+            return np.zeros(len(self), dtype=bool)
+        return np.asarray(self.da.any(axis=1) | self.du.any(axis=1))
+
+
+def along(x: FilterState, k: int, shift: Array) -> Array:
+    """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
+    if not shift.any():
+        return np.zeros(x.u.shape[1])
+    weights = np.linalg.lstsq(x.C[k].T, shift, rcond=None)[0]
+    moved: Array = weights @ x.U[k]
+    return moved
