@@ -367,9 +367,8 @@ def test_says_why_members_are_run_separately(alike):
     found = json.loads(output)
     assert code == 1
     assert found["notes"][0] == (
-        "Of 7 members 2 were stepped together, 5 separately: no other one has their settings and "
-        "sample times (2); replays and the test for jumps go back, each member to a time of its "
-        "own (2); an input has no value in their first sample (1)."
+        "Of 7 members 4 were stepped together, 3 separately: no other one has their settings and "
+        "sample times (2); an input has no value in their first sample (1)."
     )
     assert [row[1] for row in found["tables"][0]["rows"]] == ["finished"] * 6 + ["failed"]
 

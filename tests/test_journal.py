@@ -258,7 +258,7 @@ def as_nobody(code: str, *arguments: object) -> str:
 READ = """
 import os, sys
 from pathlib import Path
-import livepde, pydantic
+import livepde, pydantic, xarray  # nobody may read packages of root
 from livepde.runs import Journal
 with Journal.create(None, (), livepde.records.Layout("", "", {}, {}, [], None, {}, {}, [], [], [])):
     pass

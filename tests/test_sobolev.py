@@ -132,7 +132,8 @@ def test_products_with_other_unknowns():
     work = lp.SensitivityLaw(modes=3).prepare(
         lp.Identifier(model, sensors, lp.GradientLaw()).problem
     )
-    np.testing.assert_allclose(work.Phi.T @ gram @ work.Phi, np.eye(7), atol=1e-8)
+    Phi = work.filter.reduction.Phi
+    np.testing.assert_allclose(Phi.T @ gram @ Phi, np.eye(7), atol=1e-8)
 
 
 def test_modes_of_a_large_space_are_powers_of_those_of_H1():

@@ -52,6 +52,7 @@ class Together:
         belief: Belief = self.law.member_belief(self.work, state.now, k)
         return belief
 
+    @np.errstate(over="ignore", invalid="ignore")  # of members whose step has failed
     def beliefs(self, state: SensitivityState) -> Beliefs:
         now, reduction = state.now, self.work.filter.reduction
         latent = self.work.filter.problem.model.latent

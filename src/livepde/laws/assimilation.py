@@ -161,8 +161,10 @@ def _absorbed(
     parts = {"innovations": x.innovations.add(e, measured), "refused": refused}
     if choices.adaptive:
         parts |= _learned(x, used, d, noise, made)
-    # What is not finite of U is not finite in du, whatever its weight.
-    finite = np.isfinite((new.u + new.du).sum(axis=1) + new.da.sum(axis=1))
+    # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
+    # overflows would leave statistics that are not finite.
+    sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
+    finite = np.isfinite(sums + largest * largest)
     return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
 
 
