@@ -180,3 +180,79 @@ def test_a_bank_goes_on_where_the_step_of_a_member_fails():
     times = identifier._state.members.log[:, :, 0]
     assert np.isfinite(times).all()
     assert (np.diff(times, axis=1) > 0.0).all()
+
+
+def test_a_fleet_whose_withheld_sensors_read_channels_of_their_own():
+    model = rod({"left": lp.Channel("T_0"), "right": 0.0})
+    sensors, hidden = lp.Points([0.3, 0.6], noise=0.01), lp.Moving({"probe": "x_p"})
+    fleet = lp.Fleet(model, sensors, lp.SensitivityLaw(), 2, withheld=hidden)
+    for k in range(4):
+        inputs = {"T_0": 1.0, "x_p": 0.5}
+        assert fleet.step(0.1 * (k + 1), [[0.5, 0.3], [0.4, 0.2]], inputs).ok.all()
+
+
+def test_members_without_a_reading_step_with_the_others(monkeypatch: pytest.MonkeyPatch):
+    alone: list[int] = []
+    step = lp.laws.sensitivity.step_alone
+
+    def counted(*given: Any) -> Any:
+        alone.append(1)
+        return step(*given)
+
+    monkeypatch.setattr("livepde.laws.sensitivity.step_alone", counted)
+    model = rod({"left": 1.0, "right": 0.0})
+    fleet = lp.Fleet(model, lp.Points([0.3, 0.6], noise=5.0), lp.SensitivityLaw(), 2)
+    for k in range(5):
+        fleet.step(0.1 * (k + 1), [[0.5, 0.3], [np.nan, np.nan]])
+    assert not alone
+
+
+def test_rows_that_a_member_has_missed_stay_out_of_its_log_after_an_alarm():
+    """The log of a member that failed for some samples is that of a run of its own."""
+    model = rod({"left": lp.Channel("T_0"), "right": 0.0})
+    sensors, law = lp.Points([0.3, 0.6], noise=0.01), lp.SensitivityLaw(jumps=lp.Jumps(settle=5))
+    fleet = lp.Fleet(model, sensors, law, 2, u0=0.0)
+    one = lp.Identifier(model, sensors, law, u0=0.0)
+    rng, alarms = np.random.default_rng(0), 0
+    for k in range(40):
+        t, size = 0.1 * (k + 1), 1.0 if k < 22 else 3.0
+        z = size * np.array([0.5, 0.3]) + 0.01 * rng.standard_normal(2)
+        end = np.nan_to_num(1e308) if k in (8, 9, 10) else 1.0
+        told = fleet.step(t, [z, z], {"T_0": [1.0, end]})
+        mine = one.step(t, z, {"T_0": end})
+        assert told.statuses[1].code == mine.status.code
+        alarms += bool(mine.notes.get("jump"))
+        times = fleet._state.log[1, :, 0]
+        times = times[np.isfinite(times)]
+        wanted = one._state.log[0, :, 0]
+        assert (times > 0.0).sum() == (wanted > 0.0).sum()
+        np.testing.assert_allclose(times[times > 0.0], wanted[wanted > 0.0])
+    assert alarms
+
+
+def test_a_bank_that_learns_of_no_noise_waits_anew(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("livepde.laws.auto.SILENCE", 30)
+    model = rod({"left": 1.0, "right": 0.0})
+    identifier = lp.Identifier(model, lp.Points([0.3, 0.6]), lp.AutoLaw(), u0=0.0)
+    for k in range(100):
+        identifier.step(0.1 * (k + 1), [np.nan, np.nan])
+        waiting = identifier._state.waiting[0, :, 0]
+        assert len(waiting) <= 31
+        assert identifier._state.members.log.shape[1] < 110
+    rng = np.random.default_rng(0)
+    for k in range(100, 130):
+        estimate = identifier.step(0.1 * (k + 1), [0.7, 0.4] + 0.01 * rng.standard_normal(2))
+    assert estimate.status.ok
+    assert identifier._state.known
+
+
+def test_what_a_replay_leaves_is_what_the_law_goes_back_to():
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8), guards=lp.Guards(past=8))
+    model, rng = rod({"left": 1.0, "right": 0.0}), np.random.default_rng(0)
+    identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law, u0=0.0)
+    for k in range(8):
+        identifier.step(0.1 * (k + 1), [0.7, 0.4] + 0.01 * rng.standard_normal(2))
+    state = identifier._state
+    assert state.since_newer[0] == state.log.shape[1] - 1
+    np.testing.assert_array_equal(state.newer.q, state.now.q)
+    np.testing.assert_array_equal(state.newer.da, state.now.da)

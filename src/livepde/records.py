@@ -110,16 +110,20 @@ class RecordArrays:
     def append(self, record: Record, /) -> None:
         """Keep one more."""
         count = len(self._t)
-        for name, value in record.notes.items():
+        # All is converted before anything is kept: a value that is no number changes nothing.
+        notes = {name: float(value) for name, value in record.notes.items()}
+        found = (record.numbers, record.innovation, record.withheld_error)
+        numbers, innovation, error = (np.asarray(part, dtype=float).tobytes() for part in found)
+        for name, value in notes.items():
             column = self._notes.get(name)
             if column is None:
                 column = self._notes[name] = array("d")
             if len(column) < count:
                 column.extend([math.nan] * (count - len(column)))
             column.append(value)
-        self._numbers.frombytes(record.numbers.tobytes())
-        self._innovation.frombytes(record.innovation.tobytes())
-        self._error.frombytes(record.withheld_error.tobytes())
+        self._numbers.frombytes(numbers)
+        self._innovation.frombytes(innovation)
+        self._error.frombytes(error)
         self._status.append(record.status)
         self._steps.append(record.steps)
         self._t.append(record.t)

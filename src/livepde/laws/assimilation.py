@@ -139,13 +139,13 @@ def _absorbed(
     measured = None if whole else np.asarray(used.any(axis=1))
     if measured is not None and not measured.any():
         zero = np.zeros(len(x))
-        finite: Mask = np.isfinite(x.u.sum(axis=1) + x.U.sum(axis=(1, 2)))
+        finite: Mask = np.isfinite((x.u + x.du).sum(axis=1) + x.U.sum(axis=(1, 2)))
         return x, Assimilation(predicted, steps, OK, finite, zero, zero)
     noise = filter_.noise[None]
     if choices.adaptive or x.level[0] != 1.0:
         noise = np.sqrt(x.level)[:, None] * noise
     Y, d = Y / noise[:, None], d / noise
-    largest = np.fmax.reduce(np.abs(d), axis=1)
+    largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
     e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
     refused, count = x.refused, np.zeros(len(x))
     if choices.gate < math.inf:

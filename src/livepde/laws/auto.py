@@ -24,7 +24,14 @@ from livepde.laws.bank import (
 from livepde.laws.base import Belief, Law, Problem, Report
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guess import first_guess
-from livepde.laws.history import added, first_interval, intervals_since, opened
+from livepde.laws.history import (
+    added,
+    empty_log,
+    first_interval,
+    intervals_since,
+    opened,
+    trimmed,
+)
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed, join, take
 from livepde.laws.replay import Replay
@@ -194,8 +201,13 @@ class AutoLaw(Law[Bank, AutoState]):
         noise = first_guess(waiting[0, :, 1 : 1 + len(state.noise)])
         if noise is None and waiting.shape[1] > SILENCE:
             here = renewed(filters, filters.filter.recentred(free.now), free)
-            here = from_now(here)
-            return changed(state, waiting=state.start.log, start=here, members=here), report
+            rows = here.log.shape[1]
+            last, zero = trimmed(here.log, rows - 1), np.zeros(1, dtype=np.int64)
+            here = changed(
+                from_now(here), log=last, window=zero, since_older=zero, since_newer=zero
+            )
+            nothing = empty_log(1, len(state.noise), len(work.channels))
+            return changed(state, waiting=nothing, start=here, members=here), report
         if noise is None:
             return changed(state, waiting=waiting, members=free), report
         begun = self._initial(work, state.start, noise)
@@ -244,7 +256,7 @@ class AutoLaw(Law[Bank, AutoState]):
         )
         rested, alarm = self._rested(work, state, now)
         report = self._report(work, now, members.now.member, good, reports, before)
-        notes = {**report.notes, "jump": float(alarm), "awake": float(len(rested.members))}
+        notes = {**report.notes, "jump": float(alarm), "awake": float(len(now.members))}
         return rested, replace(report, notes=notes)
 
     def _rested(self, work: Bank, before: AutoState, state: AutoState) -> tuple[AutoState, bool]:

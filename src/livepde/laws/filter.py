@@ -231,7 +231,7 @@ class Filter:
         da, du, u = np.zeros_like(x.da), np.zeros_like(x.du), x.u + x.du
         if within is not estimate:
             beyond = (within != estimate).any(axis=1)
-            for k in np.flatnonzero(beyond).tolist():
+            for k in np.flatnonzero(beyond & np.isfinite(x.C).all(axis=(1, 2))).tolist():
                 shift = self.reduction.reduced(within[k] - x.q[k])
                 da[k] = x.da[k] - shift
                 du[k] = along(x, k, da[k])

@@ -34,9 +34,10 @@ class GradientState:
         Observed part of the state at the last sample, shape (n,).
     rate
         Last change of (u^ - u_alpha, q^) per unit of time, shape (n + m,).
-    kept, left
-        Factor of the coupled stage, and what it has left of its residual, times its step, shape
-        (n + m,).
+    kept
+        Factor of the coupled stage.
+    left, width
+        Residual of the last stage, shape (n + m,), for which the next one makes up, and its step.
     present, frozen
         Sensors of the last sample, shape (sensors,), and whether q was held.
     observed, metric, excitation
@@ -49,6 +50,7 @@ class GradientState:
     rate: Array
     kept: KeptFactor
     left: Array
+    width: float
     present: Array
     frozen: bool
     observed: Any
@@ -143,6 +145,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             rate=np.zeros(len(u0) + len(q0)),
             kept=KeptFactor.none(),
             left=np.zeros(len(u0) + len(q0)),
+            width=0.0,
             present=np.zeros(work.problem.observed.size, dtype=bool),
             frozen=False,
             observed=work.observed.init(),
@@ -191,7 +194,9 @@ class GradientLaw(Law[GradientParts, GradientState]):
         # u and q together, by coupled stages
         predicts = same and frozen == state.frozen
         rate = state.rate if predicts else None
-        stages = StageSequence(coupled, path, metric, rate, state.kept, state.left)
+        # While q is held its equation has a huge inner product: its residual is rounding.
+        left = state.left if predicts and not frozen else 0.0 * state.left
+        stages = StageSequence(coupled, path, metric, rate, state.kept, left, state.width)
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stages, y, interval)
         if failure is not None:
@@ -209,6 +214,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             rate=stages.rate(y, end),
             kept=stages.kept,
             left=stages.left,
+            width=stages.width,
             present=interval.present,
             frozen=frozen,
             observed=observed,

@@ -113,9 +113,8 @@ class StageSequence:
     ----------
     kept
         The factor that the last stage has kept.
-    left
-        What it has left of its residual, times its step, shape (n + m,); zero if the next stage is
-        not to make up for it.
+    left, width
+        Residual of the last stage, shape (n + m,), and its step: the next stage makes up for it.
     """
 
     def __init__(
@@ -126,6 +125,7 @@ class StageSequence:
         rate: Array | None,
         kept: KeptFactor,
         left: Array,
+        width: float,
     ) -> None:
         self.coupled = coupled
         self.path = path
@@ -133,6 +133,7 @@ class StageSequence:
         self.slope = rate
         self.kept = kept if rate is not None else KeptFactor.none()
         self.left = left
+        self.width = width
         self._last: tuple[StageProblem, float, StageIterate] | None = None
 
     def __call__(self, c: Array, t: float, h: float) -> Array:
@@ -140,7 +141,8 @@ class StageSequence:
         n, project = self.coupled.terms.n, self.coupled.terms.forms.split.project
         u_alpha = self.path.at(t).u
         carries, moment = self.coupled.carries, self.path.interval.at(t)
-        left = self.left / h if carries else None
+        # A shorter step makes up for its share only: in no time the rest would be an impulse.
+        left = min(1.0, self.width / h) * self.left if carries else None
         problem = StageProblem(c, h, moment, u_alpha, self.metric(c[n:], h), left)
         # The observed part moves with the data, the rest as in the step before.
         follows = c.copy()
@@ -157,7 +159,7 @@ class StageSequence:
         at, self.kept = self.coupled.solve(problem, start, predicted, self.kept)
         self._last = problem, t, at
         if carries:
-            self.left = h * at.residual
+            self.left, self.width = at.residual, h
         return at.y
 
     def equation_error(self) -> Array:

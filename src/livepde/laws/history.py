@@ -37,7 +37,9 @@ def opened(log: Array, span: Span) -> Array:
         return log
     row = np.full((len(log), log.shape[2]), np.nan)
     row[:, 0] = span.t0
-    row[:, 1 + span.z1.shape[1] :] = span.inputs0
+    sensors = span.z1.shape[1]
+    # Withheld sensors of a fleet may read more channels, which come last.
+    row[:, 1 + sensors :] = span.inputs0[:, : log.shape[2] - 1 - sensors]
     return _appended(log, row)
 
 
@@ -45,8 +47,9 @@ def added(log: Array, span: Span, taken: Mask) -> Array:
     """Return a log with the sample at the end of a span, of those members that took it."""
     row = np.empty((len(log), log.shape[2]))
     row[:, 0] = span.t1
-    row[:, 1 : 1 + span.z1.shape[1]] = span.z1
-    row[:, 1 + span.z1.shape[1] :] = span.inputs1
+    sensors = span.z1.shape[1]
+    row[:, 1 : 1 + sensors] = span.z1
+    row[:, 1 + sensors :] = span.inputs1[:, : log.shape[2] - 1 - sensors]
     if not taken.all():
         row[~taken] = np.nan
     return _appended(log, row)

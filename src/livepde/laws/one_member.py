@@ -85,6 +85,8 @@ def _assimilated(
         report = replace(report, notes={**report.notes, **notes})
     if state.log.shape[1] - state.window[0] > work.most:
         state = renewed(work, work.filter.recentred(state.now), state)
+    if work.back and state.since_newer[0] == state.log.shape[1] - 1:
+        state = changed(state, newer=state.now)  # as the replay has left it
     return state, report
 
 
@@ -257,7 +259,9 @@ def _watched(
             if not status.ok:
                 break
         start = work.filter.loosened(x, jumps.size)
-        again, found = _retaken(work, new, start, row + before, known[before:])
+        taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
+        at = row + int(taken[before])
+        again, found = _retaken(work, new, start, at, known[before:])
         if status.ok and found.status.ok:
             new = again
         else:

@@ -243,6 +243,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not iterates or distance(filter_, begun) <= CONVERGED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
+            level, samples = state.now.level, state.now.samples
+            x = changed(x, level=level, samples=samples, kept=state.now.kept)
         state = changed(state, reference=x.q)
         if not replays:
             now = filter_.recentred(now)
@@ -294,13 +296,19 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if usual.all():
             return shortened(work, new), reports
         alone: dict[int, Report] = {}
+        parts: list[SensitivityState] = []
         for k in np.flatnonzero(~usual).tolist():
             one, alone[k] = step_alone(work, take(before, k), span.member(k))
             if not alone[k].status.ok and len(state) == 1:
                 return state, reports.with_members(alone)
-            if one.log.shape[1] == before.log.shape[1] and work.keeps_log:
+            while work.keeps_log and one.log.shape[1] <= before.log.shape[1]:
                 one = changed(one, log=skipped(one.log))
-            new = one if len(state) == 1 else put(new, k, one)
+            parts.append(one)
+        if usual.any():
+            for k, one in zip(alone, parts, strict=True):
+                new = put(new, k, one)
+        else:
+            new = join(*parts) if len(parts) > 1 else parts[0]
         return shortened(work, new), reports.with_members(alone)
 
     def _together(

@@ -118,9 +118,8 @@ def drive(
     feed = Samples(
         watched(stream, total) if progress else stream, identifier.observed.names, journal.last
     )
-    at_hand = isinstance(stream, Sized)
     live = Live(
-        identifier, feed, journal, fields_every=fields_every, strict=True, waits=not at_hand
+        identifier, feed, journal, fields_every=fields_every, strict=True, waits=not _ends(stream)
     )
     live.resume()
     return conduct(live)
@@ -130,3 +129,14 @@ def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
     """Return a new journal for what an identifier takes and finds; without a path in memory."""
     layout = layout_of(identifier.model, identifier.observed, identifier.withheld)
     return Journal.create(path, identifier.channels, layout)
+
+
+def _ends(stream: object) -> bool:
+    """Return whether all samples of a stream are at hand: one that is live has no length."""
+    if not isinstance(stream, Sized):
+        return False
+    try:
+        len(stream)
+    except TypeError:  # of a stream that it wraps
+        return False
+    return True

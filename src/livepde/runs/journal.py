@@ -253,7 +253,7 @@ class Journal:
             record.t,
             record.status,
             record.steps,
-            b"".join(values.tobytes() for values in found),
+            b"".join(np.asarray(values, dtype=float).tobytes() for values in found),
             json.dumps(dict(record.notes)),
         )
         if record.snapshot is not None:

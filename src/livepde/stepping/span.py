@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -75,10 +75,10 @@ class Span:
         """Return the interval of one process, which all members have in common."""
         first = last = NO_INPUTS
         if channels:
-            first, last = (
-                np.array([[inputs[name] for name in channels]])
-                for inputs in (interval.inputs0, interval.inputs1)
-            )
+            last = np.array([[interval.inputs1[name] for name in channels]])
+            first = last
+            if interval.inputs0 is not interval.inputs1:
+                first = np.array([[interval.inputs0[name] for name in channels]])
         t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
         return cls(t0, interval.t1, channels, first, last, z0, z1, interval)
 
@@ -110,8 +110,10 @@ class Span:
         if t == self.t1:
             return self.end
         moment = None if self.interval is None else self.interval.at(t)
-        s = (t - self.start) / (self.t1 - self.start)
-        mixed = (1 - s) * self.inputs0 + s * self.inputs1
+        mixed = self.inputs1
+        if self.inputs0 is not mixed:
+            s = (t - self.start) / (self.t1 - self.start)
+            mixed = (1 - s) * self.inputs0 + s * mixed
         return Moments(t, self.channels, mixed, moment)
 
     @cached_property
@@ -129,10 +131,3 @@ class Span:
             for inputs in (self.inputs0, self.inputs1)
         )
         return Interval(float(self.t0[k]), self.t1, first, last, self.z0[k], self.z1[k])
-
-    def held(self) -> Span:
-        """Return the span with its inputs held at what the end brings."""
-        interval = self.interval
-        if interval is not None:
-            interval = replace(interval, inputs0=interval.inputs1)
-        return replace(self, inputs0=self.inputs1, interval=interval)
