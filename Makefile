@@ -25,7 +25,7 @@ PYENV := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test mpi lowest versions package check format docs bench lock clean
+.PHONY: help demo test coverage mpi lowest versions package check format docs bench lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
@@ -35,7 +35,10 @@ help:  ## List the targets
 demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) online
 	@$(BIN)/livepde demo
 
-test: $(READY)  ## Run all tests and doctests, with coverage
+test: $(READY)  ## Run all tests and doctests
+	@$(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+
+coverage: $(READY)  ## Run the same and measure coverage, which takes a third longer
 	@$(BIN)/pytest --cov --numprocesses auto --maxprocesses 8 --dist loadfile
 
 mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment of its own
