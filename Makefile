@@ -38,7 +38,7 @@ demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) 
 test: $(READY)  ## Run all tests and doctests
 	@$(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist loadfile
 
-coverage: $(READY)  ## Run the same and measure coverage, which takes a third longer
+coverage: $(READY)  ## Run the same and measure coverage, which takes longer
 	@$(BIN)/pytest --cov --numprocesses auto --maxprocesses 8 --dist loadfile
 
 mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment of its own
