@@ -23,6 +23,9 @@ FAST := $(patsubst %,tests/test_%.py,public packaging cli cases spaces fem meshe
 UV := UV_PYTHON_DOWNLOADS=never $(BIN)/uv
 PYENV := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions
 
+# Tests run in as many processes as there are cores: threads of BLAS beside them cost a fifth.
+export OMP_NUM_THREADS ?= 1
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo test coverage mpi lowest versions package check format docs bench lock clean
