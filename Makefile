@@ -18,7 +18,7 @@ PYTHON ?= python3
 # Beside the oldest one of pyproject.toml: Pythons that a fast part of the tests runs on, where found.
 VERSIONS := 3.12 3.13
 FAST := $(patsubst %,tests/test_%.py,public packaging cli cases spaces fem meshes model models linalg \
-  observation stepping gradient sensitivity identifier runs plots table parquet export mqtt opcua \
+  observation stepping identifier runs plots table parquet export mqtt opcua \
   service dashboard)
 UV := UV_PYTHON_DOWNLOADS=never $(BIN)/uv
 PYENV := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions
