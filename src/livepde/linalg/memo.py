@@ -18,8 +18,8 @@ class Memo(Generic[Key, Value]):
     kept must never change.
 
     >>> squares = Memo(most=2)
-    >>> [squares.get(k, lambda k=k: k**2) for k in (1, 2, 3)]
-    [1, 4, 9]
+    >>> sum(squares.get(k, lambda k=k: k**2) for k in (1, 2, 3))
+    14
     """
 
     def __init__(self, most: int) -> None:
