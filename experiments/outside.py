@@ -147,8 +147,8 @@ class Informed(SensitivityLaw):
 
     def prepare(self, problem: Problem) -> SensitivityWork:
         work, k = super().prepare(problem), self.directions.shape[1]
-        (motion,) = work.filter.reduction.motions
-        reduction = Reduction(problem, self.directions, (replace(motion, part=slice(0, k)),))
+        (evolution,) = work.filter.reduction.evolutions
+        reduction = Reduction(problem, self.directions, (replace(evolution, part=slice(0, k)),))
         sensors = MemberSensors(problem, reduction)
         filter_ = replace(work.filter, reduction=reduction, sensors=sensors, rank=k)
         return replace(work, filter=filter_)

@@ -250,7 +250,7 @@ class _Frozen(Law[tuple[Problem, ForwardStage], tuple[Array, Array]]):
             return forward.solve(c, q, h, interval.at(t))
 
         start = perf_counter()
-        end, steps, failure = advance(problem.control, stage, u, interval)
+        end, steps, failure = advance(problem.control, stage, u, interval.t0, interval.t1)
         self.seconds += perf_counter() - start
         status = Status() if failure is None else Status.of(failure)
         end = u if failure is not None else end

@@ -304,7 +304,7 @@ def _states(model: Model, path: Array, times: Array) -> Iterator[Array]:
         def stage(c: Array, t: float, h: float, q: Array = q, at: Any = interval.at) -> Array:
             return forward.solve(c, q, h, at(t))
 
-        u, _, failure = advance(control, stage, u, interval)
+        u, _, failure = advance(control, stage, u, t0, t1)
         if failure is not None:
             raise failure
         yield u

@@ -85,7 +85,8 @@ class Trajectory:
         self.rest = reduction.rest(0.0, 0.0)
         widths = np.diff(process.times)
         growth = [
-            np.sqrt(np.concatenate([m.growth(float(h)) for m in reduction.motions])) for h in widths
+            np.sqrt(np.concatenate([m.growth(float(h)) for m in reduction.evolutions]))
+            for h in widths
         ]
         self.moving = np.flatnonzero(growth[0] > 0.0)
         self.growth = np.array(growth)[:, self.moving]
@@ -157,7 +158,9 @@ class Trajectory:
                 rhs = (model.mass @ c[:, 1:]) / h - forcing
                 return np.column_stack([u, factor.solve(rhs * model.X.free[:, None])])
 
-            end, _, failure = advance(self.control, stage, y[:, : 1 + live], interval)
+            end, _, failure = advance(
+                self.control, stage, y[:, : 1 + live], interval.t0, interval.t1
+            )
             if failure is not None:
                 raise failure
             y[:, : 1 + live] = end

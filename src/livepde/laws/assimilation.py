@@ -93,8 +93,8 @@ class Assimilation:
 
 
 @dataclass(frozen=True)
-class Assimilator:
-    """Predict and update with the choices of a law.
+class UpdateOptions:
+    """Predict and update with the options of a law.
 
     Attributes
     ----------
@@ -111,28 +111,28 @@ class Assimilator:
 
 
 def assimilate(
-    filter_: Filter, x: FilterState, span: Span, choices: Assimilator
+    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions
 ) -> tuple[FilterState, Assimilation]:
     """Predict over a span and update at its end, linear about the linearisation points."""
     end, steps, failure = filter_.predict(x, span)
     if failure is not None:
-        predicted, _ = filter_.observe(x, span.end)
+        predicted, _ = filter_.sensors.observe(x, span.end)
         zero = np.zeros(len(x))
         return x, Assimilation(predicted, steps, Status.of(failure), zero > 0.0, zero, zero)
-    return _absorbed(filter_, end, span, choices, steps)
+    return _absorbed(filter_, end, span, options, steps)
 
 
 def assimilate_at_once(
-    filter_: Filter, x: FilterState, span: Span, choices: Assimilator
+    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions
 ) -> FilterState:
     """Update by what was measured at the end of a span, to which the state belongs."""
-    return _absorbed(filter_, x, span, choices, 0)[0]
+    return _absorbed(filter_, x, span, options, 0)[0]
 
 
 def _absorbed(
-    filter_: Filter, x: FilterState, span: Span, choices: Assimilator, steps: int
+    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int
 ) -> tuple[FilterState, Assimilation]:
-    predicted, Y = filter_.observe(x, span.end)
+    predicted, Y = filter_.sensors.observe(x, span.end)
     d = span.z1 - predicted
     used: Mask = np.isfinite(d)
     whole = bool(used.all())
@@ -142,16 +142,16 @@ def _absorbed(
         finite: Mask = np.isfinite((x.u + x.du).sum(axis=1) + x.U.sum(axis=(1, 2)))
         return x, Assimilation(predicted, steps, OK, finite, zero, zero)
     noise = filter_.noise[None]
-    if choices.adaptive or x.level[0] != 1.0:
+    if options.adaptive or x.level[0] != 1.0:
         noise = np.sqrt(x.level)[:, None] * noise
     Y, d = Y / noise[:, None], d / noise
     largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
     e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
     refused, count = x.refused, np.zeros(len(x))
-    if choices.gate < math.inf:
-        far = used & ~(np.abs(e) <= choices.gate)
+    if options.gate < math.inf:
+        far = used & ~(np.abs(e) <= options.gate)
         refused = np.where(far, refused + 1, np.where(used, 0, refused))
-        kept = used & ~(far & (refused <= choices.patience))
+        kept = used & ~(far & (refused <= options.patience))
         count = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
         used, whole = kept, bool(kept.all())
         e = np.where(used, e, np.nan)
@@ -159,7 +159,7 @@ def _absorbed(
         Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
     new, made = filter_.update(x, Y, d)
     parts = {"innovations": x.innovations.add(e, measured), "refused": refused}
-    if choices.adaptive:
+    if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
     # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
     # overflows would leave statistics that are not finite.

@@ -30,7 +30,6 @@ from livepde.laws.history import (
     first_interval,
     intervals_since,
     opened,
-    trimmed,
 )
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed, join, take
@@ -40,8 +39,8 @@ from livepde.laws.sensitivity_state import (
     NEVER,
     SensitivityState,
     SensitivityWork,
-    from_now,
-    renewed,
+    new_window,
+    restarted,
 )
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Interval
@@ -140,7 +139,7 @@ class AutoLaw(Law[Bank, AutoState]):
         work = replace(
             work,
             filter=replace(work.filter, rank=rank, drift=np.zeros(len(candidates))),
-            choices=replace(work.choices, adaptive=True),
+            options=replace(work.options, adaptive=True),
         )
         return Bank(candidates, work, replays, stated)
 
@@ -200,12 +199,7 @@ class AutoLaw(Law[Bank, AutoState]):
         waiting = added(opened(state.waiting, span), span, one)
         noise = first_guess(waiting[0, :, 1 : 1 + len(state.noise)])
         if noise is None and waiting.shape[1] > SILENCE:
-            here = renewed(filters, filters.filter.recentred(free.now), free)
-            rows = here.log.shape[1]
-            last, zero = trimmed(here.log, rows - 1), np.zeros(1, dtype=np.int64)
-            here = changed(
-                from_now(here), log=last, window=zero, since_older=zero, since_newer=zero
-            )
+            here = restarted(filters, filters.filter.relinearised(free.now), free)
             nothing = empty_log(1, len(state.noise), len(work.channels))
             return changed(state, waiting=nothing, start=here, members=here), report
         if noise is None:
@@ -313,18 +307,20 @@ class AutoLaw(Law[Bank, AutoState]):
             weights[STAYS], weights[WIDE] = weights[WIDE], -np.inf
             leader = STAYS
         pause = TRIAL if alarm else state.pause
-        now = filter_.recentred(best.now)
+        now = filter_.relinearised(best.now)
         members: list[SensitivityState] = []
         for k in range(len(work.candidates)):
             if k in awake:
                 one = awake[k]
-                members.append(renewed(filters, filter_.recentred(one.now), one) if alarm else one)
+                members.append(
+                    new_window(filters, filter_.relinearised(one.now), one) if alarm else one
+                )
                 continue
             if k == WIDE and not alarm:
                 continue
-            begun = filter_.loosened(now, JUMPS.size) if k == WIDE else now
+            begun = filter_.inflated(now, JUMPS.size) if k == WIDE else now
             due = self.replay.first if work.replays[k] else NEVER
-            copied = from_now(renewed(filters, begun, best))
+            copied = restarted(filters, begun, best)
             members.append(numbered(copied, k, due))
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)

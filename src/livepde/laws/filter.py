@@ -32,8 +32,8 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import (
     Interval,
     MemberStage,
-    Moments,
     Span,
+    StageOfMembers,
     StepFailed,
     advance,
 )
@@ -41,7 +41,6 @@ from livepde.stepping import (
 __all__ = ["Filter", "Update"]
 
 FEW = 8  # members up to which LAPACK is called for each
-NOTHING = np.zeros(0)
 BLOCK = 32  # columns that LAPACK's QR takes at once
 
 
@@ -111,7 +110,7 @@ class Filter:
         q: Array = x.q + x.da @ self.reduction.Phi.T
         return q
 
-    def moved(self, x: FilterState, h: float) -> FilterState:
+    def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
         """Return the state whose unknowns have moved for a time h; those of u have not.
 
         What they gain is in new rows of the square root, in the same order for every h.
@@ -127,7 +126,7 @@ class Filter:
         new[:, np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
         return changed(
             x,
-            q=self.reduction.moved(x.q, h),
+            q=self.reduction.predict(x.q, h),
             da=x.da @ F.T,
             U=np.concatenate([x.U, np.zeros((members, len(grows), x.U.shape[2]))], axis=1),
             C=np.concatenate([x.C @ F.T, new], axis=1),
@@ -139,11 +138,9 @@ class Filter:
 
         What unknowns gain in one substep is independent of what they gain in the next.
         """
-        count = self.problem.control.count(_between(span.start, span.t1)) if self.moves else 1
-        if count == 1:
-            x, taken, failure = self._advanced(x, span, span.start, span.t1)
-            return self._faded(x, span), taken, failure
-        at = [span.start + k / count * (span.t1 - span.start) for k in range(count)] + [span.t1]
+        length = span.t1 - span.start
+        count = self.problem.control.count(length) if self.moves else 1
+        at = [span.start + k / count * length for k in range(count)] + [span.t1]
         taken = 0
         for start, stop in pairwise(at):
             x, steps, failure = self._advanced(x, span, start, stop)
@@ -162,7 +159,7 @@ class Filter:
         self, x: FilterState, span: Span, start: float, stop: float
     ) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a part of a span."""
-        end, kept, off = self.moved(x, stop - start), x.kept, x.off_centre
+        end, kept, off = self.predict_unknowns(x, stop - start), x.kept, x.off_centre
         deviates = bool(off.any())
 
         def directions(at: FilterState) -> Array:
@@ -175,15 +172,15 @@ class Filter:
             nonlocal kept
             q, along = end.q, at_end
             if self.moves and t != stop:
-                now = self.moved(x, t - start)
+                now = self.predict_unknowns(x, t - start)
                 q, along = now.q, directions(now)
-            y, kept = self.stage.advance(columns, q, along, h, span.at(t), kept, off, x.member)
+            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off)
+            y, kept = self.stage.advance(columns, work)
             return y
 
         last = [end.du[None]] if deviates else []
         columns = np.concatenate([end.u[None], end.U.transpose(1, 0, 2), *last])
-        part = _between(start, stop)
-        columns, steps, failure = advance(self.problem.control, stage, columns, part)
+        columns, steps, failure = advance(self.problem.control, stage, columns, start, stop)
         if failure is not None:
             return x, steps, failure
         rows = end.U.shape[1]
@@ -192,13 +189,6 @@ class Filter:
         if rows > self.rank:
             U, C = self._compressed(U, C)
         return changed(end, u=columns[0], U=U, C=C, du=du, kept=kept), steps, None
-
-    def observe(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
-        """Return predicted readings, (members, sensors), and Y = [U C] H^T, (members, r, sensors).
-
-        Linear about the linearisation point.
-        """
-        return self.sensors.seen(x, at)
 
     @staticmethod
     def update(x: FilterState, Y: Array, d: Array) -> tuple[FilterState, Update]:
@@ -218,7 +208,7 @@ class Filter:
         new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
         return new, Update(left, half, spread)
 
-    def recentred(self, x: FilterState, kept: Mask | None = None) -> FilterState:
+    def relinearised(self, x: FilterState, kept: Mask | None = None) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
 
         Members in `kept`, shape (members,), keep theirs.
@@ -243,7 +233,7 @@ class Filter:
             return changed(x, u=u, q=q, du=np.where(rows, x.du, du), da=np.where(rows, x.da, da))
         return changed(x, u=u, q=estimate, du=du, da=da)
 
-    def loosened(self, x: FilterState, size: float) -> FilterState:
+    def inflated(self, x: FilterState, size: float) -> FilterState:
         """Return the state with `size` prior deviations added to the uncertainty of each unknown.
 
         Independent of what is known of u: that is as well known as before.
@@ -256,7 +246,7 @@ class Filter:
             U, C = self._compressed(U, C)
         return changed(x, U=U, C=C)
 
-    def prior_again(self, x: FilterState) -> FilterState:
+    def with_prior(self, x: FilterState) -> FilterState:
         """Return the state with the prior of the unknowns, and u as it is estimated."""
         members, k = x.da.shape
         prior = np.broadcast_to(self.problem.model.latent.prior, x.q.shape)
@@ -283,11 +273,6 @@ class Filter:
         small = np.zeros((len(C), k + kept.shape[1], k))
         small[:, :k] = root[:, :k]
         return np.concatenate([rotated[:, :k], kept], axis=1), small
-
-
-def _between(start: float, stop: float) -> Interval:
-    """Return the interval between two times, without samples."""
-    return Interval(start, stop, {}, {}, NOTHING, NOTHING)
 
 
 def _contraction(Y: Array) -> tuple[Array, Array]:

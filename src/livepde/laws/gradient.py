@@ -198,7 +198,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
         left = state.left if predicts and not frozen else 0.0 * state.left
         stages = StageSequence(coupled, path, metric, rate, state.kept, left, state.width)
         y = np.concatenate([state.u, state.q])
-        end, steps, failure = advance(work.problem.control, stages, y, interval)
+        end, steps, failure = advance(work.problem.control, stages, y, interval.t0, interval.t1)
         if failure is not None:
             predicted = work.problem.predict(state.u, state.q, moment)
             return state, Report(Status.of(failure), predicted)

@@ -15,17 +15,18 @@ from livepde.laws.assimilation import assimilate
 from livepde.laws.base import Report, Status
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards
-from livepde.laws.history import first_interval, intervals_since, opened
+from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed
 from livepde.laws.replay import CONVERGED, Replay, Window, distance, missed_most, replayed
 from livepde.laws.sensitivity_state import (
     SensitivityState,
     SensitivityWork,
-    from_now,
-    renewed,
+    new_window,
     reports_of,
+    restarted,
     stored,
+    without_past,
 )
 from livepde.stepping import Interval
 
@@ -51,15 +52,15 @@ def _filtered(
 ) -> tuple[FilterState, Report]:
     """Return the filter after a sample, linear about its reference."""
     span = work.filter.span(interval)
-    new, told = assimilate(work.filter, x, span, work.choices)
+    new, told = assimilate(work.filter, x, span, work.options)
     status = told.status
     if status.ok and not told.finite[0]:
         what = "prediction" if not np.isfinite(told.predicted).all() else "update"
         status = Status("not_finite", f"the {what} is not finite")
     if not status.ok:
-        predicted, _ = work.filter.observe(x, span.end)
+        predicted, _ = work.filter.sensors.observe(x, span.end)
         return x, Report(status, predicted[0])
-    return new, changed(reports_of(work, new, told).member(0), status=status)
+    return new, reports_of(work, new, told).member(0)
 
 
 def _assimilated(
@@ -70,7 +71,6 @@ def _assimilated(
     if not report.status.ok:
         return state, report
     span = work.filter.span(interval)
-    state = changed(state, log=opened(state.log, span))
     one = np.ones(1, dtype=bool)
     if not state.replays[0]:
         if (guards := work.guards) is not None:
@@ -78,13 +78,13 @@ def _assimilated(
             if notes:
                 told = _noted(work, x)
                 report = replace(report, notes={**report.notes, **told, **notes})
-        return stored(work, state, work.filter.recentred(x), span, one), report
+        return stored(work, state, work.filter.relinearised(x), span, one), report
     state = stored(work, state, x, span, one)
     if work.replay is not None and state.assimilated[0] >= state.due[0]:
         state, notes = _replayed(work, work.replay, state)
         report = replace(report, notes={**report.notes, **notes})
     if state.log.shape[1] - state.window[0] > work.most:
-        state = renewed(work, work.filter.recentred(state.now), state)
+        state = new_window(work, work.filter.relinearised(state.now), state)
     if work.back and state.since_newer[0] == state.log.shape[1] - 1:
         state = changed(state, newer=state.now)  # as the replay has left it
     return state, report
@@ -119,7 +119,7 @@ def _replayed(
     """Return one member after replays about better references, and notes."""
     window, notes = _window(work, state), {}
     for _ in range(replay.iterations):
-        window, status = replayed(work.filter, window, work.choices)
+        window, status = replayed(work.filter, window, work.options)
         left = distance(work.filter, window)
         notes["replay_left"] = left
         if not status.ok:  # keep the linear estimate, say so, and try again when doubled
@@ -164,7 +164,7 @@ def _iterated(
         if not (far and distance(filter_, window) > CONVERGED):
             return levelled(x, temper), tempered
         for _ in range(guards.iterations):
-            window, status = replayed(filter_, window, work.choices)
+            window, status = replayed(filter_, window, work.options)
             if not status.ok:
                 break
             if distance(filter_, window) <= CONVERGED:
@@ -194,14 +194,14 @@ def _rescued(
 
     if not astray(report):
         return changed(new, scale=scale), report
-    older = changed(work.filter.recentred(state.older), kept=new.now.kept)
+    older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
     silent = [item.silent for item in [*_since(work, state, row), interval]]
-    for start in (work.filter.loosened(older, 1.0), work.filter.prior_again(older)):
+    for start in (work.filter.inflated(older, 1.0), work.filter.with_prior(older)):
         again, found = _retaken(work, state, start, row, silent)
         if not astray(found):
             notes = {**found.notes, "restarted": 1.0}
-            return changed(from_now(again), scale=scale), replace(found, notes=notes)
+            return changed(without_past(again), scale=scale), replace(found, notes=notes)
     if not report.status.ok:
         return state, report
     return changed(new, scale=scale), replace(report, notes={**report.notes, "runaway": 1.0})
@@ -209,8 +209,6 @@ def _rescued(
 
 def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Interval]:
     """Return the intervals that one member has taken since a row of the log."""
-    if not state.log.shape[1]:
-        return []
     return intervals_since(state.log[:, row:], work.filter.problem.channels)
 
 
@@ -222,7 +220,7 @@ def _retaken(
     intervals: Sequence[Interval],
 ) -> tuple[SensitivityState, Report]:
     """Return one member after some samples, taken again from a filter at a row of the log."""
-    state = from_now(renewed(work, start, state, row))
+    state = restarted(work, start, state, row)
     for interval in intervals:
         state, report = _assimilated(work, state, interval)
         if not report.status.ok:
@@ -252,19 +250,19 @@ def _watched(
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
         before = max(len(known) - jumps.onset(state.watch, e, usual), 0)
-        x, status = changed(work.filter.recentred(state.older), kept=new.now.kept), Status()
+        x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
         for earlier in known[:before]:
             x, found = _filtered(work, x, earlier)
-            x, status = work.filter.recentred(x), found.status
+            x, status = work.filter.relinearised(x), found.status
             if not status.ok:
                 break
-        start = work.filter.loosened(x, jumps.size)
+        start = work.filter.inflated(x, jumps.size)
         taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
         at = row + int(taken[before])
         again, found = _retaken(work, new, start, at, known[before:])
         if status.ok and found.status.ok:
             new = again
         else:
-            now = work.filter.recentred(new.now)
-            new = renewed(work, work.filter.loosened(now, jumps.size), new)
+            now = work.filter.relinearised(new.now)
+            new = new_window(work, work.filter.inflated(now, jumps.size), new)
     return new, replace(report, notes={**report.notes, "jump": float(alarm)})

@@ -13,42 +13,42 @@ from livepde.fem import Evolution, FieldBlock
 from livepde.laws.base import Problem
 from livepde.linalg import Array, Mask
 
-__all__ = ["Motion", "Reduction"]
+__all__ = ["ReducedEvolution", "Reduction"]
 
 LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
 MOST_MODES = 60  # of a field with modes="auto"
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ReducedEvolution:
     """How one unknown moves by itself, in reduced coordinates.
 
     Attributes
     ----------
     part
         Where its reduced coordinates stand: copies times modes.
-    evolution, std
-        Its model, and the prior deviation of its latent coefficients.
+    model, std
+        Its model in the latent coefficients, and the prior deviation of its latent coefficients.
     """
 
     part: slice
-    evolution: Evolution
+    model: Evolution
     std: float
 
     def transition(self, h: float) -> Array:
         """Return the transition of its coordinates in a time h."""
-        F = self.evolution.transition(h)
+        F = self.model.transition(h)
         return np.asarray(np.kron(F, np.eye((self.part.stop - self.part.start) // len(F))))
 
     def growth(self, h: float) -> Array:
         """Return the variance its coordinates gain in a time h."""
-        gained = self.evolution.growth(h, self.std)
+        gained = self.model.growth(h, self.std)
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
 
     def backward(self, h: float, drift: float) -> Array:
         """Return what the coordinates are expected to have been a time h before: matrix on them."""
         F, growth = self.transition(h), self.growth(h)
-        growth = growth if self.evolution.moves else growth + drift * h
+        growth = growth if self.model.moves else growth + drift * h
         return np.asarray(np.linalg.solve(F @ F.T + np.diag(growth), F).T)
 
 
@@ -62,20 +62,20 @@ class Reduction:
         Model and sensors.
     Phi
         Prior deviations for numbers, leading modes of the prior for fields, shape (m, k).
-    motions
+    evolutions
         How the coordinates of each unknown move by themselves.
     """
 
     problem: Problem
     Phi: Array
-    motions: tuple[Motion, ...]
+    evolutions: tuple[ReducedEvolution, ...]
 
     @classmethod
     def of(cls, problem: Problem, modes: int | str | dict[str, int]) -> Reduction:
         """Return the reduction with so many modes for each field; see `SensitivityLaw`."""
         model = problem.model
         counts = _mode_counts(modes, model.parameter_space.fields)
-        blocks, motions, start = [], [], 0
+        blocks, evolutions, start = [], [], 0
         for name, item in model.latent.parts.items():
             first = slice(item.part.start, item.part.start + item.size)
             if isinstance(item.block, FieldBlock):
@@ -91,9 +91,10 @@ class Reduction:
                 phi = np.eye(item.size) * item.unknown.latent_std
             blocks.append(np.kron(np.eye(item.evolution.copies), phi))
             stop = start + blocks[-1].shape[1]
-            motions.append(Motion(slice(start, stop), item.evolution, item.unknown.latent_std))
+            std = item.unknown.latent_std
+            evolutions.append(ReducedEvolution(slice(start, stop), item.evolution, std))
             start = stop
-        return cls(problem, np.asarray(block_diag(*blocks)), tuple(motions))
+        return cls(problem, np.asarray(block_diag(*blocks)), tuple(evolutions))
 
     @property
     def size(self) -> int:
@@ -103,27 +104,27 @@ class Reduction:
     @cached_property
     def moves(self) -> bool:
         """True if an unknown moves by itself."""
-        return any(motion.evolution.moves for motion in self.motions)
+        return any(evolution.model.moves for evolution in self.evolutions)
 
     @cached_property
     def still(self) -> Mask:
         """Coordinates of unknowns that stay as they are, shape (k,)."""
         still = np.ones(self.size, dtype=bool)
-        for motion in self.motions:
-            still[motion.part] = not motion.evolution.moves
+        for evolution in self.evolutions:
+            still[evolution.part] = not evolution.model.moves
         return still
 
     def moving(self, drift: float) -> int:
         """Return how many coordinates gain variance."""
         return sum(
-            motion.part.stop - motion.part.start
-            for motion in self.motions
-            if motion.growth(1.0).any() or (drift and not motion.evolution.moves)
+            evolution.part.stop - evolution.part.start
+            for evolution in self.evolutions
+            if evolution.growth(1.0).any() or (drift and not evolution.model.moves)
         )
 
     def transition(self, h: float) -> Array:
         """Return the transition of all coordinates in a time h, shape (k, k)."""
-        return _transition(self.motions, h)
+        return _transition(self.evolutions, h)
 
     def gained(self, h: float, variance: Array, drift: Array) -> Array:
         """Return the variance that coordinates gain in a time h, shape (members, k).
@@ -138,14 +139,14 @@ class Reduction:
         drift
             Prior variances gained per unit of time by unknowns that stay, shape (members,).
         """
-        gained = np.broadcast_to(_growth(self.motions, h), variance.shape)
+        gained = np.broadcast_to(_growth(self.evolutions, h), variance.shape)
         if not drift.any():
             return gained
         # V' = drift (1 - V), whatever the length of the step.
         more = -np.expm1(-drift * h)[:, None] * np.maximum(1.0 - variance, 0.0)
         return np.where(self.still, more, gained)
 
-    def moved(self, q: Array, h: float) -> Array:
+    def predict(self, q: Array, h: float) -> Array:
         """Return the expected latent parameters a time h later, shape (members, m)."""
         latent = self.problem.model.latent
         if not latent.generator.nnz:
@@ -202,7 +203,7 @@ class Reduction:
         if not (self.moves or drift):
             return q
         prior = self.problem.model.latent.prior
-        back = block_diag(*(motion.backward(h, drift) for motion in self.motions))
+        back = block_diag(*(evolution.backward(h, drift) for evolution in self.evolutions))
         return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
 
     @cached_property
@@ -229,12 +230,12 @@ class Reduction:
         if age == 0.0 or not self._left_out.any():
             return self._unseen
         grown = []
-        for motion, item in zip(
-            self.motions, self.problem.model.latent.parts.values(), strict=True
+        for evolution, item in zip(
+            self.evolutions, self.problem.model.latent.parts.values(), strict=True
         ):
-            growth = motion.evolution.growth(age, motion.std)
-            growth = growth if motion.evolution.moves else growth + drift * age
-            variance = (motion.evolution.transition(age) ** 2).sum(axis=1) + growth
+            growth = evolution.model.growth(age, evolution.std)
+            growth = growth if evolution.model.moves else growth + drift * age
+            variance = (evolution.model.transition(age) ** 2).sum(axis=1) + growth
             grown.append(np.repeat(variance, item.size))
         return np.asarray(np.sqrt(self._left_out * np.concatenate(grown)))
 
@@ -266,10 +267,10 @@ def _enough(phi: Array, mass: Array, variance: float) -> int:
 
 
 @lru_cache(maxsize=64)
-def _transition(motions: tuple[Motion, ...], h: float) -> Array:
-    return np.asarray(block_diag(*(motion.transition(h) for motion in motions)))
+def _transition(evolutions: tuple[ReducedEvolution, ...], h: float) -> Array:
+    return np.asarray(block_diag(*(evolution.transition(h) for evolution in evolutions)))
 
 
 @lru_cache(maxsize=64)
-def _growth(motions: tuple[Motion, ...], h: float) -> Array:
-    return np.concatenate([motion.growth(h) for motion in motions])
+def _growth(evolutions: tuple[ReducedEvolution, ...], h: float) -> Array:
+    return np.concatenate([evolution.growth(h) for evolution in evolutions])

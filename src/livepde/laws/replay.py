@@ -8,7 +8,7 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.assimilation import Assimilator, assimilate, assimilate_at_once
+from livepde.laws.assimilation import UpdateOptions, assimilate, assimilate_at_once
 from livepde.laws.base import Status
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState, along
@@ -142,14 +142,14 @@ def placed(filter_: Filter, window: Window, q: Array) -> FilterState:
     return replace(start, q=q[None], u=start.u + moved, du=start.du - moved, da=start.da - shift)
 
 
-def replayed(filter_: Filter, window: Window, choices: Assimilator) -> tuple[Window, Status]:
+def replayed(filter_: Filter, window: Window, options: UpdateOptions) -> tuple[Window, Status]:
     """Run the samples again about a reference at the estimate, or on the way to it."""
     q = next_reference(filter_, window)
     x = placed(filter_, window, q)
     if window.first is not None and window.first.present.any():
-        x = assimilate_at_once(filter_, x, filter_.span(window.first), choices)
+        x = assimilate_at_once(filter_, x, filter_.span(window.first), options)
     for interval in window.intervals:
-        x, told = assimilate(filter_, x, filter_.span(interval), choices)
+        x, told = assimilate(filter_, x, filter_.span(interval), options)
         if not told.status.ok:
             return window, told.status
         if not told.finite[0]:

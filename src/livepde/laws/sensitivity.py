@@ -11,8 +11,8 @@ from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.assimilation import (
     Assimilation,
-    Assimilator,
     MemberReports,
+    UpdateOptions,
     assimilate,
     assimilate_at_once,
 )
@@ -167,8 +167,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             np.array([self.drift]),
             self.memory,
         )
-        choices = Assimilator(self.gate, self.gate_patience, self.noise == "auto")
-        return SensitivityWork(filter_, choices, self.replay, self.guards, self.jumps)
+        options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
+        return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps)
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
         filter_, problem = work.filter, work.filter.problem
@@ -226,7 +226,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         filter_, x, span = work.filter, state.now, work.filter.span(interval)
         state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool)))
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
-        if not filter_.observe(x, span.end)[1].any():
+        if not filter_.sensors.observe(x, span.end)[1].any():
             return state
         problem, replays = filter_.problem, bool(state.replays[0])
         form = problem.model.form_initial
@@ -234,7 +234,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if self.guards is not None and not replays:
             iterates = iterates or not problem.observed.linear
         for _ in range(FIRST):
-            now = assimilate_at_once(filter_, x, span, work.choices)
+            now = assimilate_at_once(filter_, x, span, work.options)
             if not np.isfinite(now.da).all():
                 return state
             begun = Window(
@@ -247,7 +247,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             x = changed(x, level=level, samples=samples, kept=state.now.kept)
         state = changed(state, reference=x.q)
         if not replays:
-            now = filter_.recentred(now)
+            now = filter_.relinearised(now)
             return changed(state, now=now, older=now, newer=now)
         return changed(
             state,
@@ -316,7 +316,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> tuple[SensitivityState, Assimilation, Mask]:
         """Return all members after a sample, and for whom nothing was out of the ordinary."""
         filter_, before = work.filter, state.now
-        x, told = assimilate(filter_, before, span, work.choices)
+        x, told = assimilate(filter_, before, span, work.options)
         if not told.status.ok:
             return state, told, told.finite
         usual, replays, present = told.finite, state.replays, span.present
@@ -340,7 +340,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             watch = where(np.broadcast_to(present, alarm.shape), seen, watch)
             usual = usual & ~(alarm & present)
         if not replays.all():
-            x = filter_.recentred(x, replays)
+            x = filter_.relinearised(x, replays)
         if not usual.all():
             if not usual.any():
                 return state, told, usual

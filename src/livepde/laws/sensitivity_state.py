@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.laws.assimilation import OK, Assimilation, Assimilator, MemberReports
+from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards, Scale
@@ -23,11 +23,12 @@ __all__ = [
     "NEVER",
     "SensitivityState",
     "SensitivityWork",
-    "from_now",
-    "renewed",
+    "new_window",
     "reports_of",
+    "restarted",
     "shortened",
     "stored",
+    "without_past",
 ]
 
 NEVER = np.iinfo(np.int64).max  # number of samples at which a filter without replay is replayed
@@ -35,18 +36,18 @@ NEVER = np.iinfo(np.int64).max  # number of samples at which a filter without re
 
 @dataclass(frozen=True, eq=False)
 class SensitivityWork:
-    """What the law computes once, and its choices.
+    """What the law computes once, and its options.
 
     Attributes
     ----------
-    filter, choices
+    filter, options
         The filter, and how it takes a sample.
     replay, guards, jumps
         Those of the law.
     """
 
     filter: Filter
-    choices: Assimilator
+    options: UpdateOptions
     replay: Replay | None
     guards: Guards | None
     jumps: Jumps | None
@@ -173,9 +174,9 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
         "innovation_ratio": now.innovations.ratio,
         "innovation_correlation": now.innovations.correlation,
     }
-    if work.choices.adaptive:
+    if work.options.adaptive:
         notes["noise_level"] = np.sqrt(now.level)
-    if work.choices.gate < np.inf:
+    if work.options.gate < np.inf:
         notes["refused"] = told.refused
     if work.jumps is not None:
         notes["jump"] = np.zeros(len(now))
@@ -183,7 +184,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
     return MemberReports((OK,) * len(now), told.predicted, steps, notes)
 
 
-def renewed(
+def new_window(
     work: SensitivityWork, start: FilterState, state: SensitivityState, row: int | None = None
 ) -> SensitivityState:
     """Return one member whose window begins at a filter, with no samples yet.
@@ -202,7 +203,7 @@ def renewed(
         now=start,
         start=start,
         log=log,
-        window=zero + max(log.shape[1] - 1, 0),
+        window=zero + log.shape[1] - 1,
         opening=no,
         initial=no,
         reference=start.q,
@@ -211,8 +212,15 @@ def renewed(
     )
 
 
-def from_now(state: SensitivityState) -> SensitivityState:
+def restarted(
+    work: SensitivityWork, start: FilterState, state: SensitivityState, row: int | None = None
+) -> SensitivityState:
+    """Return one member that begins anew at a filter, as `new_window`, and never goes back."""
+    return without_past(new_window(work, start, state, row))
+
+
+def without_past(state: SensitivityState) -> SensitivityState:
     """Return one member that goes back to now at most."""
-    last = np.array([max(state.log.shape[1] - 1, 0)])
+    last = np.array([state.log.shape[1] - 1])
     now = state.now
     return changed(state, older=now, newer=now, since_older=last, since_newer=last)

@@ -35,8 +35,11 @@ class MemberSensors:
     def _G(self) -> sp.csr_array | Array:
         return compact(self.problem.observed.G)
 
-    def seen(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
-        """Return readings, (members, sensors), and those of rows, (members, r, sensors)."""
+    def observe(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
+        """Return predicted readings, (members, sensors), and Y = [U C] H^T, (members, r, sensors).
+
+        Linear about the linearisation point.
+        """
         if self.fixed:
             return (self._G @ (x.u + x.du).T).T, self._rows(x.U)
         predicted, rows = [], []

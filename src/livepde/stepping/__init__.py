@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import Advance, Interval, advance
-from livepde.stepping.members import BandedStage, KeptFactors, MemberStage, member_stage
+from livepde.stepping.members import (
+    BandedStage,
+    KeptFactors,
+    MemberStage,
+    StageOfMembers,
+    member_stage,
+)
 from livepde.stepping.newton import TINY, Near, Newton, Solution, StepFailed
 from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
 from livepde.stepping.simulation import simulate
@@ -29,6 +35,7 @@ __all__ = [
     "Solution",
     "Span",
     "Stage",
+    "StageOfMembers",
     "StepFailed",
     "advance",
     "member_stage",

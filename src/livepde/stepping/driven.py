@@ -15,9 +15,8 @@ __all__ = ["DrivenVector"]
 
 SCALES = (1e-3, 1.0, 1e3, 1e6)  # of random inputs that tell whether a vector is affine in them
 ROUNDING = 1e-11  # relative: less is no curvature
-LARGE = (
-    2.0**20
-)  # input at which a response is measured: the vector without inputs loses it no digit
+# Input at which a response is measured: the vector without inputs costs it no digit.
+LARGE = 2.0**20
 
 
 class DrivenVector:

@@ -135,9 +135,9 @@ class Advance:
             return interval
         return replace(interval, inputs0=interval.inputs1)
 
-    def count(self, interval: Interval) -> int:
-        """Return the number of even substeps of an interval."""
-        ratio = (interval.t1 - interval.t0) / self.dt_max
+    def count(self, length: float) -> int:
+        """Return the number of even substeps of an interval of that length."""
+        ratio = length / self.dt_max
         return max(1, math.ceil(ratio * (1 - 1e-12)))
 
 
@@ -153,9 +153,9 @@ def _width(t: float, stop: float) -> float:
 
 
 def advance(
-    control: Advance, stage: Stage, y: Array, interval: Interval
+    control: Advance, stage: Stage, y: Array, t0: float, t1: float
 ) -> tuple[Array, int, StepFailed | None]:
-    """Advance y over an interval.
+    """Advance y from t0 to t1.
 
     Times are computed from integer counts, never accumulated.
 
@@ -168,13 +168,13 @@ def advance(
     failure
         None, or why the last halving still failed.
     """
-    substeps = control.count(interval)
+    substeps = control.count(t1 - t0)
     finest = substeps << control.halvings
-    width = (interval.t1 - interval.t0) / finest
+    width = (t1 - t0) / finest
     tick, stride, steps = 0, 1 << control.halvings, 0
     while tick < finest:
-        t = interval.t0 + tick * width
-        stop = interval.t1 if tick + stride == finest else interval.t0 + (tick + stride) * width
+        t = t0 + tick * width
+        stop = t1 if tick + stride == finest else t0 + (tick + stride) * width
         try:
             y = control.scheme.advance(stage, y, t, _width(t, stop))
         except StepFailed as failure:

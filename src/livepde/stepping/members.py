@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -35,7 +36,14 @@ GAIN = 1e-4  # relative error of a square root of the covariance: it steers the 
 ESTIMATE = 1e-8  # of the estimated deviation of the state
 MOST_UNKNOWNS = 64  # of which each has a matrix of its own
 
-__all__ = ["BandedStage", "KeptFactors", "MemberStage", "SeparateStages", "member_stage"]
+__all__ = [
+    "BandedStage",
+    "KeptFactors",
+    "MemberStage",
+    "SeparateStages",
+    "StageOfMembers",
+    "member_stage",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +75,33 @@ class KeptFactors:
         return Kept(self.q[k], float(self.h[k]), float(self.spent[k]), self.trend[k])
 
 
+class StageOfMembers(NamedTuple):
+    """What one stage of several members depends on, beside where it begins.
+
+    Attributes
+    ----------
+    members
+        Numbers of the members, by which they find their own factors again, shape (members,).
+    q, directions
+        Latent parameters, (members, dim), and how q changes along each tangent, (members, r, m).
+    h, at
+        Length of the stage; time and inputs at its end.
+    kept
+        What the last stage has left.
+    off_centre
+        Members whose last tangent is the estimated deviation of the state, which has to be more
+        accurate than a square root of the covariance; shape (members,).
+    """
+
+    members: IntArray
+    q: Array
+    directions: Array
+    h: float
+    at: Moments
+    kept: KeptFactors
+    off_centre: Mask
+
+
 class MemberStage(ABC):
     """Solves M (u - c)/h + B(u) + A(u) q = F for the state u of each member, and its tangents."""
 
@@ -75,33 +110,13 @@ class MemberStage(ABC):
         """Return what is kept before any stage."""
 
     @abstractmethod
-    def advance(
-        self,
-        columns: Array,
-        q: Array,
-        directions: Array,
-        h: float,
-        at: Moments,
-        kept: KeptFactors,
-        off_centre: Mask,
-        members: IntArray,
-    ) -> tuple[Array, KeptFactors]:
+    def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
         """Return states and tangents at the end of a stage, and what it leaves to the next.
 
         Parameters
         ----------
         columns
             Where the stage begins, shape (1 + r, members, n).
-        q, directions
-            Latent parameters, (members, dim), and how q changes along each tangent,
-            (members, r, m).
-        at
-            Time and inputs at the end of the stage.
-        off_centre
-            Members whose last tangent is the estimated deviation of the state, which has to be
-            more accurate than a square root of the covariance; shape (members,).
-        members
-            Numbers of the members, by which they find their own factors again.
 
         Raises
         ------
@@ -131,27 +146,17 @@ class SeparateStages(MemberStage):
             return KeptFactors.none(members)
         return KeptFactors.none(members, self.model.latent.dim, self.model.X.dim)
 
-    def advance(
-        self,
-        columns: Array,
-        q: Array,
-        directions: Array,
-        h: float,
-        at: Moments,
-        kept: KeptFactors,
-        off_centre: Mask,
-        members: IntArray,
-    ) -> tuple[Array, KeptFactors]:
-        new, left = np.empty_like(columns), []
-        for k, member in enumerate(members.tolist()):
+    def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
+        new, left, kept = np.empty_like(columns), [], stage.kept
+        for k, member in enumerate(stage.members.tolist()):
             y, after = self._stage(member).advance(
                 columns[:, k].T,
-                q[k],
-                directions[k].T,
-                h,
-                at.member(k),
+                stage.q[k],
+                stage.directions[k].T,
+                stage.h,
+                stage.at.member(k),
                 kept.member(k),
-                ESTIMATE if off_centre[k] else GAIN,
+                ESTIMATE if stage.off_centre[k] else GAIN,
             )
             new[:, k] = y.T
             left.append(after)
@@ -243,19 +248,9 @@ class BandedStage(MemberStage):
     def kept(self, members: int) -> KeptFactors:
         return KeptFactors.none(members)
 
-    def advance(
-        self,
-        columns: Array,
-        q: Array,
-        directions: Array,
-        h: float,
-        at: Moments,
-        kept: KeptFactors,
-        off_centre: Mask,
-        members: IntArray,
-    ) -> tuple[Array, KeptFactors]:
-        size, n = columns.shape[1:]
-        unknowns = self.model.latent.value(q.T).T
+    def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
+        (size, n), h, at = columns.shape[1:], stage.h, stage.at
+        unknowns = self.model.latent.value(stage.q.T).T
         storage = unknowns @ self._slope_bands
         storage += self._mass_band / h + self._rest_band
         factor = self._blocks.factorise(storage)
@@ -273,11 +268,11 @@ class BandedStage(MemberStage):
         driven = (self._slopes @ u.T).T.reshape(size, -1, n)
         if offset is not None:
             driven = driven + offset
-        forcing = directions @ driven
+        forcing = stage.directions @ driven
         new[1:] = factor.solve(known[1:] - forcing.transpose(1, 0, 2))
         if not self._boundary.zero:
             new[0] += self._boundary(at)
-        return new, kept
+        return new, stage.kept
 
 
 def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:

@@ -52,7 +52,7 @@ def simulate(
         def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:
             return forward.solve(c, q, h, interval.at(t))
 
-        u, _, failure = advance(control, stage, u, interval)
+        u, _, failure = advance(control, stage, u, t0, t1)
         if failure is not None:
             raise failure
         yield t1, u

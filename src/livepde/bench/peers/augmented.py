@@ -62,7 +62,9 @@ class Augmented:
         def stage(c: Array, t: float, h: float) -> Array:
             return self.forward.solve(c, q, h, interval.at(t))
 
-        u, _, failure = advance(self.trajectory.control, stage, self.full(x, at - 1), interval)
+        u, _, failure = advance(
+            self.trajectory.control, stage, self.full(x, at - 1), before.t, now.t
+        )
         if failure is not None:
             raise failure
         return np.concatenate([u[self.free], x[self.n :]])

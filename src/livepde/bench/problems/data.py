@@ -129,7 +129,7 @@ class Data:
             def stage(c: Array, t: float, h: float, of: Interval = interval) -> Array:
                 return stage_of.solve(c, q, h, of.at(t))
 
-            u, _, failure = advance(control, stage, u, interval)
+            u, _, failure = advance(control, stage, u, *times[k - 1 : k + 1])
             if failure is not None:
                 raise failure
             if k == WARM_UP:
