@@ -18,7 +18,7 @@ from livepde.cases.preview import preview
 from livepde.cases.template import write_template
 from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
 from livepde.fem.evolution import CONSTANT
-from livepde.laws import replay
+from livepde.laws import replay_slices
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
 from livepde.streams import AbsoluteNoise, Twin
@@ -326,14 +326,14 @@ def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
 
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: Any):
-    replayed, count = replay.replayed, []
+    placed, count = replay_slices.placed, []
 
     def counted(*arguments: Any) -> Any:
         count.append(1)
-        return replayed(*arguments)
+        return placed(*arguments)
 
-    monkeypatch.setattr("livepde.laws.one_member.replayed", counted)
-    law = lp.SensitivityLaw(modes=7, replay=lp.Replay(first=4, iterations=50))
+    monkeypatch.setattr(replay_slices, "placed", counted)
+    law = lp.SensitivityLaw(modes=7, replay=lp.Replay(first=4, iterations=50, slice=64))
     identifier = lp.Identifier(linear_model(EVOLUTIONS[name]), sensors(), law)
     for t, z in samples():
         assert identifier.step(t, z).status.ok

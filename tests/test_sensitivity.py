@@ -10,6 +10,7 @@ from skfem import ElementLineP1, ElementLineP2
 import livepde as lp
 from livepde.diagnostics import check_law
 from livepde.laws import Status
+from livepde.laws.assimilation import Assimilation
 from livepde.laws.innovations import Innovations
 
 
@@ -251,9 +252,12 @@ def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
     model = conductivity()
     sensors, samples = stream(model, 2.0, 0.1 * np.arange(12))
     ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=4)))
-    no_luck = Status("not_converged", "no luck")
-    module = "livepde.laws.one_member.replayed"
-    monkeypatch.setattr(module, lambda filter_, window, choices: (window, no_luck))
+
+    def no_luck(filter_, x, span, options):
+        zero, lost = np.zeros(1), Status("not_converged", "no luck")
+        return x, Assimilation(np.zeros((1, 1)), 0, lost, zero > 0.0, zero, zero)
+
+    monkeypatch.setattr("livepde.laws.replay_slices.assimilate", no_luck)
     estimates = [ident.step(*sample) for sample in samples]
     failed = [k for k, estimate in enumerate(estimates) if "replay_failed" in estimate.notes]
     assert failed == [4, 8]

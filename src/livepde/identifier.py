@@ -6,6 +6,7 @@ import copy
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -33,7 +34,7 @@ from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 3  # of the checkpoint
+FORMAT = 4  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -300,6 +301,17 @@ class Identifier:
         report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
+    def settled(self, estimate: Estimate) -> Estimate:
+        """Return the last estimate with parameter and state after what the law does in parts.
+
+        For the end of a run: of a replay in slices, say. The identifier does not change: the next
+        sample finds it as it was.
+        """
+        state = self.law.settled(self._work, self._state)
+        if state is self._state:
+            return estimate
+        return replace(estimate, belief=self.problem.physical(self.law.belief(self._work, state)))
+
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return what the sensors will show if nothing more is measured; nothing is learned.
 
@@ -388,6 +400,8 @@ class Identifier:
             result.add(estimate)
             if on_estimate is not None:
                 on_estimate(estimate)
+        if result.last is not None:
+            result.settle(self.settled(result.last))
         return result
 
     def _reachable(self, t: float) -> None:

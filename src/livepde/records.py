@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from sys import getsizeof
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -129,6 +129,11 @@ class RecordArrays:
         self._t.append(record.t)
         if record.snapshot is not None:
             self._snapshots.append(count, record.snapshot)
+
+    def with_last(self, numbers: Array, snapshot: Snapshot | None) -> RecordArrays:
+        """Return a copy in which numbers and fields of the last record are others."""
+        *earlier, last = self
+        return RecordArrays.of([*earlier, replace(last, numbers=numbers, snapshot=snapshot)])
 
     def __iter__(self) -> Iterator[Record]:
         kept = dict(self.snapshots())

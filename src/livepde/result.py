@@ -230,6 +230,7 @@ class Result:
         self.withheld = withheld
         self.fields_every = fields_every
         self.last: Estimate | None = None
+        self._settled: Belief | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld)
         self._count = len(self.records) if count is None else count
@@ -243,7 +244,13 @@ class Result:
         keeps = self._count % self.fields_every == 0
         self.records.append(self._record(estimate, keeps))
         self._count += 1
+        self._settled = None
         self.last = estimate
+
+    def settle(self, estimate: Estimate) -> None:
+        """Take the last parameter and state from `Identifier.settled`, in tables and datasets."""
+        if estimate is not self.last:
+            self.last, self._settled = estimate, estimate.belief
 
     def _record(self, estimate: Estimate, keeps: bool) -> Record:
         return Record(
@@ -301,6 +308,11 @@ class Result:
         `correlation` of the last numbers, over (`unknown`, `other`).
         """
         records, last = RecordArrays.of(self.records), None
+        if self.last is not None and self._settled is not None:
+            snapshot = (
+                None if records.last_snapshot < len(records) - 1 else self.snapshot(self.last)
+            )
+            records = records.with_last(np.array(self._readout(self._settled)), snapshot)
         if self.last is not None and records.last_snapshot < len(records) - 1:
             last = self.snapshot(self.last)
         return self.layout.dataset(records, last)

@@ -206,5 +206,7 @@ class Block:
                 count=journal.estimated,
             )
             if self._taken:
-                journal.keep(result.snapshot(identifier.estimate()))
+                result.last = identifier.estimate()
+                result.settle(identifier.settled(result.last))
+                journal.keep(result.snapshot(result.last))
             yield identifier, Driven(result, journal, self.status, self.error)

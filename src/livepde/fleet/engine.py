@@ -81,6 +81,10 @@ class Engine(Protocol):
         """Return the state at the end of a span; that of a failed member is the old one."""
         ...
 
+    def settled(self, state: State) -> State:
+        """Return the state after what the law does in parts; see `Law.settled`."""
+        ...
+
     def believed(self, state: State, k: int) -> Belief:
         """Return what the law believes of a member, in latent coefficients."""
         ...

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -143,6 +143,11 @@ class FleetResult:
                 estimate.notes,
             )
         )
+        self.last = estimate
+
+    def settle(self, estimate: FleetEstimate) -> None:
+        """Take the last parameters from `Fleet.settled`."""
+        self._rows[-1] = replace(self._rows[-1], parameters=estimate.parameters)
         self.last = estimate
 
     def to_xarray(self) -> xr.Dataset:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -33,7 +34,7 @@ from livepde.stepping import Scheme, Span
 
 __all__ = ["Fleet"]
 
-FORMAT = 2  # of the checkpoint
+FORMAT = 3  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -288,6 +289,12 @@ class Fleet:
         rows = [observed.predict(u[k], q[k], span.end.member(k)) for k in range(len(span))]
         return np.array(rows)
 
+    def settled(self, estimate: FleetEstimate) -> FleetEstimate:
+        """Return the last estimate, settled as that of an identifier; see `Identifier.settled`."""
+        state = self._engine.settled(self._state)
+        beliefs = self._engine.beliefs(state)
+        return replace(estimate, beliefs=beliefs, belief=lambda k: self._believed(state, k))
+
     def identifier(self, member: str | int) -> Identifier:
         """Return an identifier that goes on from where a member is, by name or number.
 
@@ -303,6 +310,8 @@ class Fleet:
         result = FleetResult(self.members, layout_of(self.model, self.observed, self.withheld))
         for sample in stream:
             result.add(self.step(*sample))
+        if result.last is not None:
+            result.settle(self.settled(result.last))
         return result
 
     def _parsed(

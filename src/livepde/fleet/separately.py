@@ -38,6 +38,9 @@ class Separately:
         taken = [self.law.step(self.work, one, span.member(k)) for k, one in enumerate(state)]
         return tuple(new for new, _ in taken), reported([report for _, report in taken])
 
+    def settled(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(self.law.settled(self.work, one) for one in state)
+
     def believed(self, state: tuple[Any, ...], k: int) -> Belief:
         belief: Belief = self.law.belief(self.work, state[k])
         return belief

@@ -45,6 +45,10 @@ class Together:
         )
         return stepped
 
+    def settled(self, state: SensitivityState) -> SensitivityState:
+        settled: SensitivityState = self.law.settled(self.work, state)
+        return settled
+
     def member(self, state: SensitivityState, k: int) -> SensitivityState:
         return take(state, k)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,6 +48,10 @@ class MemberReports:
         notes = {name: float(values[k]) for name, values in self.notes.items()}
         notes = {name: value for name, value in notes.items() if not math.isnan(value)}
         return Report(self.statuses[k], self.predicted[k], int(self.steps[k]), notes)
+
+    def with_notes(self, notes: Mapping[str, Array]) -> MemberReports:
+        """Return the reports with more notes."""
+        return replace(self, notes={**self.notes, **notes}) if notes else self
 
     def with_members(self, reports: Mapping[int, Report]) -> MemberReports:
         """Return the reports with those of some members exchanged."""

@@ -358,6 +358,12 @@ class AutoLaw(Law[Bank, AutoState]):
         notes["prior_scale"] = float(np.exp(weights @ scales))
         return Report(OK, predicted, leading.steps, notes)
 
+    def settled(self, work: Bank, state: AutoState) -> AutoState:
+        noise = state.noise if state.known else np.ones_like(state.noise)
+        filters = work.filters(state.tick, noise)
+        members = self.member.settled(filters, state.members)
+        return state if members is state.members else changed(state, members=members)
+
     def belief(self, work: Bank, state: AutoState) -> Belief:
         return self.reader(work, state)()
 

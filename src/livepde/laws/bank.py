@@ -9,6 +9,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from livepde.laws.jumps import Watch
+from livepde.laws.replay import ReplayState
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray, Mask
 
@@ -168,13 +169,14 @@ def numbered(state: SensitivityState, number: int, due: int) -> SensitivityState
     member = np.array([number])
     parts = ("now", "start", "older", "newer")
     filters = {part: replace(getattr(state, part), member=member) for part in parts}
-    return replace(state, due=np.array([due]), **filters)
+    replay = replace(state.replay, x=replace(state.replay.x, member=member))
+    return replace(state, due=np.array([due]), replay=replay, **filters)
 
 
 def scaled(state: SensitivityState, scale: float) -> SensitivityState:
     """Return a filter before the first sample with another prior deviation."""
     x = replace(state.start, U=scale * state.start.U, C=scale * state.start.C)
-    return replace(state, start=x, now=x, older=x, newer=x)
+    return replace(state, start=x, now=x, older=x, newer=x, replay=ReplayState.none(x))
 
 
 def say_the_same(work: Bank, state: AutoState, j: int, k: int) -> bool:

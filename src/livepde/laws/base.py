@@ -275,6 +275,13 @@ class Law(ABC, Generic[Work, State]):
     def step(self, work: Work, state: State, interval: Interval) -> tuple[State, Report]:
         """Return the state at the end of the interval; the old one if the step failed."""
 
+    def settled(self, work: Work, state: State) -> State:
+        """Return the state after what `step` does in parts and has not ended; here the same.
+
+        For the estimate at the end of a run: the run goes on from the state that it had.
+        """
+        return state
+
     def stepped_alone(self, work: Work) -> str:
         """Return why the members of a fleet are stepped one by one; empty if as arrays.
 

@@ -9,16 +9,19 @@ from __future__ import annotations
 import numpy as np
 
 from livepde.fem import Inputs
-from livepde.linalg import Array, Mask
+from livepde.laws.base import Problem
+from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Interval, Span
 
 __all__ = [
     "added",
     "empty_log",
     "first_interval",
+    "following",
     "intervals_since",
     "opened",
     "skipped",
+    "span_between",
     "trimmed",
 ]
 
@@ -107,3 +110,22 @@ def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
         Interval(rows[k - 1][0], rows[k][0], named[k - 1], named[k], rows[k - 1][1], rows[k][1])
         for k in range(1, len(rows))
     ]
+
+
+def following(log: Array, row: int) -> int:
+    """Return the next row of one member, shape (rows, ...), that it took; their number if none."""
+    row += 1
+    while row < len(log) and not np.isfinite(log[row, 0]):
+        row += 1
+    return row
+
+
+def span_between(log: Array, rows: IntArray, row: int, problem: Problem) -> Span:
+    """Return what members measured in one row, with one row before of each, as an interval."""
+    sensors = problem.observed.size
+    first, last = log[np.arange(len(log)), rows], log[:, row]
+    inputs0, inputs1 = first[:, 1 + sensors :], last[:, 1 + sensors :]
+    if problem.control.hold:
+        inputs0 = inputs1
+    z0, z1 = first[:, 1 : 1 + sensors], last[:, 1 : 1 + sensors]
+    return Span(first[:, 0], float(last[0, 0]), problem.channels, inputs0, inputs1, z0, z1)

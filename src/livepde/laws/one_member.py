@@ -1,6 +1,6 @@
 """One member of a sensitivity law whose sample is out of the ordinary.
 
-A replay is due, a sample moves an unknown too far, a step fails or runs away, or an alarm tells
+A sample moves an unknown too far, a step fails or runs away, or an alarm tells
 that the process has jumped. States have one member here.
 """
 
@@ -14,11 +14,18 @@ import numpy as np
 from livepde.laws.assimilation import assimilate
 from livepde.laws.base import Report, Status
 from livepde.laws.filter_state import FilterState
+from livepde.laws.gauss_newton import (
+    CONVERGED,
+    Window,
+    distance,
+    missed_most,
+    next_reference,
+    placed,
+)
 from livepde.laws.guards import Guards
-from livepde.laws.history import first_interval, intervals_since
+from livepde.laws.history import intervals_since
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed
-from livepde.laws.replay import CONVERGED, Replay, Window, distance, missed_most, replayed
 from livepde.laws.sensitivity_state import (
     SensitivityState,
     SensitivityWork,
@@ -38,7 +45,7 @@ TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not
 def step_alone(
     work: SensitivityWork, state: SensitivityState, interval: Interval
 ) -> tuple[SensitivityState, Report]:
-    """Return one member after a sample, with replays, safeguards and alarms."""
+    """Return one member after a sample, with safeguards and alarms."""
     new, report = _assimilated(work, state, interval)
     if (guards := work.guards) is not None:
         new, report = _rescued(work, guards, state, interval, new, report)
@@ -66,7 +73,7 @@ def _filtered(
 def _assimilated(
     work: SensitivityWork, state: SensitivityState, interval: Interval
 ) -> tuple[SensitivityState, Report]:
-    """Return one member after a sample, iterated or replayed where that is due."""
+    """Return one member after a sample, iterated where that is due."""
     x, report = _filtered(work, state.now, interval)
     if not report.status.ok:
         return state, report
@@ -80,13 +87,8 @@ def _assimilated(
                 report = replace(report, notes={**report.notes, **told, **notes})
         return stored(work, state, work.filter.relinearised(x), span, one), report
     state = stored(work, state, x, span, one)
-    if work.replay is not None and state.assimilated[0] >= state.due[0]:
-        state, notes = _replayed(work, work.replay, state)
-        report = replace(report, notes={**report.notes, **notes})
-    if state.log.shape[1] - state.window[0] > work.most:
+    if state.log.shape[1] - state.window[0] > work.most and not state.replay.active[0]:
         state = new_window(work, work.filter.relinearised(state.now), state)
-    if work.back and state.since_newer[0] == state.log.shape[1] - 1:
-        state = changed(state, newer=state.now)  # as the replay has left it
     return state, report
 
 
@@ -96,38 +98,6 @@ def _noted(work: SensitivityWork, x: FilterState) -> dict[str, float]:
         "innovation_ratio": float(x.innovations.ratio[0]),
         "innovation_correlation": float(x.innovations.correlation[0]),
     }
-
-
-def _window(work: SensitivityWork, state: SensitivityState) -> Window:
-    """Return the stored samples of one member, for a replay."""
-    channels, log = work.filter.problem.channels, state.log[:, int(state.window[0]) :]
-    first = first_interval(log, channels)
-    return Window(
-        state.start,
-        state.now,
-        first if state.opening[0] else None,
-        intervals_since(log, channels),
-        state.reference[0],
-        bool(state.initial[0]),
-        first.end,
-    )
-
-
-def _replayed(
-    work: SensitivityWork, replay: Replay, state: SensitivityState
-) -> tuple[SensitivityState, dict[str, float]]:
-    """Return one member after replays about better references, and notes."""
-    window, notes = _window(work, state), {}
-    for _ in range(replay.iterations):
-        window, status = replayed(work.filter, window, work.options)
-        left = distance(work.filter, window)
-        notes["replay_left"] = left
-        if not status.ok:  # keep the linear estimate, say so, and try again when doubled
-            notes["replay_failed"] = 1.0
-        if not status.ok or left <= CONVERGED:
-            break
-    due, reference = 2 * state.assimilated, window.reference[None]
-    return changed(state, now=window.now, reference=reference, due=due), notes
 
 
 def _iterated(
@@ -158,15 +128,17 @@ def _iterated(
             x, _ = _filtered(work, begin, interval)
             if guards.within_reach(x.da - begin.da)[0]:
                 return levelled(x, temper), tempered
-        reference, moment = begin.q[0], interval.end
-        window = Window(begin, x, None, [interval], reference, False, moment)
+        start, length = interval.at(interval.t0), interval.t1 - interval.t0
+        window = Window(begin, x, begin.q[0], False, start, length)
         far = missed_most(filter_, window) > guards.reach
         if not (far and distance(filter_, window) > CONVERGED):
             return levelled(x, temper), tempered
         for _ in range(guards.iterations):
-            window, status = replayed(filter_, window, work.options)
-            if not status.ok:
+            q = next_reference(filter_, window)
+            x, report = _filtered(work, placed(filter_, window, q), interval)
+            if not report.status.ok:
                 break
+            window = replace(window, now=x, reference=q)
             if distance(filter_, window) <= CONVERGED:
                 return levelled(window.now, temper), {"iterated": 1.0, **tempered}
     return _filtered(work, before, interval.silent)[0], {"held": 1.0}

@@ -19,6 +19,7 @@ from livepde.laws.assimilation import (
 from livepde.laws.base import Belief, Law, Problem, Report
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
+from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
@@ -26,7 +27,8 @@ from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed, join, put, take, where
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
-from livepde.laws.replay import CONVERGED, Replay, Window, distance, next_reference, placed
+from livepde.laws.replay import Replay, ReplayState
+from livepde.laws.replay_slices import finish_replays, replay_slice
 from livepde.laws.sensitivity_state import (
     NEVER,
     SensitivityState,
@@ -200,6 +202,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             reference=x.q,
             assimilated=zero,
             due=np.array([self.replay.first if self.replay else NEVER]),
+            replay=ReplayState.none(x),
             older=x,
             newer=x,
             since_older=zero,
@@ -237,9 +240,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             now = assimilate_at_once(filter_, x, span, work.options)
             if not np.isfinite(now.da).all():
                 return state
-            begun = Window(
-                state.start, now, interval, [], x.q[0], bool(state.initial[0]), interval.end
-            )
+            initial = bool(state.initial[0])
+            begun = Window(state.start, now, x.q[0], initial, interval.end, 0.0)
             if not iterates or distance(filter_, begun) <= CONVERGED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
@@ -285,16 +287,26 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def step_members(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, MemberReports]:
-        """Return state and reports of all members after a sample of each.
+        """Return state and reports of all members after a sample of each, and a slice of replays.
 
-        They step as arrays; whoever meets something out of the ordinary, a replay, a safeguard, an
-        alarm, a failure, or is late, steps alone.
+        They step as arrays; whoever meets something out of the ordinary, a safeguard, an alarm, a
+        failure, or is late, steps alone.
         """
+        new, reports = self._after(work, state, span)
+        if not any(status.ok for status in reports.statuses):
+            return new, reports
+        new, notes = replay_slice(work, new)
+        return shortened(work, new), reports.with_notes(notes)
+
+    def _after(
+        self, work: SensitivityWork, state: SensitivityState, span: Span
+    ) -> tuple[SensitivityState, MemberReports]:
+        """Return state and reports of all members after a sample of each."""
         before = state if state.log.shape[1] else changed(state, log=opened(state.log, span))
         new, told, usual = self._together(work, before, span)
         reports = reports_of(work, new.now, told)
         if usual.all():
-            return shortened(work, new), reports
+            return new, reports
         alone: dict[int, Report] = {}
         parts: list[SensitivityState] = []
         for k in np.flatnonzero(~usual).tolist():
@@ -309,7 +321,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 new = put(new, k, one)
         else:
             new = join(*parts) if len(parts) > 1 else parts[0]
-        return shortened(work, new), reports.with_members(alone)
+        return new, reports.with_members(alone)
 
     def _together(
         self, work: SensitivityWork, state: SensitivityState, span: Span
@@ -323,9 +335,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if len(span) > 1:
             usual = usual & span.together
         if self.replay is not None:
-            due = state.assimilated + present >= state.due
             full = state.log.shape[1] + 1 - state.window > work.most
-            usual = usual & ~(replays & (due | full))
+            usual = usual & ~(replays & full & ~state.replay.active)
         scale, watch = state.scale, state.watch
         if (guards := self.guards) is not None:
             usual = usual & (replays | guards.within_reach(x.da - before.da))
@@ -348,6 +359,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             scale, watch = where(usual, scale, state.scale), where(usual, watch, state.watch)
         new = stored(work, state, x, span, usual, scale=scale, watch=watch)
         return new, told, usual
+
+    def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
+        return finish_replays(work, state)
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)

@@ -15,7 +15,7 @@ from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, trimmed
 from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.members import changed, where
-from livepde.laws.replay import Replay
+from livepde.laws.replay import Replay, ReplayState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 
@@ -83,6 +83,8 @@ class SensitivityState:
         (`Model.initial`), and the latent parameter from which the reference of `now` comes.
     assimilated, due
         Samples used since, and at how many the next replay is due: `NEVER` without replay.
+    replay
+        The replay that is under way.
     older, newer, since_older, since_newer
         Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
     log
@@ -101,6 +103,7 @@ class SensitivityState:
     reference: Array
     assimilated: IntArray
     due: IntArray
+    replay: ReplayState
     older: FilterState
     newer: FilterState
     since_older: IntArray
@@ -159,8 +162,13 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
     first = int(np.where(state.replays, np.minimum(older, state.window), older).min())
     if first < rows // 2:
         return state
+    replay = state.replay
+    if replay.active.any():
+        row, until = (np.where(replay.active, r - first, -1) for r in (replay.row, replay.until))
+        replay = changed(replay, row=row, until=until)
     return changed(
         state,
+        replay=replay,
         log=trimmed(state.log, first),
         window=np.maximum(state.window - first, 0),
         since_older=state.since_older - first,
@@ -209,6 +217,7 @@ def new_window(
         reference=start.q,
         assimilated=zero,
         due=zero + first,
+        replay=ReplayState.none(start),
     )
 
 

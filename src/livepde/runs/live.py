@@ -210,8 +210,11 @@ class Live:
     def _conclude(self) -> None:
         if self.journal.accepted > self.journal.estimated:
             return  # stopped within a step: from the checkpoint before, it is taken again
+        last = self.result.last
+        if last is not None:
+            self.result.settle(last := self.identifier.settled(last))
         if self.journal.estimated:
-            self.journal.keep(self.result.snapshot(self.identifier.estimate()))
+            self.journal.keep(self.result.snapshot(last or self.identifier.estimate()))
         self.journal.checkpoint(self.identifier.dump())
 
     def _run(self) -> None:
