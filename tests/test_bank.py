@@ -143,7 +143,10 @@ def test_the_noise_need_not_be_stated():
     told, silent = (run(build(noise=noise), still()) for noise in (NOISE, None))
     (value, std), (expected, deviation) = (e[-1].parameters["a"] for e in (silent, told))
     assert abs(value - expected) <= deviation
-    assert std == pytest.approx(deviation, rel=0.3)
+    assert std <= 2.0 * deviation
+    # When a member wakes or sleeps depends on chance: what is alike is what is usual.
+    stds = [[e.parameters["a"][1] for e in found[100:]] for found in (silent, told)]
+    assert np.median(np.divide(*stds)) == pytest.approx(1.0, rel=0.1)
     prior = silent[GUESSED - 2].parameters["a"]
     assert prior[0] == 0.2
     assert prior[1] >= 0.2  # nothing is learned before there is a guess
