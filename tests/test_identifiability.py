@@ -10,6 +10,7 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
+from livepde.cases.preview import StatedNoise
 from livepde.diagnostics import Identifiability, identifiability
 
 MESH = lp.interval(0.0, 1.0, 12)
@@ -25,11 +26,11 @@ def learned(unknowns: dict[str, Any], rate: Any, points: Any = (0.5,), z: float 
         B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
     )
     sensors = lp.Points(list(points), noise=1e-3)
-    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(modes=8), u0=1.0)
+    identifier = lp.Identifier(model, sensors, StatedNoise(modes=8), u0=1.0)
     for t in TIMES:
         identifier.step(t, np.full(len(points), z))
     belief = identifier.latent_belief()
-    return model, replace(belief, inflation=1.0)
+    return model, belief
 
 
 def report(*args: Any, **options: Any) -> Identifiability:
@@ -93,10 +94,10 @@ def test_one_that_moves_is_never_flat_for_good():
     assert known.verdict == "partly"
 
 
-def test_inflation_counts():
+def test_the_width_counts():
     model, belief = learned({"a": lp.Scalar(0.0, 1.0)}, lambda q: q.a)
     (known,) = identifiability(model, belief).unknowns
-    (wider,) = identifiability(model, replace(belief, inflation=3.0)).unknowns
+    (wider,) = identifiability(model, replace(belief, q_factor=3.0 * belief.q_factor)).unknowns
     assert wider.left == pytest.approx(3 * known.left)
 
 

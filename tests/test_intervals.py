@@ -96,5 +96,6 @@ def test_bad_questions():
         estimate.interval("b")
     with pytest.raises(lp.SpaceError, match="level must lie between 0 and 1"):
         estimate.interval("a", 95)
-    replaced = replace(estimate, belief=replace(estimate.belief, inflation=2.0))
+    belief = estimate.belief
+    replaced = replace(estimate, belief=replace(belief, q_factor=2.0 * belief.q_factor))
     assert np.diff(replaced.interval("a")) == pytest.approx(2 * np.diff(estimate.interval("a")))

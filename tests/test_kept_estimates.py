@@ -55,7 +55,6 @@ def test_an_estimate_that_is_read_later_is_the_same(unknown, law):
         at_once = other.step(*sample).belief
         read = estimate.belief
         assert read is estimate.belief
-        assert read.inflation == at_once.inflation
         for name in ("q", "u", "q_factor", "u_factor", "prior_factor", "rest"):
             np.testing.assert_array_equal(getattr(read, name), getattr(at_once, name))
 

@@ -422,7 +422,8 @@ def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
             seed=seed,
         )
         law = lp.SensitivityLaw(replay=lp.Replay(first=8))
-        estimate = lp.Identifier(model, points, law, u0=0.0).run(twin).last
-        assert estimate.belief.inflation < 1.3
+        identifier = lp.Identifier(model, points, law, u0=0.0)
+        estimate = identifier.run(twin).last
+        assert identifier._state.now.innovations.inflation < 1.3
         for name, (value, std) in estimate.parameters.items():
             assert abs(value - truth[name]) < 3.5 * std

@@ -93,5 +93,5 @@ def _seen(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Arr
     factor = H_u @ belief.u_factor
     if H_q is not None:
         factor = factor + H_q @ belief.q_factor
-    std = belief.inflation * np.linalg.norm(factor, axis=1)
+    std = np.linalg.norm(factor, axis=1)
     return z, np.where(np.isnan(z), np.nan, std)

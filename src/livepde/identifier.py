@@ -30,7 +30,7 @@ from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Sample, number, numbers, sample_of
-from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme
+from livepde.stepping import Advance, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
 
@@ -58,7 +58,8 @@ class Identifier:
     withheld
         Sensors that are never assimilated, only scored.
     scheme, dt_max
-        Time scheme; a longer interval between samples is divided into substeps.
+        Time scheme, default that of the law (`Law.scheme`); a longer interval between samples is
+        divided into substeps.
     halvings
         A substep that is not solved is halved at most this often, before the step is a failed
         status. 0: that at once, as where steps are to be those of the samples and no others.
@@ -107,7 +108,7 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
-        control = Advance(scheme or ImplicitEuler(), dt_max, halvings, hold)
+        control = Advance(scheme or law.scheme, dt_max, halvings, hold)
         self.problem = Problem(model, self.observed, control)
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)

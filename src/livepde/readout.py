@@ -56,10 +56,10 @@ class ScalarReadout:
             return nothing, nothing
         # Rows of a matrix that is stored by columns would be summed in another order.
         chosen = factor[self._rows]
-        after = belief.inflation * np.sqrt(np.add.reduce(chosen * chosen, axis=1))
+        after = np.sqrt(np.add.reduce(chosen * chosen, axis=1))
         std = after
         if not factor.flags.c_contiguous:
-            std = belief.inflation * np.sqrt(np.add.reduce(factor * factor, axis=1))[self._rows]
+            std = np.sqrt(np.add.reduce(factor * factor, axis=1))[self._rows]
         if belief.rest is not None:
             std = np.hypot(std, belief.rest[self._rows])
         if belief.prior_factor is None:

@@ -285,7 +285,7 @@ class Result:
             found |= _split(name, block, block.at_vertices @ estimate.u[part])
             if belief.u_factor is not None:
                 squares = (block.at_vertices @ belief.u_factor[part]) ** 2
-                deviation = belief.inflation * np.sqrt(squares.sum(axis=1))
+                deviation = np.sqrt(squares.sum(axis=1))
                 found |= _split(name, block, deviation, "_std")
         for name, field in self.model.parameter_space.fields.items():
             part = self.model.parameter_space.part(name)

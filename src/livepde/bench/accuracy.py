@@ -118,7 +118,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
     def known() -> Known:
         belief = identifier.latent_belief()
         factor = belief.q_factor
-        return belief.q, None if factor is None else belief.inflation * factor
+        return belief.q, factor
 
     step(0)
     score = measured(data, step, known)

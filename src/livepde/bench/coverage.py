@@ -157,8 +157,6 @@ class Twin:
         a field at all vertices, a moving number at ten times.
     error
         Mean square of errors of latent values over their deviations.
-    inflation
-        Factor on the deviations at the end.
     doubted
         True if the run says that its model does not explain the data.
     white
@@ -168,7 +166,6 @@ class Twin:
 
     inside: Mapping[float, float]
     error: float
-    inflation: float
     doubted: bool
     white: tuple[bool, bool]
 
@@ -191,7 +188,6 @@ def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
                 PROBLEMS[name].title,
                 *inside.values(),
                 float(np.sqrt(_mean([one.error for one in several]))),
-                _mean([one.inflation for one in several]),
                 doubted,
                 *white,
             )
@@ -214,7 +210,6 @@ def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
         "68 %",
         "95 %",
         "error / deviation",
-        "inflation",
         "doubted",
         "innovations: square",
         "correlation",
@@ -257,7 +252,6 @@ def twin(problem: Problem, seed: int) -> Twin:
     return Twin(
         {level: _mean([one[level] for one in inside]) for level in LEVELS},
         _mean(errors),
-        samples[-1].belief.inflation,
         unexplained(result.to_xarray()),
         _white(samples[-1].notes, problem.samples * len(problem.sensors)),
     )

@@ -292,8 +292,9 @@ class Case:
     @cached_property
     def scheme(self) -> Scheme:
         """The time scheme."""
-        second_order = self.frame.spec.steps.scheme == "alexander2"
-        return Alexander2() if second_order else ImplicitEuler()
+        schemes = {"alexander2": Alexander2(), "implicit-euler": ImplicitEuler()}
+        name = self.frame.spec.steps.scheme
+        return self.law.scheme if name is None else schemes[name]
 
     @cached_property
     def dt_max(self) -> float:

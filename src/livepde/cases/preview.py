@@ -11,6 +11,9 @@ from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
 from livepde.identifier import Sample
 from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw
+from livepde.laws.filter_state import FilterState
+from livepde.laws.sensitivity_state import SensitivityWork
+from livepde.linalg import Array
 
 __all__ = ["Identified", "Preview", "linearised", "preview"]
 
@@ -65,6 +68,16 @@ class Preview:
     sentences: tuple[str, ...] = ()
 
 
+class StatedNoise(SensitivityLaw):
+    """The sensitivity law with the covariance of its filter: as if all it states were right.
+
+    What innovations say does not count.
+    """
+
+    def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
+        return x.U, x.C
+
+
 def linearised(law: AnyLaw) -> SensitivityLaw | None:
     """Return the law as a filter that is linear about the prior; None for one without covariance.
 
@@ -74,7 +87,7 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
         law = law.member
     if not isinstance(law, SensitivityLaw):
         return None
-    return SensitivityLaw(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
+    return StatedNoise(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
 
 
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
@@ -99,8 +112,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
         if count >= MOST_SAMPLES:
             break
     model = prepared.case.model
-    # What was measured does not matter here, so what the innovations say does not either.
-    belief = replace(identifier.latent_belief(), inflation=1.0)
+    belief = identifier.latent_belief()
     prior, posterior = belief.prior_factor, belief.q_factor
     if not count or prior is None or posterior is None:
         return Preview()

@@ -362,10 +362,10 @@ class GradientSpec(Spec):
 
 
 class StepsSpec(Spec):
-    """Time steps between samples."""
+    """Time steps between samples; the default scheme is that of the law."""
 
     dt_max: Quantity | None = None
-    scheme: Literal["implicit-euler", "alexander2"] = "implicit-euler"
+    scheme: Literal["implicit-euler", "alexander2"] | None = None
 
 
 class PublishSpec(BrokerSpec):

@@ -95,7 +95,7 @@ class Learned:
             return replace(nominal, source="fallback", why=why)
         belief = estimate.belief
         root = belief.q_factor if belief.q_factor is not None else np.zeros((len(belief.q), 0))
-        factor = belief.inflation * model.numbers(root)
+        factor = model.numbers(root)
         x, q = model.project(estimate.u), model.numbers(estimate.q)
         here = model.about(estimate.u, estimate.q, inputs) if model.frame.moves else None
         return Known(x, q, factor, model=here)

@@ -155,7 +155,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     unknowns = [
         Known(
             label,
-            belief.inflation * float(np.linalg.norm(row)),
+            float(np.linalg.norm(row)),
             bound=_bound(model, belief, label),
             moves=space.unknowns[label.split("[")[0]].evolution.moves,
         )
@@ -210,7 +210,7 @@ def _directions(
     known = dict(zip(labels, unknowns, strict=False))
     found = []
     for vector, size in zip(vectors.T, sizes, strict=True):
-        left = belief.inflation * float(size)
+        left = float(size)
         members = {
             name: float(weight)
             for name, weight in zip(labels, vector, strict=True)

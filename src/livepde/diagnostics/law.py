@@ -143,7 +143,7 @@ def _count(name: str, count: Callable[[], int], remedy: str) -> CheckLine:
 def _numbers(estimate: Estimate) -> Array:
     """Return everything that a law believes, in one vector."""
     belief = estimate.belief
-    parts = [belief.q, belief.u, np.array([belief.inflation])]
+    parts = [belief.q, belief.u]
     parts += [factor for factor in (belief.q_factor, belief.u_factor) if factor is not None]
     return np.concatenate([np.ravel(part) for part in parts])
 

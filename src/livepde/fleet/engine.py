@@ -36,14 +36,11 @@ class Factors:
     ----------
     q, u, prior
         Shapes (members, m, r), (members, n, r) and (members, m, k).
-    inflation
-        Factor on all deviations, shape (members,).
     """
 
     q: Array
     u: Array
     prior: Array
-    inflation: Array
 
 
 @dataclass(frozen=True, eq=False)

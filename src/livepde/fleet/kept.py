@@ -113,10 +113,9 @@ class Kept:
         """Return what `Record.numbers` holds, shape (members, numbers)."""
         space, columns = self.model.parameter_space, []
         after, before = (np.linalg.norm(factor, axis=2) for factor in (factors.q, factors.prior))
-        deviations = factors.inflation[:, None] * after
-        shares = deviations / np.where(before > 0.0, before, np.nan)
+        shares = after / np.where(before > 0.0, before, np.nan)
         for label, k in space.labels.items():
-            value, std = beliefs.q[:, k], deviations[:, k]
+            value, std = beliefs.q[:, k], after[:, k]
             ends = interval_ends(label, unknown_of(space, label), value, std)
             columns += [value, std, *ends.values(), shares[:, k]]
         return np.stack(columns, axis=1)
@@ -130,7 +129,7 @@ class Kept:
             part, names = self.model.state_space.part(name), variables(name, block)
             columns = factors.u[:, part].transpose(1, 0, 2).reshape(-1, members * r)
             squares = ((block.at_vertices @ columns) ** 2).reshape(-1, members, r).sum(axis=2)
-            deviations = factors.inflation * np.sqrt(squares)
+            deviations = np.sqrt(squares)
             for end, values in {"": block.at_vertices @ u[:, part].T, "_std": deviations}.items():
                 rows = values.T.reshape(members, len(names), -1)[:, :, order]
                 found |= {f"{key}{end}": rows[:, c] for c, key in enumerate(names)}

@@ -61,13 +61,12 @@ class Together:
         now, reduction = state.now, self.work.filter.reduction
         latent = self.work.filter.problem.model.latent
         a = reduction.bounded(self.work.filter.estimate(now))
-        factor = reduction.directions(a, now.C).transpose(0, 2, 1)
+        U, C = self.law.factors(self.work, now)
+        factor = reduction.directions(a, C).transpose(0, 2, 1)
         units = np.broadcast_to(np.eye(reduction.size), (len(a), *2 * (reduction.size,)))
         prior = reduction.directions(a, units).transpose(0, 2, 1)
-        spread = now.innovations.inflation
-        std = spread[:, None] * np.sqrt((factor**2).sum(axis=2))
-        U = now.U.transpose(0, 2, 1)
-        factors = Factors(factor, U, prior, spread)
+        std = np.sqrt((factor**2).sum(axis=2))
+        factors = Factors(factor, U.transpose(0, 2, 1), prior)
         return Beliefs(latent.value(a.T).T, now.u + now.du, std, factors)
 
     def leaves(self, state: SensitivityState) -> dict[str, Any]:

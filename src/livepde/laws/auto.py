@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -43,7 +44,7 @@ from livepde.laws.sensitivity_state import (
     restarted,
 )
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import Interval
+from livepde.stepping import Alexander2, Interval, Scheme
 
 __all__ = ["AutoLaw"]
 
@@ -101,6 +102,8 @@ class AutoLaw(Law[Bank, AutoState]):
     replay: Replay = field(default_factory=Replay)
     gate: float = np.inf
     gate_patience: int = 10
+
+    scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
 
     def __post_init__(self) -> None:
         number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
@@ -388,9 +391,9 @@ class AutoLaw(Law[Bank, AutoState]):
         for w, b in zip(np.sqrt(weights), each, strict=True):
             # The differences of the means are no deviations that correlation inflates.
             if b.q_factor is not None and b.u_factor is not None:
-                q_factor.append(w * np.column_stack([b.inflation * b.q_factor, b.q - q]))
-                u_factor.append(w * np.column_stack([b.inflation * b.u_factor, b.u - u]))
-        return Belief(q, u, np.hstack(q_factor), np.hstack(u_factor), 1.0, *first)
+                q_factor.append(w * np.column_stack([b.q_factor, b.q - q]))
+                u_factor.append(w * np.column_stack([b.u_factor, b.u - u]))
+        return Belief(q, u, np.hstack(q_factor), np.hstack(u_factor), *first)
 
 
 def _tick(state: AutoState, interval: Interval) -> float:

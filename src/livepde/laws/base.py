@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.stepping import Advance, Interval, StepFailed
+from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 
 __all__ = ["Belief", "Law", "Notes", "Problem", "Report", "Status"]
 
@@ -117,21 +117,18 @@ class Belief:
     q_factor, u_factor
         Square roots of the covariances, q_factor @ q_factor.T, shapes (m, k) and (n, k); None for
         a law that has no covariance.
-    inflation
-        Factor on all standard deviations for correlated or too large innovations, >= 1.
     prior_factor
         Square root of the covariance of q before the first sample, shape (m, k), its columns
         orthonormal in Q.
     rest
         Standard deviation of each coefficient of q in the modes that the law leaves out, which stay
-        as the prior has them: independent of q_factor, and not inflated, shape (m,). None: 0.
+        as the prior has them: independent of q_factor, shape (m,). None: 0.
     """
 
     q: Array
     u: Array
     q_factor: Array | None = None
     u_factor: Array | None = None
-    inflation: float = 1.0
     prior_factor: Array | None = None
     rest: Array | None = None
 
@@ -140,13 +137,13 @@ class Belief:
         """Standard deviation of each coefficient of q."""
         if self.q_factor is None:
             return None
-        std = _deviation(self.q_factor, self.inflation)
+        std = _deviation(self.q_factor)
         return std if self.rest is None else np.hypot(std, self.rest)
 
     @property
     def u_std(self) -> Array | None:
         """Standard deviation of each coefficient of u."""
-        return None if self.u_factor is None else _deviation(self.u_factor, self.inflation)
+        return None if self.u_factor is None else _deviation(self.u_factor)
 
     def deviation(self, rows: Any, part: slice) -> Array | None:
         """Return the standard deviation of rows @ q[part] for a matrix, that of point values, say.
@@ -155,7 +152,7 @@ class Belief:
         """
         if self.q_factor is None:
             return None
-        std = _deviation(rows @ self.q_factor[part], self.inflation)
+        std = _deviation(rows @ self.q_factor[part])
         return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
 
     def left(self, rows: Any) -> Array:
@@ -166,7 +163,7 @@ class Belief:
         if self.q_factor is None or self.prior_factor is None:
             return np.full(len(self.q[rows]), np.nan)
         before = np.linalg.norm(self.prior_factor[rows], axis=1)
-        after = self.inflation * np.linalg.norm(self.q_factor[rows], axis=1)
+        after = np.linalg.norm(self.q_factor[rows], axis=1)
         left: Array = after / np.where(before > 0.0, before, np.nan)
         return left
 
@@ -182,11 +179,11 @@ class Belief:
         axes, sizes, _ = np.linalg.svd(self.prior_factor[part], full_matrices=False)
         seen = sizes > 1e-12 * sizes.max(initial=0.0)
         reduced = (axes[:, seen].T @ self.q_factor[part]) / sizes[seen, None]
-        return np.asarray(self.inflation * np.linalg.svd(reduced, compute_uv=False))
+        return np.asarray(np.linalg.svd(reduced, compute_uv=False))
 
 
-def _deviation(factor: Array, inflation: float) -> Array:
-    std: Array = inflation * np.sqrt((factor**2).sum(axis=1))
+def _deviation(factor: Array) -> Array:
+    std: Array = np.sqrt((factor**2).sum(axis=1))
     return std
 
 
@@ -247,7 +244,14 @@ class Law(ABC, Generic[Work, State]):
     A law of your own is one class with these four methods. The state is a frozen dataclass of
     arrays and numbers: saving it is checkpointing. Identifiers share a law, and copies of an
     identifier share its work, maybe in threads: neither may change once it is made.
+
+    Attributes
+    ----------
+    scheme
+        Time scheme of an identifier that states none: the paper's, implicit Euler.
     """
+
+    scheme: ClassVar[Scheme] = ImplicitEuler()
 
     @abstractmethod
     def prepare(self, problem: Problem) -> Work:

@@ -146,6 +146,21 @@ class Reduction:
         more = -np.expm1(-drift * h)[:, None] * np.maximum(1.0 - variance, 0.0)
         return np.where(self.still, more, gained)
 
+    def in_prior_units(self, C: Array, age: Array) -> Array:
+        """Return rows of a, (members, r, k), in units of the prior at an age, (members,).
+
+        The prior of unknowns that move widens or is forgotten with the time since the start.
+        """
+        if not self.moves:
+            return C
+        each = []
+        for rows, h in zip(C, age.tolist(), strict=True):
+            F = self.transition(h)
+            variances, axes = np.linalg.eigh(F @ F.T + np.diag(_growth(self.evolutions, h)))
+            least = np.finfo(float).eps * variances[-1]
+            each.append(rows @ axes / np.sqrt(np.maximum(variances, least)))
+        return np.array(each)
+
     def predict(self, q: Array, h: float) -> Array:
         """Return the expected latent parameters a time h later, shape (members, m)."""
         latent = self.problem.model.latent

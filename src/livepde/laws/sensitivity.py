@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from livepde.laws.assimilation import (
     assimilate_at_once,
 )
 from livepde.laws.base import Belief, Law, Problem, Report
+from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
@@ -39,7 +41,15 @@ from livepde.laws.sensitivity_state import (
 )
 from livepde.laws.sensors import MemberSensors
 from livepde.linalg import Array, Mask
-from livepde.stepping import BandedStage, Interval, KeptFactors, Span, member_stage
+from livepde.stepping import (
+    Alexander2,
+    BandedStage,
+    Interval,
+    KeptFactors,
+    Scheme,
+    Span,
+    member_stage,
+)
 
 __all__ = ["SensitivityLaw", "without_factors"]
 
@@ -109,6 +119,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     gate_patience: int = 10
     jumps: Jumps | None = None
     guards: Guards | None = field(default_factory=Guards)
+
+    scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.drift) and self.drift >= 0):
@@ -370,18 +382,21 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         now = without_factors(state.now)
         return lambda: self.member_belief(work, now, 0)
 
-    @staticmethod
-    def member_belief(work: SensitivityWork, now: FilterState, k: int) -> Belief:
+    def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
+        """Return the square root [U C] of the covariance that is reported, of all members."""
+        return robust_factors(work.filter, x)
+
+    def member_belief(self, work: SensitivityWork, now: FilterState, k: int) -> Belief:
         """Return what is believed of one member, in latent coefficients."""
         filter_ = work.filter
-        reduction = filter_.reduction
-        drift = float(filter_.drifts(now.member[k : k + 1])[0])
+        reduction, one = filter_.reduction, take(now, k)
+        drift = float(filter_.drifts(one.member)[0])
+        U, C = self.factors(work, one)
         return Belief(
             reduction.bounded(now.q[k] + reduction.Phi @ now.da[k]),
             now.u[k] + now.du[k],
-            reduction.Phi @ now.C[k].T,
-            now.U[k].T,
-            float(now.innovations.inflation[k]),
+            reduction.Phi @ C[0].T,
+            U[0].T,
             reduction.Phi,
             reduction.rest(float(now.age[k]), drift),
         )

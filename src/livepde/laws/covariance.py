@@ -1,0 +1,39 @@
+"""The covariance that is reported: wider than the filter's own where innovations bear it out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from livepde.laws.filter import Filter
+from livepde.laws.filter_state import FilterState
+from livepde.linalg import Array
+
+__all__ = ["robust_factors"]
+
+
+def robust_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
+    """Return a square root [U C] of the robust covariance, (members, r, n) and (members, r, k).
+
+    The sandwich V = P (1 + lambda F) P of Huber (1967) and White (1982), with the prior inside: in
+    units of the prior of this time P is the covariance of the filter, F = P^-1 - 1 the information
+    of the samples, and lambda the square of `Innovations.inflation`, the factor by which a mean of
+    the innovations scatters more than the filter expects. A direction of which the share p of the
+    prior variance is left gets the variance p (p + lambda (1 - p)), and never more than its prior:
+    what no sensor sees is as well known as before, however wrong the sensors are.
+
+    What is uncertain of the state beside the unknowns has no prior: it counts `lambda` times.
+    """
+    inflation = x.innovations.inflation
+    if (inflation == 1.0).all():
+        return x.U, x.C
+    k = x.C.shape[2]
+    finite = np.isfinite(x.C).all(axis=(1, 2)) & np.isfinite(inflation)
+    C = filter_.reduction.in_prior_units(np.where(finite[:, None, None], x.C, 0.0), x.age)
+    rotation, left, _ = np.linalg.svd(C)
+    share = np.minimum(left * left, 1.0)
+    widths = np.repeat(inflation[:, None], rotation.shape[1], axis=1)
+    widened = share + inflation[:, None] ** 2 * (1.0 - share)
+    widths[:, :k] = np.sqrt(np.minimum(widened, 1.0 / np.maximum(share, np.finfo(float).tiny)))
+    widths[~finite] = 1.0
+    rows = widths[:, :, None] * rotation.transpose(0, 2, 1)
+    return rows @ x.U, rows @ x.C
