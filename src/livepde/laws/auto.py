@@ -143,6 +143,7 @@ class AutoLaw(Law[Bank, AutoState]):
             work,
             filter=replace(work.filter, rank=rank, drift=np.zeros(len(candidates))),
             options=replace(work.options, adaptive=True),
+            start_window=self.member.start_window if walks else 0,
         )
         return Bank(candidates, work, replays, stated)
 

@@ -128,8 +128,9 @@ class Filter:
             x,
             q=self.reduction.predict(x.q, h),
             da=x.da @ F.T,
-            U=np.concatenate([x.U, np.zeros((members, len(grows), x.U.shape[2]))], axis=1),
+            U=_extended(x.U, len(grows)),
             C=np.concatenate([x.C @ F.T, new], axis=1),
+            past=_extended(x.past, len(grows)),
             age=x.age + h,
         )
 
@@ -184,11 +185,9 @@ class Filter:
         if failure is not None:
             return x, steps, failure
         rows = end.U.shape[1]
-        U, C, du = columns[1 : 1 + rows].transpose(1, 0, 2), end.C, end.du
-        du = columns[-1] if deviates else du
-        if rows > self.rank:
-            U, C = self._compressed(U, C)
-        return changed(end, u=columns[0], U=U, C=C, du=du, kept=kept), steps, None
+        U, du = columns[1 : 1 + rows].transpose(1, 0, 2), columns[-1] if deviates else end.du
+        new = changed(end, u=columns[0], U=U, du=du, kept=kept)
+        return self._compressed(new) if rows > self.rank else new, steps, None
 
     @staticmethod
     def update(x: FilterState, Y: Array, d: Array) -> tuple[FilterState, Update]:
@@ -206,7 +205,16 @@ class Filter:
         half = (left @ d[:, :, None])[:, :, 0]
         U, C, row = Wt @ x.U, Wt @ x.C, half[:, None]
         new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
+        if x.past.shape[2]:
+            past = Wt @ x.past
+            new = changed(new, past=past, dpast=x.dpast + (row @ past)[:, 0])
         return new, Update(left, half, spread)
+
+    def remembered(self, x: FilterState) -> FilterState:
+        """Return the state that follows the values of a of now also from now on."""
+        now = self.reduction.reduced(x.q - self.problem.model.latent.prior) + x.da
+        past, dpast = np.concatenate([x.past, x.C], axis=2), np.concatenate([x.dpast, now], axis=1)
+        return changed(x, past=past, dpast=dpast)
 
     def relinearised(self, x: FilterState, kept: Mask | None = None) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
@@ -241,10 +249,8 @@ class Filter:
         members, _, k = x.C.shape
         unit = np.broadcast_to(size * np.eye(k), (members, k, k))
         C = np.concatenate([x.C, unit], axis=1)
-        U = np.concatenate([x.U, np.zeros((members, k, x.U.shape[2]))], axis=1)
-        if C.shape[1] > self.rank:
-            U, C = self._compressed(U, C)
-        return changed(x, U=U, C=C)
+        new = changed(x, U=_extended(x.U, k), C=C, past=_extended(x.past, k))
+        return self._compressed(new) if C.shape[1] > self.rank else new
 
     def with_prior(self, x: FilterState) -> FilterState:
         """Return the state with the prior of the unknowns, and u as it is estimated."""
@@ -252,27 +258,35 @@ class Filter:
         prior = np.broadcast_to(self.problem.model.latent.prior, x.q.shape)
         C = np.broadcast_to(np.eye(k), (members, k, k))
         U, du, da = np.zeros((members, k, x.u.shape[1])), np.zeros_like(x.du), np.zeros_like(x.da)
-        return changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C)
+        past = np.zeros((members, k, x.past.shape[2]))
+        return changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past)
 
-    def _compressed(self, U: Array, C: Array) -> tuple[Array, Array]:
-        """Return a square root of `rank` rows.
+    def _compressed(self, x: FilterState) -> FilterState:
+        """Return the state with a square root of `rank` rows.
 
         A rotation gathers all that is uncertain about the unknowns, and the state with them, in the
         first rows: they stay as they are. Of the rest, which is the state's alone, the leading
         directions are kept, measured by `scale`.
         """
-        k = C.shape[2]
-        rotation, root = np.linalg.qr(C, mode="complete")
-        rotated = rotation.transpose(0, 2, 1) @ U
+        k = x.C.shape[2]
+        rotation, root = np.linalg.qr(x.C, mode="complete")
+        rotated = rotation.transpose(0, 2, 1) @ x.U
         alone = rotated[:, k:]
         weighted = alone * self.scale
         square = weighted @ weighted.transpose(0, 2, 1)
         square[~np.isfinite(square).all(axis=(1, 2))] = 0.0  # reported by the caller
         _, vectors = np.linalg.eigh(square)
-        kept = vectors[:, :, ::-1][:, :, : self.rank - k].transpose(0, 2, 1) @ alone
-        small = np.zeros((len(C), k + kept.shape[1], k))
-        small[:, :k] = root[:, :k]
-        return np.concatenate([rotated[:, :k], kept], axis=1), small
+        leading = vectors[:, :, ::-1][:, :, : self.rank - k].transpose(0, 2, 1)
+        C = _extended(root[:, :k], leading.shape[1])
+        U = np.concatenate([rotated[:, :k], leading @ alone], axis=1)
+        past = rotation.transpose(0, 2, 1) @ x.past
+        past = np.concatenate([past[:, :k], leading @ past[:, k:]], axis=1)
+        return changed(x, U=U, C=C, past=past)
+
+
+def _extended(rows: Array, count: int) -> Array:
+    """Return rows of a square root, (members, r, ...), and so many rows of zeros."""
+    return np.concatenate([rows, np.zeros((len(rows), count, rows.shape[2]))], axis=1)
 
 
 def _contraction(Y: Array) -> tuple[Array, Array]:

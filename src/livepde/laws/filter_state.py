@@ -28,6 +28,9 @@ class FilterState:
     U, C
         Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k).
         As long as nothing moves, r = k.
+    past, dpast
+        Square root and estimate of earlier values of a, one after the other, that a smoother
+        follows; shapes (members, r, p) and (members, p), p = 0 otherwise.
     age
         Time for which the unknowns have moved, shape (members,).
     innovations
@@ -50,6 +53,8 @@ class FilterState:
     da: Array
     U: Array = field(metadata={"grows": 1})
     C: Array = field(metadata={"grows": 1})
+    past: Array = field(metadata={"grows": 1})
+    dpast: Array
     age: Array
     innovations: Innovations
     refused: IntArray

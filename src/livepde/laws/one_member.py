@@ -24,6 +24,7 @@ from livepde.laws.gauss_newton import (
 )
 from livepde.laws.guards import Guards
 from livepde.laws.history import intervals_since
+from livepde.laws.iterated_smoother import apart, iterated_smoother, learns
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import (
@@ -85,11 +86,31 @@ def _assimilated(
             if notes:
                 told = _noted(work, x)
                 report = replace(report, notes={**report.notes, **told, **notes})
-        return stored(work, state, work.filter.relinearised(x), span, one), report
+        state = stored(work, state, work.filter.relinearised(x), span, one)
+        if state.assimilated[0] >= state.start_due[0]:
+            state, notes = _smoothed(work, state)
+            report = replace(report, notes={**report.notes, **_noted(work, state.now), **notes})
+        return state, report
     state = stored(work, state, x, span, one)
     if state.log.shape[1] - state.window[0] > work.most and not state.replay.active[0]:
         state = new_window(work, work.filter.relinearised(state.now), state)
     return state, report
+
+
+def _smoothed(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityState, dict[str, float]]:
+    """Return one member about the most probable trajectory of its window, and notes."""
+    notes: dict[str, float] = {}
+    if learns(state.start, state.now):
+        found = iterated_smoother(work, state)
+        moved = np.inf if found is None else apart(work.filter, found, state.now)
+        notes["smoother_moved"] = float(moved)
+        if found is not None:
+            state = changed(state, now=work.filter.relinearised(found))
+    if state.assimilated[0] >= work.start_window:
+        return new_window(work, state.now, state), notes
+    return changed(state, start_due=2 * state.assimilated), notes
 
 
 def _noted(work: SensitivityWork, x: FilterState) -> dict[str, float]:

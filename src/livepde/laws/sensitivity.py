@@ -105,6 +105,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         After so many refusals in a row a sensor is believed again: something has really changed.
     jumps
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
+    start_window
+        While the unknowns are learned the last samples, up to this many, are assimilated again
+        whenever their number has doubled, about the most probable trajectory of the unknowns: see
+        `livepde.laws.iterated_smoother`. 0: never. Not where a `Replay` does the like.
     guards
         What to do when a linearisation is overconfident or the estimate runs away; None: nothing.
     """
@@ -118,6 +122,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     gate: float = np.inf
     gate_patience: int = 10
     jumps: Jumps | None = None
+    start_window: int = 64
     guards: Guards | None = field(default_factory=Guards)
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
@@ -148,6 +153,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 )
         if not self.gate > 0:
             raise LawError(f"SensitivityLaw: gate must be positive; got {self.gate}.")
+        if self.start_window < 0:
+            raise LawError(f"SensitivityLaw: start_window must be >= 0; got {self.start_window}.")
         if self.gate_patience < 1:
             raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
 
@@ -182,7 +189,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             self.memory,
         )
         options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
-        return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps)
+        iterated = 0 if self.replay else self.start_window
+        return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps, iterated)
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
         filter_, problem = work.filter, work.filter.problem
@@ -196,6 +204,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             da=np.zeros((1, k)),
             U=np.zeros((1, k, n)),
             C=np.eye(k)[None],
+            past=np.zeros((1, k, 0)),
+            dpast=np.zeros((1, 0)),
             age=0.0 * one,
             innovations=Innovations.start(sensors),
             refused=np.zeros((1, sensors), dtype=np.int64),
@@ -215,6 +225,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             assimilated=zero,
             due=np.array([self.replay.first if self.replay else NEVER]),
             replay=ReplayState.none(x),
+            start_due=np.array([1 if work.start_window else NEVER]),
             older=x,
             newer=x,
             since_older=zero,
@@ -260,6 +271,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             level, samples = state.now.level, state.now.samples
             x = changed(x, level=level, samples=samples, kept=state.now.kept)
         state = changed(state, reference=x.q)
+        state = changed(state, opening=np.ones(1, dtype=bool))
         if not replays:
             now = filter_.relinearised(now)
             return changed(state, now=now, older=now, newer=now)
@@ -268,7 +280,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             now=now,
             older=now,
             newer=now,
-            opening=np.ones(1, dtype=bool),
             assimilated=state.assimilated + span.present,
         )
 
@@ -350,6 +361,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             full = state.log.shape[1] + 1 - state.window > work.most
             usual = usual & ~(replays & full & ~state.replay.active)
         scale, watch = state.scale, state.watch
+        if work.start_window:
+            usual = usual & ~(state.assimilated + present >= state.start_due)
         if (guards := self.guards) is not None:
             usual = usual & (replays | guards.within_reach(x.da - before.da))
             d = span.z1 - told.predicted

@@ -42,7 +42,7 @@ class SensitivityWork:
     ----------
     filter, options
         The filter, and how it takes a sample.
-    replay, guards, jumps
+    replay, guards, jumps, start_window
         Those of the law.
     """
 
@@ -51,11 +51,12 @@ class SensitivityWork:
     replay: Replay | None
     guards: Guards | None
     jumps: Jumps | None
+    start_window: int
 
     @cached_property
     def keeps_log(self) -> bool:
         """True if the law ever goes back to earlier samples."""
-        return bool(self.back or self.replay)
+        return bool(self.back or self.replay or self.start_window)
 
     @cached_property
     def most(self) -> int:
@@ -85,6 +86,8 @@ class SensitivityState:
         Samples used since, and at how many the next replay is due: `NEVER` without replay.
     replay
         The replay that is under way.
+    start_due
+        Samples in the window at which it is iterated next; `NEVER` where a law does not.
     older, newer, since_older, since_newer
         Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
     log
@@ -104,6 +107,7 @@ class SensitivityState:
     assimilated: IntArray
     due: IntArray
     replay: ReplayState
+    start_due: IntArray
     older: FilterState
     newer: FilterState
     since_older: IntArray
@@ -138,7 +142,7 @@ def stored(
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken)
     assimilated = state.assimilated
-    if work.replay:
+    if work.replay or work.start_window:
         assimilated = assimilated + (taken & span.present)
     last = log.shape[1] - 1
     if work.back:
@@ -159,7 +163,8 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
     if rows < 3 * max(work.back, 32):
         return state
     older = state.since_older if work.back else np.full(len(state), rows - 1)
-    first = int(np.where(state.replays, np.minimum(older, state.window), older).min())
+    stays = state.replays | (state.start_due != NEVER)
+    first = int(np.where(stays, np.minimum(older, state.window), older).min())
     if first < rows // 2:
         return state
     replay = state.replay
@@ -218,6 +223,7 @@ def new_window(
         assimilated=zero,
         due=zero + first,
         replay=ReplayState.none(start),
+        start_due=zero + (1 if work.start_window and first == NEVER else NEVER),
     )
 
 

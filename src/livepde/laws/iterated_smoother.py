@@ -1,0 +1,208 @@
+"""The start of a run: the samples so far, linear about the trajectory that they make most probable.
+
+A plain update leaves a second-order error that a state with long memory never forgets. While the
+unknowns are as uncertain as their prior that error counts, so the first samples are assimilated
+again, about trajectories of the unknowns that are found by damped Gauss-Newton steps: the iterated
+Kalman smoother of Bell (1994). It accepts only what makes the samples and the prior together more
+probable, and serves unknowns that stay and unknowns that move.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from livepde.laws.assimilation import assimilate, assimilate_at_once
+from livepde.laws.filter import Filter
+from livepde.laws.filter_state import FilterState
+from livepde.laws.gauss_newton import Window, placed
+from livepde.laws.history import first_interval, intervals_since
+from livepde.laws.members import changed
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.linalg import Array
+from livepde.stepping import Interval
+
+__all__ = ["apart", "iterated_smoother", "learns"]
+
+HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
+ITERATIONS = 6  # Gauss-Newton steps at most
+HALVINGS = 4  # of a step that makes samples and prior less probable
+CONVERGED = 0.3  # standard deviations that a step moves the trajectory by, at the end of it
+STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
+OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """The samples, assimilated linear about one trajectory of the unknowns.
+
+    Attributes
+    ----------
+    trajectory, smoothed
+        Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
+        which the filter was linear, and those that it then estimates from all samples.
+    x
+        The filter after the last sample.
+    misfit
+        Minus twice the logarithm of the probability of the trajectory, up to a constant.
+    """
+
+    trajectory: Array
+    smoothed: Array
+    x: FilterState
+    misfit: float
+
+
+def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterState | None:
+    """Return the filter of one member after its samples, about their most probable trajectory.
+
+    None if no trajectory could be followed to its end.
+    """
+    problem = work.filter.problem
+    log = state.log[:, int(state.window[0]) :]
+    opening = first_interval(log, problem.channels)
+    samples = _Samples(work, state, opening, intervals_since(log, problem.channels))
+    begun = [samples.about(np.zeros((1 + len(samples.intervals), state.now.C.shape[2])))]
+    plain = samples.relinearised()
+    if plain is not None:
+        begun.append(samples.about(plain.smoothed))
+    ends = [_descended(samples, one) for one in begun if one is not None]
+    if not ends:
+        return None
+    best = min(ends, key=lambda one: one.misfit)
+    return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
+
+
+def _descended(samples: _Samples, best: _Pass) -> _Pass:
+    """Return the pass about a most probable trajectory near that of another."""
+    for _ in range(ITERATIONS):
+        step = best.smoothed - best.trajectory
+        step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
+        if _deviations(best.x, step[-1]) <= CONVERGED:
+            break
+        better = _damped(samples, best, step)
+        if better is None:
+            break
+        best = better
+    return best
+
+
+def learns(before: FilterState, now: FilterState) -> bool:
+    """True if samples have halved the variance of a direction of the unknowns of one member."""
+    earlier, later = before.C[0].T @ before.C[0], now.C[0].T @ now.C[0]
+    shares = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
+    return bool(shares[0] < HALF)
+
+
+def _damped(samples: _Samples, best: _Pass, step: Array) -> _Pass | None:
+    """Return the pass about a trajectory a step, or less, away; None if none is better."""
+    for halving in range(HALVINGS):
+        found = samples.about(best.trajectory + 0.5**halving * step)
+        if found is not None and found.misfit < best.misfit:
+            return found
+    return None
+
+
+def apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
+    """Return how far estimates of two filters are apart, in standard deviations of the first."""
+    shift = filter_.reduction.reduced(filter_.estimate(x) - filter_.estimate(other))[0]
+    return _deviations(x, shift)
+
+
+def _deviations(x: FilterState, shift: Array) -> float:
+    weights = np.linalg.lstsq(x.C[0].T, shift, rcond=None)[0]
+    return float(np.linalg.norm(weights))
+
+
+class _Samples:
+    """The samples of one member since the start, ready to be assimilated again."""
+
+    def __init__(
+        self,
+        work: SensitivityWork,
+        state: SensitivityState,
+        opening: Interval,
+        intervals: Sequence[Interval],
+    ) -> None:
+        self.work = work
+        self.state = state
+        self.opening = opening
+        self.intervals = intervals
+
+    def about(self, trajectory: Array) -> _Pass | None:
+        """Assimilate the samples, linear about a trajectory; None if that fails."""
+        return self._run(trajectory)
+
+    def relinearised(self) -> _Pass | None:
+        """Assimilate the samples, linear about each estimate; None if that fails."""
+        return self._run(None)
+
+    def _run(self, trajectory: Array | None) -> _Pass | None:
+        filter_, reduction = self.work.filter, self.work.filter.reduction
+        prior = filter_.problem.model.latent.prior
+        known = self.state.start.q[0]
+        beyond = known - prior - reduction.Phi @ reduction.reduced(known - prior)  # of the modes
+        q = known if trajectory is None else prior + beyond + reduction.Phi @ trajectory[0]
+        x, misfit = self._placed(q), 0.0
+        if self.state.opening[0]:
+            misfit += self._missed(x, self.opening)
+            x = assimilate_at_once(filter_, x, filter_.span(self.opening), self.work.options)
+        x = self._remembered(x)
+        followed = [reduction.reduced(x.q[0] - prior)]
+        misfit += float(followed[0] @ followed[0])
+        for number, interval in enumerate(self.intervals, start=1):
+            h = interval.t1 - interval.t0
+            if trajectory is None:
+                x = filter_.relinearised(x)
+            elif filter_.moves:
+                x = _about(filter_, x, trajectory[number], h)
+            x, told = assimilate(filter_, x, filter_.span(interval), self.work.options)
+            if not (told.status.ok and told.finite[0]):
+                return None
+            x = self._remembered(x)
+            followed.append(reduction.reduced(x.q[0] - prior))
+            misfit += self._missed(x, interval) + self._moved(followed[-2], followed[-1], h)
+        x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
+        smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
+        return _Pass(np.array(followed), smoothed, x, misfit)
+
+    def _remembered(self, x: FilterState) -> FilterState:
+        return self.work.filter.remembered(x) if self.work.filter.moves else x
+
+    def _placed(self, q: Array) -> FilterState:
+        state, opening = self.state, self.opening
+        length = self.intervals[-1].t1 - opening.t1 if self.intervals else 0.0
+        now, initial = state.now, bool(state.initial[0])
+        window = Window(state.start, now, state.start.q[0], initial, opening.end, length)
+        return placed(self.work.filter, window, self.work.filter.reduction.bounded(q))
+
+    def _missed(self, x: FilterState, interval: Interval) -> float:
+        """Return the squared misfit of the linearisation point at the end of an interval."""
+        filter_ = self.work.filter
+        alone = changed(x, du=np.zeros_like(x.du), da=np.zeros_like(x.da))
+        predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
+        noise = np.sqrt(x.level[0]) * filter_.noise
+        e = np.abs((interval.z1 - predicted[0]) / noise)
+        return float(np.nansum(np.minimum(e, OUTLIER) ** 2))
+
+    def _moved(self, before: Array, after: Array, h: float) -> float:
+        """Return the squared increment of a trajectory in a time h, in units of what it gains."""
+        filter_, reduction = self.work.filter, self.work.filter.reduction
+        if not filter_.moves:
+            return 0.0
+        nothing = np.zeros((1, len(before)))
+        gained = reduction.gained(h, nothing, filter_.drifts(self.state.now.member))[0]
+        increment = after - reduction.transition(h) @ before
+        return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())
+
+
+def _about(filter_: Filter, x: FilterState, a: Array, h: float) -> FilterState:
+    """Return a filter whose linearisation point is expected to have the unknowns a in a time h."""
+    reduction = filter_.reduction
+    now = np.linalg.solve(reduction.transition(h), a)
+    shift = now - reduction.reduced(x.q[0] - filter_.problem.model.latent.prior)
+    q = reduction.bounded(x.q + reduction.Phi @ shift)
+    return changed(x, q=q, da=x.da - reduction.reduced(q - x.q))
