@@ -33,7 +33,7 @@ from livepde.stepping import Scheme, Span
 
 __all__ = ["Fleet"]
 
-FORMAT = 2  # of the checkpoint
+FORMAT = 3  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 

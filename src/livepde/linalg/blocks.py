@@ -37,12 +37,12 @@ class BlockFactor:
     def solve(self, b: Array) -> Array:
         """Return x with K x = b for each block: shape (columns, blocks, n) as b, overwritten.
 
-        NaN for blocks whose matrix is singular, or whose b is not finite. Where a solution
+        NaN for blocks whose matrix is singular; not finite where b is not. Where a solution
         overflows, other blocks may be NaN with it; what is finite is right.
         """
         columns, count, n = b.shape
         bad = self.bad
-        if not math.isfinite(b.sum()):
+        if count > 1 and not math.isfinite(b.sum()):  # one block has no neighbours to disturb
             bad = np.union1d(bad, np.flatnonzero(~np.isfinite(b).all(axis=(0, 2))))
         if len(bad):
             b[:, bad] = 0.0
@@ -83,7 +83,7 @@ class BandedBlocks:
             storage[bad] = 0.0
             storage.reshape(blocks, n, height)[bad, :, middle] = 1.0
         banded = storage.reshape(blocks * n, height).T
-        if lower == upper == 1 and np.array_equal(banded[1, 1:], banded[3, :-1]):
+        if lower == upper == 1 and (banded[1, 1:] == banded[3, :-1]).all():
             diagonal, side, info = lapack.dpttrf(banded[2], banded[3, :-1])
             if info == 0:
 
