@@ -178,16 +178,15 @@ def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -
     square of what an update leaves of a sample, with the variance that is left of its prediction,
     is that of the noise, also while the unknowns are uncertain.
     """
-    left, half = made.left, made.half
-    misfit = (d * d).sum(axis=1) - (half * half).sum(axis=1)
+    left = made.left
     logs = (np.log(noise) * used).sum(axis=1)
-    missed = d - (half[:, None] @ left)[:, 0]
+    missed = d - (made.half[:, None] @ left)[:, 0]
     count, told = np.maximum(used.sum(axis=1), 1), used.any(axis=1)
     square = ((missed * missed).sum(axis=1) + (left * left).sum(axis=(1, 2))) / count
     samples = np.minimum(x.samples + LEARN, MEMORY)
     level = x.level * (1.0 + (square - 1.0) / samples)
     return {
-        "evidence": x.evidence - 0.5 * misfit - made.spread - logs,
+        "evidence": x.evidence - 0.5 * made.misfit - made.spread - logs,
         "level": np.where(told, level, x.level),
         "samples": np.where(told, samples, x.samples),
     }

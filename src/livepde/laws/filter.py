@@ -51,13 +51,14 @@ class Update(NamedTuple):
     ----------
     W, Y
         Shapes (members, r, r) and (members, r, sensors).
-    half
-        W^T Y d, shape (members, r).
+    half, misfit
+        W^T Y d, shape (members, r), and d^T (I + Y^T Y)^-1 d, shape (members,).
     """
 
     W: Array
     Y: Array
     half: Array
+    misfit: Array
 
     @property
     def left(self) -> Array:
@@ -129,9 +130,12 @@ class Filter:
         """
         if not self.moves or h == 0.0:
             return x
+        drifts = self.drifts(x.member)
+        if not (self.reduction.moves or drifts.any()):  # members of a bank, of which others drift
+            return changed(x, age=x.age + h)
         F = self.reduction.transition(h)
         variance = np.einsum("brk,brk->bk", x.C, x.C)
-        gained = self.reduction.gained(h, variance, self.drifts(x.member))
+        gained = self.reduction.gained(h, variance, drifts)
         grows = np.flatnonzero((gained > 0.0).any(axis=0))
         members, _, k = x.C.shape
         new = np.zeros((members, len(grows), k))
@@ -212,11 +216,11 @@ class Filter:
             Observed square root, (members, r, sensors), and innovations, (members, sensors), in
             units of the noise; zero where no value is.
         """
-        W, half = _contraction(Y, d)
+        W, half, misfit = _contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]
         U, C = Wt @ x.U, Wt @ x.C
         new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
-        return new, Update(W, Y, half)
+        return new, Update(W, Y, half, misfit)
 
     def relinearised(self, x: FilterState, kept: Mask | None = None) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
@@ -285,29 +289,29 @@ class Filter:
         return np.concatenate([rotated[:, :k], kept], axis=1), small
 
 
-def _contraction(Y: Array, d: Array) -> tuple[Array, Array]:
-    """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), and W^T Y d, (members, r).
+def _contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), W^T Y d, and d^T (I + Y^T Y)^-1 d.
 
-    W = R^-1 and W^T Y d = c from a QR factorisation of [I 0; Y^T d], whose upper rows are [R c]:
-    nothing is squared.
+    R = W^-1, W^T Y d and the root of the last come as [R c; 0 s] from a QR factorisation of
+    [I 0; Y^T d]: nothing is squared before.
     """
     members, r, sensors = Y.shape
     stacked = np.zeros((members, r + 1, r + sensors))  # transposed: LAPACK counts down the columns
     stacked[:, :r, r:], stacked[:, r, r:] = Y, d
     stacked.reshape(members, -1)[:, : r * (r + sensors) : r + sensors + 1] = 1.0
     if members > FEW:
-        upper: Array = np.asarray(np.linalg.qr(stacked.transpose(0, 2, 1), mode="r"))[:, :r]
+        upper: Array = np.asarray(np.linalg.qr(stacked.transpose(0, 2, 1), mode="r"))
         good = np.isfinite(upper).all(axis=(1, 2))
         inverse = np.full((members, r, r), np.nan)
-        inverse[good] = np.linalg.inv(upper[good, :, :r])
-        return inverse, upper[:, :, r]
+        inverse[good] = np.linalg.inv(upper[good, :r, :r])
+        return inverse, upper[:, :r, r], upper[:, r, r] ** 2
     # A call of NumPy for stacks of matrices takes ten times longer than LAPACK for one.
-    inverse, half = np.empty((members, r, r)), np.empty((members, r))
+    inverse, last = np.empty((members, r, r)), np.empty((members, r + 1))
     for k in range(members):
         factored = lapack.dgeqrf(stacked[k].T, lwork=BLOCK * (r + 1), overwrite_a=1)[0]
-        half[k] = factored[:r, r]
+        last[k] = factored[: r + 1, r]
         inverse[k] = lapack.dtrtri(factored[:r, :r])[0]
-    return inverse * _upper(r), half
+    return inverse * _upper(r), last[:, :r], last[:, r] ** 2
 
 
 @lru_cache(maxsize=16)
