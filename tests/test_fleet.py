@@ -420,11 +420,30 @@ def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
     right = rng.standard_normal((3, blocks, n))
     right[0, 4, 2] = np.inf
     solver = BandedBlocks(BandedSolver(pattern))
-    x = solver.factorise(solver.band(data)).solve(right)
+    x = solver.factorise(solver.band(data)).solve(right.copy())
     assert np.isnan(x[:, [1, 3, 4]]).all()
     for k in (0, 2, 5):
         dense = pattern.matrix(data[k]).toarray()
         np.testing.assert_allclose(x[:, k], np.linalg.solve(dense, right[:, k].T).T, rtol=1e-9)
+
+
+@pytest.mark.parametrize("shift", [3.0, 0.5])
+def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
+    rng = np.random.default_rng(1)
+    n, blocks = 8, 3
+    near = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 1
+    pattern = Pattern.from_entries(*np.nonzero(near), (n, n))
+    matrices = rng.standard_normal((blocks, n, n))
+    matrices = (matrices + matrices.transpose(0, 2, 1)) / 4.0 + 3.0 * np.eye(n)
+    matrices[1] += (shift - 3.0) * np.eye(n)
+    matrices *= near
+    assert (np.linalg.eigvalsh(matrices[1])[0] > 0.0) == (shift == 3.0)
+    right = rng.standard_normal((2, blocks, n))
+    solver = BandedBlocks(BandedSolver(pattern))
+    x = solver.factorise(solver.band(matrices[:, *np.nonzero(near)])).solve(right.copy())
+    for k in range(blocks):
+        wanted = np.linalg.solve(matrices[k], right[:, k].T).T
+        np.testing.assert_allclose(x[:, k], wanted, rtol=1e-10)
 
 
 @pytest.mark.parametrize("name", MODELS)

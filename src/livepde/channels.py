@@ -87,8 +87,8 @@ class Channels:
         self, z: ArrayLike | Mapping[str, float], inputs: Mapping[str, float]
     ) -> tuple[Array, Array, dict[str, float]]:
         """Return assimilated values, withheld values, and inputs, all checked."""
-        z = z if isinstance(z, np.ndarray | dict) else labelled(z)
-        if isinstance(z, Mapping):
+        z = z if isinstance(z, (np.ndarray, dict)) else labelled(z)
+        if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             measured, withheld, named = self._by_name(z, inputs)
         else:
             measured = readings(z, self.observed)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from livepde.laws.base import Report, Status
+from livepde.laws.base import Notes, Report, Status
 from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState
 from livepde.laws.members import changed
@@ -45,13 +45,16 @@ class MemberReports:
 
     def member(self, k: int) -> Report:
         """Return the report of one member."""
-        notes = {name: float(values[k]) for name, values in self.notes.items()}
-        notes = {name: value for name, value in notes.items() if not math.isnan(value)}
+        notes = Notes(lambda: self._notes_of(k))
         return Report(self.statuses[k], self.predicted[k], int(self.steps[k]), notes)
 
     def with_notes(self, notes: Mapping[str, Array]) -> MemberReports:
         """Return the reports with more notes."""
         return replace(self, notes={**self.notes, **notes}) if notes else self
+
+    def _notes_of(self, k: int) -> dict[str, float]:
+        notes = {name: float(values[k]) for name, values in self.notes.items()}
+        return {name: value for name, value in notes.items() if not math.isnan(value)}
 
     def with_members(self, reports: Mapping[int, Report]) -> MemberReports:
         """Return the reports with those of some members exchanged."""
@@ -179,16 +182,15 @@ def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -
     square of what an update leaves of a sample, with the variance that is left of its prediction,
     is that of the noise, also while the unknowns are uncertain.
     """
-    left, half, spread = made
-    misfit = (d * d).sum(axis=1) - (half * half).sum(axis=1)
+    left = made.left
     logs = (np.log(noise) * used).sum(axis=1)
-    missed = d - (half[:, None] @ left)[:, 0]
+    missed = d - (made.half[:, None] @ left)[:, 0]
     count, told = np.maximum(used.sum(axis=1), 1), used.any(axis=1)
     square = ((missed * missed).sum(axis=1) + (left * left).sum(axis=(1, 2))) / count
     samples = np.minimum(x.samples + LEARN, MEMORY)
     level = x.level * (1.0 + (square - 1.0) / samples)
     return {
-        "evidence": x.evidence - 0.5 * misfit - spread - logs,
+        "evidence": x.evidence - 0.5 * made.misfit - made.spread - logs,
         "level": np.where(told, level, x.level),
         "samples": np.where(told, samples, x.samples),
     }

@@ -22,7 +22,7 @@ from livepde.laws.bank import (
     say_the_same,
     scaled,
 )
-from livepde.laws.base import Belief, Law, Problem, Report
+from livepde.laws.base import Belief, Law, Notes, Problem, Report
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guess import first_guess
 from livepde.laws.history import (
@@ -253,16 +253,14 @@ class AutoLaw(Law[Bank, AutoState]):
             count=state.count + bool(interval.present.any()),
         )
         rested, alarm = self._rested(work, state, now)
-        report = self._report(work, now, members.now.member, good, reports, before)
-        notes = {**report.notes, "jump": float(alarm), "awake": float(len(now.members))}
-        return rested, replace(report, notes=notes)
+        return rested, self._report(work, now, members.now.member, good, reports, before, alarm)
 
     def _rested(self, work: Bank, before: AutoState, state: AutoState) -> tuple[AutoState, bool]:
         """Return the state after those that are not needed sleep, or all wake; was it an alarm."""
         if state.count == before.count:
             return state, False
         at = state.at(state.leader)
-        innovations = take(state.members.now.innovations, at).newest
+        innovations = state.members.now.innovations.newest[[at]]
         usual = take(before.members.now.innovations, before.at(state.leader))
         watch, alarms = JUMPS.add(state.watch, innovations, usual)
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
@@ -345,22 +343,29 @@ class AutoLaw(Law[Bank, AutoState]):
         good: Mask,
         reports: MemberReports,
         before: Array,
+        alarm: bool,
     ) -> Report:
         """Return the report of the mixture: predictions by the weights before the sample."""
         share = before[numbers] * good
         predicted = np.where(good[:, None], reports.predicted, 0.0)
         predicted = (share / share.sum()) @ predicted
-        weights = np.exp(state.weights)
         leading = reports.member(int(np.flatnonzero(numbers == state.leader)[0]))
-        drifts = work.drifts / state.tick
-        scales = np.log([c.scale for c in work.candidates])
-        now = state.members.now
-        notes = dict(leading.notes)
-        notes["noise_level"] = float(weights[now.member] @ np.sqrt(now.level))
-        notes["drift"] = float(weights @ drifts)
-        notes["drifting"] = float(weights @ (drifts > 0.0))
-        notes["prior_scale"] = float(np.exp(weights @ scales))
-        return Report(OK, predicted, leading.steps, notes)
+        logs, tick, now = state.weights, state.tick, state.members.now
+        awake, level = now.member, now.level  # not all of the members
+
+        def notes() -> dict[str, float]:
+            weights, drifts = np.exp(logs), work.drifts / tick
+            return {
+                **leading.notes,
+                "noise_level": float(weights[awake] @ np.sqrt(level)),
+                "drift": float(weights @ drifts),
+                "drifting": float(weights @ (drifts > 0.0)),
+                "prior_scale": float(np.exp(weights @ work.scales)),
+                "jump": float(alarm),
+                "awake": float(len(awake)),
+            }
+
+        return Report(OK, predicted, leading.steps, Notes(notes))
 
     def settled(self, work: Bank, state: AutoState) -> AutoState:
         noise = state.noise if state.known else np.ones_like(state.noise)
@@ -373,9 +378,9 @@ class AutoLaw(Law[Bank, AutoState]):
 
     def reader(self, work: Bank, state: AutoState) -> Callable[[], Belief]:
         noise = state.noise if state.known else np.ones_like(state.noise)
-        filters, now = work.filters(state.tick, noise), without_factors(state.members.now)
+        tick, now = state.tick, without_factors(state.members.now)
         weights = np.exp(state.weights[now.member])
-        return lambda: self._mixture(filters, now, weights)
+        return lambda: self._mixture(work.filters(tick, noise), now, weights)
 
     def _mixture(self, filters: SensitivityWork, now: FilterState, weights: Array) -> Belief:
         """Return the mean and covariance of all members."""

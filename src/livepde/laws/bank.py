@@ -92,6 +92,11 @@ class Bank:
         """Variance that each candidate gains from one sample to the next, shape (candidates,)."""
         return np.array([candidate.drift for candidate in self.candidates])
 
+    @cached_property
+    def scales(self) -> Array:
+        """Logarithms of the factors on prior deviations, shape (candidates,)."""
+        return np.log([candidate.scale for candidate in self.candidates])
+
     def filters(self, tick: float, noise: Array) -> SensitivityWork:
         """Return the filter of all members, for samples a time `tick` apart."""
         drift = self.drifts / tick if tick else 0.0 * self.drifts

@@ -187,28 +187,36 @@ def _deviation(factor: Array) -> Array:
     return std
 
 
-class Notes(Mapping[str, float]):
-    """Numbers worth keeping; those given by a function are computed when they are looked at.
+Value = TypeVar("Value")
 
-    >>> notes = Notes({"alpha": 2.0, "residual": lambda: 3.0})
+
+class Notes(Mapping[str, Value]):
+    """Numbers worth keeping, which are computed when they are first looked at.
+
+    >>> notes = Notes(lambda: {"alpha": 2.0, "residual": 3.0})
     >>> dict(notes)
     {'alpha': 2.0, 'residual': 3.0}
     """
 
-    def __init__(self, values: Mapping[str, float | Callable[[], float]]) -> None:
-        self._values = dict(values)
+    def __init__(self, read: Callable[[], Mapping[str, Value]]) -> None:
+        self._read = read
 
-    def __getitem__(self, name: str) -> float:
-        value = self._values[name]
-        if callable(value):
-            value = self._values[name] = value()
-        return value
+    @cached_property
+    def _values(self) -> Mapping[str, Value]:
+        return self._read()
+
+    def __getitem__(self, name: str) -> Value:
+        return self._values[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._values)
 
     def __len__(self) -> int:
         return len(self._values)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what a copy needs: the numbers themselves."""
+        return dict, (dict(self._values),)
 
 
 @dataclass(frozen=True, eq=False)

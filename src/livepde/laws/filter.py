@@ -49,15 +49,28 @@ class Update(NamedTuple):
 
     Attributes
     ----------
-    left, half
-        W^T Y, shape (members, r, sensors), and W^T Y d, shape (members, r).
-    spread
-        log det (I + Y^T Y)/2, shape (members,).
+    W, Y
+        Shapes (members, r, r) and (members, r, sensors).
+    half, misfit
+        W^T Y d, shape (members, r), and d^T (I + Y^T Y)^-1 d, shape (members,).
     """
 
-    left: Array
+    W: Array
+    Y: Array
     half: Array
-    spread: Array
+    misfit: Array
+
+    @property
+    def left(self) -> Array:
+        """Return W^T Y, shape (members, r, sensors)."""
+        left: Array = self.W.transpose(0, 2, 1) @ self.Y
+        return left
+
+    @property
+    def spread(self) -> Array:
+        """Return log det (I + Y^T Y)/2, shape (members,)."""
+        spread: Array = -np.log(np.abs(np.diagonal(self.W, axis1=1, axis2=2))).sum(axis=1)
+        return spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +130,12 @@ class Filter:
         """
         if not self.moves or h == 0.0:
             return x
+        drifts = self.drifts(x.member)
+        if not (self.reduction.moves or drifts.any()):  # members of a bank, of which others drift
+            return changed(x, age=x.age + h)
         F = self.reduction.transition(h)
         variance = np.einsum("brk,brk->bk", x.C, x.C)
-        gained = self.reduction.gained(h, variance, self.drifts(x.member))
+        gained = self.reduction.gained(h, variance, drifts)
         grows = np.flatnonzero((gained > 0.0).any(axis=0))
         members, _, k = x.C.shape
         new = np.zeros((members, len(grows), k))
@@ -160,8 +176,8 @@ class Filter:
         self, x: FilterState, span: Span, start: float, stop: float
     ) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a part of a span."""
-        end, kept, off = self.predict_unknowns(x, stop - start), x.kept, x.off_centre
-        deviates = bool(off.any())
+        end, kept, deviates = self.predict_unknowns(x, stop - start), x.kept, not x.centred
+        off = x.off_centre if deviates else np.zeros(len(x), dtype=bool)
 
         def directions(at: FilterState) -> Array:
             C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C
@@ -199,16 +215,14 @@ class Filter:
             Observed square root, (members, r, sensors), and innovations, (members, sensors), in
             units of the noise; zero where no value is.
         """
-        W, spread = _contraction(Y)
-        Wt = W.transpose(0, 2, 1)
-        left = Wt @ Y
-        half = (left @ d[:, :, None])[:, :, 0]
-        U, C, row = Wt @ x.U, Wt @ x.C, half[:, None]
+        W, half, misfit = _contraction(Y, d)
+        Wt, row = W.transpose(0, 2, 1), half[:, None]
+        U, C = Wt @ x.U, Wt @ x.C
         new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
         if x.past.shape[2]:
             past = Wt @ x.past
             new = changed(new, past=past, dpast=x.dpast + (row @ past)[:, 0])
-        return new, Update(left, half, spread)
+        return new, Update(W, Y, half, misfit)
 
     def remembered(self, x: FilterState) -> FilterState:
         """Return the state that follows the values of a of now also from now on."""
@@ -226,7 +240,7 @@ class Filter:
         """
         estimate = self.estimate(x)
         within = self.reduction.bounded(estimate)
-        da, du, u = np.zeros_like(x.da), np.zeros_like(x.du), x.u + x.du
+        da, du, u = np.zeros(x.da.shape), np.zeros(x.du.shape), x.u + x.du
         if within is not estimate:
             beyond = (within != estimate).any(axis=1)
             for k in np.flatnonzero(beyond & np.isfinite(x.C).all(axis=(1, 2))).tolist():
@@ -289,29 +303,29 @@ def _extended(rows: Array, count: int) -> Array:
     return np.concatenate([rows, np.zeros((len(rows), count, rows.shape[2]))], axis=1)
 
 
-def _contraction(Y: Array) -> tuple[Array, Array]:
-    """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), and the logarithm of 1/|det W|.
+def _contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
+    """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), W^T Y d, and d^T (I + Y^T Y)^-1 d.
 
-    W = R^-1 from a QR factorisation of [I; Y^T]: nothing is squared.
+    R = W^-1, W^T Y d and the root of the last come as [R c; 0 s] from a QR factorisation of
+    [I 0; Y^T d]: nothing is squared before.
     """
     members, r, sensors = Y.shape
-    stacked = np.zeros((members, r, r + sensors))  # transposed: LAPACK counts down the columns
-    stacked[:, :, r:] = Y
-    stacked.reshape(members, -1)[:, :: r + sensors + 1] = 1.0
+    stacked = np.zeros((members, r + 1, r + sensors))  # transposed: LAPACK counts down the columns
+    stacked[:, :r, r:], stacked[:, r, r:] = Y, d
+    stacked.reshape(members, -1)[:, : r * (r + sensors) : r + sensors + 1] = 1.0
     if members > FEW:
-        root: Array = np.asarray(np.linalg.qr(stacked.transpose(0, 2, 1), mode="r"))
-        good = np.isfinite(root).all(axis=(1, 2))
-        inverse = np.full_like(root, np.nan)
-        inverse[good] = np.linalg.inv(root[good])
-    else:  # a call of NumPy for stacks of matrices takes ten times longer than LAPACK for one
-        root, inverse = np.empty((members, r, r)), np.empty((members, r, r))
-        for k in range(members):
-            factored, _, _, _ = lapack.dgeqrf(stacked[k].T, lwork=BLOCK * r, overwrite_a=1)
-            root[k] = factored[:r]
-            inverse[k], _ = lapack.dtrtri(factored[:r])
-        inverse *= _upper(r)
-    diagonal = root.reshape(members, -1)[:, :: r + 1]
-    return inverse, np.log(np.abs(diagonal)).sum(axis=1)
+        upper: Array = np.asarray(np.linalg.qr(stacked.transpose(0, 2, 1), mode="r"))
+        good = np.isfinite(upper).all(axis=(1, 2))
+        inverse = np.full((members, r, r), np.nan)
+        inverse[good] = np.linalg.inv(upper[good, :r, :r])
+        return inverse, upper[:, :r, r], upper[:, r, r] ** 2
+    # A call of NumPy for stacks of matrices takes ten times longer than LAPACK for one.
+    inverse, last = np.empty((members, r, r)), np.empty((members, r + 1))
+    for k in range(members):
+        factored = lapack.dgeqrf(stacked[k].T, lwork=BLOCK * (r + 1), overwrite_a=1)[0]
+        last[k] = factored[: r + 1, r]
+        inverse[k] = lapack.dtrtri(factored[:r, :r])[0]
+    return inverse * _upper(r), last[:, :r], last[:, r] ** 2
 
 
 @lru_cache(maxsize=16)

@@ -67,10 +67,13 @@ class FilterState:
         return len(self.member)
 
     @property
+    def centred(self) -> bool:
+        """True if the estimate of every member is its linearisation point."""
+        return not (self.da.any() or self.du.any())
+
+    @property
     def off_centre(self) -> Mask:
         """Members whose estimate is not the linearisation point, shape (members,)."""
-        if not (self.da.any() or self.du.any()):
-            return np.zeros(len(self), dtype=bool)
         return np.asarray(self.da.any(axis=1) | self.du.any(axis=1))
 
 

@@ -221,11 +221,11 @@ class GradientLaw(Law[GradientParts, GradientState]):
             metric=learned,
             excitation=work.excited(state.excitation, u - r, u, q, moment),
         )
-        notes: dict[str, Any] = {"residual": lambda: model.X.norm(r), **path.notes()}
-        notes |= work.metric.notes(learned, q, length)
+        made = {**path.notes(), **work.metric.notes(learned, q, length)}
         if frozen:
-            notes["at_rest"] = 1.0
-        return new, Report(Status(), work.problem.predict(u, q, moment), steps, Notes(notes))
+            made["at_rest"] = 1.0
+        notes = Notes(lambda: {"residual": model.X.norm(r), **made})
+        return new, Report(Status(), work.problem.predict(u, q, moment), steps, notes)
 
     def belief(self, work: GradientParts, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

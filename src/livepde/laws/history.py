@@ -38,35 +38,37 @@ def opened(log: Array, span: Span) -> Array:
     """Return a log that begins at the start of a span, unless it has begun."""
     if log.shape[1]:
         return log
-    row = np.full((len(log), log.shape[2]), np.nan)
+    begun = _extended(log)
+    row, sensors = begun[:, -1], span.z1.shape[1]
+    row[:] = np.nan
     row[:, 0] = span.t0
-    sensors = span.z1.shape[1]
     # Withheld sensors of a fleet may read more channels, which come last.
     row[:, 1 + sensors :] = span.inputs0[:, : log.shape[2] - 1 - sensors]
-    return _appended(log, row)
+    return begun
 
 
 def added(log: Array, span: Span, taken: Mask) -> Array:
     """Return a log with the sample at the end of a span, of those members that took it."""
-    row = np.empty((len(log), log.shape[2]))
+    longer = _extended(log)
+    row, sensors = longer[:, -1], span.z1.shape[1]
     row[:, 0] = span.t1
-    sensors = span.z1.shape[1]
     row[:, 1 : 1 + sensors] = span.z1
     row[:, 1 + sensors :] = span.inputs1[:, : log.shape[2] - 1 - sensors]
-    if not taken.all():
-        row[~taken] = np.nan
-    return _appended(log, row)
+    row[~taken] = np.nan
+    return longer
 
 
 def skipped(log: Array) -> Array:
     """Return a log with a sample that nobody took."""
-    return _appended(log, np.full((len(log), log.shape[2]), np.nan))
+    longer = _extended(log)
+    longer[:, -1] = np.nan
+    return longer
 
 
-def _appended(log: Array, row: Array) -> Array:
-    """Return a log with one more row.
+def _extended(log: Array) -> Array:
+    """Return a log with one more row, to be written at once.
 
-    Logs share a buffer: the row is written where no log has written yet, else into a copy.
+    Logs share a buffer: the row is where no log has written yet, else in a copy.
     """
     rows, buffer = log.shape[1], log.base
     if (
@@ -78,7 +80,6 @@ def _appended(log: Array, row: Array) -> Array:
         room = max(ROWS, 2 * rows)
         buffer = np.full((log.shape[0], room, log.shape[2]), SPARE)
         buffer[:, :rows] = log
-    buffer[:, rows] = row
     return buffer[:, : rows + 1]
 
 

@@ -15,10 +15,16 @@ SLOW = 50  # samples over which innovations are averaged to find errors that hid
 LARGEST_CORRELATION = 0.999
 SIGNIFICANT = 1.645  # standard errors above 1 that a statistic has by chance in 5 of 100 cases
 
-KEPT, GAINED = (1.0 - 1.0 / SLOW) ** 2, 1.0 / SLOW**2  # of the variance of an average
 TINY = 1e-200  # no sum of squares of anything, but no zero
 FADE = 1.0 - 1.0 / WINDOW
 FADES = np.array([FADE, FADE**2, FADE, FADE, FADE, FADE, FADE])  # of the sums
+# A sensor that brings e has D x + s e + c after x = (seen, last, slow, slow_variance).
+DECAY = np.array([[0.0], [0.0], [1.0 - 1.0 / SLOW], [(1.0 - 1.0 / SLOW) ** 2]])
+SHARE = np.array([[0.0], [1.0], [1.0 / SLOW], [0.0]])
+GAINED = np.array([[1.0], [0.0], [0.0], [1.0 / SLOW**2]])
+# Where in products of rows of x after a sample with those of x after it, and before it, the terms
+# of the sums stand.
+TERMS = np.ravel_multi_index(([0, 0, 1, 0, 1, 0, 2], [0, 0, 1, 4, 5, 3, 2]), (4, 8))
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,55 +36,42 @@ class Innovations:
     sums
         Shape (members, 7), fading over `WINDOW` samples: number of e; of squared weights; e^2;
         number of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
-    last
-        Last e of each sensor, shape (members, sensors), NaN before its first.
+    sensors
+        Shape (members, 4, sensors), of each sensor: 1 once it has brought an e, else 0; its last e;
+        the exponential average of e over `SLOW` samples (`slow`); the variance of that for white
+        noise of size 1 (`slow_variance`).
     newest
         e of the last sample, shape (members, sensors), NaN where missing.
-    slow, slow_variance
-        Exponential average of e over `SLOW` samples, and its variance for white noise of size 1,
-        shapes (members, sensors).
     """
 
     sums: Array
-    last: Array
+    sensors: Array
     newest: Array
-    slow: Array
-    slow_variance: Array
 
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Innovations:
         """Return the value before any innovation."""
-        shape = (members, sensors)
-        never, zero = np.full(shape, np.nan), np.zeros(shape)
-        return cls(np.zeros((members, len(FADES))), never, never, zero, zero)
+        never = np.full((members, sensors), np.nan)
+        return cls(np.zeros((members, len(FADES))), np.zeros((members, 4, sensors)), never)
 
     def add(self, e: Array, measured: Mask | None = None) -> Innovations:
         """Return the value after innovations of shape (members, sensors), NaN where missing.
 
         Members that were not `measured`, shape (members,), stay as they are; default all were.
         """
-        seen = np.isfinite(e)
-        whole = bool(seen.all())
-        known = e if whole else np.where(seen, e, 0.0)
-        both = seen & np.isfinite(self.last)
-        slow = self.slow + (known - self.slow) / SLOW
-        slow_variance = KEPT * self.slow_variance + GAINED
-        last = e
-        if not whole:
-            slow = np.where(seen, slow, self.slow)
-            slow_variance = np.where(seen, slow_variance, self.slow_variance)
-            last = np.where(seen, e, self.last)
-        terms = np.empty((len(FADES), *e.shape))
-        terms[0] = terms[1] = seen
-        terms[2], terms[3] = known * known, both
-        terms[4] = known * np.where(both, self.last, 0.0)
-        terms[5], terms[6] = slow_variance * seen, slow * slow * seen
-        sums = FADES * self.sums + terms.sum(axis=2).T
-        newest = e
+        seen, before, newest = np.isfinite(e), self.sensors, e
+        if seen.all():
+            counted = sensors = DECAY * before + (SHARE * e[:, None] + GAINED)
+        else:
+            sensors = DECAY * before + (SHARE * np.where(seen, e, 0.0)[:, None] + GAINED)
+            sensors = np.where(seen[:, None], sensors, before)
+            counted = sensors * seen[:, None]
+        products = counted @ np.concatenate([sensors, before], axis=1).transpose(0, 2, 1)
+        sums = FADES * self.sums + products.reshape(len(e), -1)[:, TERMS]
         if measured is not None and not measured.all():
             sums = np.where(measured[:, None], sums, self.sums)
             newest = np.where(measured[:, None], e, self.newest)
-        return Innovations(sums, last, newest, slow, slow_variance)
+        return Innovations(sums, sensors, newest)
 
     @property
     def ratio(self) -> Array:
@@ -117,7 +110,7 @@ class Innovations:
         sensor has one from the start.
         """
         count, weight = self.sums[:, 0], self.sums[:, 1]
-        sensors = np.isfinite(self.last).sum(axis=1)
+        sensors = self.sensors[:, 0].sum(axis=1)
         averages = sensors + count**2 / (weight + TINY) / SLOW + TINY
         slow = _beyond_chance(self.persistence, np.sqrt(2.0 / averages))
         return np.maximum(self.scatter, np.sqrt(slow))

@@ -367,7 +367,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             usual = usual & (replays | guards.within_reach(x.da - before.da))
             d = span.z1 - told.predicted
             scale = scale.add(span.z1, d)
-            if (told.largest > guards.runaway).any():
+            if told.largest.max() > guards.runaway:
                 noise = np.sqrt(before.level)[:, None] * filter_.noise
                 usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
         if (jumps := self.jumps) is not None and present.any():
@@ -417,4 +417,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
 def without_factors(x: FilterState) -> FilterState:
     """Return a filter without what its last stage has left: what estimates hold."""
+    if not x.kept.trend.size:
+        return x
     return changed(x, kept=KeptFactors.none(len(x)))

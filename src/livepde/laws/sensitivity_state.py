@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
+from livepde.laws.base import Notes
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards, Scale
@@ -145,7 +146,7 @@ def stored(
     if work.replay or work.start_window:
         assimilated = assimilated + (taken & span.present)
     last = log.shape[1] - 1
-    if work.back:
+    if work.back and last - state.since_newer.min() >= work.back:
         due = taken & (last - state.since_newer >= work.back)
         if due.any():
             parts |= {
@@ -183,18 +184,23 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
 
 def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
     """Return what the members report after a sample."""
-    notes: dict[str, Array] = {
-        "innovation_ratio": now.innovations.ratio,
-        "innovation_correlation": now.innovations.correlation,
-    }
-    if work.options.adaptive:
-        notes["noise_level"] = np.sqrt(now.level)
-    if work.options.gate < np.inf:
-        notes["refused"] = told.refused
-    if work.jumps is not None:
-        notes["jump"] = np.zeros(len(now))
-    steps = np.full(len(now), told.steps)
-    return MemberReports((OK,) * len(now), told.predicted, steps, notes)
+    members, innovations, level = len(now), now.innovations, now.level  # not all of the filter
+
+    def notes() -> dict[str, Array]:
+        found = {
+            "innovation_ratio": innovations.ratio,
+            "innovation_correlation": innovations.correlation,
+        }
+        if work.options.adaptive:
+            found["noise_level"] = np.sqrt(level)
+        if work.options.gate < np.inf:
+            found["refused"] = told.refused
+        if work.jumps is not None:
+            found["jump"] = np.zeros(members)
+        return found
+
+    steps = np.full(members, told.steps)
+    return MemberReports((OK,) * members, told.predicted, steps, Notes(notes))
 
 
 def new_window(

@@ -243,33 +243,39 @@ class BandedStage(MemberStage):
     def _product(self, *parts: Array) -> sp.csr_array | Array:
         """Return matrices of the pattern one below the other, for products."""
         blocks = [self.pattern.matrix(part) for part in parts]
-        return compact(sp.csr_array(sp.vstack(blocks, format="csr")))
+        whole = sp.csr_array(sp.vstack(blocks, format="csr"))
+        whole.eliminate_zeros()  # an unknown of a layer has an effect there only
+        return compact(whole)
 
     def kept(self, members: int) -> KeptFactors:
         return KeptFactors.none(members)
 
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
+        # The equations times h: so nothing of the size of all columns has to be divided by it.
         (size, n), h, at = columns.shape[1:], stage.h, stage.at
         unknowns = self.model.latent.value(stage.q.T).T
         storage = unknowns @ self._slope_bands
-        storage += self._mass_band / h + self._rest_band
+        storage += self._rest_band
+        storage *= h
+        storage += self._mass_band
         factor = self._blocks.factorise(storage)
-        if size == 1 and not factor.good[0]:
+        if size == 1 and len(factor.bad):
             raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
-        known = (self._mass @ (columns.reshape(-1, n).T / h)).T.reshape(columns.shape)
-        state = known[0] + self._load(at)
+        known = np.array((self._mass @ columns.reshape(-1, n).T).T, order="C")
+        new = known.reshape(columns.shape)
+        if not self._load.zero:
+            new[0] += h * self._load(at)
         if not self._boundary.zero:
-            state -= self._mass_boundary(at) / h
+            new[0] -= self._mass_boundary(at)
         offset = None if self._offset.zero else self._offset(at).reshape(-1, unknowns.shape[1], n)
         if offset is not None:
-            state -= (unknowns[:, None] @ offset)[:, 0]
-        new = np.empty_like(columns)
-        new[0] = u = factor.solve(state[None])[0]
-        driven = (self._slopes @ u.T).T.reshape(size, -1, n)
+            new[0] -= h * (unknowns[:, None] @ offset)[:, 0]
+        new[:1] = factor.solve(new[:1])
+        driven = (self._slopes @ new[0].T).T.reshape(size, -1, n)
         if offset is not None:
             driven = driven + offset
-        forcing = stage.directions @ driven
-        new[1:] = factor.solve(known[1:] - forcing.transpose(1, 0, 2))
+        new[1:] -= ((h * stage.directions) @ driven).transpose(1, 0, 2)
+        new[1:] = factor.solve(new[1:])
         if not self._boundary.zero:
             new[0] += self._boundary(at)
         return new, stage.kept
