@@ -68,7 +68,7 @@ def test_a_banded_stage_gives_the_state_and_tangents_of_each_member(name: str, m
     q = np.array([0.2, 0.5]) + 0.05 * rng.standard_normal((members, 2))
     directions = rng.standard_normal((members, r, 2))
     off, each = np.ones(members, dtype=bool), np.arange(members)
-    work = StageOfMembers(each, q, directions, 0.1, at, stage.kept(members), off)
+    work = StageOfMembers(each, q, directions, 0.1, at, stage.kept(members), off, {})
     new, _ = stage.advance(columns, work)
     for k in range(members):
         row = rows[k if many else 0]
@@ -91,7 +91,7 @@ def test_other_stages_step_members_one_by_one():
     columns[1:, :, model.state_space.fixed] = 0.0
     directions, at = np.ones((2, 2, 1)), Moments(0.1, (), np.zeros((1, 0)))
     numbers, off = np.array([4, 1]), np.zeros(2, dtype=bool)
-    work = StageOfMembers(numbers, q, directions, 0.1, at, stage.kept(2), off)
+    work = StageOfMembers(numbers, q, directions, 0.1, at, stage.kept(2), off, {})
     new, _ = stage.advance(columns, work)
     for k in range(2):
         kept = KeptFactors.none(1).member(0)

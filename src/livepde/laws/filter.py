@@ -28,7 +28,7 @@ from livepde.laws.filter_state import FilterState, along
 from livepde.laws.members import changed
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensors import MemberSensors
-from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg import Array, BlockFactor, IntArray, Mask
 from livepde.stepping import (
     Interval,
     MemberStage,
@@ -184,6 +184,7 @@ class Filter:
             return self.reduction.directions(at.q, C)
 
         at_end = directions(end)
+        factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
 
         def stage(columns: Array, t: float, h: float) -> Array:
             nonlocal kept
@@ -191,7 +192,8 @@ class Filter:
             if self.moves and t != stop:
                 now = self.predict_unknowns(x, t - start)
                 q, along = now.q, directions(now)
-            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off)
+            same = factors if q is end.q else {}
+            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same)
             y, kept = self.stage.advance(columns, work)
             return y
 

@@ -19,6 +19,7 @@ from livepde.linalg import (
     Assembler,
     BandedBlocks,
     BandedSolver,
+    BlockFactor,
     IntArray,
     Mask,
     Pattern,
@@ -91,6 +92,9 @@ class StageOfMembers(NamedTuple):
     off_centre
         Members whose last tangent is the estimated deviation of the state, which has to be more
         accurate than a square root of the covariance; shape (members,).
+    factors
+        Of the matrices for the same q by the length of their stage, which a stage may use and add
+        to: those of one step of a time scheme.
     """
 
     members: IntArray
@@ -100,6 +104,7 @@ class StageOfMembers(NamedTuple):
     at: Moments
     kept: KeptFactors
     off_centre: Mask
+    factors: dict[float, BlockFactor]
 
 
 class MemberStage(ABC):
@@ -254,11 +259,13 @@ class BandedStage(MemberStage):
         # The equations times h: so nothing of the size of all columns has to be divided by it.
         (size, n), h, at = columns.shape[1:], stage.h, stage.at
         unknowns = self.model.latent.value(stage.q.T).T
-        storage = unknowns @ self._slope_bands
-        storage += self._rest_band
-        storage *= h
-        storage += self._mass_band
-        factor = self._blocks.factorise(storage)
+        factor = stage.factors.get(h)
+        if factor is None:
+            storage = unknowns @ self._slope_bands
+            storage += self._rest_band
+            storage *= h
+            storage += self._mass_band
+            factor = stage.factors[h] = self._blocks.factorise(storage)
         if size == 1 and len(factor.bad):
             raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
         known = np.array((self._mass @ columns.reshape(-1, n).T).T, order="C")
