@@ -88,8 +88,9 @@ docs: $(READY)  ## Build the documentation into site/
 	@$(BIN)/python docs/links.py
 	@echo "Built: site/index.html"
 
-bench: $(READY)  ## Measure what one step costs
-	@$(BIN)/livepde bench step
+NAME = step
+bench: $(READY)  ## Run a benchmark, as NAME="step --size 31"; without NAME what one step costs
+	@$(BIN)/python -m benchmarks $(NAME)
 
 lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest versions
 	@$(UV) pip compile --quiet --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
