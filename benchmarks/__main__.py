@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,24 +18,12 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-ProblemsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--only",
-        help="Only this problem. Repeat it for more.",
-    ),
-]
-
-LevelsOption = Annotated[
-    list[float] | None,
-    typer.Option(
-        "--level", min=0.0, max=1.0, help="Noise over the data's root mean square. Repeat for more."
-    ),
-]
-
 app = typer.Typer(
     name="benchmarks",
     help="""Measure what things cost, as ratios that hold on any machine, and what they find.
+
+    With --quick each runs its checks on fewer seeds and smaller sizes, in less than two minutes on
+    two cores. An option that is given wins over the value of --quick.
 
     Example:  python -m benchmarks step""",
     no_args_is_help=True,
@@ -46,18 +33,49 @@ app = typer.Typer(
 )
 
 
+@dataclass(frozen=True)
+class Count:
+    """Values of an option that is not given: the usual one, and that of --quick."""
+
+    usual: int
+    quick: int
+
+    def option(self, what: str, least: int = 1) -> Any:
+        """Return the option."""
+        text = f"{what} Default {self.usual}, with --quick {self.quick}."
+        return typer.Option(min=least, help=text, show_default=False)
+
+    def of(self, given: int | None, quick: bool) -> int:
+        """Return the value that is taken."""
+        return given if given is not None else self.quick if quick else self.usual
+
+
 @app.command()
 def step(
+    context: typer.Context,
     size: Annotated[
         list[int] | None,
-        typer.Option(min=5, help="Number of nodes, default 31, 1000 and 10000. Repeat for more."),
+        typer.Option(
+            min=5,
+            help="Number of nodes, default 31, 1000, 10000 and 100000, with --quick 31 and 10000. "
+            "Repeat for more.",
+        ),
     ] = None,
     modes: Annotated[
         list[int] | None,
         typer.Option(
-            min=1, help="Unknowns of the sensitivity law, default 1, 10 and 50. Repeat for more."
+            min=1,
+            help="Unknowns of the sensitivity law, default 1, 10 and 50, with --quick 1 and 10. "
+            "Repeat for more.",
         ),
     ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="Two sizes; of the rods those with 31 nodes, so that bounds of longer rods and of "
+            "the square with numbers are not checked."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Time a step of each law against one forward step of the same model.
@@ -65,20 +83,24 @@ def step(
     Example:  python -m benchmarks step --size 1000 --json
     """
     from benchmarks.rods import RODS, rods
-    from benchmarks.step import MODES, SIZES
+    from benchmarks.step import MODES, QUICK_MODES, QUICK_SIZES, SIZES
     from benchmarks.step import step as benchmark
 
-    command = ["step"]
-    command += [word for nodes in size or () for word in ("--size", str(nodes))]
-    command += [word for count in modes or () for word in ("--modes", str(count))]
-    outcome = benchmark(size or SIZES, modes or MODES)
-    filters = rods([rod for rod in RODS if not size or rod.nodes in size])
-    _report(_both(outcome, filters), command, as_json)
+    sizes = size or (QUICK_SIZES if quick else SIZES)
+    timed = size or (QUICK_SIZES[:1] if quick else ())
+    filters = rods([rod for rod in RODS if not timed or rod.nodes in timed])
+    laws = benchmark(sizes, modes or (QUICK_MODES if quick else MODES))
+    _report(context, _both(laws, filters), as_json)
+
+
+ROUNDS = Count(15, 3)
 
 
 @app.command("import")
 def startup(
-    rounds: Annotated[int, typer.Option(min=1, help="Fresh processes of each.")] = 15,
+    context: typer.Context,
+    rounds: Annotated[int | None, ROUNDS.option("Fresh processes of each.")] = None,
+    quick: Annotated[bool, typer.Option(help="Fewer processes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Time the import of livepde, in fresh processes, against that of SciPy and scikit-fem.
@@ -87,13 +109,20 @@ def startup(
     """
     from benchmarks.startup import startup as benchmark
 
-    command = ["import", "--rounds", str(rounds)]
-    _report(benchmark(rounds), command, as_json)
+    _report(context, benchmark(ROUNDS.of(rounds, quick)), as_json)
+
+
+PAIRS = Count(5, 1)
 
 
 @app.command()
 def overhead(
-    rounds: Annotated[int, typer.Option(min=1, help="Fresh processes, and pairs of runs.")] = 5,
+    context: typer.Context,
+    rounds: Annotated[int | None, PAIRS.option("Fresh processes, and pairs of runs.")] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(help="One process and one pair of runs, whose slow moments count."),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Time what the command line adds: to the first estimate, and to each sample of a rod.
@@ -102,16 +131,27 @@ def overhead(
     """
     from benchmarks.overhead import overhead as benchmark
 
-    command = ["overhead", "--rounds", str(rounds)]
-    _report(benchmark(rounds), command, as_json)
+    _report(context, benchmark(PAIRS.of(rounds, quick)), as_json)
+
+
+MEMBERS, DIRECTORIES = Count(1000, 200), Count(25, 8)
 
 
 @app.command()
 def fleet(
-    members: Annotated[int, typer.Option(min=1, help="How many rods step.")] = 1000,
+    context: typer.Context,
+    members: Annotated[int | None, MEMBERS.option("How many rods step.")] = None,
     runs: Annotated[
-        int, typer.Option(min=0, help="Rods of which run directories are made; 0 for none.")
-    ] = 25,
+        int | None,
+        DIRECTORIES.option("Rods of which run directories are made; 0 for none.", least=0),
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="Fewer rods: the less of them, the less a fleet saves, and the more the start of "
+            "a command weighs, so that bounds on times may be missed that 1000 rods keep."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Time a fleet of rods against as many separate identifiers: a step, and the command.
@@ -121,26 +161,28 @@ def fleet(
     from benchmarks.fleet import fleet as benchmark
     from benchmarks.rods import fleet as rods
 
-    command = [
-        "python",
-        "-m",
-        "benchmarks",
-        "fleet",
-        "--members",
-        str(members),
-        "--runs",
-        str(runs),
-    ]
-    _report(_both(benchmark(members, runs), rods()), command, as_json)
+    separate = benchmark(MEMBERS.of(members, quick), DIRECTORIES.of(runs, quick))
+    _report(context, _both(separate, rods()), as_json)
+
+
+LOOPS = Count(5, 1)
 
 
 @app.command()
 def control(
+    context: typer.Context,
     only: Annotated[
         list[str] | None, typer.Option(help="Only this problem. Repeat it for more.")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each kind.")] = 5,
+    seeds: Annotated[int | None, LOOPS.option("Runs of each kind.")] = None,
     draw: Annotated[Path | None, typer.Option(help="Folder for a figure of each problem.")] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="One seed, the rod alone, and of the moving horizon the first setting on the "
+            "reduced model: a horizon that is not tuned, and the worst of one seed, say less."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Hold control with livepde against true and wrong models and a moving horizon.
@@ -152,22 +194,24 @@ def control(
 
     for name in only or ():
         named(name, PROBLEMS, "problem")
-    outcome = benchmark(only, seeds, progress=True)
+    chosen = only or (["rod"] if quick else None)
+    outcome = benchmark(chosen, LOOPS.of(seeds, quick), tuned=not quick, progress=True)
     if draw is not None and can_draw(terminal(err=True)):
         draw.mkdir(parents=True, exist_ok=True)
         for name, figure in outcome.figures.items():
             figure().savefig(draw / f"{name}.png", dpi=110)
-    command = ["control"]
-    command += [word for name in only or () for word in ("--only", name)]
-    _report(outcome, [*command, "--seeds", str(seeds)], as_json)
+    _report(context, outcome, as_json)
 
 
 @app.command()
 def scale(
+    context: typer.Context,
     size: Annotated[
         list[int] | None,
         typer.Option(
-            min=2500, help="Nodes of the square, default 10000 and 100000. Repeat for more."
+            min=2500,
+            help="Nodes of the square, default 10000 and 100000, with --quick 2500 and 10000. "
+            "Repeat for more.",
         ),
     ] = None,
     cube: Annotated[
@@ -180,6 +224,13 @@ def scale(
     million: Annotated[
         bool, typer.Option(help="Only the run with a million nodes: 100 steps, minutes, 3 GB.")
     ] = False,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="Small squares, where a step of the law costs more forward steps than on large "
+            "ones: the exponent is theirs."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Time a step of the gradient law for large fields against one forward step.
@@ -188,24 +239,28 @@ def scale(
     """
     from benchmarks import scale as benchmark
 
-    command = ["scale"]
-    command += [word for nodes in size or () for word in ("--size", str(nodes))]
-    command += [word for nodes in cube or () for word in ("--cube", str(nodes))]
-    command += [word for value in gain or () for word in ("--gain", str(value))]
     if million:
-        _report(benchmark.million(), [*command, "--million"], as_json)
+        _report(context, benchmark.million(), as_json)
         return
-    outcome = benchmark.scale(size or benchmark.SIZES, gain or benchmark.GAINS, cube or ())
-    _report(outcome, command, as_json)
+    sizes = size or (benchmark.COUNTED if quick else benchmark.SIZES)
+    outcome = benchmark.scale(sizes, gain or benchmark.GAINS, cube or ())
+    _report(context, outcome, as_json)
+
+
+DATA_SETS = Count(5, 1)
 
 
 @app.command()
 def auto(
+    context: typer.Context,
     size: Annotated[
         list[int] | None,
-        typer.Option(min=25, help="Nodes of the square, default 64 to 10000. Repeat for more."),
+        typer.Option(
+            min=25,
+            help="Nodes of the square, default 64 to 10000, with --quick 64. Repeat for more.",
+        ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise.")] = 5,
+    seeds: Annotated[int | None, DATA_SETS.option("Data sets for each noise.")] = None,
     quick: Annotated[
         bool, typer.Option(help="Only the smallest square, one data set, and the smallest cost.")
     ] = False,
@@ -218,24 +273,27 @@ def auto(
     from benchmarks.auto import COSTS, SIZES
     from benchmarks.auto import auto as benchmark
 
-    command = ["auto"]
-    command += [word for nodes in size or () for word in ("--size", str(nodes))]
-    if quick:
-        _report(benchmark(SIZES[:1], 1, (min(COSTS),)), [*command, "--quick"], as_json)
-        return
-    command += ["--seeds", str(seeds)]
-    _report(benchmark(size or SIZES, seeds, tuple(COSTS)), command, as_json)
+    sizes = size or (SIZES[:1] if quick else SIZES)
+    costs = (min(COSTS),) if quick else tuple(COSTS)
+    _report(context, benchmark(sizes, DATA_SETS.of(seeds, quick), costs), as_json)
+
+
+NODES, TIMED, TURNS = Count(1_000_000, 10_000), Count(5, 2), Count(2, 1)
 
 
 @app.command()
 def mpi(
-    size: Annotated[int, typer.Option(min=2500, help="Number of nodes.")] = 1_000_000,
+    context: typer.Context,
+    size: Annotated[int | None, NODES.option("Number of nodes.", least=2500)] = None,
     ranks: Annotated[
         list[int] | None,
         typer.Option(min=1, help="Number of ranks, default 1 and 2. Repeat for more."),
     ] = None,
-    samples: Annotated[int, typer.Option(min=1, help="Steps that are timed.")] = 5,
-    rounds: Annotated[int, typer.Option(min=1, help="Runs with each number of ranks.")] = 2,
+    samples: Annotated[int | None, TIMED.option("Steps that are timed.")] = None,
+    rounds: Annotated[int | None, TURNS.option("Runs with each number of ranks.")] = None,
+    quick: Annotated[
+        bool, typer.Option(help="Few nodes: q is compared, and too little is to do for a speed-up.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Time the gradient law on several ranks of MPI, and count what crosses between them.
@@ -244,14 +302,16 @@ def mpi(
     """
     from benchmarks.mpi import mpi as benchmark
 
-    command = ["mpi", "--size", str(size)]
-    command += [word for count in ranks or () for word in ("--ranks", str(count))]
-    command += ["--samples", str(samples), "--rounds", str(rounds)]
-    _report(benchmark(size, ranks or (1, 2), samples, rounds), command, as_json)
+    counts = [
+        count.of(given, quick)
+        for count, given in ((NODES, size), (TIMED, samples), (TURNS, rounds))
+    ]
+    _report(context, benchmark(counts[0], ranks or (1, 2), *counts[1:]), as_json)
 
 
 @app.command()
 def cases(
+    context: typer.Context,
     only: Annotated[
         list[str] | None, typer.Option(help="Only this case. Repeat it for more.")
     ] = None,
@@ -261,6 +321,9 @@ def cases(
     gallery: Annotated[
         Path | None, typer.Option(help="Folder for a page with tables and figures.")
     ] = None,
+    quick: Annotated[
+        bool, typer.Option(help="Each case as it is written, without its variants.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run every case of the project with its variants, and the code that they name.
@@ -275,16 +338,29 @@ def cases(
     if gallery is not None:
         gallery.mkdir(parents=True, exist_ok=True)
         pictures = gallery if can_draw(terminal(err=True)) else None
-    outcome, runs = benchmark.bench_cases(paths, progress=True, pictures=pictures)
+    outcome, runs = benchmark.bench_cases(
+        paths, progress=True, pictures=pictures, variants=not quick
+    )
     if gallery is not None:
         page = benchmark.gallery(runs, gallery)
         terminal(err=True).print(f"Gallery: {page}", soft_wrap=True)
-    _report(outcome, ["cases"], as_json)
+    _report(context, outcome, as_json)
+
+
+TWINS = Count(200, 20)
 
 
 @app.command()
 def coverage(
-    twins: Annotated[int, typer.Option(min=1, help="How many twins of each problem.")] = 200,
+    context: typer.Context,
+    twins: Annotated[int | None, TWINS.option("How many twins of each problem.")] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="Fewer twins: bounds are those of the share of 200, and that of 20 misses some "
+            "of them by chance."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Count how often the truth lies in the intervals that are reported.
@@ -293,13 +369,23 @@ def coverage(
     """
     from benchmarks.coverage import coverage as benchmark
 
-    command = ["coverage", "--twins", str(twins)]
-    _report(benchmark(twins, progress=True), command, as_json)
+    _report(context, benchmark(TWINS.of(twins, quick), progress=True), as_json)
+
+
+JUMPS = Count(5, 1)
 
 
 @app.command()
 def alarms(
-    seeds: Annotated[int, typer.Option(min=1, help="Jumps up, and as many down, of each.")] = 5,
+    context: typer.Context,
+    seeds: Annotated[int | None, JUMPS.option("Jumps up, and as many down, of each.")] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="Of each process one jump up, one down and one calm run, and one data set for "
+            "each wrong model: two false alarms are more than the bound, with all runs five are."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure how soon jumps are flagged, how seldom without cause, and which models are doubted.
@@ -308,15 +394,34 @@ def alarms(
     """
     from benchmarks.alarms import alarms as benchmark
 
-    command = ["alarms", "--seeds", str(seeds)]
-    _report(benchmark(seeds, progress=True), command, as_json)
+    _report(context, benchmark(JUMPS.of(seeds, quick), few=quick, progress=True), as_json)
+
+
+ProblemsOption = Annotated[
+    list[str] | None, typer.Option("--only", help="Only this problem. Repeat it for more.")
+]
+LevelsOption = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--level", min=0.0, max=1.0, help="Noise over the data's root mean square. Repeat for more."
+    ),
+]
+REPEATS, AGAIN = Count(3, 1), Count(4, 1)
 
 
 @app.command()
 def accuracy(
+    context: typer.Context,
     only: ProblemsOption = None,
     level: LevelsOption = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 3,
+    seeds: Annotated[int | None, REPEATS.option("Data sets for each noise level.")] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="One data set, 1 % noise, the problems 'seed' and 'wall': an error of one draw, "
+            "not a median."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Hold our laws against what all data together can tell, at several noise levels.
@@ -324,27 +429,28 @@ def accuracy(
     Example:  python -m benchmarks accuracy --only wall --seeds 5
     """
     from benchmarks.accuracy import accuracy as benchmark
+    from benchmarks.problems import PROBLEMS
 
-    outcome = benchmark(_problems(only), seeds, levels=level, progress=True)
-    _report(outcome, _command("accuracy", only, level, seeds), as_json)
+    for name in only or ():
+        named(name, PROBLEMS, "problem")
+    chosen = only or (["seed", "wall"] if quick else [])
+    levels = level or ([0.01] if quick else None)
+    outcome = benchmark(chosen, REPEATS.of(seeds, quick), levels=levels, progress=True)
+    _report(context, outcome, as_json)
 
 
 @app.command()
 def peers(
-    only: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Only this problem. Repeat it for more.",
-        ),
-    ] = None,
+    context: typer.Context,
+    only: ProblemsOption = None,
     level: LevelsOption = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Data sets for each noise level.")] = 4,
+    seeds: Annotated[int | None, AGAIN.option("Data sets for each noise level.")] = None,
     row: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Only this estimator. Repeat it for more.",
-        ),
+        list[str] | None, typer.Option(help="Only this estimator. Repeat it for more.")
     ] = None,
+    quick: Annotated[
+        bool, typer.Option(help="One data set of the rod: an error of one draw, not a mean.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Hold our laws against filters as arrays, and other packages where they are installed.
@@ -358,24 +464,32 @@ def peers(
         named(name, PROBLEMS, "problem")
     for name in row or ():
         named(name, dict.fromkeys(ROWS), "row")
-    outcome = benchmark(only or (), seeds, levels=level or [0.01], rows=row or (), progress=True)
-    command = _command("peers", only, level, seeds)
-    command += [word for name in row or () for word in ("--row", name)]
-    _report(outcome, command, as_json)
+    chosen = only or (["rod"] if quick else [])
+    count = AGAIN.of(seeds, quick)
+    outcome = benchmark(chosen, count, levels=level or [0.01], rows=row or (), progress=True)
+    _report(context, outcome, as_json)
+
+
+KILLS, LENGTH, BROKEN = Count(200, 4), Count(2000, 400), Count(100_000, 2000)
 
 
 @app.command()
 def faults(
-    kills: Annotated[int, typer.Option(min=1, help="Kills, with a file and with a broker.")] = 200,
-    samples: Annotated[int, typer.Option(min=50, help="Samples of a run that is killed.")] = 2000,
-    malformed: Annotated[int, typer.Option(min=1, help="Broken rows and messages.")] = 100_000,
+    context: typer.Context,
+    kills: Annotated[int | None, KILLS.option("Kills, with a file and with a broker.")] = None,
+    samples: Annotated[
+        int | None, LENGTH.option("Samples of a run that is killed.", least=50)
+    ] = None,
+    malformed: Annotated[int | None, BROKEN.option("Broken rows and messages.")] = None,
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
-        typer.Option(
-            help="One of file, mqtt, restart, malformed, messages. Repeat it.",
-        ),
+        typer.Option(help="One of file, mqtt, restart, malformed, messages. Repeat it."),
     ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(help="Few kills of short runs: not every moment of a run is among them."),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Kill runs, take their sources away, feed them broken rows, and count what is lost.
@@ -387,26 +501,42 @@ def faults(
 
     for name in only or ():
         named(name, PARTS, "part")
-    outcome = benchmark(kills, samples, malformed, seed, only or (), progress=True)
-    options = ["--kills", kills, "--samples", samples, "--malformed", malformed, "--seed", seed]
-    chosen = [word for name in only or () for word in ("--only", name)]
-    _report(outcome, ["faults", *map(str, options), *chosen], as_json)
+    counts = [
+        count.of(given, quick)
+        for count, given in ((KILLS, kills), (LENGTH, samples), (BROKEN, malformed))
+    ]
+    _report(context, benchmark(*counts, seed, only or (), progress=True), as_json)
 
 
 @app.command()
-def journal(as_json: JsonOption = False) -> None:
+def journal(
+    context: typer.Context,
+    quick: Annotated[bool, typer.Option(help="One run in the place of five: no median.")] = False,
+    as_json: JsonOption = False,
+) -> None:
     """Measure what the journal costs: its share of a step of the soil case.
 
     Example:  python -m benchmarks journal --json
     """
     from benchmarks.journal import journal as benchmark
 
-    _report(benchmark(), ["journal"], as_json)
+    _report(context, benchmark(repetitions=1 if quick else None), as_json)
+
+
+STEPS = Count(1_000_000, 30_000)
 
 
 @app.command()
 def soak(
-    steps: Annotated[int, typer.Option(min=1, help="How many steps.")] = 1_000_000,
+    context: typer.Context,
+    steps: Annotated[int | None, STEPS.option("How many steps.")] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            help="Fewer steps, of which a tenth as many are retained: a leak or a slowdown that "
+            "shows in a million steps only is not seen."
+        ),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run for very long: memory, time of a step and the journal's size must not grow.
@@ -415,12 +545,27 @@ def soak(
     """
     from benchmarks.soak import soak as benchmark
 
-    command = ["soak", "--steps", str(steps)]
-    _report(benchmark(steps, progress=True), command, as_json)
+    share = 0.1 if quick else 1.0
+    _report(context, benchmark(STEPS.of(steps, quick), share=share, progress=True), as_json)
 
 
-def _report(outcome: Outcome, words: Sequence[str], as_json: bool) -> None:
-    report_outcome(outcome, ["python", "-m", "benchmarks", *words], as_json)
+def _report(context: typer.Context, outcome: Outcome, as_json: bool) -> None:
+    """Print an outcome with the command as it was given, without paths of this machine."""
+    words = ["python", "-m", "benchmarks", context.command.name or ""]
+    for option in context.command.params:
+        name = option.name or ""
+        value, source = context.params.get(name), context.get_parameter_source(name)
+        if name == "as_json" or isinstance(value, Path) or source is None:
+            continue
+        if source.name == "COMMANDLINE":
+            flag = max(option.opts, key=len)
+            for item in value if isinstance(value, list) else [value]:
+                words += [flag] if isinstance(item, bool) else [flag, _shown(item)]
+    report_outcome(outcome, words, as_json)
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _both(one: Outcome, other: Outcome) -> Outcome:
@@ -431,22 +576,6 @@ def _both(one: Outcome, other: Outcome) -> Outcome:
         checks=[*one.checks, *other.checks],
         notes=[*one.notes, *other.notes],
     )
-
-
-def _problems(only: Sequence[str] | None) -> list[str]:
-    from benchmarks.problems import PROBLEMS
-
-    for name in only or ():
-        named(name, PROBLEMS, "problem")
-    return list(only or ())
-
-
-def _command(
-    name: str, only: Sequence[str] | None, levels: Sequence[float] | None, seeds: int
-) -> list[str]:
-    chosen = [word for problem in only or () for word in ("--only", problem)]
-    chosen += [word for level in levels or () for word in ("--level", f"{level:g}")]
-    return [name, *chosen, "--seeds", str(seeds)]
 
 
 if __name__ == "__main__":

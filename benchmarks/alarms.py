@@ -368,21 +368,24 @@ def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
 # --- all of it -----------------------------------------------------------------------------------
 
 
-def alarms(seeds: int = 5, *, progress: bool = False) -> Outcome:
+def alarms(seeds: int = 5, *, few: bool = False, progress: bool = False) -> Outcome:
     """Run everything.
 
     Parameters
     ----------
     seeds
         Jumps up, and as many down, of each process.
+    few
+        One run without a jump of each process, and one data set for each wrong model.
     """
+    calm_runs, twins = (1, 1) if few else (CALM_RUNS, TWINS)
     jumped = [
         (name, seed, sign * JUMP) for name in PROCESSES for seed in range(seeds) for sign in (1, -1)
     ]
     todo: list[Any] = [
         *jumped,
-        *((name, seed, 0.0) for name in PROCESSES for seed in range(CALM_RUNS)),
-        *((name, seed) for name in SUSPECTS for seed in range(TWINS)),
+        *((name, seed, 0.0) for name in PROCESSES for seed in range(calm_runs)),
+        *((name, seed) for name in SUSPECTS for seed in range(twins)),
         *CASES,
     ]
     jumps: dict[str, list[Told]] = {name: [] for name in PROCESSES}

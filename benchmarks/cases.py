@@ -122,7 +122,11 @@ def _one_thread() -> None:
 
 
 def bench_cases(
-    paths: Sequence[Path], *, progress: bool = False, pictures: Path | None = None
+    paths: Sequence[Path],
+    *,
+    progress: bool = False,
+    pictures: Path | None = None,
+    variants: bool = True,
 ) -> tuple[Outcome, list[tuple[Job, Run]]]:
     """Run cases with their variants in processes of their own; code of theirs is run.
 
@@ -132,6 +136,8 @@ def bench_cases(
         Case files.
     progress
         Show a bar on standard error.
+    variants
+        Whether to run them, too.
     pictures
         Folder for a figure of each case.
 
@@ -144,7 +150,7 @@ def bench_cases(
     """
     # A fresh interpreter for each worker: nothing of this one, such as its threads, is copied.
     with ProcessPoolExecutor(WORKERS, get_context("spawn"), _one_thread) as pool:
-        found, failed = _collect(pool, paths, progress, pictures)
+        found, failed = _collect(pool, paths, progress, pictures, variants)
     runs = [(job, _mean(several)) for job, several in _grouped(found)] + failed
     runs.sort(key=lambda item: [path.name for path in paths].index(item[0].path.name))
     checks = [check for job, run in runs for check in _checks(job, run)]
@@ -157,14 +163,14 @@ def bench_cases(
 
 
 def _collect(
-    pool: Executor, paths: Sequence[Path], progress: bool, pictures: Path | None
+    pool: Executor, paths: Sequence[Path], progress: bool, pictures: Path | None, variants: bool
 ) -> tuple[list[tuple[Job, Run]], list[tuple[Job, Run]]]:
     """Return the runs of all jobs, and cases that cannot be read."""
     order: list[Job] = []
     failed = []
     for path in paths:
         try:
-            order += jobs_of(path, pictures)
+            order += jobs_of(path, pictures, variants)
         except LivepdeError as error:
             failed.append((Job(path), Run(error=str(error))))
     waiting = {pool.submit(run_job, job): job for job in order}
@@ -180,10 +186,12 @@ def _outcome(future: Future[Run]) -> Run:
     return Run(error=f"{type(error).__name__}: {error}") if error else future.result()
 
 
-def jobs_of(path: Path, pictures: Path | None = None) -> list[Job]:
+def jobs_of(path: Path, pictures: Path | None = None, variants: bool = True) -> list[Job]:
     """Return the runs of a case: itself, and its variants with all of their seeds."""
     figure = pictures / f"{path.stem}.png" if pictures else None
     jobs = [Job(path, figure=figure)]
+    if not variants:
+        return jobs
     for variant in load(path, allow_code=True).variants:
         changed = dict(variant.set)
         for key, value in variant.reference.items():

@@ -53,12 +53,21 @@ class Stopwatch:
         return timed
 
 
-def journal(folder: Path | None = None) -> Outcome:
-    """Time journal and steps of the soil case; `folder`: where the cases are."""
+def journal(folder: Path | None = None, *, repetitions: int | None = None) -> Outcome:
+    """Time journal and steps of the soil case.
+
+    Parameters
+    ----------
+    folder
+        Where the cases are.
+    repetitions
+        Runs of the case; default `REPETITIONS`.
+    """
+    count = repetitions or REPETITIONS
     path = next((path for path in find_cases(folder) if path.stem == CASE), None)
     if path is None:
         raise ConfigurationError(f"benchmark journal: the case {CASE}.toml is not here.")
-    runs = [_run(path) for _ in range(REPETITIONS)]
+    runs = [_run(path) for _ in range(count)]
     ratios = [written.wall / stepped.wall for written, stepped, _, _ in runs]
     chosen = int(np.argsort(ratios)[len(ratios) // 2])
     written, stepped, samples, size = runs[chosen]
@@ -67,7 +76,7 @@ def journal(folder: Path | None = None) -> Outcome:
         for name, watch in (("step", stepped), ("journal", written))
     ]
     shown = Table(
-        f"{CASE}: milliseconds for each of {samples} samples, median of {REPETITIONS} runs",
+        f"{CASE}: milliseconds for each of {samples} samples, median of {count} runs",
         ("", "clock", "processor"),
         rows,
     )

@@ -98,10 +98,17 @@ class Meter:
         """The reader is closed by who opened it."""
 
 
-def soak(steps: int = STEPS, progress: bool = False) -> Outcome:
-    """Run so many steps and hold their end against their beginning."""
-    if steps < 2 * WARM:
-        raise RunError(f"benchmark soak: --steps must be at least {2 * WARM}; got {steps}.")
+def soak(steps: int = STEPS, *, share: float = 1.0, progress: bool = False) -> Outcome:
+    """Run so many steps and hold their end against their beginning.
+
+    Parameters
+    ----------
+    share
+        Of `WARM` and `RETAINED`: runs of fewer steps have less time to warm up.
+    """
+    warm, retained = round(share * WARM), round(share * RETAINED)
+    if steps < 2 * warm:
+        raise RunError(f"benchmark soak: --steps must be at least {2 * warm}; got {steps}.")
     identifier = _identifier()
     samples = islice(_samples(identifier.model), steps)
     with TemporaryDirectory() as folder:
@@ -115,7 +122,7 @@ def soak(steps: int = STEPS, progress: bool = False) -> Outcome:
                 journal,
                 sinks=[meter],
                 fields_every=EVERY,
-                retention=Retention(RETAINED * DT, EVERY),
+                retention=Retention(retained * DT, EVERY),
                 strict=True,
             )
             live.run()
@@ -123,11 +130,13 @@ def soak(steps: int = STEPS, progress: bool = False) -> Outcome:
         with Journal.open(path) as after:
             read = sum(1 for _ in after)
     estimate = identifier.estimate()
-    return _outcome(meter, steps, kept - read, abs(estimate.parameters["k"][0] / K - 1.0))
+    error = abs(estimate.parameters["k"][0] / K - 1.0)
+    return _outcome(meter, steps, kept - read, error, share)
 
 
-def _outcome(meter: Meter, steps: int, lost: int, error: float) -> Outcome:
-    found = [reading for reading in meter.readings if reading.steps >= WARM]
+def _outcome(meter: Meter, steps: int, lost: int, error: float, share: float = 1.0) -> Outcome:
+    warm, retained = round(share * WARM), round(share * RETAINED)
+    found = [reading for reading in meter.readings if reading.steps >= warm]
     tenth = max(len(found) // 10, 1)
     first, last = found[0], found[-1]
     middle = found[len(found) // 2]
@@ -137,7 +146,7 @@ def _outcome(meter: Meter, steps: int, lost: int, error: float) -> Outcome:
     )
     shown = [*found[:: max(len(found) // 10, 1)][:10], last]
     table = Table(
-        f"{steps} steps of 31 nodes, all kept of {RETAINED} samples, of older estimates 1 in "
+        f"{steps} steps of 31 nodes, all kept of {retained} samples, of older estimates 1 in "
         f"{EVERY}",
         (
             "steps",
@@ -161,7 +170,7 @@ def _outcome(meter: Meter, steps: int, lost: int, error: float) -> Outcome:
     per_step = (last.file - middle.file) / (last.steps - middle.steps)
     checks = [
         Check(
-            f"memory: growth after {WARM} steps (MiB)",
+            f"memory: growth after {warm} steps (MiB)",
             (max(r.private for r in found) - first.private) / MIB,
             GROWTH,
             "<=",

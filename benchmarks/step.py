@@ -30,6 +30,7 @@ __all__ = ["MODES", "SIZES", "first_steps", "problem", "step"]
 
 SIZES = (31, 1_000, 10_000, 100_000)  # nodes
 MODES = (1, 10, 50)  # reduced unknowns of the sensitivity law
+QUICK_SIZES, QUICK_MODES = (31, 10_000), (1, 10)
 LONGEST_ROD = 1_000  # nodes of the rod; more are those of a square
 GAINS = ((1.0, 0.1), (1e2, 0.1), (1e4, 0.1), (1e4, 1.0))  # gain and c_1 of the gradient law
 FIRST = 100  # samples over which steps of the gradient law are timed, the first one included

@@ -53,9 +53,10 @@ class Contest:
     linear: bool = True
     shown: int = 0
 
-    def compare(self, seeds: int, progress: bool) -> Comparison:
-        """Return its runs."""
-        return compare(self.make, seeds, self.settings, linear=self.linear, progress=progress)
+    def compare(self, seeds: int, tuned: bool, progress: bool) -> Comparison:
+        """Return its runs; the moving horizon is tuned, or has the first of its settings."""
+        settings = self.settings if tuned else self.settings[:1]
+        return compare(self.make, seeds, settings, linear=self.linear, progress=progress)
 
     def figure(self, comparison: Comparison) -> Any:
         """Draw the runs of one seed."""
@@ -63,7 +64,11 @@ class Contest:
 
 
 def control(
-    only: Sequence[str] | None = None, seeds: int = 5, *, progress: bool = False
+    only: Sequence[str] | None = None,
+    seeds: int = 5,
+    *,
+    tuned: bool = True,
+    progress: bool = False,
 ) -> Outcome:
     """Compare true model, wrong fixed model, livepde and do-mpc's moving horizon in the loop.
 
@@ -73,6 +78,8 @@ def control(
         Names of problems; default all.
     seeds
         How many of each.
+    tuned
+        Whether all settings of the moving horizon are tried on the first seed.
     progress
         Show a bar.
 
@@ -85,7 +92,7 @@ def control(
         raise ConfigurationError(
             "benchmark control: do-mpc is not installed: pip install 'livepde[control]'."
         )
-    found = {name: PROBLEMS[name].compare(seeds, progress) for name in only or PROBLEMS}
+    found = {name: PROBLEMS[name].compare(seeds, tuned, progress) for name in only or PROBLEMS}
     return Outcome(
         tables=[comparison.table() for comparison in found.values()],
         checks=[check for name in found for check in promises(found[name])],
