@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -27,14 +27,14 @@ app = typer.Typer(
 
     Example:  python -m benchmarks step""",
     no_args_is_help=True,
+    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
-@dataclass(frozen=True)
-class Count:
+class Count(NamedTuple):
     """Values of an option that is not given: the usual one, and that of --quick."""
 
     usual: int
@@ -72,8 +72,9 @@ def step(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="Two sizes; of the rods those with 31 nodes, so that bounds of longer rods and of "
-            "the square with numbers are not checked."
+            "the square with numbers are not checked.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -100,7 +101,7 @@ ROUNDS = Count(15, 3)
 def startup(
     context: typer.Context,
     rounds: Annotated[int | None, ROUNDS.option("Fresh processes of each.")] = None,
-    quick: Annotated[bool, typer.Option(help="Fewer processes.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer processes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Time the import of livepde, in fresh processes, against that of SciPy and scikit-fem.
@@ -121,7 +122,7 @@ def overhead(
     rounds: Annotated[int | None, PAIRS.option("Fresh processes, and pairs of runs.")] = None,
     quick: Annotated[
         bool,
-        typer.Option(help="One process and one pair of runs, whose slow moments count."),
+        typer.Option("--quick", help="One process and one pair of runs, whose slow moments count."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -148,8 +149,9 @@ def fleet(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="Fewer rods: the less of them, the less a fleet saves, and the more the start of "
-            "a command weighs, so that bounds on times may be missed that 1000 rods keep."
+            "a command weighs, so that bounds on times may be missed that 1000 rods keep.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -179,8 +181,9 @@ def control(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="One seed, the rod alone, and of the moving horizon the first setting on the "
-            "reduced model: a horizon that is not tuned, and the worst of one seed, say less."
+            "reduced model: a horizon that is not tuned, and the worst of one seed, say less.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -227,8 +230,9 @@ def scale(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="Small squares, where a step of the law costs more forward steps than on large "
-            "ones: the exponent is theirs."
+            "ones: the exponent is theirs.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -262,7 +266,10 @@ def auto(
     ] = None,
     seeds: Annotated[int | None, DATA_SETS.option("Data sets for each noise.")] = None,
     quick: Annotated[
-        bool, typer.Option(help="Only the smallest square, one data set, and the smallest cost.")
+        bool,
+        typer.Option(
+            "--quick", help="Only the smallest square, one data set, and the smallest cost."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -292,7 +299,10 @@ def mpi(
     samples: Annotated[int | None, TIMED.option("Steps that are timed.")] = None,
     rounds: Annotated[int | None, TURNS.option("Runs with each number of ranks.")] = None,
     quick: Annotated[
-        bool, typer.Option(help="Few nodes: q is compared, and too little is to do for a speed-up.")
+        bool,
+        typer.Option(
+            "--quick", help="Few nodes: q is compared, and too little is to do for a speed-up."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -322,7 +332,7 @@ def cases(
         Path | None, typer.Option(help="Folder for a page with tables and figures.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option(help="Each case as it is written, without its variants.")
+        bool, typer.Option("--quick", help="Each case as it is written, without its variants.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -357,8 +367,9 @@ def coverage(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="Fewer twins: bounds are those of the share of 200, and that of 20 misses some "
-            "of them by chance."
+            "of them by chance.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -382,8 +393,9 @@ def alarms(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="Of each process one jump up, one down and one calm run, and one data set for "
-            "each wrong model: two false alarms are more than the bound, with all runs five are."
+            "each wrong model: two false alarms are more than the bound, with all runs five are.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -418,8 +430,9 @@ def accuracy(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="One data set, 1 % noise, the problems 'seed' and 'wall': an error of one draw, "
-            "not a median."
+            "not a median.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -449,7 +462,8 @@ def peers(
         list[str] | None, typer.Option(help="Only this estimator. Repeat it for more.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option(help="One data set of the rod: an error of one draw, not a mean.")
+        bool,
+        typer.Option("--quick", help="One data set of the rod: an error of one draw, not a mean."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -488,7 +502,9 @@ def faults(
     ] = None,
     quick: Annotated[
         bool,
-        typer.Option(help="Few kills of short runs: not every moment of a run is among them."),
+        typer.Option(
+            "--quick", help="Few kills of short runs: not every moment of a run is among them."
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -511,7 +527,9 @@ def faults(
 @app.command()
 def journal(
     context: typer.Context,
-    quick: Annotated[bool, typer.Option(help="One run in the place of five: no median.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One run in the place of five: no median.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure what the journal costs: its share of a step of the soil case.
@@ -533,8 +551,9 @@ def soak(
     quick: Annotated[
         bool,
         typer.Option(
+            "--quick",
             help="Fewer steps, of which a tenth as many are retained: a leak or a slowdown that "
-            "shows in a million steps only is not seen."
+            "shows in a million steps only is not seen.",
         ),
     ] = False,
     as_json: JsonOption = False,

@@ -312,12 +312,14 @@ def test_pages_that_the_program_writes(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     hooks = importlib.import_module("hooks")
     assert hooks.on_page_markdown("as it is") == "as it is"
-    commands = hooks.on_page_markdown("<!-- command line -->")
-    program = get_command(app)
-    for name, command in program.commands.items():
-        section = commands[commands.index(f"## `livepde {name}`\n") :]
-        for inner in getattr(command, "commands", ()):
-            assert f"### `livepde {name} {inner}`\n" in section
+    commands = hooks.on_page_markdown("<!-- command line --> <!-- benchmarks -->")
+    described = {
+        f"{prefix} {name}": command
+        for prefix, program in (("livepde", app), ("python -m benchmarks", benchmarks))
+        for name, command in get_command(program).commands.items()
+    }
+    for title, command in described.items():
+        section = commands[commands.index(f"## `{title}`\n") :]
         for option in command.params:
             name = max(option.opts, key=len)
             assert name in section or not name.startswith("--") or option.hidden, name
