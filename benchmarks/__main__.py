@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
 from livepde.cli import main
-from livepde.cli.options import JsonOption
+from livepde.cli.fmu import Standard
+from livepde.cli.options import CodeOption, JsonOption, SetOption, load_case
 from livepde.cli.printing import can_draw, named, report_outcome, terminal
 
 if TYPE_CHECKING:
@@ -566,6 +567,42 @@ def soak(
 
     share = 0.1 if quick else 1.0
     _report(context, benchmark(STEPS.of(steps, quick), share=share, progress=True), as_json)
+
+
+@app.command()
+def fmu(
+    context: typer.Context,
+    case: Annotated[
+        Path | None,
+        typer.Argument(help="The case file (TOML). Default: what livepde init writes."),
+    ] = None,
+    unit: Annotated[
+        Path | None,
+        typer.Option(help="The unit of the case. Default: one that is written for the purpose."),
+    ] = None,
+    fmi: Annotated[Standard, typer.Option(help="Version of the standard: FMI 2.0 or 3.0.")] = (
+        Standard.two
+    ),
+    samples: Annotated[
+        int | None,
+        typer.Option(min=1, help="How many of the case. Default all, with --quick 60."),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="The first samples only.")] = False,
+    as_json: JsonOption = False,
+    allow_code: CodeOption = False,
+    settings: SetOption = None,
+) -> None:
+    """Run a case as a co-simulation unit (FMU, by FMPy) and in Python, and compare all outputs.
+
+    Example:  python -m benchmarks fmu mycase/case.toml --unit rod.fmu
+    """
+    from benchmarks.fmu import fmu as benchmark
+
+    loaded = None if case is None else load_case(case, allow_code, settings)
+    count = samples or (60 if quick else None)
+    version: Literal[2, 3] = 2 if fmi is Standard.two else 3
+    outcome = benchmark(loaded, unit, fmi=version, samples=count, progress=True)
+    _report(context, outcome, as_json)
 
 
 def _report(context: typer.Context, outcome: Outcome, as_json: bool) -> None:

@@ -1,4 +1,7 @@
-"""Run a co-simulation unit as another program does, beside the identifier it was made of."""
+"""Run a co-simulation unit as another program does, beside the identifier it was made of.
+
+Both take the samples of a case, and all outputs are compared after each of them.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +10,64 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import numpy as np
 
-from livepde.cases import Case
+from livepde.cases import Case, load
+from livepde.cases.template import write_template
 from livepde.errors import ConfigurationError, RunError
+from livepde.exchange import export_fmu
 from livepde.exchange.process import Process, of_case
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.records import STATUS_CODES
+from livepde.runs.outcome import Check, Outcome, Table
 from livepde.samples import Sample
 
-__all__ = ["Comparison", "Instance", "compare_fmu", "running"]
+__all__ = ["Comparison", "Instance", "compare_fmu", "fmu", "running"]
+
+CLOSE = 1e-10  # relative difference of any output, between the unit and the identifier
+
+
+def fmu(
+    case: Case | None = None,
+    unit: Path | None = None,
+    *,
+    fmi: Literal[2, 3] = 2,
+    samples: int | None = None,
+    progress: bool = False,
+) -> Outcome:
+    """Compare the unit of a case with the identifier of the case.
+
+    Parameters
+    ----------
+    case
+        Default the one that `livepde init` writes.
+    unit
+        Of the case; default one that is written for the purpose.
+    fmi
+        Version of the standard of a unit that is written.
+    samples
+        How many of the case are taken; default all.
+    progress
+        Show how far each of both is, if standard error is a terminal.
+    """
+    with TemporaryDirectory() as folder:
+        if case is None:
+            case = load(write_template(Path(folder) / "rod")[0])
+        if unit is None:
+            unit = export_fmu(case, Path(folder) / "unit.fmu", fmi=fmi)
+        found = compare_fmu(unit, case, samples=samples, progress=progress)
+    rows = [[name, value] for name, value in found.differences.items()]
+    title = f"Unit and identifier after each of {found.samples} samples"
+    table = Table(title, ["output", "largest relative difference"], rows)
+    check = Check("largest relative difference", found.largest, CLOSE, "<=")
+    return Outcome(tables=[table], checks=[check])
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +92,15 @@ class Comparison:
         return float(np.max(list(self.differences.values())))
 
 
-def compare_fmu(unit: str | Path, case: Case, *, progress: bool = False) -> Comparison:
-    """Give all samples of a case to its unit, by FMPy, and to an identifier: two runs of the case.
+def compare_fmu(
+    unit: str | Path, case: Case, *, samples: int | None = None, progress: bool = False
+) -> Comparison:
+    """Give samples of a case to its unit, by FMPy, and to an identifier: two runs of the case.
 
     Parameters
     ----------
+    samples
+        How many; default all.
     progress
         Show how far each of both is, if standard error is a terminal.
 
@@ -68,15 +118,15 @@ def compare_fmu(unit: str | Path, case: Case, *, progress: bool = False) -> Comp
         )
     prepared = case.prepare()
     process = of_case(case, prepared.origin)
-    samples = list(prepared.stream)
+    given = list(islice(prepared.stream, samples))
     names = [*(item.name for item in process.outputs()), "status"]
 
     def taken(rows: Iterator[list[float]], what: str) -> Array:
-        return np.array(list(watched(rows, len(samples), what) if progress else rows))
+        return np.array(list(watched(rows, len(given), what) if progress else rows))
 
-    expected = taken(_stepped(prepared.identifier, process, samples), "in Python")
-    found = taken(_driven(unit, process, samples), "in the unit")
-    return Comparison(len(samples), dict(zip(names, _apart(expected, found), strict=True)))
+    expected = taken(_stepped(prepared.identifier, process, given), "in Python")
+    found = taken(_driven(unit, process, given), "in the unit")
+    return Comparison(len(given), dict(zip(names, _apart(expected, found), strict=True)))
 
 
 def _apart(expected: Array, found: Array) -> list[float]:
