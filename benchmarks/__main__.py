@@ -43,12 +43,12 @@ class Count(NamedTuple):
 
     def option(self, what: str, least: int = 1) -> Any:
         """Return the option."""
-        text = f"{what} Default {self.usual}, with --quick {self.quick}."
-        return typer.Option(min=least, help=text, show_default=False)
+        return typer.Option(min=least, help=f"{what} With --quick {self.quick}.")
 
-    def of(self, given: int | None, quick: bool) -> int:
+    def of(self, context: typer.Context, name: str) -> int:
         """Return the value that is taken."""
-        return given if given is not None else self.quick if quick else self.usual
+        value: int = context.params[name]
+        return value if not context.params["quick"] or _is_given(context, name) else self.quick
 
 
 @app.command()
@@ -101,7 +101,7 @@ ROUNDS = Count(15, 3)
 @app.command("import")
 def startup(
     context: typer.Context,
-    rounds: Annotated[int | None, ROUNDS.option("Fresh processes of each.")] = None,
+    rounds: Annotated[int, ROUNDS.option("Fresh processes of each.")] = ROUNDS.usual,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer processes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -111,7 +111,7 @@ def startup(
     """
     from benchmarks.startup import startup as benchmark
 
-    _report(context, benchmark(ROUNDS.of(rounds, quick)), as_json)
+    _report(context, benchmark(ROUNDS.of(context, "rounds")), as_json)
 
 
 PAIRS = Count(5, 1)
@@ -120,7 +120,7 @@ PAIRS = Count(5, 1)
 @app.command()
 def overhead(
     context: typer.Context,
-    rounds: Annotated[int | None, PAIRS.option("Fresh processes, and pairs of runs.")] = None,
+    rounds: Annotated[int, PAIRS.option("Fresh processes, and pairs of runs.")] = PAIRS.usual,
     quick: Annotated[
         bool,
         typer.Option("--quick", help="One process and one pair of runs, whose slow moments count."),
@@ -133,7 +133,7 @@ def overhead(
     """
     from benchmarks.overhead import overhead as benchmark
 
-    _report(context, benchmark(PAIRS.of(rounds, quick)), as_json)
+    _report(context, benchmark(PAIRS.of(context, "rounds")), as_json)
 
 
 MEMBERS, DIRECTORIES = Count(1000, 200), Count(25, 8)
@@ -142,11 +142,11 @@ MEMBERS, DIRECTORIES = Count(1000, 200), Count(25, 8)
 @app.command()
 def fleet(
     context: typer.Context,
-    members: Annotated[int | None, MEMBERS.option("How many rods step.")] = None,
+    members: Annotated[int, MEMBERS.option("How many rods step.")] = MEMBERS.usual,
     runs: Annotated[
-        int | None,
+        int,
         DIRECTORIES.option("Rods of which run directories are made; 0 for none.", least=0),
-    ] = None,
+    ] = DIRECTORIES.usual,
     quick: Annotated[
         bool,
         typer.Option(
@@ -164,7 +164,7 @@ def fleet(
     from benchmarks.fleet import fleet as benchmark
     from benchmarks.rods import fleet as rods
 
-    separate = benchmark(MEMBERS.of(members, quick), DIRECTORIES.of(runs, quick))
+    separate = benchmark(MEMBERS.of(context, "members"), DIRECTORIES.of(context, "runs"))
     _report(context, _both(separate, rods()), as_json)
 
 
@@ -177,14 +177,15 @@ def control(
     only: Annotated[
         list[str] | None, typer.Option(help="Only this problem. Repeat it for more.")
     ] = None,
-    seeds: Annotated[int | None, LOOPS.option("Runs of each kind.")] = None,
+    seeds: Annotated[int, LOOPS.option("Runs of each kind.")] = LOOPS.usual,
     draw: Annotated[Path | None, typer.Option(help="Folder for a figure of each problem.")] = None,
     quick: Annotated[
         bool,
         typer.Option(
             "--quick",
             help="One seed, the rod alone, and of the moving horizon the first setting on the "
-            "reduced model: a horizon that is not tuned, and the worst of one seed, say less.",
+            "reduced model, in 0.6 of the time: a horizon that is not tuned, and the worst of one "
+            "seed, say less.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -199,7 +200,7 @@ def control(
     for name in only or ():
         named(name, PROBLEMS, "problem")
     chosen = only or (["rod"] if quick else None)
-    outcome = benchmark(chosen, LOOPS.of(seeds, quick), tuned=not quick, progress=True)
+    outcome = benchmark(chosen, LOOPS.of(context, "seeds"), short=quick, progress=True)
     if draw is not None and can_draw(terminal(err=True)):
         draw.mkdir(parents=True, exist_ok=True)
         for name, figure in outcome.figures.items():
@@ -265,7 +266,7 @@ def auto(
             help="Nodes of the square, default 64 to 10000, with --quick 64. Repeat for more.",
         ),
     ] = None,
-    seeds: Annotated[int | None, DATA_SETS.option("Data sets for each noise.")] = None,
+    seeds: Annotated[int, DATA_SETS.option("Data sets for each noise.")] = DATA_SETS.usual,
     quick: Annotated[
         bool,
         typer.Option(
@@ -283,7 +284,7 @@ def auto(
 
     sizes = size or (SIZES[:1] if quick else SIZES)
     costs = (min(COSTS),) if quick else tuple(COSTS)
-    _report(context, benchmark(sizes, DATA_SETS.of(seeds, quick), costs), as_json)
+    _report(context, benchmark(sizes, DATA_SETS.of(context, "seeds"), costs), as_json)
 
 
 NODES, TIMED, TURNS = Count(1_000_000, 10_000), Count(5, 2), Count(2, 1)
@@ -292,13 +293,13 @@ NODES, TIMED, TURNS = Count(1_000_000, 10_000), Count(5, 2), Count(2, 1)
 @app.command()
 def mpi(
     context: typer.Context,
-    size: Annotated[int | None, NODES.option("Number of nodes.", least=2500)] = None,
+    size: Annotated[int, NODES.option("Number of nodes.", least=2500)] = NODES.usual,
     ranks: Annotated[
         list[int] | None,
         typer.Option(min=1, help="Number of ranks, default 1 and 2. Repeat for more."),
     ] = None,
-    samples: Annotated[int | None, TIMED.option("Steps that are timed.")] = None,
-    rounds: Annotated[int | None, TURNS.option("Runs with each number of ranks.")] = None,
+    samples: Annotated[int, TIMED.option("Steps that are timed.")] = TIMED.usual,
+    rounds: Annotated[int, TURNS.option("Runs with each number of ranks.")] = TURNS.usual,
     quick: Annotated[
         bool,
         typer.Option(
@@ -313,11 +314,9 @@ def mpi(
     """
     from benchmarks.mpi import mpi as benchmark
 
-    counts = [
-        count.of(given, quick)
-        for count, given in ((NODES, size), (TIMED, samples), (TURNS, rounds))
-    ]
-    _report(context, benchmark(counts[0], ranks or (1, 2), *counts[1:]), as_json)
+    nodes, steps = NODES.of(context, "size"), TIMED.of(context, "samples")
+    outcome = benchmark(nodes, ranks or (1, 2), steps, TURNS.of(context, "rounds"))
+    _report(context, outcome, as_json)
 
 
 @app.command()
@@ -364,7 +363,7 @@ TWINS = Count(200, 20)
 @app.command()
 def coverage(
     context: typer.Context,
-    twins: Annotated[int | None, TWINS.option("How many twins of each problem.")] = None,
+    twins: Annotated[int, TWINS.option("How many twins of each problem.")] = TWINS.usual,
     quick: Annotated[
         bool,
         typer.Option(
@@ -381,7 +380,7 @@ def coverage(
     """
     from benchmarks.coverage import coverage as benchmark
 
-    _report(context, benchmark(TWINS.of(twins, quick), progress=True), as_json)
+    _report(context, benchmark(TWINS.of(context, "twins"), progress=True), as_json)
 
 
 JUMPS = Count(5, 1)
@@ -390,7 +389,7 @@ JUMPS = Count(5, 1)
 @app.command()
 def alarms(
     context: typer.Context,
-    seeds: Annotated[int | None, JUMPS.option("Jumps up, and as many down, of each.")] = None,
+    seeds: Annotated[int, JUMPS.option("Jumps up, and as many down, of each.")] = JUMPS.usual,
     quick: Annotated[
         bool,
         typer.Option(
@@ -407,7 +406,7 @@ def alarms(
     """
     from benchmarks.alarms import alarms as benchmark
 
-    _report(context, benchmark(JUMPS.of(seeds, quick), few=quick, progress=True), as_json)
+    _report(context, benchmark(JUMPS.of(context, "seeds"), few=quick, progress=True), as_json)
 
 
 ProblemsOption = Annotated[
@@ -427,13 +426,13 @@ def accuracy(
     context: typer.Context,
     only: ProblemsOption = None,
     level: LevelsOption = None,
-    seeds: Annotated[int | None, REPEATS.option("Data sets for each noise level.")] = None,
+    seeds: Annotated[int, REPEATS.option("Data sets for each noise level.")] = REPEATS.usual,
     quick: Annotated[
         bool,
         typer.Option(
             "--quick",
-            help="One data set, 1 % noise, the problems 'seed' and 'wall': an error of one draw, "
-            "not a median.",
+            help="One data set, 1 % noise, the problems seed, seed-excited and heat2d: an error of "
+            "one draw, not a median.",
         ),
     ] = False,
     as_json: JsonOption = False,
@@ -447,9 +446,9 @@ def accuracy(
 
     for name in only or ():
         named(name, PROBLEMS, "problem")
-    chosen = only or (["seed", "wall"] if quick else [])
+    chosen = only or (["seed", "seed-excited", "heat2d"] if quick else [])
     levels = level or ([0.01] if quick else None)
-    outcome = benchmark(chosen, REPEATS.of(seeds, quick), levels=levels, progress=True)
+    outcome = benchmark(chosen, REPEATS.of(context, "seeds"), levels=levels, progress=True)
     _report(context, outcome, as_json)
 
 
@@ -458,7 +457,7 @@ def peers(
     context: typer.Context,
     only: ProblemsOption = None,
     level: LevelsOption = None,
-    seeds: Annotated[int | None, AGAIN.option("Data sets for each noise level.")] = None,
+    seeds: Annotated[int, AGAIN.option("Data sets for each noise level.")] = AGAIN.usual,
     row: Annotated[
         list[str] | None, typer.Option(help="Only this estimator. Repeat it for more.")
     ] = None,
@@ -480,7 +479,7 @@ def peers(
     for name in row or ():
         named(name, dict.fromkeys(ROWS), "row")
     chosen = only or (["rod"] if quick else [])
-    count = AGAIN.of(seeds, quick)
+    count = AGAIN.of(context, "seeds")
     outcome = benchmark(chosen, count, levels=level or [0.01], rows=row or (), progress=True)
     _report(context, outcome, as_json)
 
@@ -491,11 +490,11 @@ KILLS, LENGTH, BROKEN = Count(200, 4), Count(2000, 400), Count(100_000, 2000)
 @app.command()
 def faults(
     context: typer.Context,
-    kills: Annotated[int | None, KILLS.option("Kills, with a file and with a broker.")] = None,
+    kills: Annotated[int, KILLS.option("Kills, with a file and with a broker.")] = KILLS.usual,
     samples: Annotated[
-        int | None, LENGTH.option("Samples of a run that is killed.", least=50)
-    ] = None,
-    malformed: Annotated[int | None, BROKEN.option("Broken rows and messages.")] = None,
+        int, LENGTH.option("Samples of a run that is killed.", least=50)
+    ] = LENGTH.usual,
+    malformed: Annotated[int, BROKEN.option("Broken rows and messages.")] = BROKEN.usual,
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
@@ -518,11 +517,15 @@ def faults(
 
     for name in only or ():
         named(name, PARTS, "part")
-    counts = [
-        count.of(given, quick)
-        for count, given in ((KILLS, kills), (LENGTH, samples), (BROKEN, malformed))
-    ]
-    _report(context, benchmark(*counts, seed, only or (), progress=True), as_json)
+    outcome = benchmark(
+        KILLS.of(context, "kills"),
+        LENGTH.of(context, "samples"),
+        BROKEN.of(context, "malformed"),
+        seed,
+        only or (),
+        progress=True,
+    )
+    _report(context, outcome, as_json)
 
 
 @app.command()
@@ -548,7 +551,7 @@ STEPS = Count(1_000_000, 30_000)
 @app.command()
 def soak(
     context: typer.Context,
-    steps: Annotated[int | None, STEPS.option("How many steps.")] = None,
+    steps: Annotated[int, STEPS.option("How many steps.")] = STEPS.usual,
     quick: Annotated[
         bool,
         typer.Option(
@@ -566,7 +569,7 @@ def soak(
     from benchmarks.soak import soak as benchmark
 
     share = 0.1 if quick else 1.0
-    _report(context, benchmark(STEPS.of(steps, quick), share=share, progress=True), as_json)
+    _report(context, benchmark(STEPS.of(context, "steps"), share=share, progress=True), as_json)
 
 
 @app.command()
@@ -605,23 +608,26 @@ def fmu(
     _report(context, outcome, as_json)
 
 
+def _is_given(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 def _report(context: typer.Context, outcome: Outcome, as_json: bool) -> None:
-    """Print an outcome with the command as it was given, without paths of this machine."""
+    """Print an outcome with its command: with all numbers, those of --quick aside; no paths."""
     words = ["python", "-m", "benchmarks", context.command.name or ""]
     for option in context.command.params:
-        name = option.name or ""
-        value, source = context.params.get(name), context.get_parameter_source(name)
-        if name == "as_json" or isinstance(value, Path) or source is None:
+        name, flag = option.name or "", max(option.opts, key=len)
+        value = context.params.get(name)
+        told = _is_given(context, name) or not context.params["quick"]
+        if name == "as_json" or value is None or isinstance(value, Path) or not told:
             continue
-        if source.name == "COMMANDLINE":
-            flag = max(option.opts, key=len)
-            for item in value if isinstance(value, list) else [value]:
-                words += [flag] if isinstance(item, bool) else [flag, _shown(item)]
+        if isinstance(value, bool):
+            words += [flag] if value else []
+            continue
+        for item in value if isinstance(value, list | tuple) else [value]:
+            words += [flag, f"{item:g}" if isinstance(item, float) else str(item)]
     report_outcome(outcome, words, as_json)
-
-
-def _shown(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _both(one: Outcome, other: Outcome) -> Outcome:

@@ -8,6 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import bench
+from typer.main import get_command
+
+from benchmarks.__main__ import app
+from livepde.runs import Outcome
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
@@ -48,6 +53,35 @@ def test_a_fleet_is_held_against_separate_runs(costs, monkeypatch):
     found = suite.setup_cache()
     assert suite.track_step(found) > 0.0
     assert suite.track_command(found) > 0.0
+
+
+# --- commands ------------------------------------------------------------------------------------
+
+
+def test_every_benchmark_has_a_quick_run():
+    for name, command in get_command(app).commands.items():
+        assert "--quick" in {flag for option in command.params for flag in option.opts}, name
+
+
+@pytest.mark.parametrize(
+    ("words", "seeds", "told"),
+    [
+        ("", 5, " --seeds 5"),
+        ("--quick", 1, " --quick"),
+        ("--quick --seeds 3", 3, " --seeds 3 --quick"),
+    ],
+)
+def test_what_is_given_wins_over_quick(words, seeds, told, monkeypatch):
+    taken = []
+
+    def alarms(number, **options):
+        taken.append((number, options["few"]))
+        return Outcome()
+
+    monkeypatch.setattr("benchmarks.alarms.alarms", alarms)
+    code, output = bench("alarms", *words.split(), "--json")
+    assert (code, taken) == (0, [(seeds, "--quick" in words)])
+    assert json.loads(output)["command"] == f"python -m benchmarks alarms{told}"
 
 
 # --- the page of costs ---------------------------------------------------------------------------
