@@ -100,7 +100,7 @@ lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest ver
 clean:  ## Remove caches and build products (not .venv)
 	@rm -rf build dist site htmlcov .coverage .coverage.* .hypothesis
 	@rm -rf .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
-	@find src tests -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+	@find src tests benchmarks -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 # The stamp is younger than both files as long as the environment holds what they ask for.
 $(READY): pyproject.toml constraints.txt

@@ -332,7 +332,12 @@ def cases(
         Path | None, typer.Option(help="Folder for a page with tables and figures.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Each case as it is written, without its variants.")
+        bool,
+        typer.Option(
+            "--quick",
+            help="A case of each kind of process, without its variants; with --folder all of its "
+            "cases.",
+        ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -343,7 +348,8 @@ def cases(
     from benchmarks import cases as benchmark
 
     known = {path.stem: path for path in benchmark.find_cases(folder)}
-    paths = [named(name, known, "case") for name in only or ()] or list(known.values())
+    chosen = only or (benchmark.QUICK if quick and folder is None else known)
+    paths = [named(name, known, "case") for name in chosen]
     pictures = None
     if gallery is not None:
         gallery.mkdir(parents=True, exist_ok=True)
@@ -545,7 +551,7 @@ def journal(
     _report(context, benchmark(repetitions=1 if quick else None), as_json)
 
 
-STEPS = Count(1_000_000, 30_000)
+STEPS = Count(1_000_000, 20_000)
 
 
 @app.command()

@@ -46,6 +46,16 @@ forward step of the same model. Figures show the first run of each case.
 
 """
 
+QUICK = (
+    "burgers",
+    "horkheim",
+    "oude_korendijk",
+    "scratch_assay",
+    "soil_column",
+    "soil_uniform",
+    "thermal_response",
+)
+"""Cases of all kinds of processes that take seconds each."""
 WORKERS = 2
 WARM_UP = 2  # samples in which matrices are built that are built once
 
