@@ -88,8 +88,9 @@ docs: $(READY)  ## Build the documentation into site/
 	@$(BIN)/python docs/links.py
 	@echo "Built: site/index.html"
 
-bench: $(READY)  ## Measure what one step costs
-	@$(BIN)/livepde bench step
+NAME = step
+bench: $(READY)  ## Run a benchmark, as NAME="step --size 31"; without NAME what one step costs
+	@$(BIN)/python -m benchmarks $(NAME)
 
 lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest versions
 	@$(UV) pip compile --quiet --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
@@ -99,7 +100,7 @@ lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest ver
 clean:  ## Remove caches and build products (not .venv)
 	@rm -rf build dist site htmlcov .coverage .coverage.* .hypothesis
 	@rm -rf .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
-	@find src tests -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+	@find src tests benchmarks -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 # The stamp is younger than both files as long as the environment holds what they ask for.
 $(READY): pyproject.toml constraints.txt

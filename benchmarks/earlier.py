@@ -1,16 +1,15 @@
-"""Measure the forward step of an earlier version: python benchmarks/earlier.py [COMMIT].
+"""Measure the forward step of an earlier version: python -m benchmarks.earlier [COMMIT].
 
 Two processes step the same model in turns, one with the sources of the commit (a worktree of git
 that is removed afterwards), one with those of today. Printed are the forward step of today and that
-of the commit, both in forward steps of the lean reference (`livepde.bench.rods.lean_forward`), and
+of the commit, both in forward steps of the lean reference (`benchmarks.rods.lean_forward`), and
 today's over the commit's: medians of the turns, of processor times. The second column is what
-`livepde.bench.rods.EARLIER` holds.
+`benchmarks.rods.EARLIER` holds.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import subprocess
 import sys
@@ -21,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+from benchmarks import ROOT, layered
+from livepde.stepping import Advance, ImplicitEuler, simulate
+
 COMMIT = "51ef98c"
 STEPS, TURNS = 100, 15
-ENDS = ("source", "channels")
 SIZES = ((31, 2), (200, 2), (1_000, 2), (10_000, 4))
 
 
@@ -55,7 +55,7 @@ def compare(earlier: Path, commit: str, turns: int) -> None:
     write(f"| nodes | ends | {commit} / lean | today / lean | today / {commit} |\n")
     write("|---|---|---|---|---|\n")
     for nodes, unknowns in SIZES:
-        for ends in ENDS if nodes < SIZES[-1][0] else ENDS[:1]:
+        for ends in layered.ENDS if nodes < SIZES[-1][0] else layered.ENDS[:1]:
             task = f"{nodes} {unknowns} {ends}"
             times = np.array([[*_ask(then, task), *_ask(now, task)] for _ in range(turns)])
             old, new, lean = times.T
@@ -69,9 +69,9 @@ def compare(earlier: Path, commit: str, turns: int) -> None:
 
 def _worker(source: Path, what: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": str(source), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, __file__, "--serve", what]
+    command = [sys.executable, "-m", "benchmarks.earlier", "--serve", what]
     pipe = subprocess.PIPE
-    return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, text=True)
+    return subprocess.Popen(command, cwd=ROOT, env=environment, stdin=pipe, stdout=pipe, text=True)
 
 
 def _ask(worker: subprocess.Popen[str], task: str) -> list[float]:
@@ -84,22 +84,16 @@ def _ask(worker: subprocess.Popen[str], task: str) -> list[float]:
 
 def serve(lean: bool) -> None:
     """Answer each line of nodes, unknowns and ends with the median of a forward step, in s."""
-    file = ROOT / "src" / "livepde" / "bench" / "problems" / "rod.py"
-    spec = importlib.util.spec_from_file_location("rods_of_today", file)
-    if spec is None or spec.loader is None:
-        raise RuntimeError(f"{file} cannot be loaded")
-    problems = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(problems)
     models: dict[str, Any] = {}
     for line in sys.stdin:
         nodes, unknowns, ends = line.split()
         if line not in models:
             size, count = int(nodes), int(unknowns)
             square = size >= SIZES[-1][0]
-            models[line] = problems.plate(size) if square else problems.rod(size, count, ends)
-        answer = [_forward(problems, models[line], ends)]
+            models[line] = layered.plate(size) if square else layered.rod(size, count, ends)
+        answer = [_forward(models[line], ends)]
         if lean:
-            from livepde.bench.rods import Rod, lean_forward
+            from benchmarks.rods import Rod, lean_forward
 
             rod = models.setdefault(f"lean {line}", Rod(int(nodes), int(unknowns), ends))
             answer.append(float(np.median(lean_forward(rod, STEPS))))
@@ -107,11 +101,9 @@ def serve(lean: bool) -> None:
         sys.stdout.flush()
 
 
-def _forward(problems: Any, model: Any, ends: str) -> float:
-    from livepde.stepping import Advance, ImplicitEuler, simulate
-
-    times = (problems.STEP * np.arange(STEPS + 1)).tolist()
-    inputs = {t: problems.ends_at(ends, t) for t in times}.__getitem__
+def _forward(model: Any, ends: str) -> float:
+    times = (layered.STEP * np.arange(STEPS + 1)).tolist()
+    inputs = {t: layered.ends_at(ends, t) for t in times}.__getitem__
     states = simulate(model, model.latent.prior, 0.0, times, Advance(ImplicitEuler()), inputs)
     next(states)
     spent = []

@@ -1,16 +1,15 @@
 """Make docs/gallery/experiments.md, with: python docs/experiments.py [NAME ...].
 
-Runs what `livepde reproduce` knows, `livepde bench control`, the scripts of experiments/ and the
-programs of examples/, each by the name of its experiment or file; without names all of them, which
-takes hours. What they print and draw is kept in docs/gallery/experiments/, and the page is made of
-all that is there. `--draw` runs nothing. The data of the cases are read from $LIVEPDE_DATA.
+Runs what `livepde reproduce` knows, `python -m benchmarks control`, the scripts of experiments/ and
+the programs of examples/, each by the name of its experiment or file; without names all of them,
+which takes hours. What they print and draw is kept in docs/gallery/experiments/, and the page is
+made of all that is there. `--draw` runs nothing. The data of the cases are read from $LIVEPDE_DATA.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import json
 import re
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from pathlib import Path
 from textwrap import indent
 
 from matplotlib.figure import Figure
-from performance import report
+from performance import printed, report
 from PIL import Image
 
 from livepde.plots import PALETTE, figure
@@ -170,10 +169,7 @@ def run(name: str) -> None:
         return
     if name in BENCHES:
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "livepde", "bench", name, *OPTIONS.get(name, ())]
-            command += ["--draw", folder, "--json"]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-            content = json.loads(done.stdout)
+            content = printed([name, *OPTIONS.get(name, ()), "--draw", folder, "--json"])
             keep(name, Path(folder), report(content["command"], content))
         return
     script = scripts()[name]
@@ -233,8 +229,8 @@ def _report(name: str) -> str:
     rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE)
     shown = [f"![{Path(one).stem}](experiments/{one})" for one in pictures]
     rest = re.sub(r"^## (.*)$", r"**\1**", rest, flags=re.MULTILINE)
-    kind = "bench" if name in BENCHES else "reproduce"
-    command = " ".join(["livepde", kind, name, *OPTIONS.get(name, ())])
+    kind = "python -m benchmarks" if name in BENCHES else "livepde reproduce"
+    command = " ".join([kind, name, *OPTIONS.get(name, ())])
     lines = [f"### {name}", f"`{command}`", *shown, rest.strip()]
     if title != command:
         lines.insert(1, title)

@@ -1,6 +1,7 @@
 """What the program writes into pages while the site is built, in the place of comments.
 
 <!-- command line -->             the help of all commands
+<!-- benchmarks -->               the help of all benchmarks
 <!-- keys of a case -->           tables of all keys of a case file
 <!-- members of livepde.ROOM -->  what a room exports beside what livepde itself does
 """
@@ -13,12 +14,15 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import livepde
 from livepde.cases.schema import CaseSpec
 
 Schema = Mapping[str, Any]
+
+PROJECT = Path(__file__).resolve().parents[1]
 
 DEFINED = "#/$defs/"
 BOUND = '`[low, high]`, `"<= number"` or `">= number"`'  # what the validator of `expect` reads
@@ -32,10 +36,10 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     return re.sub(r"<!-- members of (\S+) -->", lambda found: members(found[1]), markdown)
 
 
-def command_line() -> str:
-    """Return the help of all commands, as Typer writes it."""
-    command = [sys.executable, "-m", "typer", "livepde.cli", "utils", "docs", "--name", "livepde"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+def command_line(module: str = "livepde.cli", name: str = "livepde") -> str:
+    """Return the help of all commands of a program, as Typer writes it."""
+    command = [sys.executable, "-m", "typer", module, "utils", "docs", "--name", name]
+    done = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True)
     text = done.stdout
     # What every command has, and lists of commands with their words cut off, are of no use here.
     text = re.sub(r"^\*\*Commands\*\*:\n\n(\*.*\n)+\n?", "", text, flags=re.MULTILINE)
@@ -44,6 +48,11 @@ def command_line() -> str:
     # Examples are words to Typer: a line for each, and as code.
     example = r"^(.*?)(Example|Replay|Service|Parallel): +(\S.*)$"
     return re.sub(example, r"\1\n\n\2: `\3`", text, flags=re.MULTILINE)
+
+
+def benchmarks() -> str:
+    """Return the help of all benchmarks."""
+    return command_line("benchmarks.__main__", "python -m benchmarks")
 
 
 def members(room: str) -> str:
@@ -139,4 +148,8 @@ SIMPLE = {
     "number": "a number",
     "string": "text",
 }
-WRITERS = {"<!-- command line -->": command_line, "<!-- keys of a case -->": keys_of_a_case}
+WRITERS = {
+    "<!-- command line -->": command_line,
+    "<!-- benchmarks -->": benchmarks,
+    "<!-- keys of a case -->": keys_of_a_case,
+}

@@ -1,9 +1,9 @@
 """Measure what docs/peers.md shows, with: python docs/peers.py [rod heat2d ...].
 
-Runs `livepde bench peers` for each problem, keeps what it prints as JSON in docs/peers/, and puts
-all that is there into the page, between two of its headings. `--draw` measures nothing: so files of
-other runs can be added by hand, as
-`livepde bench peers --only rod --seeds 16 --json > docs/peers/rod.json`.
+Runs `python -m benchmarks peers` for each problem, keeps what it prints as JSON in docs/peers/, and
+puts all that is there into the page, between two of its headings. `--draw` measures nothing: so
+files of other runs can be added by hand, as
+`python -m benchmarks peers --only rod --seeds 16 --json > docs/peers/rod.json`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def measure(names: Iterable[str]) -> None:
     MEASURED.mkdir(exist_ok=True)
     for name in names:
         seeds = str(SEEDS.get(name, FEW))
-        content = printed(["bench", "peers", "--only", name, "--seeds", seeds, "--json"])
+        content = printed(["peers", "--only", name, "--seeds", seeds, "--json"])
         (MEASURED / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
 
 

@@ -2,8 +2,8 @@
 
 Runs benchmarks of livepde, keeps what they print as JSON in docs/performance/, and makes page and
 figures of all that is there. `--draw` measures nothing: so files of longer runs can be added by
-hand, as `livepde bench step --size 1000000 --json > docs/performance/step-1e6.json`. Of a row that
-stands in several files the last one, by name, is shown.
+hand, as `python -m benchmarks step --size 1000000 --json > docs/performance/step-1e6.json`. Of a
+row that stands in several files the last one, by name, is shown.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from livepde.runs.directory import markdown
 
 DOCS = Path(__file__).resolve().parent
 MEASURED = DOCS / "performance"
-SUITE = DOCS.parent / "benchmarks" / "suite" / "costs.py"
+PROJECT = DOCS.parent
+SUITE = "benchmarks.suite.costs"
 BENCHES = ("step", "memory", "scale", "mpi", "fleet", "import")
 SIZED = ("step", "scale")  # take --size
 MEMORY_SIZES = (10_000, 40_000)
@@ -60,14 +61,14 @@ The page, its figures and the numbers behind them (`docs/performance/*.json`) ar
 *Solid: the median of the pairs. Dashed, in the same colour: what was promised. The forward step is
 an implicit Euler step of the same model with a known parameter, its matrix factorised once.*
 
-On rods, and on a square of 10 000 nodes, `livepde bench step` times the laws for a few numbers from
-the first sample on: medians, and beside them means, which have the first sample and replays in
-them. Rows with `source` have constant ends and a constant source, as a forward step of little work;
-rows with `channels` read the temperatures of both ends from the stream, as the rod of the README.
-The *lean reference* is the same filter in thirty lines of NumPy and LAPACK
-(`livepde/bench/lean.py`), without safeguards, missing samples, bounds or substeps: it has the same
+On rods, and on a square of 10 000 nodes, `python -m benchmarks step` times the laws for a few
+numbers from the first sample on: medians, and beside them means, which have the first sample and
+replays in them. Rows with `source` have constant ends and a constant source, as a forward step of
+little work; rows with `channels` read the temperatures of both ends from the stream, as the rod of
+the README. The *lean reference* is the same filter in thirty lines of NumPy and LAPACK
+(`benchmarks/lean.py`), without safeguards, missing samples, bounds or substeps: it has the same
 numbers, and a test says so. Bounds mean forward steps of commit 51ef98c, so that a faster forward
-step does not make them harder; `python benchmarks/earlier.py` steps that commit and today's sources
+step does not make them harder; `python -m benchmarks.earlier` steps that commit and today's sources
 in turns, in a process each, and prints today's forward step over that one's.
 """
 MEMORY = """\
@@ -87,19 +88,19 @@ def measure(names: Iterable[str], sizes: Sequence[int]) -> None:
             content = _memory(sizes or MEMORY_SIZES)
         else:
             chosen = [word for size in sizes for word in ("--size", str(size))]
-            command = ["bench", name, *(chosen if name in SIZED else []), "--json"]
+            command = [name, *(chosen if name in SIZED else []), "--json"]
             content = printed(command)
         (MEASURED / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
 
 
 def printed(command: Sequence[str]) -> dict[str, Any]:
-    """Return what a command of livepde prints; a check that fails is none of our business."""
-    words = [sys.executable, "-m", "livepde", *command]
-    done = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=False)
+    """Return what a benchmark prints; a check that fails is none of our business."""
+    words = [sys.executable, "-m", "benchmarks", *command]
+    done = subprocess.run(words, cwd=PROJECT, stdout=subprocess.PIPE, text=True, check=False)
     try:
         found: dict[str, Any] = json.loads(done.stdout)
     except json.JSONDecodeError:
-        raise SystemExit(f"livepde {' '.join(command)} has printed no JSON") from None
+        raise SystemExit(f"python -m benchmarks {' '.join(command)} has printed no JSON") from None
     return found
 
 
@@ -107,11 +108,13 @@ def _memory(sizes: Sequence[int]) -> dict[str, Any]:
     rows = []
     for size in sizes:
         for law in LAWS:
-            command = [sys.executable, str(SUITE), str(size), law]
-            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+            command = [sys.executable, "-m", SUITE, str(size), law]
+            done = subprocess.run(
+                command, cwd=PROJECT, stdout=subprocess.PIPE, text=True, check=True
+            )
             rows.append([size, law, float(done.stdout)])
     table = Table("Memory of an identification", ("nodes", "law", PER_UNKNOWN), rows)
-    command = "python benchmarks/suite/costs.py NODES LAW"
+    command = f"python -m {SUITE} NODES LAW"
     return {"command": command, "checks": [], "tables": [table.to_dict()], "notes": []}
 
 
@@ -215,7 +218,7 @@ def report(title: str, content: Mapping[str, Any]) -> str:
 
 def section(name: str, content: Mapping[str, Any]) -> str:
     """Return what a benchmark has printed as a part of the page."""
-    title = f"livepde bench {name}" if name != "memory" else "Memory"
+    title = f"python -m benchmarks {name}" if name != "memory" else "Memory"
     text = report(title, content)
     lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
     commands = "\n".join(content["commands"])

@@ -16,16 +16,19 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from time import process_time
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the benchmarks are not installed
+
 import livepde as lp
-from livepde.bench.accuracy import run_law
-from livepde.bench.offline import fit
-from livepde.bench.problems import PROBLEMS, Data, Problem
-from livepde.bench.problems.flow import SIDES
-from livepde.bench.scoring import Judge
+from benchmarks.accuracy import run_law
+from benchmarks.offline import fit
+from benchmarks.problems import PROBLEMS, Data, Problem
+from benchmarks.problems.flow import SIDES
+from benchmarks.scoring import Judge
 from livepde.models import burgers
 
 DRIFTS = (0.0, 0.01, 0.1, 1.0, 10.0)  # prior variances gained in the whole run

@@ -9,20 +9,29 @@ import time
 from pathlib import Path
 
 import pytest
+import typer
 from patience import PATIENCE
 from typer.testing import CliRunner
 
+from benchmarks.__main__ import app as benchmarks
 from livepde import cli
 from livepde.errors import LivepdeError, RunError
 from livepde.runs import JOURNAL, Journal
 
 
-def call(*arguments: str, stdin: str | None = None) -> tuple[int, str]:
+def call(
+    *arguments: str, stdin: str | None = None, program: typer.Typer = cli.app
+) -> tuple[int, str]:
     """Return exit code and output of a command that ends as it should."""
-    result = CliRunner().invoke(cli.app, list(arguments), input=stdin)
+    result = CliRunner().invoke(program, list(arguments), input=stdin)
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.output
+
+
+def bench(*arguments: str) -> tuple[int, str]:
+    """Return exit code and output of a benchmark."""
+    return call(*arguments, program=benchmarks)
 
 
 def bad(*arguments: str) -> str:

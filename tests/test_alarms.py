@@ -14,8 +14,9 @@ from skfem import ElementLineP1
 from typer.testing import CliRunner
 
 import livepde as lp
+from benchmarks import alarms
+from benchmarks.__main__ import app as benchmarks
 from livepde import cases, runs
-from livepde.bench import alarms
 from livepde.cases.template import NOISE, TRUE_ALPHA, write_template
 from livepde.cli import app
 from livepde.diagnostics import identifiability
@@ -263,7 +264,7 @@ def test_the_command_prints_a_check_for_each_promise(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(alarms, "CASES", (("nowhere", "nowhere", {}, True),))
     for name in ("CALM", "WATCHED", "AFTER"):
         monkeypatch.setattr(alarms, name, 60)
-    done = CliRunner().invoke(app, ["bench", "alarms", "--seeds", "1", "--json"])
+    done = CliRunner().invoke(benchmarks, ["alarms", "--seeds", "1", "--json"])
     said = json.loads(done.stdout.splitlines()[-1])
     names = [item["name"] for item in said["checks"]]
     assert names == [

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 import livepde as lp
-from livepde.bench.control.battery import graphite
+from benchmarks.control.battery import graphite
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.models import EQUATIONS, battery_particle

@@ -1,4 +1,4 @@
-"""`livepde bench auto`: the promises of the law that tunes itself, on the smallest square."""
+"""`python -m benchmarks auto`: promises of the law that tunes itself, on the smallest square."""
 
 import json
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from livepde import cli
-from livepde.bench import auto as bench
+from benchmarks import auto as bench
+from benchmarks.__main__ import app
 from livepde.laws import GradientLaw
 
 
@@ -42,9 +42,9 @@ def test_the_command_prints_every_check(monkeypatch):
     monkeypatch.setattr(bench, "SAMPLES", 5)
     monkeypatch.setattr(bench, "LEVELS", (0.0,))
     monkeypatch.setattr(bench, "GAINS", (1.0,))
-    found = CliRunner().invoke(cli.app, ["bench", "auto", "--quick", "--json"])
+    found = CliRunner().invoke(app, ["auto", "--quick", "--json"])
     content = json.loads(found.stdout)
-    assert content["command"] == "livepde bench auto --quick"
+    assert content["command"] == "python -m benchmarks auto --quick"
     names = [check["name"] for check in content["checks"]]
     assert [name.split(":")[-1].strip() for name in names] == [
         "largest error with status ok",

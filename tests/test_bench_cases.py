@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 import livepde as lp
-from livepde import cli
-from livepde.bench import cases as bench
+from benchmarks import cases as bench
+from benchmarks.__main__ import app
 from livepde.cases.template import write_template
 
 VARIANTS = """
@@ -57,7 +57,7 @@ def project(tmp_path, monkeypatch):
 
 
 def call(*arguments):
-    result = CliRunner().invoke(cli.app, ["bench", "cases", *arguments])
+    result = CliRunner().invoke(app, ["cases", *arguments])
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.stdout

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import call
+from commands import bench
 
 import livepde as lp
+from benchmarks import faults, soak
+from benchmarks.faults import breaks, broken, damage, plants, rod
+from benchmarks.journal import journal
+from benchmarks.overhead import overhead
 from livepde import cases
-from livepde.bench import faults, soak
-from livepde.bench.faults import breaks, broken, damage, plants, rod
-from livepde.bench.journal import journal
-from livepde.bench.overhead import overhead
 from livepde.records import Record
 
 MQTT = pytest.mark.skipif(
@@ -138,7 +138,7 @@ def test_soak_sees_what_grows():
 
 def test_the_journal_has_a_price(monkeypatch, tmp_path, data_dir):
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    monkeypatch.setattr("livepde.bench.journal.REPETITIONS", 1)
+    monkeypatch.setattr("benchmarks.journal.REPETITIONS", 1)
     times, ratios = journal(Path(__file__).parents[1] / "cases").tables
     assert [row[0] for row in times.rows] == ["step", "journal"]
     assert all(0.0 < cell < 1e3 for row in times.rows for cell in row[1:])
@@ -161,12 +161,12 @@ def test_the_command_line_has_a_price():
 
 def test_the_commands_print_json(monkeypatch):
     monkeypatch.setattr(
-        "livepde.bench.faults.PARTS", {"file": lambda plan: faults.Outcome(notes=[str(plan.kills)])}
+        "benchmarks.faults.PARTS", {"file": lambda plan: faults.Outcome(notes=[str(plan.kills)])}
     )
-    code, out = call("bench", "faults", "--kills", "7", "--only", "file", "--json")
+    code, out = bench("faults", "--kills", "7", "--only", "file", "--json")
     assert code == 0
     assert json.loads(out)["command"].endswith(
         "--kills 7 --samples 2000 --malformed 100000 --seed 0 --only file"
     )
     with pytest.raises(lp.ConfigurationError, match="there is no part 'nothing'"):
-        call("bench", "faults", "--only", "nothing")
+        bench("faults", "--only", "nothing")

@@ -10,12 +10,12 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.bench import accuracy as suite
-from livepde.bench import scoring
-from livepde.bench.offline import Trajectory, fit
-from livepde.bench.peers import table
-from livepde.bench.peers.augmented import Augmented
-from livepde.bench.problems import PROBLEMS, Data, Problem, Process
+from benchmarks import accuracy as suite
+from benchmarks import scoring
+from benchmarks.offline import Trajectory, fit
+from benchmarks.peers import table
+from benchmarks.peers.augmented import Augmented
+from benchmarks.problems import PROBLEMS, Data, Problem, Process
 
 TIMES = np.linspace(0.0, 1.0, 21)
 

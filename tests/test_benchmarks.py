@@ -1,4 +1,4 @@
-"""The suite that asv runs: it finds the numbers of `livepde bench`, here at quick sizes."""
+"""The suite that asv runs: it finds the numbers of `python -m benchmarks`, here at quick sizes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import bench
+from typer.main import get_command
+
+from benchmarks.__main__ import app
+from livepde.runs import Outcome
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
@@ -43,11 +48,40 @@ def test_memory_is_that_of_a_process_of_its_own(costs):
 def test_a_fleet_is_held_against_separate_runs(costs, monkeypatch):
     monkeypatch.setattr(costs.Fleet, "members", 2)
     monkeypatch.setattr(costs.Fleet, "runs", 2)
-    monkeypatch.setattr(sys.modules["livepde.bench.fleet"], "SAMPLES", 100)
+    monkeypatch.setattr(sys.modules["benchmarks.fleet"], "SAMPLES", 100)
     suite = costs.Fleet()
     found = suite.setup_cache()
     assert suite.track_step(found) > 0.0
     assert suite.track_command(found) > 0.0
+
+
+# --- commands ------------------------------------------------------------------------------------
+
+
+def test_every_benchmark_has_a_quick_run():
+    for name, command in get_command(app).commands.items():
+        assert "--quick" in {flag for option in command.params for flag in option.opts}, name
+
+
+@pytest.mark.parametrize(
+    ("words", "seeds", "told"),
+    [
+        ("", 5, " --seeds 5"),
+        ("--quick", 1, " --quick"),
+        ("--quick --seeds 3", 3, " --seeds 3 --quick"),
+    ],
+)
+def test_what_is_given_wins_over_quick(words, seeds, told, monkeypatch):
+    taken = []
+
+    def alarms(number, **options):
+        taken.append((number, options["few"]))
+        return Outcome()
+
+    monkeypatch.setattr("benchmarks.alarms.alarms", alarms)
+    code, output = bench("alarms", *words.split(), "--json")
+    assert (code, taken) == (0, [(seeds, "--quick" in words)])
+    assert json.loads(output)["command"] == f"python -m benchmarks alarms{told}"
 
 
 # --- the page of costs ---------------------------------------------------------------------------
@@ -62,7 +96,7 @@ def page(monkeypatch):
 
 
 def output(ratio: float, *, nodes: int, ok: bool = True) -> str:
-    """Return what `livepde bench step --json` prints."""
+    """Return what `python -m benchmarks step --json` prints."""
     law = "gradient, gain 1, c1 0.1"
     check = {"name": f"{nodes}", "value": ratio, "bound": 3.0, "sense": "<=", "ok": ok}
     table = {
@@ -73,7 +107,12 @@ def output(ratio: float, *, nodes: int, ok: bool = True) -> str:
             [nodes, "sensitivity", 1.0, 2.0, 3.0, None],
         ],
     }
-    content = {"command": "livepde bench step", "checks": [check], "tables": [table], "notes": []}
+    content = {
+        "command": "python -m benchmarks step",
+        "checks": [check],
+        "tables": [table],
+        "notes": [],
+    }
     return json.dumps(content)
 
 
@@ -84,14 +123,14 @@ def test_the_page_of_costs_shows_all_that_was_measured(page, tmp_path):
     (folder / "step-again.json").write_text(output(2.75, nodes=31))
     (folder / "step-large.json").write_text(output(2.5, nodes=1_000))
     table = {"title": "Memory", "columns": ["nodes", "kB per unknown"], "rows": [[1_000, 1.5]]}
-    found = {"command": "livepde bench scale", "checks": [], "tables": [table], "notes": []}
+    found = {"command": "python -m benchmarks scale", "checks": [], "tables": [table], "notes": []}
     (folder / "scale.json").write_text(json.dumps(found))
     page.write(tmp_path)
     text = (tmp_path / "performance.md").read_text()
     assert "| 31 | gradient, gain 1, c1 0.1 | 2.75 | 2.75 | 2.75 | 3 |" in text
     assert "| 1000 | sensitivity | 1 | 2 | 3 | – |" in text
     assert "4.25" not in text  # measured again
-    assert text.count("livepde bench step\n") == 2  # title and command
+    assert text.count("python -m benchmarks step\n") == 2  # title and command
     assert {"step.png", "memory.png"} <= {file.name for file in folder.iterdir()}
     assert page.remembered({"scale": found}) == {"scale": [(1_000, 1.5)]}
 
@@ -124,7 +163,7 @@ def test_the_page_of_peers_shows_all_that_was_measured(page, tmp_path):
             "columns": columns,
             "rows": [["1%", "lean", 0.5, cost]],
         }
-        content = {"command": f"livepde bench peers --only {name}", "checks": [check]}
+        content = {"command": f"python -m benchmarks peers --only {name}", "checks": [check]}
         (folder / f"{name}.json").write_text(
             json.dumps(content | {"tables": [table], "notes": ["a note"]})
         )
@@ -134,7 +173,7 @@ def test_the_page_of_peers_shows_all_that_was_measured(page, tmp_path):
     assert (tmp_path / "peers.md").read_text() == text  # what was there is replaced
     assert text.startswith("# Comparison with peers")
     assert text.index("### rod") < text.index("| 1% | lean | 0.5 | 4.25 |") < text.index("### wall")
-    assert text.count("livepde bench peers --only wall") == 1
+    assert text.count("python -m benchmarks peers --only wall") == 1
     assert text.count("FAILED") == 2
     assert "a note" not in text
     assert "## What these tables do not say" in text
@@ -143,7 +182,7 @@ def test_the_page_of_peers_shows_all_that_was_measured(page, tmp_path):
 def test_the_page_of_peers_knows_the_problems_of_the_benchmark(page):
     del page
     peers = importlib.import_module("peers")
-    assert set(peers.PROBLEMS) == set(importlib.import_module("livepde.bench.peers").PROBLEMS)
+    assert set(peers.PROBLEMS) == set(importlib.import_module("benchmarks.peers").PROBLEMS)
 
 
 def test_what_the_benchmark_of_peers_prints_is_kept(page, tmp_path, monkeypatch):
@@ -153,5 +192,5 @@ def test_what_the_benchmark_of_peers_prints_is_kept(page, tmp_path, monkeypatch)
     monkeypatch.setattr(peers, "printed", lambda words: {"command": " ".join(words)})
     peers.measure(["rod", "wall"])
     found = json.loads((tmp_path / "peers" / "rod.json").read_text())
-    assert found["command"] == "bench peers --only rod --seeds 16 --json"
+    assert found["command"] == "peers --only rod --seeds 16 --json"
     assert (tmp_path / "peers" / "wall.json").is_file()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
-from commands import bad, call, estimates, shell, until
+from commands import bad, bench, call, estimates, shell, until
 from patience import PATIENCE
 from typer.testing import CliRunner
 
@@ -36,7 +36,6 @@ COMMANDS = (
     "report",
     "watch",
     "export",
-    "bench",
     "citation",
 )
 
@@ -400,8 +399,8 @@ class Fake:
 
 @pytest.fixture
 def fake(monkeypatch):
+    from benchmarks import rods, step
     from livepde import reproduce
-    from livepde.bench import rods, step
 
     def install(value: float) -> Fake:
         one = Fake(value)
@@ -432,7 +431,7 @@ def test_reproduce_and_bench_as_json(fake, value, expected):
         {"name": "error of q", "value": value, "bound": 0.05, "sense": "<=", "ok": value < 0.05}
     ]
     assert one.asked == [("analytic", False)]
-    code, output = call("bench", "step", "--json")
+    code, output = bench("step", "--json")
     assert code == expected
     assert json.loads(output)["notes"] == ["a note"]
 
@@ -443,11 +442,11 @@ def test_reproduce_and_bench_for_people(fake, here):
     assert code == 0
     assert "failed" in output
     assert (here / "kept" / "parameter.png").is_file()
-    assert call("bench", "step")[0] == 0
+    assert bench("step")[0] == 0
     assert "the first experiment" in call("reproduce", "list")[1]
-    assert "coverage" in call("bench", "--help")[1]
+    assert "coverage" in bench("--help")[1]
     assert "did you mean 'seed'?" in bad("reproduce", "sed")
-    code, output = call("bench", "xyz")
+    code, output = bench("xyz")
     assert code == 2
     assert "No such command 'xyz'" in output
 

@@ -856,10 +856,10 @@ def test_inputs_that_are_held_do_not_ramp():
 
 @needs_mpc
 def test_the_benchmark_compares_the_same_task():
-    from livepde.bench.control.compare import compare
-    from livepde.bench.control.horizon import Setting
-    from livepde.bench.control.outcome import promises
-    from livepde.bench.control.rod import rod as task
+    from benchmarks.control.compare import compare
+    from benchmarks.control.horizon import Setting
+    from benchmarks.control.outcome import promises
+    from benchmarks.control.rod import rod as task
 
     def make(seed: int) -> Any:
         return replace(task(seed), samples=14, horizon=5, jump=float("nan"))

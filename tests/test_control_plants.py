@@ -12,17 +12,17 @@ import pytest
 from typer.testing import CliRunner
 
 import livepde.control as ct
-from livepde.bench.control import PROBLEMS
-from livepde.bench.control import battery as cell
-from livepde.bench.control import wall as house
-from livepde.bench.control.battery import battery
-from livepde.bench.control.compare import FIXED, HORIZONS, LEARNED, TRUE, compare
-from livepde.bench.control.horizon import QUIET, MovingHorizon, Setting
-from livepde.bench.control.outcome import both
-from livepde.bench.control.problem import Problem, Simulated
-from livepde.bench.control.runs import Run, closed_loop, learned, nominal, told
-from livepde.bench.control.wall import wall
-from livepde.cli import app
+from benchmarks.__main__ import app
+from benchmarks.control import PROBLEMS
+from benchmarks.control import battery as cell
+from benchmarks.control import wall as house
+from benchmarks.control.battery import battery
+from benchmarks.control.compare import FIXED, HORIZONS, LEARNED, TRUE, compare
+from benchmarks.control.horizon import QUIET, MovingHorizon, Setting
+from benchmarks.control.outcome import both
+from benchmarks.control.problem import Problem, Simulated
+from benchmarks.control.runs import Run, closed_loop, learned, nominal, told
+from benchmarks.control.wall import wall
 from livepde.errors import ConfigurationError
 
 needs_mpc = pytest.mark.skipif(find_spec("do_mpc") is None, reason="do-mpc is not installed")
@@ -255,7 +255,7 @@ def test_the_command_prints_the_checks_and_draws(monkeypatch, tmp_path):
 
     short = replace(PROBLEMS["battery"], settings=both(Setting(4, 1.0, 1.0)), make=make)
     monkeypatch.setitem(PROBLEMS, "battery", short)
-    command = ["bench", "control", "--only", "battery", "--seeds", "1", "--json"]
+    command = ["control", "--only", "battery", "--seeds", "1", "--json"]
     printed = json.loads(CliRunner().invoke(app, [*command, "--draw", str(tmp_path)]).stdout)
     assert (tmp_path / "battery.png").stat().st_size > 10_000
     names = [check["name"] for check in printed["checks"]]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from livepde.bench import coverage
-from livepde.bench.coverage import PROBLEMS, twin
-from livepde.cli import app
+from benchmarks import coverage
+from benchmarks.__main__ import app
+from benchmarks.coverage import PROBLEMS, twin
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -73,7 +73,7 @@ def test_a_field_seen_in_part_is_covered_outside_too():
 def test_the_command_prints_checks(monkeypatch: pytest.MonkeyPatch):
     short = {name: replace(item, samples=20) for name, item in PROBLEMS.items()}
     monkeypatch.setattr(coverage, "PROBLEMS", short)
-    done = CliRunner().invoke(app, ["bench", "coverage", "--twins", "2", "--json"])
+    done = CliRunner().invoke(app, ["coverage", "--twins", "2", "--json"])
     found = json.loads(done.stdout)
     assert done.exit_code == (0 if all(item["ok"] for item in found["checks"]) else 1)
     assert len(found["tables"][0]["rows"]) == len(PROBLEMS)

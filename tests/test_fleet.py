@@ -11,7 +11,7 @@ from problems import laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
-from livepde.bench.fleet import fleet as benchmark
+from benchmarks.fleet import fleet as benchmark
 from livepde.fleet import Kept
 from livepde.laws.innovations import Innovations
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern

@@ -14,7 +14,7 @@ from scipy.special import exp1
 from skfem import ElementQuad1, MeshQuad
 
 import livepde as lp
-from livepde.bench.cases import bench_cases
+from benchmarks.cases import bench_cases
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.fem import grid

@@ -10,7 +10,7 @@ import pytest
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
-from livepde.bench import scale
+from benchmarks import scale
 from livepde.errors import LawError
 from livepde.laws.coupled import StageForms
 from livepde.laws.information import InformationMetric, trace_probes
@@ -357,7 +357,7 @@ def test_missing_sensors_are_no_noise_that_turns_back():
 
 
 def square(size: int) -> tuple[lp.Model, list[tuple[float, np.ndarray]], Callable]:
-    """Return the problem of `bench scale`, exact samples, and the error of an estimate."""
+    """Return the problem of `benchmarks.scale`, exact samples, and the error of an estimate."""
     model = scale.problem(size)
     samples = list(scale.readings(model, 80))
     truth, mass = model.initial_parameter(scale.q_true), model.parameter_mass

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import livepde as lp
-from livepde.bench.step import problem
+from benchmarks.step import problem
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.linalg import SuperLUSolver
 

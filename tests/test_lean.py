@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.linalg import sqrtm
 
 import livepde as lp
-from livepde.bench import lean
-from livepde.bench import rods as costs
-from livepde.bench.peers import arrays, table
-from livepde.bench.peers.augmented import Augmented
-from livepde.bench.problems import PROBLEMS
-from livepde.bench.problems.rod import ENDS, ROD, STEP, rod
+from benchmarks import earlier, lean
+from benchmarks import rods as costs
+from benchmarks.layered import ENDS, STEP, rod
+from benchmarks.peers import arrays, table
+from benchmarks.peers.augmented import Augmented
+from benchmarks.problems import PROBLEMS
+from benchmarks.problems.rod import ROD
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Inputs, Moment, linear
 
@@ -258,9 +256,6 @@ def test_every_bound_is_of_a_process_that_is_timed():
 
 
 def test_the_earlier_forward_step_is_asked_in_turns(monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
-    sys.modules.pop("earlier", None)
-    earlier = importlib.import_module("earlier")
     monkeypatch.setattr(earlier, "SIZES", ((12, 2), (31, 2)))
     earlier.compare(earlier.ROOT / "src", "HEAD", 2)
     lines = capsys.readouterr().out.splitlines()

@@ -148,12 +148,9 @@ def fish(line: str) -> list[str]:
     ("line", "expected"),
     [
         ("livepde re", ["report", "reproduce"]),
-        ("livepde bench imp", ["import"]),
         ("livepde equations heat", ["heat"]),
         ("livepde equations ", list(EQUATIONS)),
         ("livepde reproduce seed-ex", ["seed-excited", "seed-excited-noise"]),
-        ("livepde bench peers --only w", ["wall"]),
-        ("livepde bench faults --only m", ["mqtt", "malformed", "messages"]),
         ("livepde citation --format b", ["bibtex"]),
         ("livepde run case.toml --engine ", ["own", "petsc"]),
     ],

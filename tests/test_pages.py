@@ -31,10 +31,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from pydantic import BaseModel
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from benchmarks.__main__ import app as benchmarks
 from livepde.cases.read import read_spec
 from livepde.cases.schema import CaseSpec
 from livepde.cli import app
@@ -56,12 +58,12 @@ COMPLETES = ROOT / "cases" / "soil_layers.toml"  # gives what a part of a case l
 # those for which a test stands. `.ci/run` calls make; what installs is tried with the packages.
 ELSEWHERE = {
     "test_pages.py": ["make", "python3 -m venv .venv", ". .venv/bin/activate", "pip install"],
-    "test_cli.py": ["livepde bench step"],
-    "test_schur.py": ["livepde bench scale"],
-    "test_public.py::test_the_benchmark_of_the_import": ["livepde bench import"],
-    "test_lean.py::test_peers_are_divided_by_the_prior": ["livepde bench peers"],
-    "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["livepde bench fleet"],
-    "test_benchmarks.py::test_steps_are_ratios": ["python benchmarks/suite/costs.py"],
+    "test_cli.py": ["python -m benchmarks step"],
+    "test_schur.py": ["python -m benchmarks scale"],
+    "test_public.py::test_the_benchmark_of_the_import": ["python -m benchmarks import"],
+    "test_lean.py::test_peers_are_divided_by_the_prior": ["python -m benchmarks peers"],
+    "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["python -m benchmarks fleet"],
+    "test_benchmarks.py::test_steps_are_ratios": ["python -m benchmarks.suite.costs"],
     "test_cli_fleet.py::test_each_row_is_a_run_of_its_own": ["livepde fleet mycase"],
     "test_dashboard.py::test_watch_says_where_and_ends_with_ctrl_c": ["livepde watch"],
     "test_dashboard.py::test_the_page_follows_a_run_and_looks_back": [
@@ -89,6 +91,7 @@ ELSEWHERE = {
     ],
     "test_deploy.py::test_options_exist": ["docker build", "LIVEPDE_TOKEN=$(openssl"],
 }
+BENCHMARKS = "python -m benchmarks "
 BEGINNINGS = [start for several in ELSEWHERE.values() for start in several]
 
 
@@ -139,14 +142,16 @@ class Session:
             if _stands_elsewhere(command):
                 continue
             program, *arguments = shlex.split(command, comments=True)
-            if program == "python":
+            if command.startswith(BENCHMARKS):
+                self._invoke(benchmarks, command, arguments[2:])
+            elif program == "python":
                 runpy.run_path(arguments[0], run_name="__main__")
             else:
-                self._livepde(command, arguments)
+                self._invoke(app, command, arguments)
 
-    def _livepde(self, command: str, arguments: list[str]) -> None:
+    def _invoke(self, program: typer.Typer, command: str, arguments: list[str]) -> None:
         try:
-            done = CliRunner().invoke(app, arguments, catch_exceptions=False)
+            done = CliRunner().invoke(program, arguments, catch_exceptions=False)
         except LivepdeError as error:
             self.refused = f"{command}: {error}"
             print(f"Error: {error}")
@@ -243,7 +248,7 @@ def is_a_test(name: str) -> bool:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_a_page_names_is_there(page):
     """Commands, experiments, files and tests of the project, in quotes."""
-    program = get_command(app)
+    program, measures = get_command(app), get_command(benchmarks)
     for name in set(re.findall(r"`([^`\n]+)`", page.read_text(encoding="utf-8"))):
         words = name.split()
         if re.fullmatch(r"test_\w+\.py(::\w+)?", name):
@@ -252,10 +257,10 @@ def test_what_a_page_names_is_there(page):
             assert (ROOT / words[-1]).exists(), name
         elif words[0] == "make" and words[1:] and words[1].islower():
             assert re.search(rf"^{words[1]}:", MAKEFILE, re.MULTILINE), name
+        elif name.startswith(BENCHMARKS) and re.fullmatch(r"[a-z]+", words[3]):
+            assert words[3] in measures.commands, name
         elif words[0] == "livepde" and words[1:] and re.fullmatch(r"[a-z]+", words[1]):
             assert words[1] in program.commands, name
-            if words[1] == "bench" and words[2:]:
-                assert words[2] in program.commands["bench"].commands, name
             if words[1] == "reproduce" and words[2:] and words[2].islower():
                 assert words[2] in EXPERIMENTS, name
 
@@ -307,12 +312,14 @@ def test_pages_that_the_program_writes(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     hooks = importlib.import_module("hooks")
     assert hooks.on_page_markdown("as it is") == "as it is"
-    commands = hooks.on_page_markdown("<!-- command line -->")
-    program = get_command(app)
-    for name, command in program.commands.items():
-        section = commands[commands.index(f"## `livepde {name}`\n") :]
-        for inner in getattr(command, "commands", ()):
-            assert f"### `livepde {name} {inner}`\n" in section
+    commands = hooks.on_page_markdown("<!-- command line --> <!-- benchmarks -->")
+    described = {
+        f"{prefix} {name}": command
+        for prefix, program in (("livepde", app), ("python -m benchmarks", benchmarks))
+        for name, command in get_command(program).commands.items()
+    }
+    for title, command in described.items():
+        section = commands[commands.index(f"## `{title}`\n") :]
         for option in command.params:
             name = max(option.opts, key=len)
             assert name in section or not name.startswith("--") or option.hidden, name

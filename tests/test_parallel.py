@@ -175,9 +175,10 @@ def test_the_gradient_law_of_a_subdomain_is_refused_on_several_ranks_in_a_senten
 
 @needs_mpi
 def test_the_benchmark_counts_what_crosses():
-    command = ["bench", "mpi", "--size", "2700", "--samples", "1", "--rounds", "1", "--json"]
+    command = ["mpi", "--size", "2700", "--samples", "1", "--rounds", "1", "--json"]
     done = subprocess.run(
-        [sys.executable, "-m", "livepde", *command],
+        [sys.executable, "-m", "benchmarks", *command],
+        cwd=Path(__file__).parents[1],
         env={**os.environ, **SETTINGS},
         capture_output=True,
         text=True,

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import livepde
+from benchmarks.startup import BASE, SCRIPT, startup
 from livepde import errors
-from livepde.bench.startup import BASE, SCRIPT, startup
 
 DOCUMENTED = (
     ".models",
@@ -113,7 +113,7 @@ def test_what_a_script_uses_is_light():
         "livepde",
     }
     assert not {"asyncio", "decimal", "multiprocessing", "sqlite3", "ssl"} & more
-    above = "bench cases cli dashboard diagnostics fleet models reproduce runs streams"
+    above = "cases cli dashboard diagnostics fleet models reproduce runs streams"
     assert not {f"livepde.{name}" for name in above.split()} & more
 
 

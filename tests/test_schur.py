@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import livepde as lp
-from livepde.bench import scale
+from benchmarks import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.coupled import StageProblem, blocks

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from livepde.bench.cases import jobs_of, run_job
+from benchmarks.cases import jobs_of, run_job
 
 CASES = Path(__file__).parents[1] / "cases"
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skfem import ElementLineHermite
 
 import livepde as lp
-from livepde.bench.cases import jobs_of, run_job
+from benchmarks.cases import jobs_of, run_job
 from livepde.cases import load
 from livepde.diagnostics import check_model
 from livepde.models import EQUATIONS, allen_cahn, burgers, kdv, kuramoto_sivashinsky

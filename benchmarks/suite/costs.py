@@ -1,4 +1,7 @@
-"""Costs of steps, of memory, and of a fleet; `livepde bench` prints them with their bounds."""
+"""Costs of steps, of memory, and of a fleet; `python -m benchmarks` prints their bounds, too.
+
+`python -m benchmarks.suite.costs NODES LAW` prints the memory of one identification.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from benchmarks import ROOT
+from benchmarks.fleet import fleet
+from benchmarks.step import problem, step
 from livepde import GradientLaw, Identifier, ResidualDamping, SensitivityLaw
-from livepde.bench.fleet import fleet
-from livepde.bench.step import problem, step
 
 LAWS = ("gradient", "sensitivity")
 MODES = 10
@@ -44,8 +48,9 @@ class Memory:
     param_names = ("nodes", "law")
 
     def track_memory(self, nodes: int, law: str) -> float:
-        command = [sys.executable, __file__, str(nodes), law]
-        return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        command = [sys.executable, "-m", "benchmarks.suite.costs", str(nodes), law]
+        done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
+        return float(done.stdout)
 
     track_memory.unit = "kB per unknown"  # type: ignore[attr-defined]
 

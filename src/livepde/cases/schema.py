@@ -390,7 +390,7 @@ class OutputSpec(Spec):
 
 
 class VariantSpec(Spec):
-    """The case with other values: what 'livepde bench cases' runs beside it."""
+    """The case with other values: what 'python -m benchmarks cases' runs beside it."""
 
     name: Name
     set: dict[str, Any] = Field(default_factory=dict)

@@ -10,7 +10,6 @@ from rich.markup import escape
 from threadpoolctl import threadpool_limits
 
 from livepde import __version__
-from livepde.cli.bench import bench
 from livepde.cli.cases import equations, init
 from livepde.cli.check import check
 from livepde.cli.citation import citation
@@ -52,15 +51,14 @@ COMMANDS = (
 )
 for command in COMMANDS:
     app.command()(command)
-app.add_typer(bench)
 
 
-def main() -> int:
-    """Run the command line and return its exit code."""
+def main(program: typer.Typer | None = None) -> int:
+    """Run a command line and return its exit code: by default that of livepde."""
     try:
         # The dense matrices of a step are small: threads for them cost more than they save.
         with threadpool_limits(1):
-            app(standalone_mode=True)
+            (program or app)(standalone_mode=True)
     except LivepdeError as error:
         terminal(err=True).print(f"[bold red]Error:[/] {escape(str(error))}", soft_wrap=True)
         return BAD_INPUT

@@ -4,6 +4,5 @@ from __future__ import annotations
 
 from livepde.exchange.export import export_fmu
 from livepde.exchange.regressor import OnlineRegressor, river_regressor
-from livepde.exchange.verify import Comparison, compare_fmu
 
-__all__ = ["Comparison", "OnlineRegressor", "compare_fmu", "export_fmu", "river_regressor"]
+__all__ = ["OnlineRegressor", "export_fmu", "river_regressor"]

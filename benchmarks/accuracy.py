@@ -1,0 +1,271 @@
+"""How close the laws come to what the data can tell: errors, intervals, and what a step costs.
+
+Every contender is given the same model, samples and noise level. Below stands the prior, which has
+seen nothing; above, the fit of all data with hindsight (`bench.offline`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import TypeAlias
+
+import numpy as np
+
+from benchmarks.offline import Fit, Trajectory, fit
+from benchmarks.problems import PROBLEMS, Data, Problem
+from benchmarks.scoring import (
+    Contender,
+    Found,
+    Judge,
+    Known,
+    Score,
+    error_ratio,
+    measured,
+    scored,
+    step_ratio,
+    table_of,
+)
+from livepde.errors import LivepdeError
+from livepde.identifier import Identifier
+from livepde.laws import AnyLaw, AutoLaw, GradientLaw, Replay, ResidualDamping, SensitivityLaw
+from livepde.linalg import Array
+from livepde.observation import Discrepancy, Observation, Tikhonov
+from livepde.progress import watched
+from livepde.runs.outcome import Check, Outcome
+from livepde.stepping import StepFailed
+
+__all__ = ["LAWS", "ROWS", "accuracy", "run_law"]
+
+LawBuilder: TypeAlias = Callable[[Data], tuple[Observation, AnyLaw] | None]
+
+PROMISED = "sensitivity, auto"  # the row of which the promises below are checked
+ALL_DATA = "offline fit of all data"
+EACH_SAMPLE = "offline fit, again at each sample"
+LARGEST_ERROR = 1.3  # of the promised row over that of the offline fit
+LARGEST_TIME = 1 / 20
+SAMPLES = 1000  # for which that time is promised
+
+
+# --- our laws ------------------------------------------------------------------------------------
+
+
+def _sensitivity(replay: Replay | None, data: Data) -> tuple[Observation, AnyLaw]:
+    return data.observation, SensitivityLaw(modes=data.modes, replay=replay)
+
+
+def _bank(data: Data) -> tuple[Observation, AnyLaw]:
+    return data.observation, AutoLaw(modes=data.modes)
+
+
+def _gradient(auto: bool, smooth: bool, data: Data) -> tuple[Observation, AnyLaw] | None:
+    gain, observation = data.problem.gain, data.observation
+    if gain is None:
+        return None
+    law = GradientLaw(gain="auto") if auto else GradientLaw(gain, ResidualDamping(1.0))
+    if smooth:
+        weights = data.process.weights
+        gram = np.eye(len(data.noise)) if weights is None else weights
+        delta = float(np.sqrt(data.noise @ (np.diag(gram) * data.noise)))
+        observation = replace(observation, reconstruction=Tikhonov(alpha=Discrepancy(delta=delta)))
+    return observation, law
+
+
+LAWS: dict[str, LawBuilder] = {
+    "sensitivity": partial(_sensitivity, None),
+    "sensitivity, replay": partial(_sensitivity, Replay()),
+    "sensitivity, auto": _bank,
+    "gradient": partial(_gradient, False, False),
+    "gradient, smoothed": partial(_gradient, False, True),
+    "gradient, auto": partial(_gradient, True, False),
+    "gradient, auto, smoothed": partial(_gradient, True, True),
+}
+"""Row -> observation and law for a data set; None where it is not meant for the sensors.
+
+Everything as it comes, but for the number of modes and the hand-set gain that the problem states.
+"""
+
+
+def _law(builder: LawBuilder, data: Data) -> Score | None:
+    built = builder(data)
+    return None if built is None else run_law(data, *built)
+
+
+def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
+    """Run a law over a data set; `observation` says what it is told of the sensors."""
+    process, samples = data.process, list(data)
+    identifier = Identifier(
+        process.model,
+        observation,
+        law,
+        u0=process.u0,
+        t0=float(process.times[0]),
+        withheld=process.withheld,
+        scheme=process.scheme,
+        dt_max=process.dt_max,
+        assimilate_from=process.assimilate_from,
+    )
+    failed, missed = 0, []
+
+    def step(at: int) -> None:
+        nonlocal failed
+        sample = samples[at]
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        failed += not estimate.status.ok
+        missed.append(estimate.withheld_error)
+
+    def known() -> Known:
+        belief = identifier.latent_belief()
+        factor = belief.q_factor
+        return belief.q, factor
+
+    step(0)
+    score = measured(data, step, known)
+    error = score.error if process.q_true is not None else _hidden(data, np.array(missed))
+    return replace(score, error=error, failed=failed)
+
+
+def _hidden(data: Data, missed: Array) -> float:
+    """Return the root mean square of what withheld sensors missed, shape (times, withheld)."""
+    late = data.process.times >= data.process.assimilate_from
+    return float(np.sqrt(np.nanmean(missed[late][1:] ** 2)))
+
+
+# --- what to hold them against -------------------------------------------------------------------
+
+
+def _prior(data: Data) -> Score:
+    """Judge the prior: what is known without any sample."""
+    judge, trajectory = Judge(data), Trajectory(data)
+    nothing = np.zeros(trajectory.size)
+    error, covered = judge.judged(
+        (k, trajectory.latent(nothing, k), trajectory.directions(k)) for k in judge.scored
+    )
+    if data.process.hidden is not None:
+        shown = trajectory.run(nothing, sensitivities=False)[1]
+        error = _hidden(data, data.process.hidden - shown)
+    return Score(error, covered, 1.0, 1.0, 1.0)
+
+
+@lru_cache(maxsize=1)
+def _fitted(data: Data) -> Fit:
+    return fit(data)
+
+
+def _all_data(data: Data) -> Score:
+    """Judge the fit of all data; its time is divided by the samples."""
+    found, judge = _fitted(data), Judge(data)
+    error, covered = judge.judged((k, found.q[k], found.factor(k)) for k in judge.scored)
+    if data.process.hidden is not None:
+        error = _hidden(data, data.process.hidden - found.hidden)
+    cut = "" if found.converged else ", cut off"
+    note = f"{found.evaluations} runs over {len(data)} samples{cut}"
+    return Score(error, covered, found.seconds / len(data) / data.forward, note=note)
+
+
+def _each_sample(data: Data) -> Score:
+    """Judge fits of the data so far: what one who fits online would know.
+
+    Cost: for each of `SAMPLES` samples a single run with sensitivities over those so far, half of
+    them on average; the least that one Gauss-Newton step costs. It is a third where unknowns become
+    as many as samples: later runs have more of them.
+    """
+    found, judge = _fitted(data), Judge(data)
+    run = found.seconds / found.evaluations / len(data) * SAMPLES
+    cost = run / data.forward * (1 / 3 if data.problem.varying else 1 / 2)
+
+    def fits() -> Iterator[tuple[int, Array, Array | None]]:
+        start = None
+        for at in judge.scored:
+            now = found if at == len(data) - 1 else fit(data.until(at), start)
+            start = now.coordinates
+            yield at, now.q[at], now.factor(at)
+
+    error, covered = judge.judged(fits())
+    return Score(error, covered, cost, note=f"one run for each of {SAMPLES} samples")
+
+
+ROWS: Mapping[str, Contender] = {
+    "prior": _prior,
+    **{name: partial(_law, builder) for name, builder in LAWS.items()},
+    ALL_DATA: _all_data,
+    EACH_SAMPLE: _each_sample,
+}
+"""Row -> contender."""
+
+
+# --- the benchmark -------------------------------------------------------------------------------
+
+
+def accuracy(
+    only: Sequence[str] = (),
+    seeds: int = 3,
+    *,
+    levels: Sequence[float] | None = None,
+    problems: Mapping[str, Problem] = PROBLEMS,
+    progress: bool = False,
+) -> Outcome:
+    """Run our laws, the prior and the offline fit on all problems and noise levels.
+
+    Parameters
+    ----------
+    only
+        Names of problems; default all.
+    seeds
+        Data sets for each noise level.
+    levels
+        Noise levels; default those of each problem.
+    problems
+        What there is to choose from.
+    progress
+        Show a bar on standard error.
+    """
+    found: Found = {}
+    notes = []
+    jobs = [
+        (problem, level, seed)
+        for problem in (problems[name] for name in only or problems)
+        for level in problem.chosen(levels)
+        for seed in range(seeds if level is not None else 1)
+    ]
+    for problem, level, seed in watched(jobs, len(jobs), "data sets") if progress else jobs:
+        try:
+            data = problem.data(level, seed)
+        except (LivepdeError, StepFailed) as error:
+            notes.append(f"{problem.name}: not run, {error}")
+            continue
+        for name, contender in ROWS.items():
+            score = scored(contender, data)
+            if score is not None:
+                found.setdefault((problem.name, level, name), []).append(score)
+    tables = table_of(found, limit=EACH_SAMPLE)
+    return Outcome(tables=tables, checks=_checks(found), notes=[*dict.fromkeys(notes), *NOTES])
+
+
+def _checks(found: Found) -> list[Check]:
+    """Return the promises: errors at each level, and the time for each problem."""
+    checks = []
+    for problem, level, row in found:
+        if row != PROMISED or level is None:
+            continue
+        error = error_ratio(found, (problem, level), PROMISED, EACH_SAMPLE)
+        time = step_ratio(found, (problem, level), PROMISED, EACH_SAMPLE)
+        name = f"{problem}, {level:.0%} noise: {{}} of '{PROMISED}' over '{EACH_SAMPLE}'"
+        checks.append(Check(name.format("error"), error, LARGEST_ERROR, "<="))
+        checks.append(Check(name.format("time"), time, LARGEST_TIME, "<="))
+    return checks
+
+
+NOTES = (
+    "error: relative, of the parameter, at the end; where it moves the root mean square over times "
+    "in the second half. Median over seeds, least and largest. soil: K, at the withheld sensor, "
+    "one step ahead (prior and offline fit: in a free run).",
+    f"limit: error over that of '{EACH_SAMPLE}', which is given all data up to the time that is "
+    f"scored. '{ALL_DATA}' is the same for what is constant, and a smoother for what moves: it "
+    "knows the future.",
+    "covered: share of values whose 95 % interval holds the truth, mean over seeds.",
+    "step: processor time of a step over that of a forward step with the matrix kept, mean over "
+    f"seeds; of '{ALL_DATA}' all of its time, divided by the samples; of '{EACH_SAMPLE}' computed: "
+    "a run with sensitivities over the samples so far.",
+)

@@ -1,0 +1,512 @@
+"""Alarms: how soon a jump is flagged, how seldom one is without cause, which models are doubted.
+
+A jump: a coefficient changes by a fifth between two samples, at noise of 1 % of the data. It has to
+be flagged within 30 samples, and the estimate has to find the new value without a restart. Without
+a jump the same filters have to stay silent for 10 000 samples on average.
+
+A wrong model: uniform where the ground has layers, a loss or a source left out. The run has to say
+that the model does not explain the data; with the right model it must not. Twins have data of the
+estimator's own scheme, so that a right model is right; real data are those of the cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cases import find_cases
+from livepde.cases import load
+from livepde.errors import LivepdeError
+from livepde.fem import Field, Piecewise, Scalar, dot, grad, interval, linear
+from livepde.identifier import Identifier
+from livepde.laws import Jumps, Replay, SensitivityLaw
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.models import burgers
+from livepde.observation import Observation, Points, Subdomain
+from livepde.plots import NORMAL_95
+from livepde.progress import watched
+from livepde.reproduce import seed_excited
+from livepde.runs import Check, Outcome, Table, drive, unexplained
+from livepde.stepping import Advance, ImplicitEuler, simulate
+
+__all__ = ["PROCESSES", "SUSPECTS", "Process", "Suspect", "Told", "alarms", "followed", "warned"]
+
+JUMP = 0.2  # relative change of the coefficient
+NOISE = 0.01  # of the root mean square of the data
+STEP = 0.05  # between two samples
+BEFORE = (200, 300)  # samples before the jump
+AFTER = 300  # samples after it
+CALM = 3000  # samples of a run without a jump
+CALM_RUNS = 3  # of each process
+SOON = 30  # samples within which a jump has to be flagged
+SELDOM = 1.0  # false alarms in 10 000 samples, at most
+FOUND = JUMP / 3  # relative error after the jump, at most
+WATCHED = 300  # samples of a run whose model is in question
+TWINS = 10  # data sets for each wrong model
+
+POINTS = (0.25, 0.5, 0.75)
+MESH = interval(0.0, 1.0, 20, regions={"left half": lambda x: x[0] < 0.5})
+
+
+# --- processes that jump -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """A process with a coefficient that may jump.
+
+    Attributes
+    ----------
+    title
+        What jumps, and what is seen.
+    model, observation, u0
+        As an `Identifier` takes them.
+    draw
+        rng -> coefficients of the truth before the jump, shape (m,).
+    law
+        Of the estimator.
+    where
+        Coefficients that are compared with the truth; default all.
+    """
+
+    title: str
+    model: Model
+    observation: Observation
+    u0: Any
+    draw: Callable[[np.random.Generator], Array]
+    law: SensitivityLaw = field(default_factory=lambda: SensitivityLaw(jumps=Jumps()))
+    where: Any = field(default_factory=lambda: slice(None))
+
+    def data(self, at: int, count: int, change: float, rng: np.random.Generator) -> Data:
+        """Return `count` samples; the coefficient changes after sample `at`, relative by `change`.
+
+        A change of zero is no jump.
+        """
+        q, times = self.draw(rng), _times(count)
+        states = _states(self.model, q, self.u0, times[: at + 1])
+        if at < count:
+            states += _states(self.model, (1.0 + change) * q, states[-1], times[at:])[1:]
+        return _seen(self.model, self.observation, states, times, q, rng)
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """Noisy samples of a process.
+
+    Attributes
+    ----------
+    times, z
+        Shapes (count + 1,), (count + 1, sensors); the first is the start.
+    q
+        Coefficients before the jump.
+    observation
+        With its noise.
+    """
+
+    times: Array
+    z: Array
+    q: Array
+    observation: Any
+
+
+def _seen(
+    model: Model,
+    observation: Any,
+    states: Sequence[Array],
+    times: Array,
+    q: Array,
+    rng: np.random.Generator,
+) -> Data:
+    """Return what sensors show of states, with noise."""
+    observed = observation.bind(model.state_space, model.X, model.parameter_space)
+    exact = np.array([observed.G @ u for u in states])
+    noise = NOISE * float(np.sqrt((exact**2).mean()))
+    z = exact + noise * rng.standard_normal(exact.shape)
+    return Data(times, z, q, replace(observation, noise=noise))
+
+
+def _times(count: int) -> Array:
+    times: Array = STEP * np.arange(count + 1.0)
+    return times
+
+
+def _states(model: Model, q: Array, u0: Any, times: Array) -> list[Array]:
+    """Return the states of the forward model by the estimator's own scheme."""
+    latent = model.latent.inverse(q)
+    return [u for _, u in simulate(model, latent, u0, times.tolist(), Advance(ImplicitEuler()))]
+
+
+def _driven(x: Any, t: float) -> Any:
+    return np.sin(3.0 * t) + 0.0 * x[0]
+
+
+def _heat(law: SensitivityLaw, title: str) -> Process:
+    model = Model(
+        Field(MESH, linear(MESH), dirichlet={"left": _driven, "right": 0.0}),
+        {"a": Scalar(0.3, 0.1, transform="log")},
+        A=lambda q, u, v, x: q.a * dot(grad(u), grad(v)),
+    )
+    return Process(title, model, Points(POINTS), 0.0, lambda rng: rng.uniform(0.2, 0.4, 1), law)
+
+
+def _reaction(unknown: Any, title: str, observation: Observation, **options: Any) -> Process:
+    """Return the paper's equation with the forcing of `seed-excited`."""
+    model = Model(
+        Field(MESH, linear(MESH), dirichlet={"boundary": 0.0}),
+        {"q": unknown},
+        A=lambda q, u, v, x: q.q * u * v,
+        B=lambda u, v, x: seed_excited.D * dot(grad(u), grad(v)),
+        f=seed_excited.f,
+    )
+    return Process(title, model, observation, lambda x: seed_excited.u_true(x, 0.0), **options)
+
+
+@cache
+def _reaction_number() -> Process:
+    return _reaction(
+        Scalar(3.0, 1.0),
+        "reaction q of the paper's equation, three points",
+        Points(POINTS),
+        draw=lambda rng: rng.uniform(2.0, 4.0, 1),
+    )
+
+
+@cache
+def _reaction_field() -> Process:
+    x = MESH.p[0]
+
+    def draw(rng: np.random.Generator) -> Array:
+        return np.asarray(2.0 + rng.uniform(1.0, 3.0) * np.sin(np.pi * x) ** 2)
+
+    return _reaction(
+        Field(MESH, linear(MESH), inner="H1", prior=3.0, std=1.0),
+        "reaction q(x) of the paper's equation, seen on (0.3, 0.87)",
+        Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87)),
+        draw=draw,
+        where=(x > 0.3) & (x < 0.87),
+    )
+
+
+@cache
+def _burgers() -> Process:
+    sides: dict[str, Any] = {"left": lambda x, t: 0.5 + 0.5 * np.sin(2.0 * t) + 0.0 * x[0]}
+    nu = Scalar(0.1, 0.03, transform="log")
+    model = burgers(interval(0.0, 1.0, 32), nu, dirichlet={**sides, "right": 0.0})
+    return Process(
+        "viscosity of Burgers' equation, three points",
+        model,
+        Points(POINTS),
+        lambda x: 0.5 * (1.0 - x[0]),
+        lambda rng: rng.uniform(0.08, 0.12, 1),
+    )
+
+
+PROCESSES: Mapping[str, Callable[[], Process]] = {
+    "heat": cache(lambda: _heat(SensitivityLaw(jumps=Jumps()), "diffusivity, three points")),
+    "heat, replayed": cache(
+        lambda: _heat(SensitivityLaw(jumps=Jumps(), replay=Replay()), "diffusivity, three points")
+    ),
+    "reaction": _reaction_number,
+    "reaction field": _reaction_field,
+    "burgers": _burgers,
+}
+"""Name -> maker of a process."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What one run told of one jump.
+
+    Attributes
+    ----------
+    delay
+        Samples from the jump to the first alarm after it; infinite if there was none.
+    false
+        Alarms before the jump.
+    again
+        Alarms after the first one.
+    error
+        Relative error at the end, root mean square over what is compared.
+    covered
+        Share of what is compared that lies in its 95 % interval at the end.
+    """
+
+    delay: float
+    false: int
+    again: int
+    error: float
+    covered: float
+
+
+def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0) -> Told:
+    """Run a process with a jump; the same seed gives the same numbers.
+
+    Parameters
+    ----------
+    change
+        Relative change of the coefficient; zero: no jump in `samples` samples.
+    """
+    rng = np.random.default_rng(seed)
+    at = int(rng.integers(*BEFORE)) if change else samples
+    count = at + AFTER if change else samples
+    data = process.data(at, count, change, rng)
+    identifier = Identifier(process.model, data.observation, process.law, u0=process.u0)
+    alarms = []
+    for k in range(1, count + 1):
+        estimate = identifier.step(data.times[k], data.z[k])
+        if estimate.notes.get("jump"):
+            alarms.append(k)
+    late = [k - at for k in alarms if k > at]
+    truth = ((1.0 + change) * data.q)[process.where]
+    belief, latent = identifier.latent_belief(), process.model.latent
+    error = latent.value(belief.q)[process.where] / truth - 1.0
+    # The interval in latent coefficients, through which every transform maps its ends.
+    std = np.asarray(belief.q_std, dtype=float)
+    exact = latent.inverse((1.0 + change) * data.q)
+    inside = np.abs(belief.q - exact) <= NORMAL_95 * std
+    return Told(
+        late[0] if late else np.inf,
+        len(alarms) - len(late),
+        max(len(late) - 1, 0),
+        float(np.sqrt(np.mean(error**2))),
+        float(inside[process.where].mean()),
+    )
+
+
+# --- models that are wrong -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A model that lacks something, and one that does not.
+
+    Attributes
+    ----------
+    title
+        What is wrong.
+    right, wrong
+        Models of a rod with three points.
+    draw
+        rng -> coefficients of the truth in the right model, shape (m,).
+    """
+
+    title: str
+    right: Model
+    wrong: Model
+    draw: Callable[[np.random.Generator], Array]
+
+
+def _rod(a: Any, loss: float = 0.0, source: float = 0.0) -> Model:
+    ends: dict[str, Any] = {"left": lambda x, t: 5.0 * np.sin(t) + 0.0 * x[0], "right": 0.0}
+
+    def others(u: Any, v: Any, x: Any) -> Any:
+        heating = source * np.exp(-(((x[0] - 0.4) / 0.1) ** 2))
+        return loss * (u - 2.0) * v - heating * v
+
+    return Model(
+        Field(MESH, linear(MESH), dirichlet=ends),
+        {"a": a},
+        A=lambda q, u, v, x: q.a * dot(grad(u), grad(v)),
+        B=others,
+    )
+
+
+def _suspects() -> dict[str, Suspect]:
+    number = Scalar(0.3, 0.1, transform="log")
+    halves: dict[str, Any] = {"left": "left half", "right": lambda x: x[0] >= 0.5}
+    layers = Piecewise(halves, prior=0.3, std=0.1, transform="log")
+    plain = _rod(number)
+
+    def layered(rng: np.random.Generator) -> Array:
+        first = rng.uniform(0.2, 0.4)
+        return np.array([first, first * rng.choice([0.5, 2.0])])
+
+    def one(rng: np.random.Generator) -> Array:
+        return rng.uniform(0.2, 0.4, 1)
+
+    return {
+        "uniform": Suspect(
+            "uniform; it has two layers, one twice the other", _rod(layers), plain, layered
+        ),
+        "loss": Suspect("no side loss; it has one", _rod(number, loss=0.5), plain, one),
+        "forcing": Suspect("no source; it has one", _rod(number, source=2.0), plain, one),
+    }
+
+
+SUSPECTS: Mapping[str, Suspect] = _suspects()
+"""Name -> what is wrong."""
+
+CASES: tuple[tuple[str, str, dict[str, Any], bool], ...] = (
+    ("soil, uniform", "soil_uniform", {"law.noise": "0.1 K"}, True),
+    ("soil, layers with offsets", "soil_offsets", {}, False),
+    ("stream bed, uniform", "streambed_035_uniform", {}, True),
+    ("stream bed, layers with offsets", "streambed_035_layers", {}, False),
+)
+"""Row, case, settings, whether the model is wrong: noise of the thermometers in all."""
+
+
+def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
+    """Return whether the right and the wrong model are doubted on the same data."""
+    rng = np.random.default_rng(seed)
+    q, times = suspect.draw(rng), _times(WATCHED)
+    states = _states(suspect.right, q, 0.0, times)
+    data = _seen(suspect.right, Points(POINTS), states, times, q, rng)
+    told = []
+    for model in (suspect.right, suspect.wrong):
+        law = SensitivityLaw(replay=Replay())
+        identifier = Identifier(model, data.observation, law, u0=0.0)
+        run = identifier.run(zip(times[1:], data.z[1:], strict=True))
+        told.append(unexplained(run.to_xarray()))
+    return told[0], told[1]
+
+
+# --- all of it -----------------------------------------------------------------------------------
+
+
+def alarms(seeds: int = 5, *, few: bool = False, progress: bool = False) -> Outcome:
+    """Run everything.
+
+    Parameters
+    ----------
+    seeds
+        Jumps up, and as many down, of each process.
+    few
+        One run without a jump of each process, and one data set for each wrong model.
+    """
+    calm_runs, twins = (1, 1) if few else (CALM_RUNS, TWINS)
+    jumped = [
+        (name, seed, sign * JUMP) for name in PROCESSES for seed in range(seeds) for sign in (1, -1)
+    ]
+    todo: list[Any] = [
+        *jumped,
+        *((name, seed, 0.0) for name in PROCESSES for seed in range(calm_runs)),
+        *((name, seed) for name in SUSPECTS for seed in range(twins)),
+        *CASES,
+    ]
+    jumps: dict[str, list[Told]] = {name: [] for name in PROCESSES}
+    quiet: dict[str, list[Told]] = {name: [] for name in PROCESSES}
+    models: dict[str, list[tuple[bool, bool]]] = {name: [] for name in SUSPECTS}
+    real, notes = [], []
+    for name, *rest in watched(todo, len(todo), "runs") if progress else todo:
+        if len(rest) == 1:
+            models[name].append(warned(SUSPECTS[name], rest[0]))
+        elif len(rest) == 2:
+            seed, change = rest
+            told = followed(PROCESSES[name](), seed, change, CALM)
+            (jumps if change else quiet)[name].append(told)
+        else:
+            case, settings, wrong = rest
+            try:
+                real.append((name, wrong, _case(case, settings)))
+            except LivepdeError as error:
+                notes.append(f"{name}: not run, {error}")
+    tables = [_jumps(jumps), _false(jumps, quiet), _models(models, real)]
+    return Outcome(tables, _checks(jumps, quiet, models, real), [*NOTES, *notes])
+
+
+NOTES = (
+    f"Jump of {JUMP:.0%} up or down, noise {NOISE:.0%} of the data, samples {STEP:g} apart; data "
+    f"of the estimator's scheme. Error and share in the 95 % interval: {AFTER} samples later.",
+)
+
+
+def _case(name: str, settings: Mapping[str, Any]) -> bool:
+    """Return whether a run of a case says that its model does not explain the data."""
+    path = next((path for path in find_cases() if path.stem == name), None)
+    if path is None:
+        raise LivepdeError(f"there is no case {name}.toml beside the other cases.")
+    prepared = load(path, settings=settings).prepare()
+    run = drive(prepared.identifier, prepared.stream, journal=prepared.journal())
+    return unexplained(run.result.to_xarray())
+
+
+def _jumps(found: Mapping[str, Sequence[Told]]) -> Table:
+    rows = []
+    for name, told in found.items():
+        delays = np.array([one.delay for one in told])
+        errors = np.array([one.error for one in told])
+        rows.append(
+            (
+                name,
+                PROCESSES[name]().title,
+                len(told),
+                _percent(delays <= SOON),
+                float(np.median(delays)),
+                float(delays.max()),
+                sum(one.again for one in told),
+                f"{100 * np.median(errors):.2g} %",
+                f"{100 * errors.max():.2g} %",
+                _percent(np.array([one.covered for one in told])),
+            )
+        )
+    columns = (
+        "process",
+        "what jumps",
+        "jumps",
+        f"flagged in {SOON}",
+        "median delay",
+        "longest",
+        "more alarms",
+        "median error",
+        "largest",
+        "in the interval",
+    )
+    return Table("Jumps", columns, rows)
+
+
+def _false(jumps: Mapping[str, Sequence[Told]], quiet: Mapping[str, Sequence[Told]]) -> Table:
+    rows = []
+    for name, told in quiet.items():
+        number = sum(one.false for one in told)
+        rows.append((name, CALM * len(told), number, sum(one.false for one in jumps[name])))
+    columns = ("process", "samples without a jump", "alarms", "alarms before a jump")
+    return Table("False alarms", columns, rows)
+
+
+def _models(
+    models: Mapping[str, Sequence[tuple[bool, bool]]], real: Sequence[tuple[str, bool, bool]]
+) -> Table:
+    rows: list[tuple[Any, ...]] = []
+    for name, told in models.items():
+        right, wrong = (sum(one) for one in zip(*told, strict=True))
+        rows.append((SUSPECTS[name].title, f"{wrong} of {len(told)}", f"{right} of {len(told)}"))
+    for name, wrong, said in real:
+        answer = "yes" if said else "no"
+        rows.append((f"{name} (real)", *((answer, "–") if wrong else ("–", answer))))
+    columns = ("model", "warned", "the right one warned")
+    return Table("Does the run say that its model does not explain the data?", columns, rows)
+
+
+def _percent(values: Any) -> str:
+    return f"{100 * float(np.mean(values)):.3g} %"
+
+
+def _checks(
+    jumps: Mapping[str, Sequence[Told]],
+    quiet: Mapping[str, Sequence[Told]],
+    models: Mapping[str, Sequence[tuple[bool, bool]]],
+    real: Sequence[tuple[str, bool, bool]],
+) -> list[Check]:
+    checks = []
+    for name, told in jumps.items():
+        soon = float(np.mean([one.delay <= SOON for one in told]))
+        largest = max(one.error for one in told)
+        checks.append(Check(f"{name}: flagged within {SOON} samples", soon, 1.0, ">="))
+        checks.append(Check(f"{name}: error after the jump", largest, FOUND, "<="))
+    samples = CALM * sum(len(told) for told in quiet.values())
+    number = sum(one.false for told in quiet.values() for one in told)
+    rate = 1e4 * number / samples
+    checks.append(Check("false alarms in 10 000 samples", rate, SELDOM, "<="))
+    for name, pairs in models.items():
+        right, wrong = (float(np.mean(one)) for one in zip(*pairs, strict=True))
+        checks.append(Check(f"{name}: wrong model warned", wrong, 1.0, ">="))
+        checks.append(Check(f"{name}: right model warned", right, 0.0, "<="))
+    for name, wrong, said in real:
+        bound, sense = (1.0, ">=") if wrong else (0.0, "<=")
+        checks.append(Check(f"{name}: warned", float(said), bound, sense))  # type: ignore[arg-type]
+    return checks

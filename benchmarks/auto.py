@@ -1,0 +1,171 @@
+"""What `GradientLaw(gain="auto")` promises, on the square of `benchmarks.scale`.
+
+A field of unknowns is identified from the strip of a square, on several meshes, from exact data and
+from data with white noise. The law is told nothing: neither a gain nor how large the noise is. Its
+error is that of q in L2, relative to that of q = 0. With exact data it is held against the best of
+a grid of constant gains and c_1, chosen by the truth. Its cost is that of the processes of
+`python -m benchmarks step`, in steps of the forward model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from benchmarks import scale
+from benchmarks import step as steps
+from livepde.identifier import Identifier
+from livepde.laws import GradientLaw, ResidualDamping
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.runs.outcome import Check, Outcome, Table
+
+__all__ = ["COSTS", "LEVELS", "SEEDS", "SIZES", "auto"]
+
+SIZES = (64, 256, 1024, 2500, 10_000)  # nodes of the square
+LEVELS = (0.0, 1e-3, 1e-2)  # noise over the root mean square of the readings
+SEEDS = 5  # data sets for each level of noise
+SAMPLES = 100
+GAINS = (1.0, 1e2, 1e4, 1e6)  # of the law that it is held against
+DAMPINGS = (0.1, 1.0)  # and its c_1
+WORST = 1.05  # largest error on any sample with status ok; q = 0 has 1
+RATIO = 1.3  # error with exact data over that of the best constant gain
+COSTS = {31: 15.0, 1_000: 15.0, 10_000: 10.0}  # nodes -> forward steps that a step may cost
+
+
+@dataclass(frozen=True)
+class Course:
+    """Errors of q along a run.
+
+    Attributes
+    ----------
+    worst, last
+        The largest on a sample with status ok, and that after the last sample.
+    failed
+        Samples with another status.
+    """
+
+    worst: float
+    last: float
+    failed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Square:
+    """The process on one mesh, and its exact readings.
+
+    Attributes
+    ----------
+    model
+        The process.
+    truth
+        Exact parameter, shape (m,).
+    samples
+        Times and readings.
+    """
+
+    model: Model
+    truth: Array
+    samples: list[tuple[float, Array]]
+
+    @classmethod
+    def of(cls, size: int) -> Square:
+        """Return the square with about so many nodes."""
+        model = scale.problem(size)
+        truth = model.initial_parameter(scale.q_true)
+        return cls(model, truth, list(scale.readings(model, SAMPLES)))
+
+    def noisy(self, level: float, seed: int) -> list[tuple[float, Array]]:
+        """Return the samples with white noise of a level, relative to all readings."""
+        if level == 0.0:
+            return self.samples
+        rng = np.random.default_rng(seed)
+        size = level * float(np.sqrt(np.mean([np.mean(z**2) for _, z in self.samples])))
+        return [(t, z + size * rng.standard_normal(len(z))) for t, z in self.samples]
+
+    def follow(self, law: GradientLaw, samples: Sequence[tuple[float, Array]]) -> Course:
+        """Return the errors of q of a law."""
+        identifier = Identifier(self.model, scale.OMEGA, law, q0=0.0, u0=2.0)
+        worst = last = 0.0
+        failed = 0
+        for t, z in samples:
+            estimate = identifier.step(t, z)
+            last = self.error(estimate.q)
+            if estimate.status.ok:
+                worst = max(worst, last)
+            else:
+                failed += 1
+        return Course(worst, last, failed)
+
+    def error(self, q: Array) -> float:
+        """Return the error of q in L2, relative to that of q = 0."""
+        mass, miss = self.model.parameter_mass, q - self.truth
+        return float(np.sqrt((miss @ (mass @ miss)) / (self.truth @ (mass @ self.truth))))
+
+
+def auto(
+    sizes: Sequence[int] = SIZES, seeds: int = SEEDS, costs: Sequence[int] = tuple(COSTS)
+) -> Outcome:
+    """Check the promises of the law that tunes itself.
+
+    Parameters
+    ----------
+    sizes
+        Numbers of nodes of the square.
+    seeds
+        Data sets for each level of noise.
+    costs
+        Numbers of nodes where the cost is measured, of `COSTS`.
+    """
+    rows: list[tuple[object, ...]] = []
+    checks: list[Check] = []
+    for size in sizes:
+        square = Square.of(size)
+        best, name = _best(square)
+        for level in LEVELS:
+            found = [
+                square.follow(GradientLaw(gain="auto"), square.noisy(level, seed))
+                for seed in range(seeds if level else 1)
+            ]
+            worst, last = max(c.worst for c in found), [c.last for c in found]
+            failed = sum(c.failed for c in found)
+            rows.append((square.model.X.dim, level, min(last), max(last), worst, failed, name))
+            label = f"{square.model.X.dim} nodes, noise {level:g}"
+            checks.append(Check(f"{label}: largest error with status ok", worst, WORST, "<="))
+            if level == 0.0:
+                ratio = max(last) / best
+                checks.append(Check(f"{label}: error / best constant gain", ratio, RATIO, "<="))
+                name = ""
+    times, bounds = _costs(costs)
+    columns = ("nodes", "noise", "least", "largest", "worst", "failed", "best constant gain")
+    table = Table("Error of q after the last sample (q = 0: 1)", columns, rows)
+    note = (
+        f"{SAMPLES} samples, {seeds} data sets for each noise; worst: on any sample with status "
+        "ok; failed: samples with another. Constant gains: "
+        f"{', '.join(f'{gain:g}' for gain in GAINS)} with c1 {DAMPINGS[0]:g} and {DAMPINGS[1]:g}."
+    )
+    return Outcome(tables=[table, times], checks=[*checks, *bounds], notes=[note])
+
+
+def _best(square: Square) -> tuple[float, str]:
+    """Return the smallest error of constant gains with exact data, and with which that was."""
+    found = []
+    for gain, c1 in product(GAINS, DAMPINGS):
+        course = square.follow(GradientLaw(gain, ResidualDamping(c1)), square.samples)
+        found.append((course.last, f"{course.last:.3g}: {gain:g}, c1 {c1:g}"))
+    return min(found)
+
+
+def _costs(sizes: Sequence[int]) -> tuple[Table, list[Check]]:
+    """Return the cost of a step, in forward steps of the same process."""
+    rows, checks = [], []
+    for size in sizes:
+        low, middle, high, mean = steps.first_steps(steps.problem(size), GradientLaw(gain="auto"))
+        rows.append((size, low, middle, high, mean, COSTS[size]))
+        name = f"{size} nodes: step / forward step, median"
+        checks.append(Check(name, middle, COSTS[size], "<="))
+    columns = ("nodes", "min", "median", "max", "mean", "bound")
+    return Table("One step over one forward step", columns, rows), checks

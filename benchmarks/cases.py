@@ -1,0 +1,374 @@
+"""Every case of the project, with its variants: what it finds, how well, and at what price.
+
+Beside each run goes a forward run with the unknowns frozen at their prior, sample by sample in the
+same process. It gives two numbers: the error of the model without data, and the time of a forward
+step, of which the cost of the law is a multiple.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from threadpoolctl import threadpool_limits
+
+from livepde.cases import Prepared, load
+from livepde.errors import CaseError, LivepdeError
+from livepde.laws import Belief, Law, Problem, Report, Status
+from livepde.linalg import Array
+from livepde.progress import watched
+from livepde.result import Result
+from livepde.runs import Check, Outcome, Table, measures
+from livepde.runs.directory import markdown
+from livepde.runs.outcome import Bound, Sense
+from livepde.runs.summary import digits, shown
+from livepde.stepping import ForwardStage, Interval, advance
+
+__all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run_job"]
+
+GALLERY = """\
+# Gallery: cases
+
+Every case on measurements or fields that others published, with its variants: what was estimated,
+the deviation that the law states, what others found, and the checks of the case. Written by
+`python -m benchmarks cases --gallery FOLDER`. RMSE is one step ahead, with all learning in it,
+"prior" that of the model with its unknowns at their prior, and time that of a sample over that of a
+forward step of the same model. Figures show the first run of each case.
+
+"""
+
+QUICK = (
+    "burgers",
+    "horkheim",
+    "oude_korendijk",
+    "scratch_assay",
+    "soil_column",
+    "soil_uniform",
+    "thermal_response",
+)
+"""Cases of all kinds of processes that take seconds each."""
+WORKERS = 2
+WARM_UP = 2  # samples in which matrices are built that are built once
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: a case, or one of its variants with one seed."""
+
+    path: Path
+    variant: str = ""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    figure: Path | None = None
+
+    @property
+    def label(self) -> str:
+        """Case and variant."""
+        return f"{self.path.stem}: {self.variant}" if self.variant else self.path.stem
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run gave.
+
+    Attributes
+    ----------
+    numbers
+        As `runs.measures` has them.
+    unknowns
+        Label -> unit, reference (NaN if none).
+    expected
+        Numbers that the case expects of it.
+    samples, ratio
+        Samples, and their time over that of as many forward steps.
+    prior
+        RMSE with the unknowns frozen at their prior.
+    error
+        Why there is nothing of this.
+    """
+
+    title: str = ""
+    source: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    unknowns: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    expected: Mapping[str, tuple[Sense, Bound]] = field(default_factory=dict)
+    samples: int = 0
+    ratio: float = math.nan
+    prior: float = math.nan
+    error: str = ""
+
+
+def find_cases(folder: Path | None = None) -> list[Path]:
+    """Return the project's case files: those of a folder, or of the next 'cases' above this one.
+
+    Raises
+    ------
+    CaseError
+        There is none.
+    """
+    here = Path.cwd()
+    folders = [folder] if folder else [base / "cases" for base in (here, *here.parents)]
+    for place in folders:
+        found = sorted(place.glob("*.toml"))
+        if found:
+            return found
+    raise CaseError(
+        f"{folder or here}: there are no case files (*.toml) here"
+        + ("." if folder else ", nor in a folder 'cases' above; go there, or add --folder DIR.")
+    )
+
+
+def _one_thread() -> None:
+    """Keep a worker to one thread: its dense matrices are small, and all cores have a worker."""
+    threadpool_limits(1)
+
+
+def bench_cases(
+    paths: Sequence[Path],
+    *,
+    progress: bool = False,
+    pictures: Path | None = None,
+    variants: bool = True,
+) -> tuple[Outcome, list[tuple[Job, Run]]]:
+    """Run cases with their variants in processes of their own; code of theirs is run.
+
+    Parameters
+    ----------
+    paths
+        Case files.
+    progress
+        Show a bar on standard error.
+    variants
+        Whether to run them, too.
+    pictures
+        Folder for a figure of each case.
+
+    Returns
+    -------
+    outcome
+        Two tables, and a check for every number that a case expects.
+    runs
+        Means over the seeds: of each case, and of each variant.
+    """
+    # A fresh interpreter for each worker: nothing of this one, such as its threads, is copied.
+    with ProcessPoolExecutor(WORKERS, get_context("spawn"), _one_thread) as pool:
+        found, failed = _collect(pool, paths, progress, pictures, variants)
+    runs = [(job, _mean(several)) for job, several in _grouped(found)] + failed
+    runs.sort(key=lambda item: [path.name for path in paths].index(item[0].path.name))
+    checks = [check for job, run in runs for check in _checks(job, run)]
+    notes = [f"{job.label}: {run.error}" for job, run in runs if run.error]
+    notes.append(
+        "Time is that of a sample over that of a forward step of the same model, taken in turns; "
+        "'prior' is the RMSE of the model with its unknowns at their prior."
+    )
+    return Outcome(_tables(runs), checks, notes), runs
+
+
+def _collect(
+    pool: Executor, paths: Sequence[Path], progress: bool, pictures: Path | None, variants: bool
+) -> tuple[list[tuple[Job, Run]], list[tuple[Job, Run]]]:
+    """Return the runs of all jobs, and cases that cannot be read."""
+    order: list[Job] = []
+    failed = []
+    for path in paths:
+        try:
+            order += jobs_of(path, pictures, variants)
+        except LivepdeError as error:
+            failed.append((Job(path), Run(error=str(error))))
+    waiting = {pool.submit(run_job, job): job for job in order}
+    done: Iterable[Any] = as_completed(waiting)
+    for _ in watched(done, len(order), "runs") if progress else done:
+        pass
+    return [(job, _outcome(future)) for future, job in waiting.items()], failed
+
+
+def _outcome(future: Future[Run]) -> Run:
+    """Return a run; one that raised what it should not is a row as well."""
+    error = future.exception()
+    return Run(error=f"{type(error).__name__}: {error}") if error else future.result()
+
+
+def jobs_of(path: Path, pictures: Path | None = None, variants: bool = True) -> list[Job]:
+    """Return the runs of a case: itself, and its variants with all of their seeds."""
+    figure = pictures / f"{path.stem}.png" if pictures else None
+    jobs = [Job(path, figure=figure)]
+    if not variants:
+        return jobs
+    for variant in load(path, allow_code=True).variants:
+        changed = dict(variant.set)
+        for key, value in variant.reference.items():
+            changed[f'reference."{key}"'] = value
+        for seed in range(variant.seeds):
+            seeds = {"data.options.seed": seed} if variant.seeds > 1 else {}
+            jobs.append(Job(path, variant.name, changed | seeds))
+    return jobs
+
+
+def run_job(job: Job) -> Run:
+    """Run a case beside its forward model; a failure is a sentence."""
+    try:
+        case = load(job.path, allow_code=True, settings=job.settings)
+        prepared = case.prepare()
+        data, prior, ratio = _paired(prepared)
+    except LivepdeError as error:
+        return Run(error=str(error))
+    if job.figure is not None:
+        from livepde import plots
+
+        plots.overview(data, title=case.title).savefig(job.figure, dpi=120)
+    variants = {variant.name: variant.expect for variant in case.variants}
+    space = case.model.parameter_space
+    return Run(
+        title=case.title,
+        source=case.source,
+        numbers=measures(data),
+        unknowns={
+            label: (space.unknowns[label.split("[")[0]].unit, case.references.get(label, math.nan))
+            for label in space.labels
+        },
+        expected=variants[job.variant] if job.variant else case.expected,
+        samples=data.sizes["time"],
+        ratio=ratio,
+        prior=measures(prior)["rmse"],
+    )
+
+
+# --- a run beside a forward run ------------------------------------------------------------------
+
+
+class _Frozen(Law[tuple[Problem, ForwardStage], tuple[Array, Array]]):
+    """No law: the forward model with the parameter where it started; it times its own steps."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def prepare(self, problem: Problem) -> tuple[Problem, ForwardStage]:
+        return problem, ForwardStage(problem.model)
+
+    def init(self, work: tuple[Problem, ForwardStage], q0: Array, u0: Array) -> tuple[Array, Array]:
+        return u0, q0
+
+    def step(
+        self,
+        work: tuple[Problem, ForwardStage],
+        state: tuple[Array, Array],
+        interval: Interval,
+    ) -> tuple[tuple[Array, Array], Report]:
+        (problem, forward), (u, q) = work, state
+
+        def stage(c: Array, t: float, h: float) -> Array:
+            return forward.solve(c, q, h, interval.at(t))
+
+        start = perf_counter()
+        end, steps, failure = advance(problem.control, stage, u, interval.t0, interval.t1)
+        self.seconds += perf_counter() - start
+        status = Status() if failure is None else Status.of(failure)
+        end = u if failure is not None else end
+        return (end, q), Report(status, problem.predict(end, q, interval.end), steps)
+
+    def belief(self, work: tuple[Problem, ForwardStage], state: tuple[Array, Array]) -> Belief:
+        u, q = state
+        return Belief(q, u)
+
+
+def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
+    """Return the run, the forward run, and the ratio of their times."""
+    frozen = _Frozen()
+    runs = [prepared.identifier, prepared.identifier_with(frozen)]
+    every = prepared.case.fields_every
+    results = [
+        Result(one.model, one.observed, one.withheld, every, layout=prepared.layout) for one in runs
+    ]
+    seconds = 0.0
+    for count, sample in enumerate(prepared.stream):
+        start = perf_counter()
+        results[0].add(runs[0].step(sample.t, sample.z, sample.inputs))
+        seconds += perf_counter() - start
+        results[1].add(runs[1].step(sample.t, sample.z, sample.inputs))
+        if count == WARM_UP:
+            seconds = frozen.seconds = 0.0
+    datasets = [result.to_xarray() for result in results]
+    ratio = seconds / frozen.seconds if frozen.seconds else math.nan
+    return datasets[0], datasets[1], ratio
+
+
+# --- what is shown -------------------------------------------------------------------------------
+
+
+def _grouped(found: Sequence[tuple[Job, Run]]) -> Iterator[tuple[Job, list[Run]]]:
+    """Yield the first job of each case and variant, with the runs of all seeds."""
+    groups: dict[tuple[Path, str], list[tuple[Job, Run]]] = {}
+    for job, run in found:
+        groups.setdefault((job.path, job.variant), []).append((job, run))
+    for pairs in groups.values():
+        yield pairs[0][0], [run for _, run in pairs]
+
+
+def _mean(runs: Sequence[Run]) -> Run:
+    """Return the mean over seeds; a run that failed stands for all."""
+    first = next((run for run in runs if run.error), runs[0])
+    if first.error or len(runs) == 1:
+        return first
+    return replace(
+        first,
+        numbers={name: float(np.mean([r.numbers[name] for r in runs])) for name in first.numbers},
+        ratio=float(np.mean([run.ratio for run in runs])),
+        prior=float(np.mean([run.prior for run in runs])),
+    )
+
+
+def _checks(job: Job, run: Run) -> list[Check]:
+    if run.error:
+        return [Check(f"{job.label}: runs that failed", 1, 0, "<=")]
+    return [
+        Check(f"{job.label}: {name}", run.numbers.get(name, math.nan), bound, sense)
+        for name, (sense, bound) in run.expected.items()
+    ]
+
+
+def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
+    """Return what was found, and how good and how dear it was."""
+    rows: list[tuple[Any, ...]] = []
+    quality: list[tuple[Any, ...]] = []
+    for job, run in runs:
+        if run.error:
+            quality.append((job.label, *["–"] * 5, "failed"))
+            continue
+        numbers = run.numbers
+        rmse, withheld = numbers["rmse"], numbers.get("rmse.withheld", math.nan)
+        errors = [shown(value) for value in (rmse, withheld, run.prior)]
+        steps = int(numbers["failed_steps"])
+        quality.append((job.label, *errors, run.samples, shown(run.ratio, ".1f"), steps))
+        for label, (unit, reference) in run.unknowns.items():
+            estimate = digits(numbers[label], numbers[f"{label}.std"])
+            error = shown(100 * numbers.get(f"{label}.error", math.nan), ".2g", " %")
+            rows.append((job.label, label, *estimate, unit, shown(reference, ".5g"), error))
+    columns = ("case", "unknown", "estimate", "± deviation", "unit", "reference", "error")
+    more = ("case", "RMSE", "withheld", "prior", "samples", "time", "failed steps")
+    return [Table("Estimates", columns, rows), Table("Runs", more, quality)]
+
+
+def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
+    """Write gallery.md: for each case its figure, the tables of its runs, and its checks."""
+    parts = []
+    for path in dict.fromkeys(job.path for job, _ in runs):
+        some = [(job, run) for job, run in runs if job.path == path]
+        job, run = some[0]
+        checks = [check for pair in some for check in _checks(*pair)]
+        source = [f"Reference: {run.source}"] if run.source else []
+        report = markdown("", _tables(some), checks, source).removeprefix("# \n\n")
+        lines = [f"## {run.title or path.stem}", f"`python -m benchmarks cases --only {path.stem}`"]
+        if job.figure and job.figure.exists():
+            lines.append(f"![{path.stem}]({job.figure.name})")
+        parts.append("\n\n".join([*lines, re.sub("(?m)^## (.*)$", r"**\1**", report)]))
+    target = folder / "gallery.md"
+    target.write_text(GALLERY + "\n".join(parts), encoding="utf-8")
+    return target

@@ -1,0 +1,133 @@
+"""A battery particle that is charged as fast as its surface allows, while its diffusivity drifts.
+
+Charging fills a particle of graphite from its surface. Where the surface is too full, lithium metal
+is deposited, which ruins the cell: the filling there has a limit. How much fuller the surface is
+than the mean is what the diffusivity says. It is not known, and it drifts, with the temperature and
+as the cell ages. What is measured is a voltage, a known curve of the filling at the surface, which
+is flat just where the limit lies: there a model has to say what the voltage does not. Who believes
+in too fast a diffusion goes over the limit; who believes in too slow a one charges slowly; and in
+both cases the filter mends its state with what is wrong with its diffusivity, so that the mean
+filling, which is the charge that the cell is said to hold, is wrong, too.
+
+The cell is charged and discharged in turn, as on a test bench; the limit of the current is lower
+when it is discharged. The diffusivity is a random walk, drawn for each seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from benchmarks.control.problem import Problem, Simulated
+from livepde.control import Goal, Trust, reduce
+from livepde.fem import On, RandomWalk, Scalar, line
+from livepde.identifier import Identifier
+from livepde.laws import SensitivityLaw
+from livepde.model import Model
+from livepde.models import battery_particle
+from livepde.models.battery import FARADAY
+from livepde.observation import Functionals, Points, Transformed
+from livepde.stepping import Alexander2
+
+__all__ = ["battery", "graphite"]
+
+RADIUS, AREA, FULL = 5e-6, 1.0, 30555.0  # m, m^2, mol/m^3
+CAPACITY = FARADAY * FULL * AREA * RADIUS / 3  # C, of the particle from empty to full
+ONE = CAPACITY / 3600.0  # A, that fills it in an hour
+D, SPREAD = 3e-15, 0.5  # m^2/s, prior and deviation of its logarithm
+DRIFT = 0.3 / np.sqrt(3600.0)  # deviation that the logarithm gains, per square root of a second
+NOISE = 2e-3  # V
+FASTEST = (-3.0 * ONE, 1.0 * ONE)  # A: charge, discharge
+LIMITS = (0.05, 0.85)  # of the filling at the surface
+LOW, HIGH = 0.3, 0.8  # mean filling
+CYCLE, CHARGING = 5400.0, 2700.0  # s
+CYCLES = 2
+PERIOD, HORIZON = 30.0, 12
+CELLS, FINE = 24, (72, 3.0)  # of model and truth; s
+
+
+def process(cells: int) -> Model:
+    """Return the particle, on a mesh that is finer towards the surface."""
+    inward = np.linspace(1.0, 0.0, cells + 1)
+    mesh = line((RADIUS * (1.0 - inward**2)).tolist())
+    walk = RandomWalk(DRIFT)
+    unknown = Scalar(D, SPREAD * D, bounds=(0.0, np.inf), transform="log", evolution=walk)
+    return battery_particle(mesh, unknown, area=AREA, c_max=FULL)
+
+
+def graphite(x: Any) -> Any:
+    """Return the open-circuit voltage for a filling, Safari and Delacourt (2011)."""
+    return (
+        0.6379
+        + 0.5416 * np.exp(-305.5309 * x)
+        + 0.044 * np.tanh((0.1958 - x) / 0.1088)
+        - 0.1978 * np.tanh((x - 1.0571) / 0.0854)
+        - 0.6875 * np.tanh((x + 0.0117) / 0.0529)
+        - 0.0175 * np.tanh((x - 0.5692) / 0.0875)
+    )
+
+
+def fillings() -> Functionals:
+    """Return mean filling and filling at the surface: exact in the weights of the model."""
+    return Functionals(
+        {
+            "mean": lambda q, c, x: 3.0 * x[0] ** 2 / RADIUS**3 * c / FULL,
+            "surface": On("right", lambda q, c, x: c / FULL),
+        }
+    )
+
+
+def drawn(seed: int) -> tuple[list[float], list[float]]:
+    """Return times and diffusivities of a truth."""
+    rng = np.random.default_rng([seed, 0])
+    times = PERIOD * np.arange(round(CYCLES * CYCLE / PERIOD) + 1)
+    gained = DRIFT * np.sqrt(PERIOD) * rng.standard_normal(len(times))
+    path = D * np.exp(SPREAD * rng.standard_normal() + np.cumsum(gained))
+    return times.tolist(), path.tolist()
+
+
+def battery(seed: int = 0) -> Problem:
+    """Return the task of a seed."""
+    voltage = Transformed(Points({"V": RADIUS}), lambda c: graphite(c / FULL), noise=NOISE)
+    model, fine = process(CELLS), process(FINE[0])
+    times, path = drawn(seed)
+    start = LOW * FULL
+
+    def truth(t: float) -> Mapping[str, float]:
+        return {"D": float(np.interp(t, times, path))}
+
+    def plant(noise: int) -> Simulated:
+        at = {"I": 0.0}
+        return Simulated(
+            fine, voltage, fillings(), truth, u0=start, step=FINE[1], seed=noise, start=at
+        )
+
+    return Problem(
+        name="battery",
+        title="A battery particle whose diffusivity drifts",
+        reduced=reduce(
+            model, fillings(), ["I"], sensors=voltage, modes=2, rates=(1.0 / PERIOD,), u=start
+        ),
+        identifier=lambda: Identifier(
+            model, voltage, SensitivityLaw(), u0=start, scheme=Alexander2(), hold=True
+        ),
+        goal=Goal(
+            track={"mean": 1.0},
+            move={"I": 1e-5 / ONE**2},
+            inputs={"I": FASTEST},
+            limits={"surface": LIMITS},
+        ),
+        period=PERIOD,
+        horizon=HORIZON,
+        samples=round(CYCLES * CYCLE / PERIOD),
+        plant=plant,
+        truth=truth,
+        drive={"I": 0.02 * ONE},
+        reference=lambda t: {"mean": HIGH if t % CYCLE < CHARGING else LOW},
+        disturbances=lambda t: {},
+        before={"I": 0.0},
+        tolerance=0.01,
+        trust=Trust(spread=1.0),
+    )

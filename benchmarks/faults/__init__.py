@@ -1,0 +1,60 @@
+"""What a run survives: kills at any moment, brokers and sources that go away, rows that are broken.
+
+Kills: `livepde run --resume` takes a few thousand rows from a file that grows or from a broker, is
+killed with SIGKILL again and again, and ends as a run does that nobody disturbed: bit by bit. The
+moments are drawn at random: while it starts and resumes, while it steps, right when its journal
+grows, and while it ends.
+
+Broken rows: real and generated rows, mutated in every way that we could think of, between rows that
+are right. Each is counted with a reason, and what is right arrives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from benchmarks.faults.broken import broken_messages, broken_rows
+from benchmarks.faults.kills import kills_of_files, kills_of_topics
+from benchmarks.faults.outages import outages
+from benchmarks.faults.plan import Plan
+from livepde.runs import Check, Outcome, Table
+
+__all__ = ["PARTS", "faults"]
+
+KILLS, SAMPLES, MALFORMED = 200, 2000, 100_000
+
+PARTS: Mapping[str, Callable[[Plan], Outcome]] = {
+    "file": kills_of_files,
+    "mqtt": kills_of_topics,
+    "restart": outages,
+    "malformed": broken_rows,
+    "messages": broken_messages,
+}
+
+
+def faults(
+    kills: int = KILLS,
+    samples: int = SAMPLES,
+    malformed: int = MALFORMED,
+    seed: int = 0,
+    only: Sequence[str] = (),
+    progress: bool = False,
+) -> Outcome:
+    """Do harm to runs, and count what was lost.
+
+    Parameters
+    ----------
+    kills, samples
+        Kills of runs with so many samples, for a file and for a broker.
+    malformed
+        Rows and messages that are broken.
+    only
+        Some of `PARTS`.
+    """
+    tables: list[Table] = []
+    checks: list[Check] = []
+    for name in only or PARTS:
+        outcome = PARTS[name](Plan(kills, samples, malformed, seed, progress))
+        tables += outcome.tables
+        checks += outcome.checks
+    return Outcome(tables=tables, checks=checks)

@@ -1,0 +1,188 @@
+"""Rows and messages that are broken, between those that are right."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cases import find_cases
+from benchmarks.faults.breaks import BYTES, CSV, JSON, broken_line, csv_line, json_line
+from benchmarks.faults.damage import Damage, Found, same
+from benchmarks.faults.plan import Plan
+from benchmarks.faults.plants import PATIENCE
+from benchmarks.faults.rod import Row, case_text, rod_rows
+from benchmarks.faults.run import hearing, undisturbed
+from livepde.cases import Case, load
+from livepde.cases.data import data_file
+from livepde.cases.sources import policy_of, source_of
+from livepde.errors import LivepdeError
+from livepde.identifier import Sample
+from livepde.records import Record
+from livepde.runs import Check, Outcome, Table
+from livepde.runs.feeds import Gathered
+from livepde.runs.live import Live
+from livepde.streams.intake import Intake, Ready
+from livepde.streams.intake import Outcome as RowOutcome
+from livepde.streams.sources import Row as SourceRow
+from livepde.streams.sources import Source
+
+__all__ = ["Fed", "broken_messages", "broken_rows", "fed"]
+
+
+def broken_rows(plan: Plan) -> Outcome:
+    """Feed broken rows to a live run, between right ones."""
+    rng = np.random.default_rng(plan.seed)
+    tables, checks = [], []
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "case.toml").write_text(case_text())
+        rod = load(folder / "case.toml")
+        rows = rod_rows(min(plan.samples, 1000))
+        feeds = {
+            "generated, JSON": (rod, rows, "rows.jsonl"),
+            "generated, CSV": (rod, rows, "rows.csv"),
+        }
+        soil = _soil()
+        if soil is not None:
+            feeds["soil, CSV"] = (soil[0], soil[1], "soil.csv")
+            feeds["soil, JSON"] = (soil[0], soil[1], "soil.jsonl")
+        sent, each = 0, math.ceil(plan.malformed / len(feeds))
+        for title, (case, chosen, file) in feeds.items():
+            found = fed(case, chosen, folder / file, each, rng)
+            tables.append(found.table(title))
+            checks += found.checks(title)
+            sent += found.sent.total()
+    return Outcome(
+        tables=tables, checks=[Check("broken rows", sent, plan.malformed, ">="), *checks]
+    )
+
+
+def broken_messages(plan: Plan) -> Outcome:
+    """Send broken messages to the real command, between right ones."""
+    rng = np.random.default_rng(plan.seed)
+    rows, count = rod_rows(min(plan.samples, 600)), max(plan.malformed // 20, 1)
+    expected, _ = undisturbed(len(rows))
+    with hearing(rows) as (_, topic, run):
+        per_row = np.bincount(rng.integers(0, len(rows), count), minlength=len(rows))
+        for k, times in enumerate(per_row.tolist()):
+            topic.supply(k + 1)
+            for _ in range(times):
+                _, line = broken_line(JSON | BYTES, rows[k], json_line, rng)
+                topic.send(line).wait_for_publish(PATIENCE)
+        run.end(len(rows))
+        found = Found.of(run.out)
+    damage = Damage()
+    damage.compare(found, expected)
+    reasons = ", ".join(f"{kind} {number}" for kind, number in sorted(found.counts.items()))
+    table = Table(
+        f"Broken messages between {len(rows)} right ones, from a broker to livepde run",
+        ("sent", "reasons", "lost", "doubled", "different"),
+        [(count, reasons, damage.lost, damage.doubled, damage.different)],
+    )
+    counted = Check("broken messages: counted", found.counts.total(), count, ">=")
+    return Outcome(tables=[table], checks=[counted, *damage.checks("broken messages")])
+
+
+def _soil() -> tuple[Case, list[dict[str, Any]]] | None:
+    """Return the soil case and its real rows, if they are here."""
+    try:
+        path = next(path for path in find_cases() if path.stem == "soil_uniform")
+        case = load(path, settings={"intake.leap": "10 d"})
+        with data_file(case.frame).open(newline="", encoding="utf-8") as file:
+            rows = [dict(row) for row in csv.DictReader(file)]
+        return case, [row for row in rows if row[case.clock.name] >= str(case.clock.start)]
+    except (StopIteration, LivepdeError, OSError):
+        return None
+
+
+class _Audited(Gathered):
+    """Remembers what became of each row, by the place where its line begins."""
+
+    def __init__(self, source: Source, intake: Intake) -> None:
+        super().__init__(source, intake)
+        self.reasons: dict[int, set[str]] = {}
+
+    def _outcome(self, row: SourceRow, token: Any) -> RowOutcome:
+        found = super()._outcome(row, token)
+        self.reasons[row.token[1]] = {remark.kind for remark in found.remarks}
+        return found
+
+
+@dataclass(frozen=True)
+class Fed:
+    """What became of a file with broken rows between the right ones."""
+
+    sent: Counter[str]
+    reasons: Counter[str]
+    silent: int
+    right: int
+    arrived: int
+    different: int
+
+    def table(self, title: str) -> Table:
+        """Return what was sent and what was said of it."""
+        rows = [("sent", kind, number) for kind, number in sorted(self.sent.items())]
+        rows += [("counted", kind, number) for kind, number in sorted(self.reasons.items())]
+        rows += [("right rows", "sent", self.right), ("right rows", "arrived", self.arrived)]
+        return Table(f"Broken rows, {title}", ("", "kind", "number"), rows)
+
+    def checks(self, title: str) -> list[Check]:
+        """Every broken row has a reason, every right one arrives, nothing else does."""
+        return [
+            Check(f"{title}: broken rows without a reason", self.silent, 0, "<="),
+            Check(f"{title}: right rows that are missing", self.right - self.arrived, 0, "<="),
+            Check(f"{title}: estimates that differ in a bit", self.different, 0, "<="),
+        ]
+
+
+def fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.Generator) -> Fed:
+    """Feed right rows with so many broken ones between them, and the right ones alone."""
+    write = json_line if path.suffix == ".jsonl" else csv_line
+    head = b"" if path.suffix == ".jsonl" else ",".join(rows[0]).encode() + b"\n"
+    clean = path.with_stem("clean")
+    clean.write_bytes(head + b"".join(write(row) + b"\n" for row in rows))
+    expected, _ = _taken(case, clean)
+    breaks = (JSON if path.suffix == ".jsonl" else CSV) | BYTES
+    sent, broken = Counter[str](), set[int]()
+    per_row = np.bincount(rng.integers(0, len(rows), count), minlength=len(rows))
+    with path.open("wb") as file:
+        file.write(head)
+        for row, times in zip(rows, per_row.tolist(), strict=True):
+            file.write(write(row) + b"\n")
+            for _ in range(times):
+                kind, line = broken_line(breaks, row, write, rng)
+                sent[kind] += 1
+                broken.add(file.tell())
+                file.write(line + b"\n")
+    found, reasons = _taken(case, path)
+    told = Counter(kind for place in broken for kind in sorted(reasons.get(place, ()))[:1])
+    return Fed(
+        sent,
+        told,
+        sum(not reasons.get(place) for place in broken),
+        len(expected),
+        len(found),
+        sum(not same(one, other) for one, other in zip(found, expected, strict=False)),
+    )
+
+
+def _taken(case: Case, path: Path) -> tuple[list[Record], dict[int, set[str]]]:
+    """Return what a live run of a file finds, and what it said of each line."""
+    spec = case.frame.spec.data
+    intake = Intake(case.columns, case.clock, policy_of(case.frame), missing=spec.missing)
+    feed = _Audited(source_of(case.frame, str(path), ""), intake)
+    begun: list[Ready] = []
+    while not begun:
+        begun += feed.poll(0.0)
+    prepared = case.begin(Sample(begun[0].t, begun[0].values), intake.start)
+    with prepared.journal() as journal:
+        Live(prepared.identifier, feed, journal, fields_every=100, begun=begun).run()
+        return list(journal), feed.reasons

@@ -1,0 +1,263 @@
+"""The table of peers: who they are, each run in a process of its own, what is promised of them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import accuracy
+from benchmarks.peers import arrays
+from benchmarks.peers.filters import ensemble, unscented
+from benchmarks.peers.horizon import moving_horizon
+from benchmarks.peers.network import network
+from benchmarks.problems import PROBLEMS as ALL
+from benchmarks.problems import Problem
+from benchmarks.problems.rod import ROD, ROD_SOURCE
+from benchmarks.scoring import Contender, Found, Score, scored
+from livepde.errors import LivepdeError
+from livepde.progress import watched
+from livepde.runs.outcome import Check, Outcome, Table
+
+__all__ = ["PEERS", "PROBLEMS", "ROWS", "Peer", "peers"]
+
+PROBLEMS: Mapping[str, Problem] = {
+    **{problem.name: problem for problem in (ROD, ROD_SOURCE)},
+    **{name: problem for name, problem in ALL.items() if None not in problem.levels},
+}
+"""Problems with a known truth."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another package's estimator.
+
+    Attributes
+    ----------
+    packages
+        What has to be installed: names to import.
+    run
+        Its contender.
+    """
+
+    packages: tuple[str, ...]
+    run: Contender
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Packages that are not installed."""
+        return tuple(name for name in self.packages if find_spec(name) is None)
+
+
+PEERS: dict[str, Peer] = {
+    **{
+        f"EnKF as arrays, {members} members": Peer((), partial(arrays.ensemble, members))
+        for members in (20, 50)
+    },
+    "unscented filter as arrays": Peer((), arrays.unscented),
+    "lean reference": Peer((), arrays.reference),
+    **{
+        f"DAPPER, one by one: EnKF, {members} members": Peer(
+            ("dapper",), partial(ensemble, members)
+        )
+        for members in (20, 50, 100)
+    },
+    "filterpy, one by one: unscented filter": Peer(("filterpy",), unscented),
+    "do-mpc: moving horizon": Peer(("do_mpc", "casadi"), moving_horizon),
+    "DeepXDE: network": Peer(("deepxde", "torch"), network),
+}
+"""Row -> peer. Those as arrays are this project's own lines, as a user would write them."""
+
+
+OURS = (
+    "prior",
+    "sensitivity",
+    "sensitivity, replay",
+    "sensitivity, auto",
+    "gradient, auto",
+    accuracy.ALL_DATA,
+    accuracy.EACH_SAMPLE,
+)
+ROWS = (*OURS, *PEERS)
+LEVEL = 0.01
+MINE = "sensitivity"  # the row of which the promises below are checked
+RIVAL = "EnKF as arrays, 20 members"  # is to cost more, wherever it is not more exact
+LEAST_WORK = {"do-mpc: moving horizon": 50.0}
+"""Peer -> how many times the work of our step it takes."""
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what packages print and warn of at import to themselves."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    os.environ.setdefault("DDE_BACKEND", "pytorch")
+    nowhere = io.StringIO()
+    with (
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(nowhere),
+        contextlib.redirect_stderr(nowhere),
+    ):
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _peak(reset: bool = False) -> float:
+    """Return the largest memory of this process so far in MB, or since a reset; NaN if unknown."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return math.nan
+    return next((int(row.split()[1]) / 1024 for row in lines if row.startswith("VmHWM")), math.nan)
+
+
+def run_row(problem: Problem, level: float | None, seed: int, row: str) -> Score | None:
+    """Run one row on one data set, in the process that calls."""
+    peer = PEERS.get(row)
+    if peer is not None and peer.missing:
+        return Score(note=f"not installed: {', '.join(peer.missing)}")
+    data = problem.data(level, seed)
+    data.forward  # noqa: B018 (what it needs is not the contender's memory)
+    with _quiet():
+        for package in peer.packages if peer is not None else ():
+            __import__(package)
+        before = _peak(reset=True)
+        score = scored(accuracy.ROWS[row] if peer is None else peer.run, data)
+    return None if score is None else replace(score, megabytes=_peak() - before)
+
+
+def _job(name: str, level: float | None, seed: int, row: str) -> Score | None:
+    return run_row(PROBLEMS[name], level, seed, row)
+
+
+def peers(
+    only: Sequence[str] = (),
+    seeds: int = 1,
+    *,
+    levels: Sequence[float] = (LEVEL,),
+    rows: Sequence[str] = (),
+    progress: bool = False,
+) -> Outcome:
+    """Run our laws and the peers on the same data, each row in a fresh process.
+
+    Parameters
+    ----------
+    only
+        Names of problems; default all that have a known truth.
+    seeds
+        Data sets for each noise level.
+    levels
+        Noise levels.
+    rows
+        Names of rows; default all. The prior, by whose error the others are divided, always runs.
+    progress
+        Show a bar on standard error.
+    """
+    chosen = [row for row in ROWS if not rows or row in ("prior", *rows)]
+    jobs = [
+        (name, level, seed, row)
+        for name in only or PROBLEMS
+        for level in PROBLEMS[name].chosen(levels)
+        for seed in range(seeds)
+        for row in chosen
+    ]
+    found: Found = {}
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
+        waiting = [pool.submit(_job, *job) for job in jobs]
+        pairs = list(zip(jobs, waiting, strict=True))
+        for (name, level, _, row), future in (
+            watched(pairs, len(pairs), "runs") if progress else pairs
+        ):
+            try:
+                score = future.result()
+            except (LivepdeError, ArithmeticError, RuntimeError, ValueError) as error:
+                score = Score(note=f"{type(error).__name__}: {error}")
+            if score is not None:
+                found.setdefault((name, level, row), []).append(score)
+    return Outcome(tables=_tables(found), checks=_checks(found), notes=NOTES)
+
+
+def _relative(found: Found, at: tuple[str, float | None], row: str) -> list[float]:
+    """Return the error of a row over that of the prior, for each data set that has one."""
+    scores, priors = found.get((*at, row), []), found.get((*at, "prior"), [])
+    if not scores:
+        return []
+    pairs = zip(scores, priors, strict=True)
+    shares = [score.error / prior.error for score, prior in pairs]
+    return [share for share in shares if math.isfinite(share)]
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _tables(found: Found) -> list[Table]:
+    """Return a table for each problem: rows are noise level and contender."""
+    tables = []
+    for name in dict.fromkeys(key[0] for key in found):
+        lines, most = [], 0
+        for (problem, level, row), scores in found.items():
+            if problem != name:
+                continue
+            shares, most = _relative(found, (problem, level), row), max(most, len(scores))
+            cells = [
+                _mean(shares),
+                float(np.std(shares)) if shares else math.nan,
+                _mean([score.covered for score in scores]),
+                _mean([score.whole for score in scores]),
+                _mean([score.median for score in scores]),
+                _mean([score.megabytes for score in scores]),
+            ]
+            notes = "; ".join(dict.fromkeys(score.note for score in scores if score.note))
+            shown = ["–" if math.isnan(cell) else cell for cell in cells]
+            lines.append([f"{level:.0%}", row, *shown, sum(s.failed for s in scores), notes])
+        columns = ["noise", "estimator", "error", "spread", "covered", "mean", "median", "MB"]
+        title = f"{name}, {most} seed{'s' if most > 1 else ''}"
+        tables.append(Table(title, [*columns, "failed steps", "note"], lines))
+    return tables
+
+
+def _checks(found: Found) -> list[Check]:
+    """Return the promises: less work than the peers, wherever ours is at most as wrong."""
+    checks = []
+    for problem, level, peer in found:
+        at = (problem, level)
+        mine, other = (_mean(_relative(found, at, row)) for row in (MINE, peer))
+        costs = [_mean([s.whole for s in found.get((*at, row), ())]) for row in (MINE, peer)]
+        name = f"{problem}, {level:.0%} noise"
+        if peer == RIVAL and mine <= other:
+            work = f"{name}: cost of '{MINE}' over '{peer}'"
+            checks.append(Check(work, costs[0] / costs[1], 1.0, "<="))
+        if peer in LEAST_WORK and math.isfinite(mine / other):
+            error = f"{name}: error of '{MINE}' over '{peer}'"
+            work = f"{name}: cost of '{peer}' over '{MINE}'"
+            checks.append(Check(error, mine / other, 1.0, "<="))
+            checks.append(Check(work, costs[1] / costs[0], LEAST_WORK[peer], ">="))
+    return checks
+
+
+NOTES = (
+    "Same model, samples, prior, reduced coordinates and noise level for all; knobs of peers are "
+    "set to the best of those tried, with the truth of the very data set (see note).",
+    "error: of the parameter, over that of the prior on the same data set; mean over the data sets "
+    "and their standard deviation (spread).",
+    "mean, median: processor time of a sample over that of a forward step with the matrix kept; "
+    "the mean is over all samples, the first included. MB: memory needed on top of what data and "
+    "imported packages take.",
+    "As arrays: all members stepped as one block, by lines of NumPy and LAPACK. One by one: a "
+    "Python loop over the members around our forward model; what that costs is not what the "
+    "method costs.",
+)

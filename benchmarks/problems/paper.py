@@ -1,0 +1,53 @@
+"""The paper's equation, as it is there and excited."""
+
+from __future__ import annotations
+
+from functools import cache
+from types import ModuleType
+
+import numpy as np
+
+from benchmarks.problems.data import Problem, Process
+from livepde.reproduce import seed, seed_excited
+from livepde.streams import Twin
+
+__all__ = ["SEED", "SEED_EXCITED"]
+
+
+@cache
+def _twin(experiment: ModuleType, std: float) -> Process:
+    """Return an experiment's own twin, with a prior deviation of q."""
+    model, observation = experiment.build(std=std)
+    twin = Twin(
+        model=model,
+        observation=observation,
+        q_true=experiment.q_true,
+        u_true=experiment.u_true,
+        times=experiment.TIMES,
+    )
+    return Process(
+        model=model,
+        observation=observation,
+        times=np.asarray(twin.times, dtype=float),
+        exact=twin.exact_data,
+        q_true=np.tile(twin.q, (len(twin.times), 1)),
+        u0=twin.states[0],
+        scheme=twin.scheme,
+        weights=twin.weights,
+    )
+
+
+SEED = Problem(
+    name="seed",
+    summary="Paper's example: q(x) from u on (0.3, 0.87), data of the same scheme",
+    make=lambda _: _twin(seed, 0.01),
+    floor=1e-5,
+    gain=1e8,
+)
+
+SEED_EXCITED = Problem(
+    name="seed-excited",
+    summary="The same equation, excited and fully observed, data of the same scheme",
+    make=lambda _: _twin(seed_excited, 3.0),
+    gain=1e2,
+)

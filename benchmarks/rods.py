@@ -1,0 +1,329 @@
+"""Cost of one sample of the filter laws on rods, in forward steps, beside a lean reference.
+
+A run takes the first samples of a stream, each timed by itself, and then as many forward steps of
+the same model with a known parameter; runs of all candidates are made in turns. The median of a run
+is that of usual samples, the mean has the first sample and replays in it. Both are divided by the
+median forward step, and the median over the runs is shown.
+
+What is promised is promised in forward steps of an earlier version, so that a faster forward step
+does not make the promise harder. That version's forward step is known in forward steps of the lean
+reference (`EARLIER`), which depend on NumPy, SciPy and the processor only and are timed in the same
+runs: `python -m benchmarks.earlier` measures these factors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from time import process_time
+from typing import Any, TypeAlias
+
+import numpy as np
+import scipy.sparse.linalg as spla
+
+from benchmarks import lean
+from benchmarks.layered import ENDS, POINTS, STEP, ends_at, plate, rod
+from livepde.fem import Inputs, Moment
+from livepde.fleet import Fleet
+from livepde.identifier import Identifier
+from livepde.laws import AnyLaw, AutoLaw, SensitivityLaw
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Points
+from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import Advance, ImplicitEuler, simulate
+
+__all__ = ["EARLIER", "RODS", "SIZES", "Rod", "fleet", "lean_forward", "rods"]
+
+SIZES = (31, 200, 1_000, 10_000)
+SQUARE = 10_000  # nodes, from which the process is a square
+FIRST = 100  # samples of a run, the first one included
+RUNS = 5
+NOISE = 0.01
+COMMIT = "51ef98c"
+SENSITIVITY, AUTO, LEAN = "SensitivityLaw", "AutoLaw", "lean reference"
+AWAKE = 6  # members of the bank that are at work in these samples
+
+BOUNDS: dict[tuple[str, int, int], float] = {
+    (SENSITIVITY, 31, 2): 5.0,
+    (SENSITIVITY, 200, 2): 4.0,
+    (SENSITIVITY, 1_000, 2): 4.5,
+    (SENSITIVITY, 31, 10): 6.0,
+    (SENSITIVITY, 200, 10): 6.0,
+    (SENSITIVITY, 1_000, 10): 9.0,
+    (AUTO, 31, 2): 15.0,
+    (AUTO, 200, 2): 20.0,
+    (AUTO, 1_000, 2): 42.0,
+    (SENSITIVITY, SQUARE, 4): 5.0,
+}
+"""Law, nodes, unknowns -> forward steps of the earlier version that a sample may cost."""
+
+EARLIER: dict[tuple[int, str], float] = {
+    (31, "source"): 3.83,
+    (31, "channels"): 4.41,
+    (200, "source"): 2.46,
+    (200, "channels"): 2.69,
+    (1_000, "source"): 1.29,
+    (1_000, "channels"): 1.37,
+    (SQUARE, "source"): 0.925,
+}
+"""Nodes, ends -> a forward step of the earlier version in forward steps of the lean reference."""
+
+FLEET = 1.5  # times the lean reference that a fleet may cost
+MEMBERS, MEMBERS_NODES = 50, 31
+
+Row: TypeAlias = tuple[Any, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Rod:
+    """A process of some size with a stream of samples.
+
+    Parameters
+    ----------
+    nodes, unknowns
+        Of the mesh; layers of a rod. A square has four quarters.
+    ends
+        "source" or "channels", see `benchmarks.layered`.
+    """
+
+    nodes: int
+    unknowns: int
+    ends: str
+
+    @cached_property
+    def model(self) -> Model:
+        """The process."""
+        if self.nodes >= SQUARE:
+            return plate(self.nodes)
+        return rod(self.nodes, self.unknowns, self.ends)
+
+    @cached_property
+    def sensors(self) -> Points:
+        """Four point sensors; on a square nine."""
+        square = [(x, y) for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)]
+        return Points(square if self.nodes >= SQUARE else list(POINTS), noise=NOISE)
+
+    def forward(self, q: Array, count: int) -> Iterator[tuple[float, Array]]:
+        """Simulate: the initial state, and after each step."""
+        times = (STEP * np.arange(count + 1)).tolist()
+        inputs = {t: ends_at(self.ends, t) for t in times}.__getitem__
+        return simulate(self.model, q, 0.0, times, Advance(ImplicitEuler()), inputs)
+
+    def samples(self, count: int, seed: int = 0) -> list[tuple[float, Array, dict[str, float]]]:
+        """Return time, measurements and channels of the start and of so many samples."""
+        rng, latent = np.random.default_rng(seed), self.model.latent
+        q = latent.prior + latent.deviations * rng.standard_normal(latent.dim)
+        G = self.sensors.matrix(self.model.state_space)
+        return [
+            (t, G @ u + NOISE * rng.standard_normal(G.shape[0]), ends_at(self.ends, t))
+            for t, u in self.forward(q, count)
+        ]
+
+    @cached_property
+    def matrices(self) -> lean.Matrices:
+        """The process as the lean reference has it."""
+        return lean.Matrices.of(self.model, np.diag(self.model.latent.deviations), STEP)
+
+    @property
+    def title(self) -> str:
+        """Name of the process in checks."""
+        kind = "square" if self.nodes >= SQUARE else "rod"
+        return f"{kind} of {self.nodes} nodes, {self.unknowns} unknowns, {self.ends}"
+
+
+RODS: tuple[Rod, ...] = (
+    *(Rod(nodes, m, ends) for nodes in SIZES[:3] for m in (2, 10) for ends in ENDS),
+    Rod(SQUARE, 4, "source"),
+)
+"""The processes that are timed."""
+
+
+# --- candidates: each is a function that returns the times of the samples of a run, in s ---------
+
+
+def _law(given: Rod, law: AnyLaw, samples: Sequence[Any]) -> tuple[list[float], float]:
+    """Time a law, and return how many members of a bank are awake at the end."""
+    identifier = Identifier(given.model, given.sensors, law, u0=0.0)
+    identifier.step(*samples[0])
+    spent, awake = [], np.nan
+    for sample in samples[1:]:
+        begun = process_time()
+        estimate = identifier.step(*sample)
+        spent.append(process_time() - begun)
+        awake = estimate.notes.get("awake", np.nan)
+    return spent, awake
+
+
+def _forward(given: Rod, count: int) -> list[float]:
+    """Time forward steps of the model at its prior."""
+    states, spent = given.forward(given.model.latent.prior, count), []
+    next(states)
+    for _ in range(count):
+        begun = process_time()
+        next(states)
+        spent.append(process_time() - begun)
+    return spent
+
+
+def _lean(given: Rod, samples: Sequence[Any]) -> list[float]:
+    """Time the lean reference."""
+    spent, matrices = [], given.matrices
+    G = given.sensors.matrix(given.model.state_space).toarray()[:, matrices.order] / NOISE
+    start = given.model.initial(0.0, _moment(samples[0]))
+    state = lean.initial(matrices, start, 1, given.unknowns)
+    for sample in samples[1:]:
+        begun = process_time()
+        z = sample[1][None] / NOISE
+        state = lean.step(matrices, G, state, matrices.forcing(_moment(sample)), z)
+        spent.append(process_time() - begun)
+    return spent
+
+
+def _moment(sample: Any) -> Moment:
+    return Moment(sample[0], Inputs(sample[2]))
+
+
+def lean_forward(given: Rod, count: int) -> list[float]:
+    """Time forward steps as NumPy and SciPy make them, matrix factorised once and source known."""
+    solve, mass = _stepper(given)
+    f, u, spent = given.model.F(), np.zeros(given.model.X.dim), []
+    for _ in range(count):
+        begun = process_time()
+        u = solve(mass @ u + f)
+        spent.append(process_time() - begun)
+    return spent
+
+
+def _stepper(given: Rod) -> tuple[Callable[[Array], Array], Any]:
+    """Return the solution of a step for its right-hand side, and the mass over the time step."""
+    if given.nodes < SQUARE:
+        matrices = given.matrices
+        lu = matrices.factorise(np.zeros((1, given.unknowns)))
+        return lambda known: matrices.solve(lu, known[None])[0], matrices.M
+    mass, S = lean.assembled(given.model, given.model.latent.prior, STEP)
+    return spla.splu(S.tocsc(), permc_spec="MMD_AT_PLUS_A").solve, mass
+
+
+# --- tables --------------------------------------------------------------------------------------
+
+
+def rods(
+    only: Iterable[Rod] = RODS, *, runs: int = RUNS, first: int = FIRST, auto: bool = True
+) -> Outcome:
+    """Time the filter laws and the lean reference in forward steps.
+
+    Parameters
+    ----------
+    only
+        The processes to take.
+    runs, first
+        How often each is run, and how many samples a run has.
+    auto
+        Whether `AutoLaw` is timed, too; on a square, where a run takes minutes, it is not.
+    """
+    rows: list[Row] = []
+    checks: list[Check] = []
+    for given in only:
+        large = given.nodes >= SQUARE
+        for row, check in _timed(given, min(runs, 2) if large else runs, first, auto and not large):
+            rows.append(row)
+            checks += [check] if check is not None else []
+    if not rows:
+        return Outcome()
+    columns = ("nodes", "unknowns", "ends", "law", "median", "mean", f"over {COMMIT}", "bound")
+    title = f"One sample over one forward step, the first {first} samples"
+    return Outcome(tables=[Table(title, columns, rows)], checks=checks, notes=NOTES)
+
+
+def _timed(given: Rod, runs: int, first: int, auto: bool) -> Iterator[tuple[Row, Check | None]]:
+    """Yield a row and its check for each candidate."""
+    samples, large = given.samples(first), given.nodes >= SQUARE
+    laws: dict[str, AnyLaw] = {SENSITIVITY: SensitivityLaw()} | ({AUTO: AutoLaw()} if auto else {})
+    spent: dict[str, list[list[float]]] = {name: [] for name in (*laws, LEAN)}
+    units, lean_units, awake = [], [], np.nan
+    for _ in range(runs):
+        for name, law in laws.items():
+            found, awake = _law(given, law, samples)
+            spent[name].append(found)
+        if not large:  # where a factorisation costs more than a correction it is no reference
+            spent[LEAN].append(_lean(given, samples))
+        units.append(float(np.median(_forward(given, first))))
+        lean_units.append(float(np.median(lean_forward(given, first))))
+    earlier = EARLIER.get((given.nodes, given.ends))
+    for name, times in spent.items():
+        if not times:
+            continue
+        each = np.array(times)
+        median = float(np.median(np.median(each, axis=1) / units))
+        mean = float(np.median(each.mean(axis=1) / units))
+        kind = each.mean(axis=1) if large else np.median(each, axis=1)
+        over = np.nan
+        if earlier is not None:
+            over = float(np.median(kind / (earlier * np.array(lean_units))))
+        bound = BOUNDS.get((name, given.nodes, given.unknowns)) if given.ends == ENDS[0] else None
+        label = f"{name}, {awake:g} awake" if name == AUTO else name
+        cells = (given.nodes, given.unknowns, given.ends, label, median, mean)
+        check = None
+        if bound is not None:
+            what = "mean" if large else "median"
+            text = f"{given.title}, {name}: sample / forward step of {COMMIT}, {what}"
+            check = Check(text, over, bound, "<=")
+        yield (*cells, None if np.isnan(over) else over, bound), check
+
+
+def fleet(members: int = MEMBERS, *, runs: int = RUNS, first: int = FIRST) -> Outcome:
+    """Time a fleet of rods of 31 nodes against the lean reference with a leading axis."""
+    rows: list[Row] = []
+    checks: list[Check] = []
+    for ends in ENDS:
+        given = Rod(MEMBERS_NODES, 2, ends)
+        streams = [given.samples(first, seed) for seed in range(members)]
+        samples = [
+            (row[0][0], np.array([one[1] for one in row]), row[0][2])
+            for row in zip(*streams, strict=True)
+        ]
+        ratios = np.array([_fleet_pair(given, members, samples) for _ in range(runs)])
+        median, mean, apart = np.median(ratios, axis=0)
+        rows.append((ends, float(median), float(mean)))
+        text = f"fleet of {members} rods of {given.nodes} nodes, {ends}"
+        checks.append(Check(f"{text}: sample / lean reference", float(median), FLEET, "<="))
+        checks.append(Check(f"{text}: difference of the estimates", float(apart), 1e-8, "<="))
+    title = f"A fleet of {members} rods of {MEMBERS_NODES} nodes over the lean reference"
+    columns = ("ends", "median", f"mean of the first {first}")
+    return Outcome(tables=[Table(title, columns, rows)], checks=checks)
+
+
+def _fleet_pair(given: Rod, members: int, samples: Sequence[Any]) -> tuple[float, float, float]:
+    """Return median and mean cost of a sample over the reference's, and how q differs."""
+    law = SensitivityLaw(guards=None)
+    together = Fleet(given.model, given.sensors, law, members, u0=0.0)
+    matrices, spent, reference = given.matrices, [], []
+    G = given.sensors.matrix(given.model.state_space).toarray()[:, matrices.order] / NOISE
+    start = given.model.initial(0.0, _moment(samples[0]))
+    state = lean.initial(matrices, start, members, given.unknowns)
+    together.step(*samples[0])
+    for sample in samples[1:]:
+        begun = process_time()
+        estimate = together.step(*sample)
+        spent.append(process_time() - begun)
+    for sample in samples[1:]:
+        begun = process_time()
+        f = matrices.forcing(_moment(sample))
+        state = lean.step(matrices, G, state, f, sample[1] / NOISE)
+        reference.append(process_time() - begun)
+    q = given.model.latent.prior + state.y[:, :, 0] * given.model.latent.deviations
+    apart = float(np.abs(estimate.q / q - 1.0).max())
+    unit = float(np.median(reference))
+    return float(np.median(spent)) / unit, float(np.mean(spent)) / unit, apart
+
+
+NOTES = (
+    "median, mean: of the samples of a run, in forward steps of this version (livepde.simulate, "
+    "matrix factorised once, processor time, median); the mean has the first sample in it.",
+    f"over {COMMIT}: the same in forward steps of that commit, which the bounds mean: the median "
+    "of a rod, the mean on the square.",
+    "ends: 'source' holds them at constant values beside a constant source, 'channels' reads both "
+    "temperatures from the stream.",
+)

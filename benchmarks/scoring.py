@@ -1,0 +1,236 @@
+"""How a contender is judged: against the truth, and by what its steps cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from time import process_time
+from typing import TypeAlias
+
+import numpy as np
+
+from benchmarks.offline import Trajectory
+from benchmarks.problems import WARM_UP, Data
+from livepde.errors import LivepdeError
+from livepde.fem import FieldBlock
+from livepde.linalg import Array
+from livepde.plots import NORMAL_95
+from livepde.runs.outcome import Table
+from livepde.stepping import StepFailed
+
+__all__ = [
+    "Contender",
+    "Found",
+    "Judge",
+    "Known",
+    "Score",
+    "error_ratio",
+    "measured",
+    "scored",
+    "step_ratio",
+    "table_of",
+]
+
+QUICK = 1.0  # s
+TIMES = 11  # in the second half, at which a parameter that moves is scored
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one contender reached on one data set.
+
+    Attributes
+    ----------
+    error
+        Relative error of the parameter; of a real process, error of the withheld sensor.
+    covered
+        Share of values whose 95 % interval holds the truth; NaN without intervals or truth.
+    step
+        Processor time of a step over that of a forward step, mean without the first samples.
+    whole, median
+        The same as mean over all samples, the first included, and as median.
+    failed
+        Steps that could not be taken.
+    megabytes
+        Largest memory that was allocated at once, where it was measured.
+    note
+        Why there is nothing, or what to know.
+    """
+
+    error: float = math.nan
+    covered: float = math.nan
+    step: float = math.nan
+    whole: float = math.nan
+    median: float = math.nan
+    failed: int = 0
+    megabytes: float = math.nan
+    note: str = ""
+
+
+Contender: TypeAlias = Callable[[Data], Score | None]
+"""Runs on a data set; None where it does not apply."""
+
+Known: TypeAlias = tuple[Array, Array | None]
+"""Latent coefficients of the parameter and a square root of their covariance, None: not known."""
+
+Found: TypeAlias = dict[tuple[str, float | None, str], list[Score]]
+"""Problem, noise level, row -> a score for each data set."""
+
+
+class Judge:
+    """Compares beliefs with the truth of a data set."""
+
+    def __init__(self, data: Data) -> None:
+        self.data = data
+        self.model = data.process.model
+        last = len(data) - 1
+        first, count = (last // 2, TIMES) if data.problem.varying else (last, 1)
+        self.scored: list[int] = np.linspace(first, last, count).round().astype(int).tolist()
+
+    @cached_property
+    def probe(self) -> Array:
+        """Rows that evaluate the latent coefficients: numbers, and fields at vertices."""
+        latent = self.model.latent
+        rows = []
+        for part in latent.parts.values():
+            size = part.size
+            local = part.block.at_vertices if isinstance(part.block, FieldBlock) else np.eye(size)
+            local = local.toarray() if hasattr(local, "toarray") else np.asarray(local)
+            row = np.zeros((len(local), latent.dim))
+            row[:, part.part.start : part.part.start + size] = local
+            # Where a boundary value is known there is nothing to cover.
+            rows.append(row[(np.abs(np.delete(row, latent.fixed, axis=1)) > 0).any(axis=1)])
+        return np.vstack(rows)
+
+    @cached_property
+    def rest(self) -> Array:
+        """Deviation of what `probe` evaluates in the modes that no estimator has, (rows,)."""
+        rest: Array = np.abs(self.probe) @ Trajectory(self.data).rest
+        return rest
+
+    def error(self, q: Array, at: int) -> float:
+        """Return the relative error of latent coefficients at a time."""
+        return self.data.problem.error(self.data.process, self.model.latent.value(q), at)
+
+    def covered(self, q: Array, factor: Array | None, at: int) -> float:
+        """Return the share of 95 % intervals that hold the truth, NaN if there are none."""
+        true = self.data.process.q_true
+        if factor is None or true is None:
+            return math.nan
+        distance = np.abs(self.probe @ (q - self.model.latent.inverse(true[at])))
+        std = np.sqrt(((self.probe @ factor) ** 2).sum(axis=1) + self.rest**2)
+        return float(np.mean(distance <= NORMAL_95 * std))
+
+    def judged(self, beliefs: Iterable[tuple[int, Array, Array | None]]) -> tuple[float, float]:
+        """Return error (root mean square over the scored times) and coverage."""
+        errors, shares = [], []
+        for at, q, factor in beliefs:
+            errors.append(self.error(q, at))
+            shares.append(self.covered(q, factor, at))
+        return float(np.sqrt(np.mean(np.square(errors)))), float(np.mean(shares))
+
+
+def measured(data: Data, step: Callable[[int], None], known: Callable[[], Known]) -> Score:
+    """Take all samples but the first and judge what is known then.
+
+    Parameters
+    ----------
+    step
+        Number of the sample -> takes it; only this is timed.
+    known
+        Returns what is known now.
+    """
+    judge, found = Judge(data), []
+    seconds: list[float] = []
+    for at in range(1, len(data)):
+        start = process_time()
+        step(at)
+        seconds.append(process_time() - start)
+        if at in judge.scored:
+            found.append((at, *known()))
+    error, covered = judge.judged(found)
+    costs = np.array(seconds) / data.forward
+    settled, whole, median = costs[WARM_UP:].mean(), costs.mean(), np.median(costs)
+    return Score(error, covered, float(settled), float(whole), float(median))
+
+
+def scored(contender: Contender, data: Data) -> Score | None:
+    """Run a contender; one that fails is a score with a reason.
+
+    What is quick is run three times, and the median times count.
+    """
+    start = process_time()
+    try:
+        score = contender(data)
+        runs = [score]
+        for _ in range(2 if score is not None and process_time() - start < QUICK else 0):
+            runs.append(contender(data))
+    except (LivepdeError, StepFailed, np.linalg.LinAlgError) as error:
+        return Score(note=f"{type(error).__name__}: {error}")
+    if score is None:
+        return None
+    times = [(run.step, run.whole, run.median) for run in runs if run is not None]
+    step, whole, median = np.median(times, axis=0).tolist()
+    return replace(score, step=step, whole=whole, median=median)
+
+
+def error_ratio(found: Found, at: tuple[str, float | None], row: str, other: str) -> float:
+    """Return the median error of a row over that of another; NaN if one has none."""
+    return _median(found, (*at, row)) / _median(found, (*at, other))
+
+
+def step_ratio(found: Found, at: tuple[str, float | None], row: str, other: str) -> float:
+    """Return the cost of a step of a row over that of another; NaN if one has none."""
+    mine, others = ([score.step for score in found.get((*at, key), ())] for key in (row, other))
+    return _mean(mine) / _mean(others)
+
+
+def _median(found: Found, key: tuple[str, float | None, str]) -> float:
+    errors = [score.error for score in found.get(key, ())]
+    return float(np.nanmedian(errors)) if np.isfinite(errors).any() else math.nan
+
+
+def table_of(found: Found, limit: str) -> list[Table]:
+    """Return a table for each problem: rows are noise level and contender.
+
+    Parameters
+    ----------
+    limit
+        Row by whose error the others are divided.
+    """
+    tables = []
+    for name in dict.fromkeys(key[0] for key in found):
+        rows, most = [], 0
+        for (problem, level, row), scores in found.items():
+            if problem != name:
+                continue
+            most = max(most, len(scores))
+            known = [score.error for score in scores if math.isfinite(score.error)] or [math.nan]
+            cells = [
+                float(np.median(known)),
+                min(known),
+                max(known),
+                error_ratio(found, (problem, level), row, limit),
+                _mean([score.covered for score in scores]),
+                _mean([score.step for score in scores]),
+            ]
+            rows.append(
+                [
+                    "as measured" if level is None else f"{level:.0%}",
+                    row,
+                    *("–" if math.isnan(cell) else cell for cell in cells),
+                    sum(score.failed for score in scores),
+                    "; ".join(dict.fromkeys(score.note for score in scores if score.note)),
+                ]
+            )
+        columns = ["noise", "estimator", "error", "least", "largest", "limit", "covered", "step"]
+        columns += ["failed steps", "note"]
+        tables.append(Table(f"{name}, {most} seed{'s' if most > 1 else ''}", columns, rows))
+    return tables
+
+
+def _mean(values: Sequence[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan

@@ -1,0 +1,250 @@
+"""A run that goes on and on: memory, time of a step and size of the journal must not grow.
+
+Diffusion on 31 nodes with an unknown that moves and one that does not, three sensors with noise, a
+boundary value that comes and goes; all as a live run has it: samples into the journal, estimates
+out, checkpoints, retention, and a reader that has the journal open all the time.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import count, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+
+import numpy as np
+
+from livepde.errors import RunError
+from livepde.fem import Channel, Field, Inputs, RandomWalk, Scalar, dot, grad, interval, linear
+from livepde.identifier import Identifier, Sample
+from livepde.laws import Jumps, SensitivityLaw
+from livepde.model import Model
+from livepde.observation import Points
+from livepde.progress import watched
+from livepde.result import Estimate
+from livepde.runs import Check, Journal, Outcome, Table, journal_of
+from livepde.runs.database import log_of
+from livepde.runs.feeds import Samples
+from livepde.runs.live import Live, Retention
+from livepde.stepping import Advance, ImplicitEuler, simulate
+
+__all__ = ["soak"]
+
+STEPS = 1_000_000
+WARM = 10_000  # steps before memory is looked at
+BLOCK = 1000  # steps of one measurement
+FRESH = 50  # steps of the one beside it
+GROWTH = 5.0  # MiB of memory, at most
+SLOWER = 1.2  # last tenth of the steps over the first one, at most
+KEPT = 20.0  # bytes that the journal may grow by with a step: those of the estimates that stay
+LOG = 32.0  # MiB of the write-ahead log, at most
+RETAINED = 20_000  # samples of which all is kept
+EVERY = 24  # of older estimates one in so many
+DT = 0.05
+PERIOD = 200  # samples
+NOISE = 0.01
+K, LOSS = 0.05, 0.3
+SENSORS = {"a": 0.2, "b": 0.5, "c": 0.8}
+MIB = 2.0**20
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was measured after so many steps: CPU seconds of a step, MiB of memory and files.
+
+    `fresh` has the CPU seconds of a step of an identifier that has just begun, at the same time: a
+    machine that others load slows both.
+    """
+
+    steps: int
+    seconds: float
+    fresh: float
+    private: float
+    resident: float
+    file: float
+    log: float
+
+
+@dataclass
+class Meter:
+    """A sink that measures every `BLOCK` steps, and reads the journal as a page would."""
+
+    reader: Journal
+    fresh: Callable[[], float]
+    readings: list[Reading] = field(default_factory=list)
+    failed: int = 0
+    _steps: int = 0
+    _read: int = 0
+    _since: float = field(default_factory=process_time)
+
+    def put(self, estimate: Estimate) -> None:
+        """Take one estimate."""
+        self._steps += 1
+        self.failed += not estimate.status.ok
+        if self._steps % BLOCK:
+            return
+        seconds = (process_time() - self._since) / BLOCK
+        for number, _ in self.reader.after(self._read):
+            self._read = number
+        file = self.reader.path
+        sizes = [_size(path) for path in (file, log_of(file))]
+        self.readings.append(Reading(self._steps, seconds, self.fresh(), *_memory(), *sizes))
+        self._since = process_time()
+
+    def close(self) -> None:
+        """The reader is closed by who opened it."""
+
+
+def soak(steps: int = STEPS, *, share: float = 1.0, progress: bool = False) -> Outcome:
+    """Run so many steps and hold their end against their beginning.
+
+    Parameters
+    ----------
+    share
+        Of `WARM` and `RETAINED`: runs of fewer steps have less time to warm up.
+    """
+    warm, retained = round(share * WARM), round(share * RETAINED)
+    if steps < 2 * warm:
+        raise RunError(f"benchmark soak: --steps must be at least {2 * warm}; got {steps}.")
+    identifier = _identifier()
+    samples = islice(_samples(identifier.model), steps)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "journal.sqlite"
+        journal = journal_of(identifier, path)
+        with journal, Journal.open(path) as reader:
+            meter = Meter(reader, _fresh())
+            live = Live(
+                identifier,
+                Samples(watched(samples, steps) if progress else samples),
+                journal,
+                sinks=[meter],
+                fields_every=EVERY,
+                retention=Retention(retained * DT, EVERY),
+                strict=True,
+            )
+            live.run()
+            kept = len(journal)
+        with Journal.open(path) as after:
+            read = sum(1 for _ in after)
+    estimate = identifier.estimate()
+    error = abs(estimate.parameters["k"][0] / K - 1.0)
+    return _outcome(meter, steps, kept - read, error, share)
+
+
+def _outcome(meter: Meter, steps: int, lost: int, error: float, share: float = 1.0) -> Outcome:
+    warm, retained = round(share * WARM), round(share * RETAINED)
+    found = [reading for reading in meter.readings if reading.steps >= warm]
+    tenth = max(len(found) // 10, 1)
+    first, last = found[0], found[-1]
+    middle = found[len(found) // 2]
+    early, late = (
+        float(np.median([r.seconds / r.fresh for r in some]))
+        for some in (found[:tenth], found[-tenth:])
+    )
+    shown = [*found[:: max(len(found) // 10, 1)][:10], last]
+    table = Table(
+        f"{steps} steps of 31 nodes, all kept of {retained} samples, of older estimates 1 in "
+        f"{EVERY}",
+        (
+            "steps",
+            "ms of a step (CPU)",
+            "of a fresh one",
+            "private MiB",
+            "resident MiB",
+            "journal MiB",
+            "log MiB",
+        ),
+        [
+            (
+                r.steps,
+                1e3 * r.seconds,
+                1e3 * r.fresh,
+                *(size / MIB for size in (r.private, r.resident, r.file, r.log)),
+            )
+            for r in shown
+        ],
+    )
+    per_step = (last.file - middle.file) / (last.steps - middle.steps)
+    checks = [
+        Check(
+            f"memory: growth after {warm} steps (MiB)",
+            (max(r.private for r in found) - first.private) / MIB,
+            GROWTH,
+            "<=",
+        ),
+        Check(
+            "time of a step over a fresh one: last tenth / first tenth", late / early, SLOWER, "<="
+        ),
+        Check("journal: growth in the second half (bytes a step)", per_step, KEPT, "<="),
+        Check("write-ahead log: largest (MiB)", max(r.log for r in found) / MIB, LOG, "<="),
+        Check("steps that failed", meter.failed, 0, "<="),
+        Check("estimates that a reader does not find", lost, 0, "<="),
+        Check("relative error of k at the end", error, 0.02, "<="),
+    ]
+    return Outcome(tables=[table], checks=checks)
+
+
+def _identifier() -> Identifier:
+    mesh = interval(0.0, 1.0, 30)
+    model = Model(
+        state=Field(mesh, linear(mesh), dirichlet={"left": Channel("left"), "right": 0.0}),
+        parameter={
+            "k": Scalar(0.04, std=0.02),
+            "loss": Scalar(0.2, std=0.1, evolution=RandomWalk(0.001)),
+        },
+        A=lambda q, u, v, x: q.k * dot(grad(u), grad(v)) + q.loss * u * v,
+    )
+    return Identifier(model, Points(SENSORS, noise=NOISE), SensitivityLaw(jumps=Jumps()))
+
+
+def _fresh() -> Callable[[], float]:
+    """Return what measures the CPU seconds of a step of an identifier that has just begun."""
+    identifier = _identifier()
+    samples = list(islice(_samples(identifier.model), FRESH))
+    begun = identifier.dump()
+
+    def measure() -> float:
+        identifier.restore(begun)
+        since = process_time()
+        for sample in samples:
+            identifier.step(sample.t, sample.z)
+        return (process_time() - since) / FRESH
+
+    return measure
+
+
+def _samples(model: Model) -> Iterator[Sample]:
+    """Yield samples without end: a periodic truth of the estimator's scheme, and noise."""
+    run_up = 6 * PERIOD  # after five periods nothing is left of the start
+    phase = 2 * np.pi * np.arange(run_up + 1) / PERIOD
+    times, left = DT * np.arange(run_up + 1), 1.0 + np.sin(phase)
+
+    def inputs(t: float) -> Inputs:
+        return Inputs({"left": float(left[round(t / DT)])})
+
+    q = np.array([K, LOSS])
+    states = simulate(model, q, 0.0, times.tolist(), Advance(ImplicitEuler()), inputs)
+    G = Points(SENSORS).matrix(model.state_space)
+    seen = [(G @ u).tolist() for _, u in states][-PERIOD:]
+    rng = np.random.default_rng(0)
+    for k in count():
+        noise = NOISE * rng.standard_normal(len(SENSORS))
+        z = {n: x + e for n, x, e in zip(SENSORS, seen[k % PERIOD], noise.tolist(), strict=True)}
+        yield Sample(DT * k, {**z, "left": float(left[1 + k % PERIOD])})
+
+
+def _memory() -> tuple[float, float]:
+    """Return bytes of memory: of this process alone, and with what it shares."""
+    try:
+        _, resident, shared, *_ = Path("/proc/self/statm").read_text().split()
+    except OSError:
+        raise RunError("benchmark soak reads /proc/self/statm: it needs Linux.") from None
+    page = os.sysconf("SC_PAGE_SIZE")
+    return page * (int(resident) - int(shared)), page * int(resident)
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0

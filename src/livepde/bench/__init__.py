@@ -1,1 +1,0 @@
-"""The project's benchmarks: ratios measured in one run, never absolute times."""
