@@ -17,9 +17,9 @@ from livepde.errors import LivepdeError, RunError
 from livepde.runs import JOURNAL, Journal
 
 
-def call(*arguments: str, stdin: str | None = None) -> tuple[int, str]:
+def call(*arguments: str | Path, stdin: str | None = None) -> tuple[int, str]:
     """Return exit code and output of a command that ends as it should."""
-    result = CliRunner().invoke(cli.app, list(arguments), input=stdin)
+    result = CliRunner().invoke(cli.app, list(map(str, arguments)), input=stdin)
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.output

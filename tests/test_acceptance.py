@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from problems import laplace, observe, product
+from factories import laplace, observe, product
 from skfem import ElementLineP2
 
 import livepde as lp

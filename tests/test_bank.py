@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1
+from factories import driven_rod, readings
 
 import livepde as lp
 from livepde.cases import load
 from livepde.cases.template import write_template
 from livepde.laws import MemberReports
 from livepde.laws.guess import GUESSED, PATIENCE, first_guess
-from livepde.stepping import ForwardStage
 
 POINTS = [0.25, 0.5, 0.75]
 NOISE = 0.01
@@ -31,26 +29,15 @@ def rod(
     **unknown: Any,
 ) -> lp.Model:
     """Return a rod in units that are u, x and t times smaller."""
-    mesh = lp.interval(0.0, x, cells)
-    ends = {"left": lambda X, s: u * np.sin(3 * s / t) + 0.0 * X[0], "right": 0.0}
     unit = x**2 / t
-    return lp.Model(
-        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
-        {"a": lp.Scalar(0.2 * unit, std * unit, **unknown)},
-        A=lambda q, w, v, X: q.a * lp.dot(lp.grad(w), lp.grad(v)),
-    )
+    a = {"a": lp.Scalar(0.2 * unit, std * unit, **unknown)}
+    return driven_rod(a, lambda s: u * np.sin(3 * s / t), lp.interval(0.0, x, cells))
 
 
 def samples(
     a: Any, count: int, seed: int = 0, noise: float = NOISE, dt: float = 0.05
 ) -> list[tuple[float, Any]]:
-    model, rng = rod(), np.random.default_rng(seed)
-    observed = lp.Points(POINTS).bind(model.state_space, model.X, model.parameter_space)
-    forward, u, found = ForwardStage(model), model.initial(0.0), []
-    for t0, t1 in pairwise((dt * np.arange(count + 1)).tolist()):
-        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
-        found.append((t1, observed.G @ u + noise * rng.standard_normal(len(POINTS))))
-    return found
+    return readings(rod(), lp.Points(POINTS), a, dt * np.arange(count + 1), noise, seed)
 
 
 def build(

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from typer.testing import CliRunner
+from commands import call
 
-from livepde import Fleet, cases, cli, runs
+from livepde import Fleet, cases, runs
 from livepde.cases import together
 from livepde.cases.template import write_template
 from livepde.cli.printing import INTERRUPTED
@@ -40,14 +40,6 @@ def here(tmp_path, monkeypatch):
     Path("rod/warm.csv").write_text("\n".join(rows[:30]) + "\n")
     Path("rods.csv").write_text(TABLE)
     return tmp_path
-
-
-def call(*arguments: str) -> tuple[int, str]:
-    """Return exit code and output of a command that ends as it should."""
-    result = CliRunner().invoke(cli.app, list(arguments))
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.stdout
 
 
 @pytest.fixture

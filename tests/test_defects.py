@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import diffusion, laplace, line, observe, product, truth
+from factories import diffusion, laplace, line, observe, product, truth
 from skfem import ElementLineP1
 
 import livepde as lp

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import CASES, excited, line, observe, reaction
+from factories import CASES, excited, line, observe, reaction
 from skfem import ElementLineHermite, ElementLineP1
 
 import livepde as lp

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1
+from factories import driven_rod, line
 
 import livepde as lp
 from livepde.reproduce import seed_excited
@@ -19,14 +19,9 @@ TIMES = 0.05 * np.arange(401)
 
 
 def rod(a: Any, loss: float = 0.0) -> lp.Model:
-    mesh = lp.interval(0.0, 1.0, 20)
-    ends = {"left": lambda x, t: 5 * np.sin(t) + 0.0 * x[0], "right": 0.0}
-    return lp.Model(
-        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
-        a if isinstance(a, dict) else {"a": a},
-        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
-        B=lambda u, v, x: loss * (u - 2.0) * v,
-    )
+    unknowns = a if isinstance(a, dict) else {"a": a}
+    loses = lambda u, v, x: loss * (u - 2.0) * v  # noqa: E731
+    return driven_rod(unknowns, lambda t: 5 * np.sin(t), line(20), B=loses)
 
 
 def run(model: lp.Model, truth: lp.Model, shift: Any = 0.0, **options: Any) -> Any:

@@ -15,15 +15,15 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from commands import call
 from meshio.xdmf import TimeSeriesReader
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.wait import WebDriverWait
 from skfem import MeshHex, MeshTri
-from typer.testing import CliRunner
 
 import livepde as lp
-from livepde import cli, runs
+from livepde import runs
 from livepde.dashboard.report import write_report
 from livepde.errors import ConfigurationError, LivepdeError, RunError
 from livepde.models import heat
@@ -97,13 +97,6 @@ def made(folder, kind: str = "line", count: int = SAMPLES, **attrs) -> runs.Run:
 @pytest.fixture
 def rod(tmp_path) -> runs.Run:
     return made(tmp_path / "rod", origin=ORIGIN)
-
-
-def call(*arguments) -> tuple[int, str]:
-    result = CliRunner().invoke(cli.app, [str(item) for item in arguments])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.output
 
 
 # --- names and units -------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
-from problems import laplace, line, truth
+from factories import laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp

@@ -6,7 +6,7 @@ import copy
 
 import numpy as np
 import pytest
-from problems import excited, excited_u, line
+from factories import excited, excited_u, line
 from skfem import ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp

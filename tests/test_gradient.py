@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from dense import DenseStage
-from problems import (
+from factories import (
     CASES,
     excited,
     excited_q,

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import driven_rod, readings
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -25,33 +26,21 @@ GUARDED = ("iterated", "tempered", "held", "restarted", "runaway")
 
 def explosive() -> lp.Model:
     """u_t - u_xx = q exp(u): no steady state beyond q = 3.5, and no step far beyond."""
-    state = lp.Field(
-        MESH,
-        ElementLineP1(),
-        dirichlet={"left": lambda x, t: 0.3 * np.sin(t) + 0.0 * x[0], "right": 0.0},
-    )
-    return lp.Model(
-        state,
+    return driven_rod(
         {"q": lp.Scalar(1.0, 1.0)},
-        A=lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.q * np.exp(u) * v,
+        lambda t: 0.3 * np.sin(t),
+        MESH,
+        lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.q * np.exp(u) * v,
     )
 
 
 def rod(driven: Any = lambda t: 1.0, **unknown: Any) -> lp.Model:
-    ends = {"left": lambda x, t: driven(t) * np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
-    state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
     a = {"a": lp.Scalar(0.2, 0.2, **unknown)}
-    return lp.Model(state, a, A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
+    return driven_rod(a, lambda t: driven(t) * np.sin(3 * t), MESH)
 
 
 def samples(model: lp.Model, q: float, count: int, seed: int = 0) -> list[tuple[float, Any]]:
-    rng = np.random.default_rng(seed)
-    observed = POINTS.bind(model.state_space, model.X, model.parameter_space)
-    forward, u, found = ForwardStage(model), model.initial(0.0), []
-    for t0, t1 in pairwise((0.05 * np.arange(count + 1)).tolist()):
-        u = forward.solve(u, np.array([q]), t1 - t0, lp.Moment(t1))
-        found.append((t1, observed.G @ u + 0.01 * rng.standard_normal(3)))
-    return found
+    return readings(model, POINTS, lambda t: q, 0.05 * np.arange(count + 1), 0.01, seed)
 
 
 def run(model: lp.Model, stream: Any, **options: Any) -> list[lp.Estimate]:

@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1
+from factories import driven_rod, line, readings
 
 import livepde as lp
 from livepde.laws.innovations import Innovations
 from livepde.laws.jumps import Jumps
-from livepde.stepping import ForwardStage
 
-MESH = lp.interval(0.0, 1.0, 16)
 POINTS = [0.25, 0.5, 0.75]
 NOISE = 0.01
 
 
 def rod() -> lp.Model:
-    ends = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
-    state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
-    unknown = {"a": lp.Scalar(0.2, 0.2)}
-    return lp.Model(state, unknown, A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
+    return driven_rod({"a": lp.Scalar(0.2, 0.2)}, lambda t: np.sin(3 * t), line(16))
 
 
 def samples(a: Any, count: int, seed: int, noise: float = NOISE) -> list[tuple[float, Any]]:
-    model, rng = rod(), np.random.default_rng(seed)
-    observed = lp.Points(POINTS).bind(model.state_space, model.X, model.parameter_space)
-    forward, u, found = ForwardStage(model), model.initial(0.0), []
-    for t0, t1 in pairwise((0.05 * np.arange(count + 1)).tolist()):
-        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
-        found.append((t1, observed.G @ u + noise * rng.standard_normal(len(POINTS))))
-    return found
+    return readings(rod(), lp.Points(POINTS), a, 0.05 * np.arange(count + 1), noise, seed)
 
 
 def run(law: lp.SensitivityLaw, stream: Any, guess: float = NOISE) -> list[lp.Estimate]:

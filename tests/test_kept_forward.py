@@ -2,9 +2,12 @@
 
 from dataclasses import replace
 
+import factories
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from factories import laplace, reaction
+from skfem import ElementTriP1
 
 import livepde as lp
 from livepde.errors import LinearAlgebraError
@@ -25,12 +28,11 @@ H = 0.1
 
 def square(cells=50, wind=0.0):
     """Heat conduction with an unknown reaction, and with wind if that is not 0."""
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
-    return lp.Model(
-        lp.Field(mesh, lp.linear(mesh), dirichlet={"left": 0.0}),
-        lp.Field(mesh, lp.linear(mesh), inner="H1"),
-        A=lambda q, u, v, x: q * u * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)) + wind * lp.grad(u)[0] * v,
+    return reaction(
+        factories.square(cells),
+        ElementTriP1(),
+        dirichlet={"left": 0.0},
+        B=lambda u, v, x: laplace(u, v, x) + wind * lp.grad(u)[0] * v,
         f=lambda x, t: 1.0 + t,
     )
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from factories import driven_rod, line, readings
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
@@ -203,24 +203,16 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
         return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
     def rod(unknown: lp.Scalar) -> lp.Model:
-        fine = lp.interval(0.0, 1.0, 20)
-        left = lambda x, t: np.sin(3.0 * t) + 0.0 * x[0]  # noqa: E731
-        state = lp.Field(fine, ElementLineP1(), dirichlet={"left": left, "right": 0.0})
-        return lp.Model(
-            state, {"a": unknown}, lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v))
-        )
+        return driven_rod({"a": unknown}, lambda t: np.sin(3.0 * t), line(20))
 
-    truth, rng = rod(lp.Scalar(1.0)), np.random.default_rng(0)
     model = rod(lp.Scalar(0.2, 0.2, evolution=lp.Periodic(10.0)))
+    points = lp.Points(SENSORS, noise=0.01)
     law = lp.SensitivityLaw(replay=lp.Replay(first=8))
-    identifier = lp.Identifier(model, lp.Points(SENSORS, noise=0.01), law)
-    forward, u = ForwardStage(truth), truth.initial(0.0)
+    identifier = lp.Identifier(model, points, law)
     errors = []
-    for t0, t1 in itertools.pairwise(np.arange(0.0, 20.0, 0.05).tolist()):
-        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
-        estimate = identifier.step(t1, identifier.observed.G @ u + 0.01 * rng.standard_normal(3))
-        value, std = estimate.parameters["a"]
-        errors.append([value - a(t1), std])
+    for t, z in readings(rod(lp.Scalar(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
+        value, std = identifier.step(t, z).parameters["a"]
+        errors.append([value - a(t), std])
     late = np.array(errors[200:])
     assert np.sqrt((late[:, 0] ** 2).mean()) < 0.002
     assert np.sqrt(((late[:, 0] / late[:, 1]) ** 2).mean()) < 2.0

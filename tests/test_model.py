@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems import CASES, laplace, line, product, reaction
+from factories import CASES, laplace, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementLineP2, ElementTriP1, MeshTri
 
 import livepde as lp

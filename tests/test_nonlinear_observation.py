@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems import excited, excited_q, excited_u, observe, reaction
+from factories import excited, excited_q, excited_u, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp

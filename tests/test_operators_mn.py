@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import CASES, line, observe, reaction
+from factories import CASES, line, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from factories import laplace, line, reaction
 from skfem import (
     ElementLineHermite,
     ElementLineP1,
@@ -21,18 +22,8 @@ ELEMENTS = [ElementLineHermite, ElementLineP1, ElementLineP2]
 MIDDLE = lambda x: (x[0] > 0.3) & (x[0] < 0.87)  # noqa: E731
 
 
-def laplace(u, v, x):
-    return lp.dot(lp.grad(u), lp.grad(v))
-
-
 def rod(element=ElementLineHermite, cells=20, dirichlet=None):
-    mesh = lp.interval(0.0, 1.0, cells)
-    return lp.Model(
-        state=lp.Field(mesh, element(), dirichlet=dirichlet or {}),
-        parameter=lp.Field(mesh, ElementLineP1(), inner="H1"),
-        A=lambda q, u, v, x: q * u * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
-    )
+    return reaction(line(cells), element(), ElementLineP1(), dirichlet=dirichlet or {})
 
 
 def bind(model, observation):

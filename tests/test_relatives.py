@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from problems import excited, excited_q, excited_u, laplace, reaction
+from factories import excited, excited_q, excited_u, laplace, reaction
 from skfem import ElementLineP1
 
 import livepde as lp

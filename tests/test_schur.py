@@ -6,6 +6,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from factories import laplace, reaction, square
+from skfem import ElementTriP1
 
 import livepde as lp
 from livepde.bench import scale
@@ -24,13 +26,12 @@ def inside(x):
     return (x[0] < 0.6) | (x[1] < 0.6)
 
 
-def plane(cells=16, *, A=lambda q, u, v, x: q * u * v, inner="H1", diffusion=1.0, **options):
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
-    return lp.Model(
-        state=lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 2.0}),
-        parameter=lp.Field(mesh, lp.linear(mesh), inner=inner),
-        A=A,
-        B=lambda u, v, x: diffusion * lp.dot(lp.grad(u), lp.grad(v)),
+def plane(cells=16, *, diffusion=1.0, **options):
+    return reaction(
+        square(cells),
+        ElementTriP1(),
+        dirichlet={"boundary": 2.0},
+        B=lambda u, v, x: diffusion * laplace(u, v, x),
         f=lambda x, t: 10 * (1 + x[0]) * (1 + 0.3 * np.sin(3 * t)),
         **options,
     )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import io
 import json
-import logging
 import pickle
 import socket
 import threading
@@ -339,17 +338,6 @@ def test_elsewhere_a_token_is_made(serving):
 def test_tokens_that_are_none(host, token):
     with pytest.raises(lp.RunError, match="token"):
         Address(host, token=token)
-
-
-@pytest.fixture
-def logs():
-    """Leave logging as it was."""
-    root = logging.getLogger()
-    before, level = list(root.handlers), root.level
-    yield
-    root.handlers[:] = before
-    root.setLevel(level)
-    logging.getLogger("livepde").setLevel(logging.NOTSET)
 
 
 def test_a_given_token_is_shown_nowhere(serving, tmp_path, monkeypatch, logs):

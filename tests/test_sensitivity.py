@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems import excited, excited_q, excited_u, laplace, line, truth
+from factories import excited, excited_q, excited_u, laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from factories import observe
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from problems import observe
 from skfem import (
     ElementLineHermite,
     ElementLineP1,

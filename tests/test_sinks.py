@@ -19,18 +19,6 @@ from livepde.runs.sinks import JsonLinesSink
 from livepde.streams.sources import Rows
 
 
-@pytest.fixture
-def logs():
-    """Leave logging as it was."""
-    root = logging.getLogger()
-    before, level = list(root.handlers), root.level
-    yield
-    root.handlers[:] = before
-    root.setLevel(level)
-    for name in ("livepde", "asyncua"):
-        logging.getLogger(name).setLevel(logging.NOTSET)
-
-
 def test_each_estimate_is_a_line(tmp_path):
     stream = io.StringIO()
     run = live(tmp_path, Rows(rows(4)), sinks=[JsonLinesSink(stream)])

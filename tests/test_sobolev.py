@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.linalg as sl
-from problems import CASES, excited, excited_q, excited_u, line, product, reaction
+from factories import CASES, excited, excited_q, excited_u, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementQuadBFS, ElementTriP1, MeshTri
 
 import livepde as lp

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import CASES, laplace, line, product, reaction
+from factories import CASES, laplace, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import excited, excited_q, excited_u, line, observe, product
+from factories import excited, excited_q, excited_u, line, observe, product
 from skfem import ElementLineHermite, ElementLineP1, ElementLineP2
 from typer.testing import CliRunner
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import conduction, driven_rod, readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -25,27 +26,15 @@ SENSORS = [0.25, 0.5, 0.75]
 mesh = lp.interval(0.0, 1.0, 20)
 
 
-def swinging(x: Any, t: float) -> Any:
-    return np.sin(3.0 * t) + 0.0 * x[0]
-
-
 def rod(parameter: Any, A: Any = None, **options: Any) -> lp.Model:
     """Return a rod heated and cooled at its left end; the diffusivity is `a` unless A is given."""
-    state = lp.Field(mesh, ElementLineP1(), dirichlet={"left": swinging, "right": 0.0})
-    A = A or (lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
-    return lp.Model(state, parameter, A, **options)
+    return driven_rod(parameter, lambda t: np.sin(3.0 * t), mesh, A or conduction, **options)
 
 
 def data(a: Any, times: Any, noise: float = NOISE, seed: int = 0) -> list[tuple[float, Any]]:
     """Return noisy samples of the sensors for a diffusivity a(t)."""
-    model, rng = rod({"a": lp.Scalar(1.0)}), np.random.default_rng(seed)
-    observed = lp.Points(SENSORS).bind(model.state_space, model.X, model.parameter_space)
-    forward, u = ForwardStage(model), model.initial(0.0)
-    samples = [(float(times[0]), observed.G @ u)]
-    for t0, t1 in itertools.pairwise(times):
-        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
-        samples.append((float(t1), observed.G @ u + noise * rng.standard_normal(len(SENSORS))))
-    return samples
+    found = readings(rod({"a": lp.Scalar(1.0)}), lp.Points(SENSORS), a, times, noise, seed)
+    return [(float(times[0]), np.zeros(len(SENSORS))), *found]
 
 
 def estimates(model: lp.Model, law: Any, samples: Any, **options: Any) -> list[lp.Estimate]:
