@@ -60,6 +60,7 @@ def run(scale, noise, strict):
     return np.array(q), np.array(ok)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("scale", SCALES)
 def test_an_accepted_stage_is_solved(scale, noise):

@@ -15,6 +15,8 @@ from livepde.cases.template import write_template
 from livepde.laws import MemberReports
 from livepde.laws.guess import GUESSED, PATIENCE, first_guess
 
+pytestmark = pytest.mark.slow
+
 POINTS = [0.25, 0.5, 0.75]
 NOISE = 0.01
 

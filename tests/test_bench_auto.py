@@ -10,6 +10,8 @@ from livepde import cli
 from livepde.bench import auto as bench
 from livepde.laws import GradientLaw
 
+pytestmark = pytest.mark.study
+
 
 @pytest.fixture(scope="module")
 def square():

@@ -13,6 +13,8 @@ from livepde import cli
 from livepde.bench import cases as bench
 from livepde.cases.template import write_template
 
+pytestmark = pytest.mark.study
+
 VARIANTS = """
 [reference]
 alpha = "9.7e-5 m^2/s"

@@ -17,6 +17,8 @@ from livepde.bench.peers import table
 from livepde.bench.peers.augmented import Augmented
 from livepde.bench.problems import PROBLEMS, Data, Problem, Process
 
+pytestmark = pytest.mark.study
+
 TIMES = np.linspace(0.0, 1.0, 21)
 
 

@@ -20,6 +20,8 @@ from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
 from livepde.runs import JOURNAL, Journal
 
+pytestmark = pytest.mark.slow
+
 TABLE = """name,data,unknowns.alpha.prior,law.noise
 plain,,,
 warm,rod/warm.csv,4e-5 m^2/s,
@@ -104,6 +106,7 @@ def test_goes_on_with_what_is_there(here):
     assert [row[0] for row in rows[1]] == ["plain", "warm"]
 
 
+@pytest.mark.process
 @pytest.mark.usefixtures("processes")
 def test_in_several_processes(here):
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "one")
@@ -222,6 +225,7 @@ def test_members_that_are_alike_step_together(alike):
     pd.testing.assert_frame_equal(left, right, rtol=1e-7)
 
 
+@pytest.mark.process
 @pytest.mark.usefixtures("processes")
 def test_each_process_steps_its_part_together(alike):
     Path("rods.csv").write_text(ALIKE + "d,rod/third.csv,\n")

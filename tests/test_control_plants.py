@@ -25,6 +25,8 @@ from livepde.bench.control.wall import wall
 from livepde.cli import app
 from livepde.errors import ConfigurationError
 
+pytestmark = pytest.mark.study
+
 needs_mpc = pytest.mark.skipif(find_spec("do_mpc") is None, reason="do-mpc is not installed")
 
 

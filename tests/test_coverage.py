@@ -13,6 +13,8 @@ from livepde.bench import coverage
 from livepde.bench.coverage import PROBLEMS, twin
 from livepde.cli import app
 
+pytestmark = pytest.mark.study
+
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_twin_is_the_same_for_the_same_seed(name: str):

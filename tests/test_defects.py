@@ -131,6 +131,7 @@ def test_a_checkpoint_of_other_options_is_refused_and_changes_nothing(tmp_path):
     assert (many.t, many._state) == before
 
 
+@pytest.mark.slow
 def test_a_checkpoint_from_before_the_start_starts_again(tmp_path):
     one, two = (lp.Identifier(conduction(), lp.Full(), lp.GradientLaw()) for _ in range(2))
     z = np.full(one.observed.size, 0.1)

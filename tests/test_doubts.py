@@ -57,6 +57,7 @@ def test_a_process_that_is_missing_is_said():
     assert "The model does not explain the data" in found[0]
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_always_off_is_named():
     model = rod(lp.Scalar(0.2, 0.1))
     found = doubts(run(model, model, shift=[0.0, 1.0, 0.0], replay=lp.Replay()))
@@ -72,6 +73,7 @@ def test_an_estimate_at_its_bound_is_said():
     assert any("a ends at its bound 0.25" in sentence for sentence in found)
 
 
+@pytest.mark.slow
 def test_an_unknown_that_nothing_shows_is_said():
     unseen = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
     data = run(rod(unseen), rod(lp.Scalar(0.2)))
@@ -91,6 +93,7 @@ def test_the_gradient_law_has_no_innovations_to_judge():
     assert doubts(identifier.run([]).to_xarray()) == []
 
 
+@pytest.mark.slow
 def test_a_replay_that_did_not_converge_is_said():
     far = rod(lp.Scalar(3.0, 3.0, transform="log"))
     once = lp.Replay(first=300, iterations=1)
@@ -98,6 +101,7 @@ def test_a_replay_that_did_not_converge_is_said():
     assert any("The last replay has not converged" in sentence for sentence in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "said"), [(5, False), (50, True)])
 def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
     model = rod(lp.Scalar(0.5, 0.3))
@@ -129,6 +133,7 @@ def reaction(cells: int) -> lp.Model:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [60, 180])
 def test_an_equation_error_that_is_no_noise_does_not_drive_a_field_out_of_its_prior(cells: int):
     """Data of 180 cells: 60 leave an error of the mesh, and q does not take it up."""
@@ -156,6 +161,7 @@ def test_an_equation_error_that_is_no_noise_does_not_drive_a_field_out_of_its_pr
     assert not doubts(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("last", "said"), [(0.9, False), (1.1, True)])
 def test_only_the_end_counts_for_what_has_left_its_prior(last: float, said: bool):
     model = rod(lp.Scalar(0.5, 0.3))

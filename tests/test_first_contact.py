@@ -20,6 +20,8 @@ import livepde as lp
 from livepde.models import heat
 from livepde.stepping import Advance, Alexander2, simulate
 
+pytestmark = pytest.mark.process
+
 PROJECT = Path(__file__).resolve().parents[1]
 DIFFUSIVITY = 6.4e-5  # of the user's rod, m^2/s
 NOISE = 0.05  # K

@@ -50,6 +50,7 @@ def energies(model, law, q_true, states, times, **options):
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e1, 1e2, 1e3, 1e4, 1e5])
 @pytest.mark.parametrize(
     "damping", [lp.ResidualDamping(0.0), lp.ResidualDamping(1.0), lp.ConstantDamping(2.0)]
@@ -70,6 +71,7 @@ def test_energy_never_grows(gain, damping):
     assert energy[-1] < energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e3, 1e5])
 def test_energy_of_the_papers_example(gain):
     """Degenerate information: |q*| <= 0.00625, dying excitation, steps of 0.6."""
@@ -159,6 +161,7 @@ def partly_observed(scheme, steps, h_total=1.0, **options):
     return np.concatenate([estimate.u, estimate.q])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "order"), [(lp.ImplicitEuler(), 1), (lp.Alexander2(), 2)], ids=["euler", "alexander"]
 )
@@ -223,6 +226,7 @@ RULES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("nu", [0.0, 0.4])
 def test_stage_solves_its_equations(rule, nu):
@@ -233,6 +237,7 @@ def test_stage_solves_its_equations(rule, nu):
     assert dense.relative(y + 1e-6 * problem.c, *given) > 1e-9  # which would show a wrong solution
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3, 1e5])
 @pytest.mark.parametrize("rule", [lp.ResidualDamping(1.0), lp.ConstantDamping(0.5, floor=1e-3)])
 @pytest.mark.parametrize("gain", [1.0, 1e4])
@@ -479,6 +484,7 @@ def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
     assert np.isfinite(after.u).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [lp.ResidualDamping(0.0), lp.ConstantDamping(1.0)])
 def test_a_reaction_that_blows_up(damping):
     """u_t = exp(u) - ... reaches infinity in finite time wherever nothing is observed."""
@@ -497,6 +503,7 @@ def test_a_reaction_that_blows_up(damping):
     assert ident.t == 0.001
 
 
+@pytest.mark.slow
 def test_checked_contract():
     model = excited(8)
     times = [0.1, 0.2, 0.35, 0.5, 0.55, 0.7]

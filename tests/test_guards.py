@@ -103,6 +103,7 @@ def test_guards_do_nothing_where_all_is_well(replay: Any):
         assert one.notes == other.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "length"), [(3.0, 1), (1.0, 10), (3.0, 10), (30.0, 10)])
 def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     """Sensors that are off by far push q to where no step can be taken: stuck for ever."""
@@ -120,6 +121,7 @@ def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     assert found[-1].parameters["q"][1] < 0.5
 
 
+@pytest.mark.slow
 def test_what_guards_did_is_said():
     model = explosive()
     stream = [(t, z + 3.0 * (60 <= k < 70)) for k, (t, z) in enumerate(samples(model, 2.0, 80))]
@@ -147,6 +149,7 @@ def test_a_failure_that_nothing_helps_against_is_a_status():
     assert identifier.step(0.2, [0.0, 0.0, 0.0], {"T": 0.0}).status.ok
 
 
+@pytest.mark.slow
 def test_no_burst_follows_a_rest():
     """Excitation returns at once after 10 s, in which the unknown may have gone anywhere."""
     model = rod(lambda t: float(t < 2 or t > 12), evolution=lp.RandomWalk(0.2))
@@ -161,6 +164,7 @@ def test_no_burst_follows_a_rest():
     assert [values[-1] for values in ends[lp.Guards()]] == pytest.approx([0.3] * 3, abs=0.05)
 
 
+@pytest.mark.slow
 def test_nothing_winds_up_while_nothing_is_excited():
     model = rod(lambda t: float(t < 2))
     found = run(model, samples(model, 0.3, 2000), drift=0.3)
@@ -206,6 +210,7 @@ def test_a_prediction_runs_away_beyond_all_that_was_seen():
     assert scale.beyond(np.array([[np.nan, 2.0]]), np.array([[0.1, 0.001]])) == 25.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 def test_a_gain_too_large_for_the_noise_is_said(gain: float):
     ends = {"left": lambda x, t: 1 + np.sin(t) + 0.0 * x[0], "right": 1.0}
@@ -258,6 +263,7 @@ def holds(data: Any) -> np.ndarray:
     return held == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: float):
     model = reaction(lambda t: 1.0 * (t < 20.0))
@@ -276,6 +282,7 @@ def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: floa
     assert not any("Nothing but noise" in s for s in doubts(free))
 
 
+@pytest.mark.slow
 def test_the_law_goes_on_when_excitation_returns():
     model = reaction(lambda t: 1.0 * (t < 2.0 or t > 20.0))
     data = learned(model, full(model, 1000), gain=1.0)
@@ -288,6 +295,7 @@ def test_the_law_goes_on_when_excitation_returns():
     assert any("samples, last at t = 20" in s for s in doubts(data))
 
 
+@pytest.mark.slow
 def test_a_process_faster_than_the_samples_is_not_at_rest():
     values = np.random.default_rng(1).standard_normal(700)
     fast = learned(m := reaction(lambda t: values[round(t / 2.0)]), full(m, 600, h=2.0))
@@ -297,6 +305,7 @@ def test_a_process_faster_than_the_samples_is_not_at_rest():
     assert not holds(late).any()
 
 
+@pytest.mark.slow
 def test_an_exact_excitation_that_dies_out_is_none():
     model = reaction(lambda t: 1.0 / (1.0 + t) ** 2)
     data = learned(model, full(model, 600, noise=0.0), gain=1e4)
@@ -342,6 +351,7 @@ FAST = np.random.default_rng(1).standard_normal(2000)
 PART = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.9))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 @pytest.mark.parametrize("sensors", [lp.Full(), PART], ids=["full", "part"])
 @pytest.mark.parametrize(
@@ -365,6 +375,7 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
     assert last.correlation < 0.5  # this, it would be held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 @pytest.mark.parametrize("c1", [0.1, 1.0])
 def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):

@@ -200,6 +200,7 @@ def test_halvings_that_cannot_be_meant(halvings):
         cubic_decay(lp.GradientLaw(), halvings=halvings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [

@@ -12,6 +12,8 @@ import livepde as lp
 from livepde.laws.innovations import Innovations
 from livepde.laws.jumps import Jumps
 
+pytestmark = pytest.mark.slow
+
 POINTS = [0.25, 0.5, 0.75]
 NOISE = 0.01
 

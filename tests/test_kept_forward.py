@@ -77,6 +77,7 @@ def go(model, parameters, tolerance=1e-8, kept_from_start=True):
     return found, forward, kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wind", [0.0, 5.0])
 def test_a_kept_factor_gives_what_one_for_each_parameter_gives(wind):
     model = square(wind=wind)
@@ -203,6 +204,7 @@ ENGINES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
     model, engine, monkeypatch
@@ -248,6 +250,7 @@ def transport(share):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", list(ENGINES))
 @pytest.mark.parametrize(
     ("share", "claimed"),
@@ -288,6 +291,7 @@ def test_units_of_components_do_not_hide_what_is_not_symmetric():
     assert not ForwardStage(two).symmetric
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-157, 1e-158, 1e-159, 1e-160])
 def test_a_state_may_fade_until_its_squares_underflow(model, size):
     kept, directions = Kept.none(), np.ones((model.Q.dim, 1))

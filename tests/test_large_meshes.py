@@ -61,6 +61,7 @@ def quads():
     return MeshQuad(mesh.p + 0.05 * np.sin(7.0 * mesh.p[::-1]), mesh.t)  # no parallelograms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_models_on_large_meshes(name, pieces):
     def make():
@@ -101,6 +102,7 @@ def nonlinear(mesh, element):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", [ElementTriP1(), ElementTriP2()])
 def test_nonlinear_forms_with_boundaries_and_regions(element, pieces):
     small, large = both(nonlinear(triangles(), element), pieces)
@@ -253,6 +255,7 @@ def square(cells=12):
     return reaction(factories.square(cells), ElementTriP1(), f=lambda x, t: np.exp(-t) * x[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "sensors"),
     [

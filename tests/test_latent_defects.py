@@ -116,6 +116,7 @@ class Dense:
         return V @ self.x[self.n :], np.sqrt(variance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("substeps", [1, 4])
 @pytest.mark.parametrize("replay", [None, lp.Replay(first=4), lp.Replay(first=4, window=11)])
 @pytest.mark.parametrize("name", EVOLUTIONS)
@@ -139,6 +140,7 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: Any, subste
         np.testing.assert_allclose(np.sqrt((factor**2).sum(axis=1)), std, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 @pytest.mark.parametrize("replay", [None, lp.Replay(first=3, window=9)])
 def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
@@ -198,6 +200,7 @@ def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
     assert abs(value - 5.0) < std < 0.01
 
 
+@pytest.mark.slow
 def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
     def a(t: float) -> float:
         return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -316,6 +319,7 @@ def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
     assert other.posterior == pytest.approx(row.posterior, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: Any):
     replayed, count = replay.replayed, []
@@ -332,6 +336,7 @@ def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: 
     assert 3 <= len(count) <= 15  # three doublings
 
 
+@pytest.mark.slow
 def test_replays_find_the_most_probable_parameter():
     left = lambda x, t: np.sin(3 * t) + 0 * x[0]  # noqa: E731
     state = lp.Field(mesh, ElementLineP1(), dirichlet={"left": left})
@@ -393,6 +398,7 @@ def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
         assert strength == pytest.approx([0.5 * 3.0 * slope * 0.5])
 
 
+@pytest.mark.slow
 def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
     """A logarithm that sensors see directly: the first samples overshot, and widened all."""
     model = lp.Model(

@@ -11,6 +11,7 @@ import livepde as lp
 from livepde.fem import Inputs, Moment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_check_model_passes(name):
     lp.check_model(CASES[name].model(f=lambda x, t: x[0] * t)).raise_if_failed()

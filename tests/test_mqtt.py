@@ -26,6 +26,8 @@ from livepde.streams.intake import Intake, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
 from livepde.streams.sources import Rows
 
+pytestmark = pytest.mark.broker
+
 pytest.importorskip("paho.mqtt")
 pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
 

@@ -193,6 +193,7 @@ def needs_data(page: Path) -> bool:
     return any("cases/" in one and not _stands_elsewhere(one) for one in commands)
 
 
+@pytest.mark.pages
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_runs(page, tmp_path, monkeypatch, request):
     if needs_data(page):
@@ -240,6 +241,7 @@ def is_a_test(name: str) -> bool:
     return not function or re.search(rf"^def {function}\(", source, re.MULTILINE) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_a_page_names_is_there(page):
     """Commands, experiments, files and tests of the project, in quotes."""
@@ -282,6 +284,7 @@ def test_warnings_of_the_site_are_errors():
     assert "--quiet" not in command
 
 
+@pytest.mark.slow
 def test_a_site_that_loads_something_from_elsewhere_is_refused(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     links = importlib.import_module("links")
@@ -302,6 +305,7 @@ def test_the_house_is_drawn_as_it_is_built():
     assert drawn == [re.findall(r"\w+", layer) for layer in layers]
 
 
+@pytest.mark.slow
 def test_pages_that_the_program_writes(monkeypatch):
     """Every command with its options, and every key with what it may be."""
     monkeypatch.syspath_prepend(str(ROOT / "docs"))

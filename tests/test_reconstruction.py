@@ -309,6 +309,7 @@ def test_the_gradient_law_uses_and_reports_it():
     assert set(result.to_xarray()) >= {"alpha", "misfit", "residual"}
 
 
+@pytest.mark.slow
 def test_checked_contract_of_the_law():
     lp.check_law(
         lp.GradientLaw(gain=100.0),
@@ -327,6 +328,7 @@ def test_white_noise_has_its_level_in_L2():
     assert len(noisy.WhiteNoise(twin, 0.05, 0)) == len(ratio)
 
 
+@pytest.mark.study
 def test_the_noisy_excited_twin_shows_what_smoothing_is_good_for(monkeypatch):
     monkeypatch.setattr(noisy, "SEEDS", (100, 101))
     monkeypatch.setattr(noisy, "GRID", (100.0,))

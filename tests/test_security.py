@@ -125,6 +125,7 @@ def call(*arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.slow
 def test_a_run_of_somebody_else_runs_nothing(hostile):
     trace = Path("trace")
     assert call("report", str(hostile))[0] == 0
@@ -140,6 +141,7 @@ def test_a_run_of_somebody_else_runs_nothing(hostile):
     assert trace.exists()  # who allows it gets it
 
 
+@pytest.mark.slow
 def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
     mine = tmp_path / "mine.txt"
     mine.write_text("mine")
@@ -152,6 +154,7 @@ def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
     assert mine.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_damaged_dataset_is_one_sentence(hostile):
     path = hostile / "estimates.nc"
     whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
@@ -167,6 +170,7 @@ def test_a_damaged_dataset_is_one_sentence(hostile):
     assert refused > 100
 
 
+@pytest.mark.slow
 def test_a_case_cannot_allow_its_own_code(hostile):
     path = hostile / "case.toml"
     path.write_text("allow_code = true\n" + path.read_text())
@@ -340,6 +344,7 @@ def test_tokens_that_are_none(host, token):
         Address(host, token=token)
 
 
+@pytest.mark.slow
 def test_a_given_token_is_shown_nowhere(serving, tmp_path, monkeypatch, logs):
     server = serving(token=TOKEN)
     assert TOKEN in server.url

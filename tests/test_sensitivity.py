@@ -218,6 +218,7 @@ def test_a_sensor_that_sees_a_parameter():
     np.testing.assert_allclose(estimate.innovation, 0.0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay(first=3))])
 @pytest.mark.parametrize("scheme", [lp.ImplicitEuler(), lp.Alexander2()])
 def test_passes_the_shipped_check(law, scheme):

@@ -66,6 +66,7 @@ def child(folder: Path, output) -> str:
     return ended.stderr
 
 
+@pytest.mark.process
 def test_a_closed_pipe_ends_the_sink_and_not_the_run(tmp_path):
     reading, writing = os.pipe()
     os.close(reading)
@@ -76,6 +77,7 @@ def test_a_closed_pipe_ends_the_sink_and_not_the_run(tmp_path):
     assert "Exception ignored" not in told
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_ends_the_sink_and_not_the_run(tmp_path):
     with Path("/dev/full").open("w") as full:

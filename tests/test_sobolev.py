@@ -32,6 +32,7 @@ def test_balakrishnan(sigma, largest):
     np.testing.assert_allclose(power, x**sigma, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["line P1", "line P2 / P1", "triangles P1", "quads Q1", "tets P1"])
 @pytest.mark.parametrize("zero", [False, True])
 @pytest.mark.parametrize("s", ORDERS)
@@ -49,6 +50,7 @@ def test_gram_is_the_spectral_power(name, zero, s):
     np.testing.assert_allclose(ratios, 1.0, rtol=1e-7 if s == int(s) else 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("s", [0.0, 0.75, 1.0, 1.75, 2.0])
 def test_spaces_pass_their_check(name, s):
@@ -136,6 +138,7 @@ def test_products_with_other_unknowns():
     np.testing.assert_allclose(Phi.T @ gram @ Phi, np.eye(7), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_modes_of_a_large_space_are_powers_of_those_of_H1():
     """H^s has the modes of H^1, with their variance to the power s; nothing is written out."""
     mesh, element = MeshTri().refined(6), ElementTriP1()
@@ -175,6 +178,7 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
     np.testing.assert_allclose(found[0].u, found[1].u, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [lp.GradientLaw(gain=1e3), lp.SensitivityLaw(noise=1e-3)])
 @pytest.mark.parametrize("inner", [lp.Sobolev(0.75, 0.2), lp.Sobolev(1.5, 0.2), lp.Sobolev(2, 0.2)])
 def test_both_laws_identify(law, inner):

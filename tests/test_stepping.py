@@ -47,6 +47,7 @@ def cubic(**options):
     return model, exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "order"), [("euler", 1), ("alexander", 2)])
 def test_order_in_time_with_moving_boundary_data(name, order):
     """The solution lies in the space, so all of the error is the scheme's."""

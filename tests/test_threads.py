@@ -30,6 +30,8 @@ from skfem import ElementLineP1, ElementTriP1, MeshTri
 import livepde as lp
 from livepde import laws
 
+pytestmark = pytest.mark.slow
+
 TRIALS = int(os.environ.get("LIVEPDE_THREAD_TRIALS", "1"))
 SWITCH = 1e-6  # seconds until another thread may run: the default of 5e-3 hides most races
 SLEEPS = 0.02  # share of the calls and returns at which a thread sleeps

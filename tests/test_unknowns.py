@@ -98,6 +98,7 @@ def test_models_in_latent_coefficients_pass_the_checks(name: str):
     check_model(rod({"a": UNKNOWNS[name]}), u=1.0).raise_if_failed()
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.2, 3.0), st.floats(0.2, 3.0), st.integers(0, 100))
 def test_residuals_nonlinear_in_q_pass_the_checks(k: float, s: float, seed: int):
@@ -170,6 +171,7 @@ def test_positive_unknowns_are_found_and_stay_positive():
     assert found[-1].q_std is not None
 
 
+@pytest.mark.slow
 def test_the_gradient_law_learns_a_positive_field_and_a_nonlinear_unknown():
     model = rod({"a": UNKNOWNS["field"], "c": lp.Scalar(2.0, 1.0)}, A=None)
     assert model.latent.dim == 22
@@ -205,6 +207,7 @@ def rms(found: list[lp.Estimate], a: Any, after: float) -> tuple[float, float]:
     return float(np.sqrt((errors**2).mean())), float(np.sqrt(((errors / values[:, 1]) ** 2).mean()))
 
 
+@pytest.mark.slow
 def test_a_periodic_unknown_is_followed_without_delay():
     def a(t: float) -> float:
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -219,6 +222,7 @@ def test_a_periodic_unknown_is_followed_without_delay():
     assert 3 * error < slower < 0.03
 
 
+@pytest.mark.slow
 def test_a_random_walk_is_followed_with_an_honest_deviation():
     times, rate = np.arange(0.0, 60.0, 0.05), 0.02
     rng = np.random.default_rng(3)
@@ -231,6 +235,7 @@ def test_a_random_walk_is_followed_with_an_honest_deviation():
     assert error < 0.5 * np.sqrt(((walk - 0.4) ** 2).mean())
 
 
+@pytest.mark.slow
 def test_the_gradient_law_rotates_a_periodic_unknown():
     def a(t: float) -> float:
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -249,6 +254,7 @@ def test_the_gradient_law_rotates_a_periodic_unknown():
     assert 3 * errors["periodic"] < errors["constant"]
 
 
+@pytest.mark.slow
 def test_an_unknown_initial_state_is_found_with_the_diffusivity():
     start = lp.Field(
         mesh,
