@@ -26,10 +26,11 @@ from livepde.streams.intake import Intake, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
 from livepde.streams.sources import Rows
 
-pytestmark = pytest.mark.broker
-
 pytest.importorskip("paho.mqtt")
-pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
+pytestmark = [
+    pytest.mark.broker,
+    pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto"),
+]
 
 
 @pytest.fixture(autouse=True)
