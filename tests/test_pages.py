@@ -14,6 +14,7 @@ A block with title="FILE" is a file of that name for the blocks after it.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import csv
 import doctest
@@ -275,6 +276,32 @@ def test_links_of_pages_outside_of_the_site_lead_somewhere(name):
             titles = re.findall(r"^#+ (.+)$", (page.parent / file).read_text(), re.MULTILINE)
             slugs = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
             assert anchor in slugs, target
+
+
+def markers(source: str, function: str) -> set[str]:
+    """Return what a test is marked by, itself or with its whole file."""
+    body = ast.parse(source).body
+    marked = [
+        node.value
+        for node in body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "pytestmark"
+    ]
+    for node in body:
+        if isinstance(node, ast.FunctionDef) and node.name == function:
+            marked += node.decorator_list
+    return set(re.findall(r"pytest\.mark\.(\w+)", " ".join(map(ast.unparse, marked))))
+
+
+def test_guarantees_are_among_the_tests_of_what_users_rely_on():
+    (left_out,) = re.findall(r'^USERS := -m "not \((.*)\)"$', MAKEFILE, re.MULTILINE)
+    page = (ROOT / "docs" / "guarantees.md").read_text(encoding="utf-8")
+    held = page[page.index("## Guaranteed") : page.index("\n## ", page.index("## Guaranteed") + 1)]
+    names = re.findall(r"`(test_\w+\.py)::(\w+)`", held)
+    assert len(names) > 20
+    for file, function in names:
+        if file != "test_parallel.py":  # `make mpi`
+            source = (ROOT / "tests" / file).read_text(encoding="utf-8")
+            assert not markers(source, function) & set(left_out.split(" or ")), (file, function)
 
 
 def test_warnings_of_the_site_are_errors():
