@@ -58,7 +58,7 @@ COMPLETES = ROOT / "cases" / "soil_layers.toml"  # gives what a part of a case l
 ELSEWHERE = {
     "test_pages.py": ["make", "python3 -m venv .venv", ". .venv/bin/activate", "pip install"],
     "test_cli.py": ["livepde bench step"],
-    "test_schur.py": ["livepde bench scale"],
+    "test_block_solver.py": ["livepde bench scale"],
     "test_public.py::test_the_benchmark_of_the_import": ["livepde bench import"],
     "test_lean.py::test_peers_are_divided_by_the_prior": ["livepde bench peers"],
     "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["livepde bench fleet"],

@@ -1,4 +1,4 @@
-"""Defects of moving and transformed unknowns found in review, each with the case that showed it."""
+"""Moving and transformed unknowns: the Kalman filter, replays, checkpoints, the theory."""
 
 from __future__ import annotations
 

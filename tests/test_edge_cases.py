@@ -1,4 +1,4 @@
-"""Defects that a review found once, each by its smallest example."""
+"""Edge cases of models, samples and checkpoints, each by its smallest example."""
 
 from __future__ import annotations
 
