@@ -96,6 +96,7 @@ def bank_still(noise: float | None = NOISE) -> list[lp.Estimate]:
 # --- what it finds -------------------------------------------------------------------------------
 
 
+@pytest.mark.study
 def test_an_unknown_that_moves_is_followed_as_with_the_best_drift_in_hindsight():
     auto = bank_moving()
     hand = [
@@ -201,6 +202,7 @@ def test_units_scale_out(unit: dict[str, float], noise: float | None):
         )
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("a", [stays, wandering])
 def test_the_sampling_rate_hardly_matters(a: Any):
     slow = run(build(), samples(a, 300, dt=0.05))
@@ -214,6 +216,7 @@ def test_the_sampling_rate_hardly_matters(a: Any):
     assert missed([slow[-1], fast[-1]], lambda t: fast[-1].parameters["a"][0]) <= 3 * usual
 
 
+@pytest.mark.study
 def test_the_mesh_hardly_matters():
     coarse, fine = (run(build(model=rod(cells)), moving()) for cells in (32, 64))
     for one, two in zip(coarse[50:], fine[50:], strict=True):

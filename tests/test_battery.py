@@ -139,7 +139,7 @@ def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
         assert std < 0.1 * abs(truth)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_an_ageing_diffusivity_is_followed_through_a_voltage():
     """ln D falls by one in eight hours; seen is a voltage behind an unknown resistance."""
     noise, end = 1e-3, 8 * 3600.0

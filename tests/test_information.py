@@ -203,7 +203,7 @@ def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
     assert max(information) <= 1.5 * min(information)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
     # Noise of each sensor by itself, of one spectral density.
     rates, meshes = (0.1, 0.05, 0.025), (20, 40, 80)
@@ -214,7 +214,7 @@ def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
     assert max(alphas) <= 1.2 * min(alphas)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("noise", [0.01, 0.03, 0.1])
 def test_smoothing_that_balances_its_biases_beats_the_discrepancy_principle(noise: float) -> None:
     untold = run(*rod(), noise=noise)[0]

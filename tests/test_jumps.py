@@ -33,9 +33,18 @@ def run(law: lp.SensitivityLaw, stream: Any, guess: float = NOISE) -> list[lp.Es
     return found
 
 
-@pytest.mark.parametrize("replay", [None, lp.Replay()])
-@pytest.mark.parametrize("change", [0.8, 1.2])
-@pytest.mark.parametrize("seed", range(3))
+# Every two of replay, change and seed once.
+@pytest.mark.parametrize(
+    ("seed", "replay", "change"),
+    [
+        (0, None, 0.8),
+        (0, lp.Replay(), 1.2),
+        (1, None, 1.2),
+        (1, lp.Replay(), 0.8),
+        (2, None, 0.8),
+        (2, lp.Replay(), 1.2),
+    ],
+)
 def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, seed: int):
     def a(t: float) -> float:
         return 0.3 if t < 15.0 else 0.3 * change
@@ -87,6 +96,7 @@ def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
     assert hits >= 72  # of 80
 
 
+@pytest.mark.study
 def test_white_innovations_raise_no_alarm():
     rng, jumps = np.random.default_rng(0), Jumps(probability=1e-5)
     watch, usual, alarms = jumps.start(), Innovations.start(3), 0
@@ -98,6 +108,7 @@ def test_white_innovations_raise_no_alarm():
     assert alarms <= 1
 
 
+@pytest.mark.study
 def test_the_rate_of_false_alarms_is_about_the_stated_one():
     rng, jumps = np.random.default_rng(1), Jumps(probability=2e-3, settle=0)
     watch, usual, alarms = jumps.start(), Innovations.start(2), 0

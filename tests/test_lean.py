@@ -208,7 +208,7 @@ def test_filters_as_arrays_find_the_parameter(row):
     assert score.median > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_what_cannot_be_stepped_as_arrays_says_why():
     score = table.run_row(PROBLEMS["burgers-varying"], 0.01, 0, "unscented filter as arrays")
     assert score is not None

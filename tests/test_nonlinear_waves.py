@@ -200,7 +200,7 @@ def test_burgers_from_a_published_field(data_dir, noise, share, bound):
 CASES = ("burgers", "burgers_shock", "kdv", "kdv_pde_find", "allen_cahn")
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_cases_are_short_and_fit_their_equations(name):
     path = Path(__file__).parents[1] / "cases" / f"{name}.toml"

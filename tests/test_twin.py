@@ -129,7 +129,7 @@ def test_same_seed_same_noise() -> None:
     assert np.array_equal(data(twin()), noisy.exact_data)
 
 
-@pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("observation", [SENSORS, MIDDLE, lp.Full()])
 def test_relative_noise_has_its_level_in_the_norm_of_Z(observation: lp.Observation) -> None:
     level, squares = 0.05, []
