@@ -93,6 +93,7 @@ def test_no_jump_no_word(tmp_path: Path):
     assert not [sentence for sentence in doubts(data) if "Jump" in sentence]
 
 
+@pytest.mark.slow
 def test_settings_of_the_test_reach_the_law(tmp_path: Path):
     law: Any = cases.load(rod(tmp_path / "a", jumps="{ probability = 1e-3, window = 8 }")).law
     assert (law.jumps.probability, law.jumps.window, law.jumps.size) == (1e-3, 8, 1.0)

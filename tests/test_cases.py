@@ -100,6 +100,7 @@ def test_pint_is_loaded_only_for_a_case():
 # --- what a case may say ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_template_runs_and_finds_the_truth(rod):
     prepared, data = result_of(rod())
     case = prepared.case

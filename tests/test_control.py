@@ -481,6 +481,7 @@ def test_limits_are_kept_for_all_that_the_conductivity_may_be():
     assert found.inputs[0] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 @needs_mpc
 def test_scenarios_stay_where_the_model_makes_sense():
     """Two deviations of 30 below a conductivity of 20 are none."""

@@ -162,6 +162,7 @@ def test_an_ensemble_as_arrays_is_a_loop_over_its_members(data):
     np.testing.assert_allclose(factor @ factor.T, expected @ expected.T, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_an_unscented_filter_as_arrays_is_a_loop_over_its_points(data):
     filter_ = arrays.Unscented(arrays.Stack(data))
     augmented = Augmented(data)

@@ -99,6 +99,7 @@ def test_varying_and_degenerate_diffusivities(outcome):
         draw().canvas.draw()
 
 
+@pytest.mark.study
 def test_antidiffusion_is_bounded_with_nu_and_fails_without(outcome):
     rows = [
         dict(zip(outcome.tables[0].columns, row, strict=True)) for row in outcome.tables[0].rows

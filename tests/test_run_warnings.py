@@ -45,6 +45,7 @@ def as_tuple(item: Any) -> tuple[float, Any]:
     return (item.t, item.z) if isinstance(item, lp.Sample) else (item[0], item[1])
 
 
+@pytest.mark.slow
 def test_the_right_model_raises_no_doubts():
     model = rod(lp.Scalar(0.2, 0.1))
     data = run(model, model)
