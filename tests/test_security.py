@@ -235,6 +235,7 @@ def test_a_long_message_is_refused():
     assert json_row(b"[" * 100_000).broken
 
 
+@pytest.mark.slow
 def test_an_event_repeats_no_long_text(tmp_path):
     row = {"t": "x" * 500_000, "a": 1.0}
     run = live(tmp_path, Rows([row, *rows(2)]))
