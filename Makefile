@@ -15,11 +15,14 @@ endif
 endif
 PYTHON ?= python3
 
-# Beside the oldest one of pyproject.toml: Pythons that a fast part of the tests runs on, where found.
+# The tiers of the tests, by the markers of pyproject.toml.
+PYTEST := pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+USERS := -m "not (study or process or broker or browser or pages)"
+FAST := -m "not (slow or study or process or broker or browser or pages)"
+# With other versions: the fast ones, and those of what brokers are spoken to with.
+OTHERS := -m "not (slow or study or process or browser or pages)"
+# Beside the oldest one of pyproject.toml: Pythons that they run on, where found.
 VERSIONS := 3.12 3.13
-FAST := $(patsubst %,tests/test_%.py,public packaging cli cases spaces fem meshes model models linalg \
-  observation stepping identifier runs plots table parquet export mqtt opcua \
-  service dashboard)
 UV := UV_PYTHON_DOWNLOADS=never $(BIN)/uv
 PYENV := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions
 
@@ -28,33 +31,38 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test coverage mpi lowest versions package check format docs bench lock clean
+.PHONY: help demo test test-fast test-all coverage mpi lowest versions package check format docs bench lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
 	@echo
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) online
 	@$(BIN)/livepde demo
 
-test: $(READY)  ## Run all tests and doctests
-	@$(BIN)/pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+test: $(READY)  ## Run the tests of what users rely on, and the doctests
+	@$(BIN)/$(PYTEST) $(USERS)
 
-coverage: $(READY)  ## Run the same and measure coverage, which takes longer
-	@$(BIN)/pytest --cov --numprocesses auto --maxprocesses 8 --dist loadfile
+test-fast: $(READY)  ## Run those that take less than a second each
+	@$(BIN)/$(PYTEST) $(FAST)
+
+test-all: $(READY)  ## Run all: brokers, browsers, processes, studies and pages, too
+	@$(BIN)/$(PYTEST)
+
+coverage: $(READY)  ## Run all and measure coverage, which takes longer
+	@$(BIN)/$(PYTEST) --cov
 
 mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment of its own
 	@.venv-petsc/bin/python -c 'import petsc4py, pytest, livepde; livepde.Model' 2>/dev/null || deploy/petsc.sh .venv-petsc
 	@.venv-petsc/bin/python -m pip --disable-pip-version-check --quiet install pytest
 	@.venv-petsc/bin/python -m pytest --quiet tests/test_parallel.py
 
-lowest: $(READY)  ## Run a fast part of the tests with the lowest versions of all dependencies
+lowest: $(READY)  ## Run the fast tests with the lowest versions of all dependencies
 	@$(UV) venv --quiet --clear --python 3.11 .venv-lowest
 	@$(UV) pip install --quiet --python .venv-lowest --resolution lowest-direct -e ".[test]"
 	@# What they import in turn is new, and warns them.
-	@.venv-lowest/bin/pytest --quiet --numprocesses auto --maxprocesses 8 --dist loadfile \
-	  -W ignore::DeprecationWarning $(FAST)
+	@.venv-lowest/bin/$(PYTEST) --quiet -W ignore::DeprecationWarning $(OTHERS)
 
 versions: $(READY)  ## Run the same on every other Python that is found, with constraints.txt
 	@for version in $(VERSIONS); do \
@@ -66,8 +74,7 @@ versions: $(READY)  ## Run the same on every other Python that is found, with co
 	  echo "Python $$version: $$("$$python" $(VERSION))"; \
 	  $(UV) venv --quiet --clear --python "$$python" .venv-$$version && \
 	  $(UV) pip install --quiet --python .venv-$$version --constraint constraints.txt -e ".[test]" && \
-	  .venv-$$version/bin/pytest --quiet --numprocesses auto --maxprocesses 8 --dist loadfile $(FAST) || \
-	    exit 1; \
+	  .venv-$$version/bin/$(PYTEST) --quiet $(OTHERS) || exit 1; \
 	done
 
 package: $(READY)  ## Build wheel and source distribution into dist/, and try the wheel in an empty environment

@@ -20,10 +20,10 @@ from livepde.runs import JOURNAL, Journal
 
 
 def call(
-    *arguments: str, stdin: str | None = None, program: typer.Typer = cli.app
+    *arguments: str | Path, stdin: str | None = None, program: typer.Typer = cli.app
 ) -> tuple[int, str]:
     """Return exit code and output of a command that ends as it should."""
-    result = CliRunner().invoke(program, list(arguments), input=stdin)
+    result = CliRunner().invoke(program, list(map(str, arguments)), input=stdin)
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.output

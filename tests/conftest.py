@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from importlib.util import find_spec
@@ -41,6 +42,18 @@ def server(tmp_path):
     running = Server(folder)
     yield running
     running.close()
+
+
+@pytest.fixture
+def logs():
+    """Leave logging as it was."""
+    root = logging.getLogger()
+    before, level = list(root.handlers), root.level
+    yield
+    root.handlers[:] = before
+    root.setLevel(level)
+    for name in ("livepde", "asyncua"):
+        logging.getLogger(name).setLevel(logging.NOTSET)
 
 
 @pytest.fixture

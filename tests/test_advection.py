@@ -88,6 +88,7 @@ def test_flux_and_head_add_up():
     assert np.allclose(found, run(one, 0.0, times))
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(st.floats(1e-7, 1e-5), st.floats(-1e-4, 1e-4), st.floats(1e-4, 1e-1), st.integers(0, 99))
 def test_random_columns_pass_the_checks(kappa, flux, dispersivity, seed):

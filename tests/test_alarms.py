@@ -57,6 +57,7 @@ def rod(folder: Path, change: float = CHANGE, jumps: str = "true") -> Path:
     return case
 
 
+@pytest.mark.slow
 def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
     case = rod(tmp_path / "rod")
     done = CliRunner().invoke(app, ["run", str(case), "--out", str(tmp_path / "run"), "--json"])
@@ -84,6 +85,7 @@ def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
     assert len(lines) == 3  # the unknown, innovations, and withheld channels
 
 
+@pytest.mark.slow
 def test_no_jump_no_word(tmp_path: Path):
     case = cases.load(rod(tmp_path / "rod", change=1.0)).prepare()
     data = runs.drive(case.identifier, case.stream).result.to_xarray()
@@ -92,6 +94,7 @@ def test_no_jump_no_word(tmp_path: Path):
     assert not [sentence for sentence in doubts(data) if "Jump" in sentence]
 
 
+@pytest.mark.slow
 def test_settings_of_the_test_reach_the_law(tmp_path: Path):
     law: Any = cases.load(rod(tmp_path / "a", jumps="{ probability = 1e-3, window = 8 }")).law
     assert (law.jumps.probability, law.jumps.window, law.jumps.size) == (1e-3, 8, 1.0)
@@ -235,6 +238,7 @@ def test_a_law_without_covariance_says_nothing_of_it():
     assert "What the data have told" not in [table.title for table in tables(data)]
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["heat", "reaction"])
 @pytest.mark.parametrize("change", [0.2, -0.2])
 def test_a_jump_of_the_benchmark_is_flagged_and_the_same_each_time(name: str, change: float):
@@ -246,6 +250,7 @@ def test_a_jump_of_the_benchmark_is_flagged_and_the_same_each_time(name: str, ch
     assert told.error < 0.03
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", alarms.PROCESSES)
 def test_a_process_that_stays_as_it_is_raises_no_alarm(name: str):
     told = alarms.followed(alarms.PROCESSES[name](), 0, samples=400)
@@ -253,11 +258,13 @@ def test_a_process_that_stays_as_it_is_raises_no_alarm(name: str):
     assert told.false == 0
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", alarms.SUSPECTS)
 def test_only_the_wrong_model_is_doubted(name: str):
     assert alarms.warned(alarms.SUSPECTS[name], 0) == (False, True)
 
 
+@pytest.mark.study
 def test_the_command_prints_a_check_for_each_promise(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(alarms, "PROCESSES", {"heat": alarms.PROCESSES["heat"]})
     monkeypatch.setattr(alarms, "SUSPECTS", {"loss": alarms.SUSPECTS["loss"]})

@@ -81,6 +81,7 @@ def test_what_leaves_is_the_charge():
     assert lost == pytest.approx(3 * CURRENT * TIMES[-1] / (FARADAY * AREA * R), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_diffusivity_follows_the_filling():
     """Near the surface -D(c) c_r is the flux."""
     r, c = discharged(particle(400, slope=lp.Scalar(2.0, 1.0)), TIMES)
@@ -93,6 +94,7 @@ def test_diffusivity_follows_the_filling():
     assert np.allclose(without, constant)
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(
     value=st.floats(1e-15, 1e-12),
@@ -111,6 +113,7 @@ def pulses(t: float) -> dict[str, float]:
     return {"I": 1.36 * (t // 300 % 2 < 1) * (1 if t // 3600 % 2 < 1 else -1)}
 
 
+@pytest.mark.slow
 def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
     model = particle(slope=lp.Scalar(0.0, 1.0))
     sensor = lp.Points({"surface": R}, noise=50.0)
@@ -136,6 +139,7 @@ def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
         assert std < 0.1 * abs(truth)
 
 
+@pytest.mark.study
 def test_an_ageing_diffusivity_is_followed_through_a_voltage():
     """ln D falls by one in eight hours; seen is a voltage behind an unknown resistance."""
     noise, end = 1e-3, 8 * 3600.0

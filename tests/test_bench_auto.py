@@ -10,6 +10,8 @@ from benchmarks import auto as bench
 from benchmarks.__main__ import app
 from livepde.laws import GradientLaw
 
+pytestmark = pytest.mark.study
+
 
 @pytest.fixture(scope="module")
 def square():

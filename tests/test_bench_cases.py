@@ -13,6 +13,8 @@ from benchmarks import cases as bench
 from benchmarks.__main__ import app
 from livepde.cases.template import write_template
 
+pytestmark = pytest.mark.study
+
 VARIANTS = """
 [reference]
 alpha = "9.7e-5 m^2/s"

@@ -30,6 +30,7 @@ def failed(outcome) -> list[str]:
     return [check.name for check in outcome.checks if not check.ok]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("part", ["file", pytest.param("mqtt", marks=MQTT)])
 def test_runs_are_killed_and_lose_nothing(part):
     pytest.importorskip("paho.mqtt")
@@ -40,18 +41,21 @@ def test_runs_are_killed_and_lose_nothing(part):
     assert sum(table.rows[0][1:5]) == 2
 
 
+@pytest.mark.broker
 @MQTT
 def test_sources_go_away_and_come_back():
     pytest.importorskip("paho.mqtt")
     assert not failed(faults.faults(samples=100, only=["restart"]))
 
 
+@pytest.mark.broker
 @MQTT
 def test_broken_messages_reach_the_real_command():
     pytest.importorskip("paho.mqtt")
     assert not failed(faults.faults(samples=100, malformed=1000, only=["messages"]))
 
 
+@pytest.mark.study
 def test_broken_rows_have_a_reason_and_right_ones_arrive():
     outcome = faults.faults(samples=100, malformed=1200, only=["malformed"])
     assert not failed(outcome)
@@ -109,6 +113,7 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
     assert fed.reasons["leap"] == 2
 
 
+@pytest.mark.slow
 def test_soak_in_small(monkeypatch):
     monkeypatch.setattr(soak, "WARM", 500)
     monkeypatch.setattr(soak, "BLOCK", 100)
@@ -136,6 +141,7 @@ def test_soak_sees_what_grows():
     assert len(failed(soak._outcome(meter, 30_000, 1, 0.1))) == 7
 
 
+@pytest.mark.study
 def test_the_journal_has_a_price(monkeypatch, tmp_path, data_dir):
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
     monkeypatch.setattr("benchmarks.journal.REPETITIONS", 1)
@@ -148,6 +154,7 @@ def test_the_journal_has_a_price(monkeypatch, tmp_path, data_dir):
         journal(tmp_path)
 
 
+@pytest.mark.study
 def test_the_command_line_has_a_price():
     outcome = overhead(rounds=1, samples=60)
     (table,) = outcome.tables

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1
+from factories import driven_rod, line
 
 import livepde as lp
 from benchmarks import accuracy as suite
@@ -17,18 +17,15 @@ from benchmarks.peers import table
 from benchmarks.peers.augmented import Augmented
 from benchmarks.problems import PROBLEMS, Data, Problem, Process
 
+pytestmark = pytest.mark.study
+
 TIMES = np.linspace(0.0, 1.0, 21)
 
 
 def rod(seed: int, evolution: lp.RandomWalk | None = None) -> Process:
-    mesh = lp.interval(0.0, 1.0, 12)
-    ends = {"left": lambda x, t: np.sin(4 * t) + 0.0 * x[0], "right": 0.0}
     moves = {} if evolution is None else {"evolution": evolution}
-    model = lp.Model(
-        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
-        {"a": lp.Scalar(0.3, 0.1, transform="log", **moves)},
-        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
-    )
+    unknown = lp.Scalar(0.3, 0.1, transform="log", **moves)
+    model = driven_rod({"a": unknown}, lambda t: np.sin(4 * t), line(12))
     points = lp.Points([0.3, 0.6])
     q = np.array([0.3 * np.exp(np.random.default_rng(seed).normal() / 3)])
     G = points.matrix(model.state_space)

@@ -14,6 +14,8 @@ from typer.main import get_command
 from benchmarks.__main__ import app
 from livepde.runs import Outcome
 
+pytestmark = pytest.mark.study
+
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 
 

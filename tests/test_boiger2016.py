@@ -11,6 +11,8 @@ from livepde import plots
 from livepde.reproduce import boiger2016, seed, seed_excited
 from livepde.reproduce.boiger2016 import LEVELS, PAPER, Ensemble
 
+pytestmark = pytest.mark.study
+
 SEEDS = (0, 1)
 
 

@@ -57,6 +57,7 @@ def final(process: lp.Model, times: Any, q: Any = None) -> Any:
     return x[order], (process.state_block.at_vertices @ u)[order]
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(
     k=st.floats(0.5, 6.0),
@@ -106,6 +107,7 @@ def test_late_the_fluid_follows_the_line_source():
     assert T[0] - 10.0 == pytest.approx(rise, rel=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.5, 2.0])
 def test_an_unknown_capacity_is_that_capacity(factor):
     """Radii counted by the heat they hold change nothing that is measured at the borehole."""
@@ -118,6 +120,7 @@ def test_an_unknown_capacity_is_that_capacity(factor):
     assert abs(final(scaled, times)[1][0] - one[0]) > 0.3  # and it matters
 
 
+@pytest.mark.slow
 def test_a_twin_finds_conductivity_and_resistance():
     process = model(50)
     sensor = lp.Points({"T": 0.02}, noise=0.02)
@@ -204,6 +207,7 @@ def test_forms_in_the_plane_pass_the_shipped_checks():
     ).raise_if_failed()
 
 
+@pytest.mark.slow
 def test_the_ends_cool_the_borehole():
     """With both ends at T0 the mean of a line source is lower, at the radius r, by
 
@@ -222,6 +226,7 @@ def test_the_ends_cool_the_borehole():
     assert fluid(plane(H=tall), times) == pytest.approx(few[0], abs=1e-3)
 
 
+@pytest.mark.study
 def test_the_sandbox_from_five_hours_on(data_dir, monkeypatch):
     """k was measured independently; the interval covers it from the first sample on."""
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))

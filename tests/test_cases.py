@@ -100,6 +100,7 @@ def test_pint_is_loaded_only_for_a_case():
 # --- what a case may say ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_template_runs_and_finds_the_truth(rod):
     prepared, data = result_of(rod())
     case = prepared.case
@@ -140,6 +141,7 @@ def test_template_is_not_written_over(tmp_path):
         write_template(tmp_path / "file" / "below")
 
 
+@pytest.mark.slow
 def test_units_of_columns(rod, tmp_path):
     """The same data in Fahrenheit, minutes and with other numbers give the same estimate."""
     import pandas as pd
@@ -166,6 +168,7 @@ GRADIENT = ('kind = "sensitivity" ', 'kind = "gradient"\ngain = 1e-12\n#')
 NO_REPLAY = ("replay = true ", "#")
 
 
+@pytest.mark.slow
 def test_layers(rod):
     prepared, data = result_of(rod(LAYERS))
     assert {"alpha[a]", "alpha[b]"} <= set(measures(data))
@@ -177,6 +180,7 @@ def test_layers_that_end_inside_of_a_cell_get_a_note(rod):
     assert "ends inside of a cell" in cases.load(path).notes[0]
 
 
+@pytest.mark.slow
 def test_field(rod):
     prepared, data = result_of(rod(FIELD))
     assert data.attrs["fields"] == "alpha"
@@ -185,6 +189,7 @@ def test_field(rod):
     assert 3e-5 <= best.prior <= 1.01 * np.sqrt(2) * 3e-5  # std inside, more at free ends
 
 
+@pytest.mark.slow
 def test_gradient_law_on_averages(rod):
     path = rod(GRADIENT, NO_REPLAY,
                ('at = "10 cm", noise = "0.05 K"', 'over = ["8 cm", "12 cm"]'),
@@ -511,6 +516,7 @@ REFUSED = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "named"), REFUSED)
 def test_what_is_refused_gets_one_sentence(rod, old, new, named):
     path = rod((old, new))
@@ -534,6 +540,7 @@ REFUSED_WITH_DATA = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "named"), REFUSED_WITH_DATA)
 def test_what_is_refused_with_data(rod, old, new, named):
     case = cases.load(rod((old, new)))
@@ -686,6 +693,7 @@ def test_regions_of_a_rectangle(tmp_path, regions, named):
     assert named in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("evolution", "expected"),
     [
@@ -862,6 +870,7 @@ def test_means_along_a_line(rod):
         cases.load(rod(('along = ["28 cm", 0.32]', 'along = ["28 cm", "1 m"]')))
 
 
+@pytest.mark.slow
 def test_a_sensor_that_moves(rod):
     import pandas as pd
 
@@ -904,6 +913,7 @@ def with_reader(rod, body: str, *changes: tuple[str, str]) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_reader_gives_what_the_file_gives(rod, monkeypatch):
     _, first = result_of(rod())
     path = with_reader(rod, READER)
@@ -914,6 +924,7 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
     assert float(second.alpha[-1]) == float(first.alpha[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
@@ -1170,6 +1181,7 @@ def measured(data_dir, monkeypatch):
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("measured")
 def test_soil_uniform(tmp_path):
     _, data = result_of(shipped("soil_uniform", tmp_path))
@@ -1180,6 +1192,7 @@ def test_soil_uniform(tmp_path):
     assert found["failed_steps"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("measured")
 def test_soil_by_layer(tmp_path):
     _, data = result_of(shipped("soil_layers", tmp_path))
@@ -1192,6 +1205,7 @@ def test_soil_by_layer(tmp_path):
         assert abs(found[name] - fit) <= 4 * found[f"{name}.std"]
 
 
+@pytest.mark.study
 @pytest.mark.usefixtures("measured")
 def test_thermal_response_does_not_depend_on_the_prior(tmp_path):
     ends = []

@@ -49,13 +49,16 @@ def here(tmp_path, monkeypatch):
 
 @pytest.fixture
 def rod(here):
-    write_template(here / "rod")
+    """The case of `livepde init` without its replays, which take most of the time."""
+    path, _ = write_template(here / "rod")
+    path.write_text(path.read_text().replace("replay = true", "replay = false"))
     return "rod/case.toml"
 
 
 # --- help and errors -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_teaches(command):
     code, output = call(command, "--help")
@@ -67,6 +70,7 @@ def test_version():
     assert call("--version") == (0, f"livepde {livepde.__version__}\n")
 
 
+@pytest.mark.process
 def test_bad_input_is_one_sentence_and_exit_code_2(here):
     result = shell("run", "none.toml")
     assert result.returncode == 2
@@ -77,6 +81,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(here):
     assert list(here.iterdir()) == []
 
 
+@pytest.mark.process
 def test_wrong_usage_is_exit_code_2():
     assert shell("run").returncode == 2
     assert shell("walk").returncode == 2
@@ -110,6 +115,7 @@ def test_equations(here):
     assert "did you mean 'heat'" in bad("equations", "haet")
 
 
+@pytest.mark.slow
 def test_values_set_from_outside(rod, here, monkeypatch):
     setting = ("--set", "data.every=9", "--set", "title=Thin")
     assert call("check", rod, *setting)[1].startswith("Thin")
@@ -127,6 +133,7 @@ def test_values_set_from_outside(rod, here, monkeypatch):
     assert code == 0
 
 
+@pytest.mark.slow
 def test_init_check_run_report(here):
     code, output = call("init", "mine")
     assert code == 0
@@ -156,6 +163,7 @@ def test_init_check_run_report(here):
     assert (here / "runs" / "mine" / "report.md").read_text() == before
 
 
+@pytest.mark.slow
 def test_run_as_json_with_checks(rod):
     code, output = call("run", rod, "--json", "--out", "out")
     assert code == 0
@@ -170,6 +178,7 @@ def test_run_as_json_with_checks(rod):
     assert json.loads(again)["checks"] == content["checks"]
 
 
+@pytest.mark.slow
 def test_a_failed_check_is_exit_code_1_with_json(rod):
     path = Path(rod)
     path.write_text(
@@ -188,6 +197,7 @@ def test_a_failed_check_is_exit_code_1_with_json(rod):
     assert "failed" in output
 
 
+@pytest.mark.slow
 def test_nothing_is_written_over(rod, here):
     call("run", rod, "--out", "out")
     before = {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()}
@@ -226,7 +236,7 @@ def test_check_tells_what_can_hardly_be_identified(rod):
 def test_check_shows_notes_and_failures(rod, monkeypatch):
     path = Path(rod)
     path.write_text(path.read_text().replace('kind = "sensitivity"', 'kind = "gradient"')
-                    .replace("replay = true", "#"))  # fmt: skip
+                    .replace("replay = false", "#"))  # fmt: skip
     code, output = call("check", rod)
     assert code == 0
     assert "Note: The gradient law" in output
@@ -247,12 +257,14 @@ def lines(count: int) -> str:
     return "".join(row.format(t=20 * k, v=20 + k % 7) for k in range(count))
 
 
+@pytest.mark.slow
 def test_standard_input(rod):
     code, output = call("run", rod, "--data", "-", "--json", "--out", "out", stdin=lines(12))
     assert code in (0, 1)
     assert json.loads(output)["tables"][1]["rows"][0][4] == 12
 
 
+@pytest.mark.slow
 def test_a_bad_line_ends_a_run_that_is_kept(rod, here):
     stdin = lines(5) + '{"time_s": 100, "T_left": "warm"}\n'
     with pytest.raises(livepde.SampleError, match="line 6, 'T_left': got 'warm'"):
@@ -265,6 +277,7 @@ def test_a_bad_line_ends_a_run_that_is_kept(rod, here):
     assert "Stopped after 5 samples" in output
 
 
+@pytest.mark.slow
 def test_json_lines_file_can_be_checked(rod, here):
     (here / "data.jsonl").write_text(lines(30))
     for arguments in (("--data", "data.jsonl"), ("--set", f"data.file={here}/data.jsonl")):
@@ -274,6 +287,7 @@ def test_json_lines_file_can_be_checked(rod, here):
         assert "One more sensor helps most at" in output
 
 
+@pytest.mark.process
 def test_ctrl_c_keeps_what_there_is(rod, here):
     code = "import sys; from livepde.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "run", rod, "--data", "-", "--out", "out"]
@@ -293,7 +307,10 @@ def test_ctrl_c_keeps_what_there_is(rod, here):
     assert json.loads(record.read_text())["samples"] == 8
 
 
+@pytest.mark.slow
 def test_resume_goes_on_where_a_run_was_killed(rod, here):
+    path = Path(rod)
+    path.write_text(path.read_text().replace("replay = false", "replay = true"))
     assert call("run", rod, "--out", "whole")[0] == 0
     whole = runs.open("whole").dataset
     shutil.copytree("whole", "cut")
@@ -314,6 +331,7 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     xr.testing.assert_identical(runs.open("begun").dataset, whole)
 
 
+@pytest.mark.slow
 def test_a_run_resumed_with_an_engine_says_how_well_it_agrees(rod, here):
     class Serves:
         reason = "another program"
@@ -332,6 +350,7 @@ def test_a_run_resumed_with_an_engine_says_how_well_it_agrees(rod, here):
             assert ("not to the last digit" in notes) == resumed
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_sentence_where_a_run_goes_on_or_is_shown(rod, here, monkeypatch):
     assert call("run", rod, "--out", "full")[0] == 0
 
@@ -360,6 +379,7 @@ def test_no_figures_without_matplotlib(rod, here, monkeypatch):
     assert not list((here / "out").glob("*.png"))
 
 
+@pytest.mark.process
 def test_silence_in_a_pipe(rod):
     result = shell("run", rod, "--json", "--out", "out", env={**os.environ, "TERM": "dumb"})
     assert result.returncode == 0, result.stderr
@@ -452,6 +472,7 @@ def test_reproduce_and_bench_for_people(fake, here):
 
 
 # The preview of the others takes long: they have hundreds of sensors or many unknowns.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["thermal_response", "sioux", "streambed_047", "soil_column", "soil_layers"]
 )

@@ -11,14 +11,16 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from typer.testing import CliRunner
+from commands import call
 
-from livepde import Fleet, cases, cli, runs
+from livepde import Fleet, cases, runs
 from livepde.cases import together
 from livepde.cases.template import write_template
 from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
 from livepde.runs import JOURNAL, Journal
+
+pytestmark = pytest.mark.slow
 
 TABLE = """name,data,unknowns.alpha.prior,law.noise
 plain,,,
@@ -40,14 +42,6 @@ def here(tmp_path, monkeypatch):
     Path("rod/warm.csv").write_text("\n".join(rows[:30]) + "\n")
     Path("rods.csv").write_text(TABLE)
     return tmp_path
-
-
-def call(*arguments: str) -> tuple[int, str]:
-    """Return exit code and output of a command that ends as it should."""
-    result = CliRunner().invoke(cli.app, list(arguments))
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.stdout
 
 
 @pytest.fixture
@@ -112,6 +106,7 @@ def test_goes_on_with_what_is_there(here):
     assert [row[0] for row in rows[1]] == ["plain", "warm"]
 
 
+@pytest.mark.process
 @pytest.mark.usefixtures("processes")
 def test_in_several_processes(here):
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "one")
@@ -230,6 +225,7 @@ def test_members_that_are_alike_step_together(alike):
     pd.testing.assert_frame_equal(left, right, rtol=1e-7)
 
 
+@pytest.mark.process
 @pytest.mark.usefixtures("processes")
 def test_each_process_steps_its_part_together(alike):
     Path("rods.csv").write_text(ALIKE + "d,rod/third.csv,\n")

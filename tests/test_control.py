@@ -306,6 +306,7 @@ def test_samples_of_the_filter_are_checked():
     assert other.step(0.0, [np.nan, 20.0], inputs).x.tolist() == by_name.tolist()
 
 
+@pytest.mark.slow
 def test_an_offset_removes_the_lasting_error_at_a_sensor():
     model, plant = reduced(), Plant(40.0)
     plain = ct.Kalman(model, PERIOD, drive={"heater": 0.001})
@@ -361,6 +362,7 @@ def plan(count: int, limits: int = 0) -> ct.Plan:
     return ct.Plan(np.full((count, 1), 45.0), np.full((count, 1), ROOM), -far, far)
 
 
+@pytest.mark.slow
 def test_the_linear_quadratic_controller_is_optimal():
     model = reduced()
     free = replace(GOAL, inputs={})
@@ -442,6 +444,7 @@ def test_prices_alone_are_not_for_the_linear_quadratic_controller():
         ct.LQ(reduced(modes=1), priced, PERIOD)
 
 
+@pytest.mark.slow
 @needs_mpc
 def test_the_predictive_controller_is_optimal_where_nothing_binds():
     model = reduced(modes=2)
@@ -454,6 +457,7 @@ def test_the_predictive_controller_is_optimal_where_nothing_binds():
     assert found.inputs[0] == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.slow
 @needs_mpc
 def test_limits_are_kept_for_all_that_the_conductivity_may_be():
     """The less is known, the more cautious; where nothing is possible it does its best."""
@@ -477,6 +481,7 @@ def test_limits_are_kept_for_all_that_the_conductivity_may_be():
     assert found.inputs[0] == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.slow
 @needs_mpc
 def test_scenarios_stay_where_the_model_makes_sense():
     """Two deviations of 30 below a conductivity of 20 are none."""
@@ -605,6 +610,7 @@ def test_without_trust_the_loop_acts_as_the_nominal_model_would():
     assert mine[-1].estimate.parameters["k"][0] == pytest.approx(26.0, rel=0.1)
 
 
+@pytest.mark.slow
 def test_what_is_learned_is_used_after_some_good_samples():
     loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), ct.Trust(patience=4))
     found = drive(loop, Plant(), 60)
@@ -619,6 +625,7 @@ def test_what_is_learned_is_used_after_some_good_samples():
 # --- loop ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["LQ", pytest.param("MPC", marks=needs_mpc)])
 def test_a_loop_goes_on_where_it_was_saved(kind, tmp_path):
     def loop() -> ct.Loop:
@@ -667,6 +674,7 @@ def test_what_is_not_a_number_is_missing():
         loop.step(2 * PERIOD, [ROOM] * 2, {"room": np.inf}, reference={"tip": 45.0})
 
 
+@pytest.mark.slow
 def test_inputs_may_stand_among_the_measurements():
     """As for an identifier; those that are given apart go first."""
     ends = []
@@ -854,6 +862,7 @@ def test_inputs_that_are_held_do_not_ramp():
 # --- benchmark -----------------------------------------------------------------------------------
 
 
+@pytest.mark.study
 @needs_mpc
 def test_the_benchmark_compares_the_same_task():
     from benchmarks.control.compare import compare

@@ -12,6 +12,8 @@ import pytest
 import livepde as lp
 import livepde.control as ct
 
+pytestmark = pytest.mark.slow
+
 PERIOD, ROOM = 30.0, 300.0
 SENSORS = lp.Points({"T_2": 0.02, "T_5": 0.05, "T_8": 0.08}, noise=0.1)
 OUTPUTS = lp.Points({"face": 0.0})

@@ -25,6 +25,8 @@ from benchmarks.control.runs import Run, closed_loop, learned, nominal, told
 from benchmarks.control.wall import wall
 from livepde.errors import ConfigurationError
 
+pytestmark = pytest.mark.study
+
 needs_mpc = pytest.mark.skipif(find_spec("do_mpc") is None, reason="do-mpc is not installed")
 
 

@@ -96,6 +96,7 @@ def dataset(kind: str = "line", count: int = 6, **options):
 # --- figures -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MESHES)
 @pytest.mark.parametrize("field", [False, True])
 def test_every_kind_of_run_has_its_panels(kind, field):
@@ -271,6 +272,7 @@ def test_a_view_follows_a_run(tmp_path, monkeypatch):
     assert view.look().status == "stopped"
 
 
+@pytest.mark.slow
 def test_a_long_run_is_read_bit_by_bit_and_thinned(tmp_path, monkeypatch):
     monkeypatch.setattr(views, "OFTEN", 0.0)
     monkeypatch.setattr(views, "AT_ONCE", 100)
@@ -337,6 +339,7 @@ def test_ctrl_c_while_it_says_where_ends_it(tmp_path, monkeypatch):
     assert {*threading.enumerate()} == before  # threads that serve would keep it from its end
 
 
+@pytest.mark.process
 def test_watch_says_where_and_ends_with_ctrl_c(tmp_path, ctrl_c):
     begun(tmp_path, identifier()).close()
     command = [sys.executable, "-m", "livepde", "watch", str(tmp_path), "--address", "0"]
@@ -402,6 +405,7 @@ slow_run(Path(sys.argv[1]))
 """
 
 
+@pytest.mark.browser
 def test_the_page_follows_a_run_and_looks_back(tmp_path):
     from selenium.webdriver.common.by import By
     from selenium.webdriver.common.keys import Keys
@@ -455,6 +459,7 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
         child.wait()
 
 
+@pytest.mark.browser
 def test_text_from_files_is_shown_as_text(tmp_path):
     who = identifier()
     with begun(tmp_path, who, title=HOSTILE) as journal:
@@ -486,6 +491,7 @@ def rewrite_layout(path: Path, **changes) -> None:
     db.close()
 
 
+@pytest.mark.browser
 def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
     who = identifier("tetra", field=True)
     with begun(tmp_path, who) as journal:

@@ -43,6 +43,7 @@ def test_options_exist(command):
         assert option in told
 
 
+@pytest.mark.process
 @pytest.mark.skipif(ANALYZE is None, reason="needs systemd-analyze")
 def test_the_unit_is_one(tmp_path):
     program = tmp_path / "livepde"
@@ -58,6 +59,7 @@ def test_the_unit_is_one(tmp_path):
     assert "Failed to parse boolean value, ignoring: maybe" in found.stderr
 
 
+@pytest.mark.process
 def test_the_health_check_asks_the_run():
     health = {"ok": True}
     monitor = Monitor(Address(token="a-token-of-the-example"), lambda: health, Metrics([]))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import CASES, excited, line, observe, reaction
+from factories import CASES, excited, line, observe, reaction
 from skfem import ElementLineHermite, ElementLineP1
 
 import livepde as lp
@@ -26,6 +26,7 @@ def failed(report):
     return [line.name for line in report.failed]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_good_models_pass(name):
     check_model(CASES[name].model(f=1.0), u=1.0).raise_if_failed()
@@ -193,6 +194,7 @@ def test_a_good_law_passes():
     check_law(OpenLoop(), build, SAMPLES).raise_if_failed()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "words"), [(Dice(), "two runs"), (Scribbler(), "value"), (Fragile(), "missing")]
 )

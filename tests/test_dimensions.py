@@ -19,6 +19,7 @@ def outcome(request) -> Outcome:
     return EXPERIMENTS["dimensions"].run(request.param)
 
 
+@pytest.mark.study
 def test_orders_of_convergence(outcome):
     """First order elements: 2 for u; second order: 3; Bogner-Fox-Schmit: 4 (measured 3.6)."""
     assert outcome.ok, [check for check in outcome.checks if not check.ok]
@@ -102,6 +103,7 @@ def test_meshes_and_elements():
         smooth(MeshTri())
 
 
+@pytest.mark.slow
 def test_hexahedra_with_a_ball_observed():
     """A twin on hexes: q = 2 is found from u on a ball."""
     mesh = MeshHex().refined(2)

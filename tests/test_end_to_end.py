@@ -11,12 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 from browser import chromium, count, text, wait
 from commands import start, stopped, until
 from patience import PATIENCE
 
 from livepde import cases, runs
 from livepde.runs import drive
+
+pytestmark = [pytest.mark.broker, pytest.mark.browser]
 
 CASE = Path(__file__).parents[1] / "cases" / "soil_uniform.toml"
 SAMPLES = 240  # ten days

@@ -15,6 +15,8 @@ import livepde as lp
 from livepde.cli import app
 from livepde.models import EQUATIONS
 
+pytestmark = pytest.mark.pages
+
 ROOT = Path(__file__).parents[1]
 TUTORIAL = ROOT / "docs" / "tutorials" / "own-pde.md"
 TOML = re.compile(r"^```toml[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)

@@ -91,6 +91,7 @@ def history(count, start=0):
         yield 20.0 * k, [20.0 + k, 20.0 + 0.1 * k, 20.0, 20.0]
 
 
+@pytest.mark.slow
 def test_the_unit_gives_the_numbers_of_the_identifier(rod, unit):
     prepared = load(rod).prepare()
     with running(unit, 0.0) as instance:
@@ -107,6 +108,7 @@ def test_the_unit_gives_the_numbers_of_the_identifier(rod, unit):
     assert k == 180
 
 
+@pytest.mark.slow
 def test_the_unit_compares_with_its_case(rod, unit):
     found = compare_fmu(unit, load(rod))
     assert found.samples == 181
@@ -114,6 +116,7 @@ def test_the_unit_compares_with_its_case(rod, unit):
     assert found.largest <= 1e-10
 
 
+@pytest.mark.slow
 def test_the_comparison_shows_how_far_it_is(rod, unit, monkeypatch):
     bars = {}
 
@@ -127,6 +130,7 @@ def test_the_comparison_shows_how_far_it_is(rod, unit, monkeypatch):
     assert bars == {"in Python": 181, "in the unit": 181}
 
 
+@pytest.mark.slow
 def test_a_unit_of_another_case_is_found_out(rod, tmp_path):
     other = load(rod, settings={"unknowns.alpha.prior": "6e-5 m^2/s"})
     found = compare_fmu(export_fmu(other, tmp_path / "other.fmu"), load(rod))
@@ -157,6 +161,7 @@ def test_the_description_says_names_units_and_times(unit):
     assert description.generationTool.startswith(f"livepde {lp.__version__} by PythonFMU")
 
 
+@pytest.mark.slow
 def test_a_simulation_runs_the_unit_as_users_do(rod, unit):
     """FMPy sets the inputs of each communication point, and reads a step later."""
     prepared = load(rod).prepare()
@@ -412,6 +417,7 @@ def test_a_function_of_ones_own_becomes_a_unit(tmp_path, monkeypatch):
             assert found == pytest.approx([estimate.q[0], estimate.q_std[0]], rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_case_with_code_asks_for_leave_and_takes_its_files_along(rod, tmp_path):
     (tmp_path / "inside").mkdir()
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
@@ -486,6 +492,7 @@ def test_a_case_without_data_becomes_a_unit(rod, tmp_path):
         compare_fmu(unit, load(case))
 
 
+@pytest.mark.slow
 def test_dates_of_the_case_hold_in_the_unit(rod, tmp_path):
     header, *rows = rod.with_name("rod.csv").read_text().splitlines()
     begin = datetime(2025, 4, 1)
@@ -558,6 +565,7 @@ def test_a_unit_that_does_not_run_says_why(rod, tmp_path, monkeypatch):
         pass
 
 
+@pytest.mark.process
 def test_many_units_run_in_one_process(rod, tmp_path):
     """Each in a library of its own; one that gives back too much would crash the next."""
     paths = []
@@ -581,6 +589,7 @@ def test_many_units_run_in_one_process(rod, tmp_path):
     assert lines == 3 * (2 * ["5e-05 5e-05"] + 2 * ["6e-05 6e-05"])
 
 
+@pytest.mark.process
 def test_the_unit_runs_in_a_program_that_is_no_python(rod, tmp_path):
     compiler = shutil.which("cc")
     folder, name = sysconfig.get_config_vars("LIBDIR", "INSTSONAME")
@@ -614,6 +623,7 @@ def test_the_unit_runs_in_a_program_that_is_no_python(rod, tmp_path):
         assert component.outputs[1:3] == pytest.approx(shown, rel=1e-10)
 
 
+@pytest.mark.slow
 def test_the_command_writes_compares_and_tells(rod, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = CliRunner()
@@ -718,6 +728,7 @@ def test_a_target_that_is_missing_is_not_learned_from(sensors):
     assert model.estimate.q[0] == pytest.approx(slab(sensors).model.initial_parameter()[0])
 
 
+@pytest.mark.slow
 def test_rivers_own_evaluation_runs_it():
     evaluate = pytest.importorskip("river.evaluate")
     metrics = pytest.importorskip("river.metrics")
@@ -737,6 +748,7 @@ def test_rivers_own_evaluation_runs_it():
     assert 0.0 < last <= first
 
 
+@pytest.mark.slow
 def test_rivers_checks_that_fit():
     """Not those that leave out features (there is no time then), or pickle models of lambdas."""
     common = pytest.importorskip("river.checks.common")

@@ -15,15 +15,15 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from commands import call
 from meshio.xdmf import TimeSeriesReader
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.wait import WebDriverWait
 from skfem import MeshHex, MeshTri
-from typer.testing import CliRunner
 
 import livepde as lp
-from livepde import cli, runs
+from livepde import runs
 from livepde.dashboard.report import write_report
 from livepde.errors import ConfigurationError, LivepdeError, RunError
 from livepde.models import heat
@@ -97,13 +97,6 @@ def made(folder, kind: str = "line", count: int = SAMPLES, **attrs) -> runs.Run:
 @pytest.fixture
 def rod(tmp_path) -> runs.Run:
     return made(tmp_path / "rod", origin=ORIGIN)
-
-
-def call(*arguments) -> tuple[int, str]:
-    result = CliRunner().invoke(cli.app, [str(item) for item in arguments])
-    if result.exception and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.output
 
 
 # --- names and units -------------------------------------------------------------------------
@@ -235,6 +228,7 @@ def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
         assert found["status"].attrs["flag_values"].dtype.kind == found["status"].dtype.kind
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in MESHES if kind != "line"])
 def test_a_mesh_after_ugrid(tmp_path, kind):
     export(made(tmp_path / "run", kind), tmp_path / "run.nc")
@@ -295,6 +289,7 @@ def test_a_table_without_dates(tmp_path):
 # --- fields on their mesh --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MESHES)
 def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
     elsewhere = tmp_path / "elsewhere"
@@ -323,6 +318,7 @@ def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
         assert (lengths > 0.0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".vtu", ".vtk"])
 @pytest.mark.parametrize("kind", MESHES)
 def test_vtk_holds_one_time(tmp_path, kind, ending):
@@ -412,6 +408,7 @@ def watched_run(folder, title="A rod", status="finished"):
     return runs.open(folder)
 
 
+@pytest.mark.slow
 def test_a_report_says_what_there_is_to_say(tmp_path):
     run = watched_run(tmp_path / "run")
     code, output = call("export", run.path, tmp_path / "run.html")
@@ -449,6 +446,7 @@ def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
     assert 'title = "F\N{REPLACEMENT CHARACTER}hler"' in Page(tmp_path / "run.html").text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("value", "doubts", "said"),
     [
@@ -535,6 +533,7 @@ def browser():
         yield found
 
 
+@pytest.mark.browser
 @pytest.mark.parametrize("kind", ["line", "triangle", "tetra"])
 def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
     run = made(tmp_path / "run", kind, origin=ORIGIN)
@@ -579,6 +578,7 @@ def test_the_command_writes_several(rod, tmp_path):
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.nc", "a.csv", "a.xdmf", "a.vtu", "a.zarr"])
 def test_nothing_is_written_over_unasked(rod, tmp_path, name):
     target = tmp_path / name
@@ -610,6 +610,7 @@ def test_a_folder_that_is_no_store_stays(rod, tmp_path):
     assert (mine / "notes").read_text() == "mine"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -627,6 +628,7 @@ def test_what_cannot_be_is_said_in_one_sentence(rod, tmp_path, arguments, said):
     assert [path.name for path in tmp_path.iterdir()] == ["rod"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["110", "1.9 min", "2025-04-01 06:02", "2025-04-01T08:02+02:00"])
 def test_a_moment_is_a_number_a_quantity_or_a_date(rod, tmp_path, moment):
     assert call("export", rod.path, tmp_path / "a.vtu", "--at", moment)[0] == 0
@@ -640,6 +642,7 @@ def test_a_date_needs_dates(tmp_path):
         call("export", run.path, tmp_path / "a.vtu", "--at", "2025-04-01")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "package"), [("a.zarr", "zarr"), ("a.xdmf", "h5py"), ("a.vtu", "meshio")]
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import skfem
-from problems import CASES, diffusion, laplace, line, product, reaction
+from factories import CASES, diffusion, laplace, line, product, reaction
 from skfem import (
     Basis,
     BilinearForm,

@@ -44,6 +44,7 @@ def test_the_exact_wave_of_fisher_kpp():
     assert coarse / fine > 3.5  # second order in space and time
 
 
+@pytest.mark.slow
 def test_the_sharp_wave_of_porous_fisher():
     coarse, fine = (error(porous_fisher, sharp_wave, n, (-10, 20)) for n in (150, 600))
     assert np.abs(fine).max() < 3e-3  # at the foot
@@ -87,6 +88,7 @@ def test_what_is_refused():
         porous_fisher(mesh, ONE, ONE, m=0.5)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("density", "D", "r"), [(10, 0.0074, 1.05), (14, 0.0164, 1.16), (18, 0.0177, 1.30)]
 )

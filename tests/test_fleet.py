@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
-from problems import laplace, line, truth
+from factories import laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
@@ -161,6 +161,7 @@ def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
     return fleet, estimate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS.values(), ids=LAWS.keys())
 @pytest.mark.parametrize("build", MODELS.values(), ids=MODELS.keys())
 def test_equals_separate_identifiers(build, law):
@@ -168,6 +169,7 @@ def test_equals_separate_identifiers(build, law):
     assert fleet.together, fleet.note
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", MODELS.values(), ids=MODELS.keys())
 def test_equals_separate_identifiers_with_another_scheme_and_substeps(build):
     fleet, estimate = compare(build(), LAWS["plain"], scheme=lp.Alexander2(), dt_max=0.04)
@@ -208,6 +210,7 @@ def test_a_bound_is_kept_and_left_again():
     assert ((alpha >= 0.45) & (alpha <= 0.55)).all()
 
 
+@pytest.mark.slow
 def test_a_member_that_fails_does_not_disturb_the_others():
     """Its input overflows for some samples: it stays as it was, and later goes on."""
 
@@ -233,6 +236,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
     assert estimates[8].steps[2] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "why"),
     [
@@ -274,6 +278,7 @@ def moving_matrix():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "why"),
     [
@@ -298,6 +303,7 @@ def test_sensors_that_see_an_unknown_step_one_by_one():
     assert "sensors" in fleet.note
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [LAWS["plain"], lp.SensitivityLaw(replay=lp.Replay(first=5))])
 def test_goes_on_from_a_checkpoint_with_the_same_numbers(law, tmp_path):
     model = rod()
@@ -446,6 +452,7 @@ def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
         np.testing.assert_allclose(x[:, k], wanted, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
     """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
@@ -510,6 +517,7 @@ def test_a_leap_of_too_many_substeps_is_refused():
         fleet.step(1e6, z, inputs)
 
 
+@pytest.mark.study
 def test_the_benchmark_compares_equal_estimates(monkeypatch):
     monkeypatch.setattr(sys.modules[benchmark.__module__], "SAMPLES", 100)
     outcome = benchmark(members=3, runs=2)

@@ -6,7 +6,7 @@ import copy
 
 import numpy as np
 import pytest
-from problems import excited, excited_u, line
+from factories import excited, excited_u, line
 from skfem import ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -75,6 +75,7 @@ def test_a_forecast_is_what_the_next_step_expects(law):
             assert found.names == ("a", "b", "c")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [rod, plate])
 @pytest.mark.parametrize("law", LAWS)
 def test_a_horizon_is_steps_in_which_nothing_is_measured(law, build):
@@ -92,6 +93,7 @@ def test_a_horizon_is_steps_in_which_nothing_is_measured(law, build):
     assert np.array_equal(found.z[-1], other.forecast(other.t).z[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", [rod, plate])
 @pytest.mark.parametrize("law", LAWS)
 def test_nothing_is_learned_from_a_forecast_or_a_copy(law, build):

@@ -76,6 +76,7 @@ def plane(cell: float = 4.0) -> MeshQuad:
     return MeshQuad.init_tensor(axis, axis)
 
 
+@pytest.mark.slow
 def test_wells_in_the_plane_superpose():
     T, S = 5e-3, 2e-3
     wells = {"Q1": (-20.0, 0.0), "Q2": (21.0, 9.0)}
@@ -129,6 +130,7 @@ def test_a_constant_field_of_storativity_is_a_number():
     assert np.allclose(*values)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=10)
 @given(st.floats(-7, -1), st.floats(-7, -1), st.integers(0, 1000))
 def test_radial_flow_passes_the_checks(log_k: float, log_Ss: float, seed: int):
@@ -138,6 +140,7 @@ def test_radial_flow_passes_the_checks(log_k: float, log_Ss: float, seed: int):
     check_model(model, u=rng.normal(), inputs={"Q": rng.normal()}, seed=seed).raise_if_failed()
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=10)
 @given(st.floats(-5, 0), st.floats(-5, 0), st.booleans(), st.integers(0, 1000))
 def test_flow_in_the_plane_passes_the_checks(log_T: float, log_S: float, field: bool, seed: int):
@@ -181,6 +184,7 @@ def test_they_are_ready_made():
         assert EQUATIONS[name].name == name
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", ["oude_korendijk", "sioux", "horkheim"])
 def test_published_tests_are_found_again(name: str, data_dir: Any, monkeypatch: Any):
     """Whatever the prior: each case runs with its variants, which expect something, too."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import driven_rod, readings
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -25,33 +26,21 @@ GUARDED = ("iterated", "tempered", "held", "restarted", "runaway")
 
 def explosive() -> lp.Model:
     """u_t - u_xx = q exp(u): no steady state beyond q = 3.5, and no step far beyond."""
-    state = lp.Field(
-        MESH,
-        ElementLineP1(),
-        dirichlet={"left": lambda x, t: 0.3 * np.sin(t) + 0.0 * x[0], "right": 0.0},
-    )
-    return lp.Model(
-        state,
+    return driven_rod(
         {"q": lp.Scalar(1.0, 1.0)},
-        A=lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.q * np.exp(u) * v,
+        lambda t: 0.3 * np.sin(t),
+        MESH,
+        lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.q * np.exp(u) * v,
     )
 
 
 def rod(driven: Any = lambda t: 1.0, **unknown: Any) -> lp.Model:
-    ends = {"left": lambda x, t: driven(t) * np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
-    state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
     a = {"a": lp.Scalar(0.2, 0.2, **unknown)}
-    return lp.Model(state, a, A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
+    return driven_rod(a, lambda t: driven(t) * np.sin(3 * t), MESH)
 
 
 def samples(model: lp.Model, q: float, count: int, seed: int = 0) -> list[tuple[float, Any]]:
-    rng = np.random.default_rng(seed)
-    observed = POINTS.bind(model.state_space, model.X, model.parameter_space)
-    forward, u, found = ForwardStage(model), model.initial(0.0), []
-    for t0, t1 in pairwise((0.05 * np.arange(count + 1)).tolist()):
-        u = forward.solve(u, np.array([q]), t1 - t0, lp.Moment(t1))
-        found.append((t1, observed.G @ u + 0.01 * rng.standard_normal(3)))
-    return found
+    return readings(model, POINTS, lambda t: q, 0.05 * np.arange(count + 1), 0.01, seed)
 
 
 def run(model: lp.Model, stream: Any, **options: Any) -> list[lp.Estimate]:
@@ -114,7 +103,8 @@ def test_guards_do_nothing_where_all_is_well(replay: Any):
         assert one.notes == other.notes
 
 
-@pytest.mark.parametrize(("size", "length"), [(3.0, 1), (1.0, 10), (3.0, 10), (30.0, 10)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "length"), [(3.0, 1), (1.0, 10), (30.0, 10)])
 def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     """Sensors that are off by far push q to where no step can be taken: stuck for ever."""
     model = explosive()
@@ -131,6 +121,7 @@ def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     assert found[-1].parameters["q"][1] < 0.5
 
 
+@pytest.mark.slow
 def test_what_guards_did_is_said():
     model = explosive()
     stream = [(t, z + 3.0 * (60 <= k < 70)) for k, (t, z) in enumerate(samples(model, 2.0, 80))]
@@ -158,6 +149,7 @@ def test_a_failure_that_nothing_helps_against_is_a_status():
     assert identifier.step(0.2, [0.0, 0.0, 0.0], {"T": 0.0}).status.ok
 
 
+@pytest.mark.slow
 def test_no_burst_follows_a_rest():
     """Excitation returns at once after 10 s, in which the unknown may have gone anywhere."""
     model = rod(lambda t: float(t < 2 or t > 12), evolution=lp.RandomWalk(0.2))
@@ -172,6 +164,7 @@ def test_no_burst_follows_a_rest():
     assert [values[-1] for values in ends[lp.Guards()]] == pytest.approx([0.3] * 3, abs=0.05)
 
 
+@pytest.mark.slow
 def test_nothing_winds_up_while_nothing_is_excited():
     model = rod(lambda t: float(t < 2))
     found = run(model, samples(model, 0.3, 2000), drift=0.3)
@@ -217,6 +210,7 @@ def test_a_prediction_runs_away_beyond_all_that_was_seen():
     assert scale.beyond(np.array([[np.nan, 2.0]]), np.array([[0.1, 0.001]])) == 25.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 def test_a_gain_too_large_for_the_noise_is_said(gain: float):
     ends = {"left": lambda x, t: 1 + np.sin(t) + 0.0 * x[0], "right": 1.0}
@@ -269,6 +263,7 @@ def holds(data: Any) -> np.ndarray:
     return held == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: float):
     model = reaction(lambda t: 1.0 * (t < 20.0))
@@ -287,6 +282,7 @@ def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: floa
     assert not any("Nothing but noise" in s for s in doubts(free))
 
 
+@pytest.mark.slow
 def test_the_law_goes_on_when_excitation_returns():
     model = reaction(lambda t: 1.0 * (t < 2.0 or t > 20.0))
     data = learned(model, full(model, 1000), gain=1.0)
@@ -299,6 +295,7 @@ def test_the_law_goes_on_when_excitation_returns():
     assert any("samples, last at t = 20" in s for s in doubts(data))
 
 
+@pytest.mark.slow
 def test_a_process_faster_than_the_samples_is_not_at_rest():
     values = np.random.default_rng(1).standard_normal(700)
     fast = learned(m := reaction(lambda t: values[round(t / 2.0)]), full(m, 600, h=2.0))
@@ -308,6 +305,7 @@ def test_a_process_faster_than_the_samples_is_not_at_rest():
     assert not holds(late).any()
 
 
+@pytest.mark.slow
 def test_an_exact_excitation_that_dies_out_is_none():
     model = reaction(lambda t: 1.0 / (1.0 + t) ** 2)
     data = learned(model, full(model, 600, noise=0.0), gain=1e4)
@@ -353,6 +351,7 @@ FAST = np.random.default_rng(1).standard_normal(2000)
 PART = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.9))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 @pytest.mark.parametrize("sensors", [lp.Full(), PART], ids=["full", "part"])
 @pytest.mark.parametrize(
@@ -376,6 +375,7 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
     assert last.correlation < 0.5  # this, it would be held
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 @pytest.mark.parametrize("c1", [0.1, 1.0])
 def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):

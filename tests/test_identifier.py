@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from problems import excited, excited_u, laplace, line, truth
+from factories import excited, excited_u, laplace, line, truth
 from skfem import ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -200,6 +200,7 @@ def test_halvings_that_cannot_be_meant(halvings):
         cubic_decay(lp.GradientLaw(), halvings=halvings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [

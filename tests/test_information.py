@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -117,6 +118,12 @@ def test_excited_twin_with_exact_data() -> None:
     assert 0.1 < estimate.notes["departure"] < 0.6  # H1 is rough, and its q is smooth: as expected
 
 
+@cache
+def unscaled(options: tuple[tuple[str, float], ...]) -> tuple[np.ndarray, dict[str, float]]:
+    return run(*rod(), **dict(options))[1:]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{}, {"noise": 0.02}, {"noise": 0.02, "told": 1.0}, {"noise": 0.02, "own": False}]
 )
@@ -124,7 +131,7 @@ def test_excited_twin_with_exact_data() -> None:
     "units", [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
 )
 def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> None:
-    _, plain, before = run(*rod(), **options)
+    plain, before = unscaled(tuple(options.items()))
     _, scaled, notes = run(*rod(**units), **options)
     size = units.get("q", 1.0)
     assert np.abs(scaled / size - plain).max() <= 1e-6 * np.abs(plain).max()
@@ -133,6 +140,7 @@ def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> 
     assert notes["departure"] == pytest.approx(before["departure"], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_sampling_rate_and_mesh_do_not_matter_without_noise() -> None:
     errors = [run(*rod(**case))[0] for case in ({}, {"dt": 0.05}, {"dt": 0.025}, {"cells": 40})]
     assert max(errors) <= 0.01
@@ -176,6 +184,7 @@ def test_what_has_faded_was_told_all_the_same() -> None:
     assert notes["information"] == learned.total.sum() / learned.spread
 
 
+@pytest.mark.slow
 def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:
     # Noise of one spectral density: a deviation that grows with the root of the rate.
     notes = [
@@ -185,6 +194,7 @@ def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None
     assert max(information) <= 2 * min(information)
 
 
+@pytest.mark.slow
 def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
     # Noise of each node by itself: twice the nodes are twice the data.
     information = [
@@ -193,6 +203,7 @@ def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
     assert max(information) <= 1.5 * min(information)
 
 
+@pytest.mark.study
 def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
     # Noise of each sensor by itself, of one spectral density.
     rates, meshes = (0.1, 0.05, 0.025), (20, 40, 80)
@@ -203,6 +214,7 @@ def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
     assert max(alphas) <= 1.2 * min(alphas)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("noise", [0.01, 0.03, 0.1])
 def test_smoothing_that_balances_its_biases_beats_the_discrepancy_principle(noise: float) -> None:
     untold = run(*rod(), noise=noise)[0]
@@ -221,11 +233,13 @@ def test_exact_data_are_not_smoothed() -> None:
         assert max(alphas) == 0.0
 
 
+@pytest.mark.slow
 def test_more_noise_less_weight_on_the_data() -> None:
     found = [run(*rod(), noise=noise)[2]["information"] for noise in (0.0, 0.01, 0.03, 0.1)]
     assert found == sorted(found, reverse=True)
 
 
+@pytest.mark.slow
 def test_what_was_learned_stays_without_excitation() -> None:
     mesh = lp.interval(0, 1, 20)
     rest = {"boundary": 0.0}
@@ -328,6 +342,7 @@ def test_what_cannot_be_is_one_sentence() -> None:
         lp.Identifier(model, lp.Full(), AUTO, u0=0.0)
 
 
+@pytest.mark.slow
 def test_missing_sensors_are_no_noise_that_turns_back():
     """What a change of the sensors leaves in r made the noise level negative, and the gain huge."""
     points, rng = np.linspace(0.1, 0.9, 9), np.random.default_rng(1)
@@ -369,6 +384,7 @@ def square(size: int) -> tuple[lp.Model, list[tuple[float, np.ndarray]], Callabl
     return model, samples, error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "best"), [(64, 0.098), (256, 0.105)])
 @pytest.mark.parametrize("noise", [0.0, 0.001, 0.01])
 def test_a_square_seen_in_a_part(size: int, best: float, noise: float) -> None:
@@ -453,6 +469,7 @@ def test_probes_give_traces(size: int) -> None:
         assert np.trace(V.T @ J @ V) == pytest.approx(exact, rel=rel)
 
 
+@pytest.mark.slow
 def test_what_the_data_taught_does_not_depend_on_how_well_a_stage_is_solved() -> None:
     model, twin = rod(observation=lp.Subdomain(lambda x: x[0] > 0.4))
     found = []

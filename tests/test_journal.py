@@ -80,6 +80,7 @@ class Breaks:
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["accept", "append", "checkpoint", "step"])
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(tmp_path, monkeypatch, method):
     count = CHECKPOINT + 40
@@ -169,6 +170,7 @@ def limit_pages(kept: Journal, more: int) -> None:
     kept._db.execute(f"PRAGMA max_page_count = {pages + more}")
 
 
+@pytest.mark.slow
 def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
     whole, full = tmp_path / "whole", tmp_path / "full"
     whole.mkdir(), full.mkdir()
@@ -223,6 +225,7 @@ except livepde.RunError as error:
 """
 
 
+@pytest.mark.process
 @pytest.mark.skipif(sys.platform == "win32", reason="needs limits of POSIX")
 def test_a_file_that_may_not_grow(tmp_path):
     whole, full = tmp_path / "whole", tmp_path / "full"
@@ -284,6 +287,7 @@ def shared():
     shutil.rmtree(folder)
 
 
+@pytest.mark.process
 @pytest.mark.skipif(sys.platform == "win32", reason="needs permissions of POSIX")
 @pytest.mark.parametrize("killed", [False, True])
 def test_a_folder_that_may_only_be_read(shared, killed):
@@ -391,6 +395,7 @@ def refused(path: Path, match: str = "damaged|not a journal|malformed|not a data
         other.unlink()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", [0, 1, 50, 99, 4096, 5000, 20000])
 def test_a_file_that_was_cut_off(tmp_path, keep):
     path = finished(tmp_path)
@@ -404,6 +409,7 @@ def twelve(tmp_path_factory) -> bytes:
     return finished(tmp_path_factory.mktemp("twelve"), 12).read_bytes()
 
 
+@pytest.mark.slow
 @settings(
     max_examples=60,
     deadline=None,
@@ -465,6 +471,7 @@ HOSTILE = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", HOSTILE)
 def test_a_file_made_to_do_harm_is_one_sentence(tmp_path, command):
     path = finished(tmp_path)
@@ -502,6 +509,7 @@ def archive(**leaves) -> bytes:
     return found.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pickle", "bomb", "header", "nested", "huge", "shapes"])
 def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
@@ -549,6 +557,7 @@ run.run()
 """
 
 
+@pytest.mark.process
 def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(tmp_path):
     path, seen = tmp_path / NAME, 0
     for _ in range(3):
@@ -568,6 +577,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
     assert seen >= 150
 
 
+@pytest.mark.slow
 def test_an_open_reader_does_not_let_the_log_grow(tmp_path):
     run = started(tmp_path, 3000)
     with Journal.open(tmp_path / NAME) as reader:
@@ -595,6 +605,7 @@ class First:
 # --- retention -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path):
     count, retention = 4 * CHECKPOINT, Retention(10.0, 7)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -628,6 +639,7 @@ def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path
                 assert (mine[t].snapshot is None) == (yours[t].snapshot is None)
 
 
+@pytest.mark.slow
 def test_thinning_while_somebody_iterates(tmp_path):
     run = started(tmp_path, 3 * CHECKPOINT)
     run.run()
@@ -641,6 +653,7 @@ def test_thinning_while_somebody_iterates(tmp_path):
     run.journal.close()
 
 
+@pytest.mark.slow
 def test_a_journal_that_is_thinned_stops_growing(tmp_path):
     run = started(tmp_path, 1)
     run.run()
@@ -680,6 +693,7 @@ ROWS = st.fixed_dictionaries(
 ) | st.dictionaries(st.text(max_size=5), VALUES, max_size=4)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.lists(ROWS, max_size=20))
 def test_any_row_becomes_part_of_a_sample_or_has_a_reason(found):
@@ -698,6 +712,7 @@ def test_any_row_becomes_part_of_a_sample_or_has_a_reason(found):
     assert all(not np.isinf(value) for ready in out for value in ready.values.values())
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=200) | st.text(max_size=100) | ROWS.map(json.dumps))
 def test_any_line_of_json_is_a_row_or_says_why_not(line):
@@ -778,6 +793,7 @@ def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
 
 
+@pytest.mark.process
 def test_an_error_has_an_exit_code(tmp_path):
     command = [sys.executable, "-m", "livepde", "report", str(tmp_path)]
     found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import factories
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import CASES
+from factories import CASES, reaction
 from skfem import (
     ElementLineHermite,
     ElementQuad2,
@@ -60,6 +61,7 @@ def quads():
     return MeshQuad(mesh.p + 0.05 * np.sin(7.0 * mesh.p[::-1]), mesh.t)  # no parallelograms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_models_on_large_meshes(name, pieces):
     def make():
@@ -100,6 +102,7 @@ def nonlinear(mesh, element):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", [ElementTriP1(), ElementTriP2()])
 def test_nonlinear_forms_with_boundaries_and_regions(element, pieces):
     small, large = both(nonlinear(triangles(), element), pieces)
@@ -249,16 +252,10 @@ def test_vector_fields_and_points_on_large_meshes(pieces):
 
 
 def square(cells=12):
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
-    return lp.Model(
-        lp.Field(mesh, ElementTriP1(), dirichlet={"boundary": 0.0}),
-        lp.Field(mesh, ElementTriP1(), inner="H1"),
-        A=lambda q, u, v, x: q * u * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
-        f=lambda x, t: np.exp(-t) * x[0],
-    )
+    return reaction(factories.square(cells), ElementTriP1(), f=lambda x, t: np.exp(-t) * x[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "sensors"),
     [

@@ -39,6 +39,7 @@ def latent(given: costs.Rod, state: lean.Filter):
     return own.prior + state.y[:, :, 0] * own.deviations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ENDS)
 @pytest.mark.parametrize(("nodes", "unknowns"), [(31, 2), (31, 10), (60, 3)])
 def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
@@ -87,6 +88,7 @@ def test_a_lean_forward_step_is_one_of_simulate():
         np.testing.assert_allclose(u[place], expected, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_square_is_assembled_as_simulate_does():
     given = costs.Rod(costs.SQUARE, 4, "source")
     model = given.model
@@ -135,6 +137,7 @@ def data(request):
     return problems[request.param].data(0.01, 0).until(5)
 
 
+@pytest.mark.slow
 def test_an_ensemble_as_arrays_is_a_loop_over_its_members(data):
     members, inflation = 6, 1.02
     filter_ = arrays.Ensemble(arrays.Stack(data), members, inflation)
@@ -157,6 +160,7 @@ def test_an_ensemble_as_arrays_is_a_loop_over_its_members(data):
     np.testing.assert_allclose(factor @ factor.T, expected @ expected.T, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_an_unscented_filter_as_arrays_is_a_loop_over_its_points(data):
     filter_ = arrays.Unscented(arrays.Stack(data))
     augmented = Augmented(data)
@@ -193,6 +197,7 @@ def full(augmented, columns, order):
     return whole[order]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", ["EnKF as arrays, 20 members", "unscented filter as arrays"])
 def test_filters_as_arrays_find_the_parameter(row):
     score = table.run_row(ROD, 0.01, 0, row)
@@ -202,12 +207,14 @@ def test_filters_as_arrays_find_the_parameter(row):
     assert score.median > 0.0
 
 
+@pytest.mark.study
 def test_what_cannot_be_stepped_as_arrays_says_why():
     score = table.run_row(PROBLEMS["burgers-varying"], 0.01, 0, "unscented filter as arrays")
     assert score is not None
     assert score.note == "not run: constant unknowns and linear sensors only"
 
 
+@pytest.mark.slow
 def test_the_lean_reference_is_a_row_where_it_applies():
     score = table.run_row(ROD, 0.01, 0, "lean reference")
     ours = table.run_row(ROD, 0.01, 0, "sensitivity")
@@ -255,6 +262,7 @@ def test_every_bound_is_of_a_process_that_is_timed():
     assert {(given.nodes, given.ends) for given in costs.RODS} == set(costs.EARLIER)
 
 
+@pytest.mark.slow
 def test_the_earlier_forward_step_is_asked_in_turns(monkeypatch, capsys):
     monkeypatch.setattr(earlier, "SIZES", ((12, 2), (31, 2)))
     earlier.compare(earlier.ROOT / "src", "HEAD", 2)
@@ -263,6 +271,7 @@ def test_the_earlier_forward_step_is_asked_in_turns(monkeypatch, capsys):
     assert all(float(cell) > 0.0 for cell in lines[2].split("|")[3:6])
 
 
+@pytest.mark.study
 def test_peers_are_divided_by_the_prior():
     outcome = table.peers(["rod"], 2, rows=["lean reference"])
     (found,) = outcome.tables

@@ -42,6 +42,7 @@ def matrices(draw, rows, cols):
 SIZES = st.integers(1, 6)
 
 
+@pytest.mark.slow
 @given(st.data(), SIZES, SIZES, SIZES, SIZES)
 @settings(max_examples=60, deadline=None)
 def test_sandwich_is_the_product_for_any_data(data, p, n, m, k):
@@ -55,6 +56,7 @@ def test_sandwich_is_the_product_for_any_data(data, p, n, m, k):
     np.testing.assert_allclose(found, expected, atol=1e-10 * (1 + abs(expected).max(initial=0)))
 
 
+@pytest.mark.slow
 @given(st.data(), SIZES, SIZES)
 @settings(max_examples=60, deadline=None)
 def test_assembler_is_the_dense_block_matrix(data, n, m):

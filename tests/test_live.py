@@ -101,6 +101,7 @@ run.journal.close()
 """
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
@@ -223,6 +224,7 @@ def test_what_comes_too_fast_is_merged_or_dropped_and_counted(tmp_path, overflow
     assert len(run.journal) == 10
 
 
+@pytest.mark.slow
 def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
     good = list(rows(200))
     mixed = []
@@ -280,6 +282,7 @@ class Batch(Rows):
         return [row for _ in range(5) for row in super(Batch, self).poll(wait)]
 
 
+@pytest.mark.slow
 def test_what_is_irregular_is_counted_once_whenever_it_is_killed(tmp_path):
     write(tmp_path, 30)
     path = tmp_path / "data.csv"

@@ -157,6 +157,7 @@ def test_members_are_taken_put_and_joined_and_square_roots_widened():
     assert changed(whole, value=np.zeros(3)).inner is whole.inner
 
 
+@pytest.mark.slow
 def test_a_bank_goes_on_where_the_step_of_a_member_fails():
     """All step alone then: logs of members stay in line, and the others have their sample."""
     model = lp.Model(
@@ -209,6 +210,7 @@ def test_members_without_a_reading_step_with_the_others(monkeypatch: pytest.Monk
     assert not alone
 
 
+@pytest.mark.slow
 def test_rows_that_a_member_has_missed_stay_out_of_its_log_after_an_alarm():
     """The log of a member that failed for some samples is that of a run of its own."""
     model = rod({"left": lp.Channel("T_0"), "right": 0.0})

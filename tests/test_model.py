@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems import CASES, laplace, line, product, reaction
+from factories import CASES, laplace, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementLineP2, ElementTriP1, MeshTri
 
 import livepde as lp
 from livepde.fem import Inputs, Moment
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_check_model_passes(name):
     lp.check_model(CASES[name].model(f=lambda x, t: x[0] * t)).raise_if_failed()

@@ -27,7 +27,10 @@ from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
 from livepde.streams.sources import Rows
 
 pytest.importorskip("paho.mqtt")
-pytestmark = pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto")
+pytestmark = [
+    pytest.mark.broker,
+    pytest.mark.skipif(MOSQUITTO is None, reason="needs the broker mosquitto"),
+]
 
 
 @pytest.fixture(autouse=True)

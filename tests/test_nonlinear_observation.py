@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems import excited, excited_q, excited_u, observe, reaction
+from factories import excited, excited_q, excited_u, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -89,6 +89,7 @@ def test_bad_sensors():
         bound(lambda T: T[:2]).predict(np.ones(13), np.zeros(13), START)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reading", [(lambda T: np.exp(T / 2), None), (lambda T: T, None)])
 def test_gradient_law(reading):
     """With z = exp(u/2) it finds q as well as with z = u, and with g = id it is the same law."""

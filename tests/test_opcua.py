@@ -17,6 +17,8 @@ import livepde as lp
 from livepde.streams.opcua import OpcuaSource
 from livepde.streams.sources import Row, Rows, drained
 
+pytestmark = pytest.mark.broker
+
 pytest.importorskip("asyncua")
 COLUMNS = {"ns=2;s=a": "a", "ns=2;s=b": "b", "ns=2;s=left": "left"}
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import CASES, line, observe, reaction
+from factories import CASES, line, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -30,6 +30,7 @@ def integrated(model, D, nu=1.0):
     return forms.pull, forms.hidden, forms
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("D", [1.0, -1.0, lambda x: x[0] - 0.5])
 def test_M_and_N_share_the_domain(name, D):
@@ -90,6 +91,7 @@ def outcome() -> Outcome:
     return EXPERIMENTS["degenerate"].run()
 
 
+@pytest.mark.study
 def test_varying_and_degenerate_diffusivities(outcome):
     assert outcome.ok, [check for check in outcome.checks if not check.ok]
     json.dumps(outcome.to_dict(), allow_nan=False)
@@ -97,6 +99,7 @@ def test_varying_and_degenerate_diffusivities(outcome):
         draw().canvas.draw()
 
 
+@pytest.mark.study
 def test_antidiffusion_is_bounded_with_nu_and_fails_without(outcome):
     rows = [
         dict(zip(outcome.tables[0].columns, row, strict=True)) for row in outcome.tables[0].rows
@@ -122,6 +125,7 @@ def test_the_manufactured_state_solves_the_discrete_process():
         np.testing.assert_allclose(u, model.exact(t), atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("D", "nu", "holds"), [(0.05, 0.0, True), (-0.05, 0.9, False)])
 def test_it_is_the_sign_of_D_that_needs_nu_above_one(D, nu, holds):
     """With D > 0 the same gains hold p without nu; with D < 0 nu = 0.9 is too little, as |D| says.

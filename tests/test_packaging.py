@@ -143,6 +143,7 @@ def fish(line: str) -> list[str]:
     return [row.split("\t")[0] for row in text.splitlines() if row]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shell", [bash, zsh, fish])
 @pytest.mark.parametrize(
     ("line", "expected"),
@@ -172,6 +173,7 @@ def test_scripts(shell):
     assert "livepde" in script
 
 
+@pytest.mark.process
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_bash_completes(tmp_path):
     """The shell calls what its script defines, with the words of a line, as after Tab."""

@@ -14,6 +14,7 @@ A block with title="FILE" is a file of that name for the blocks after it.
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import csv
 import doctest
@@ -59,7 +60,7 @@ COMPLETES = ROOT / "cases" / "soil_layers.toml"  # gives what a part of a case l
 ELSEWHERE = {
     "test_pages.py": ["make", "python3 -m venv .venv", ". .venv/bin/activate", "pip install"],
     "test_cli.py": ["python -m benchmarks step"],
-    "test_schur.py": ["python -m benchmarks scale"],
+    "test_block_solver.py": ["python -m benchmarks scale"],
     "test_public.py::test_the_benchmark_of_the_import": ["python -m benchmarks import"],
     "test_lean.py::test_peers_are_divided_by_the_prior": ["python -m benchmarks peers"],
     "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["python -m benchmarks fleet"],
@@ -198,6 +199,7 @@ def needs_data(page: Path) -> bool:
     return any("cases/" in one and not _stands_elsewhere(one) for one in commands)
 
 
+@pytest.mark.pages
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_page_runs(page, tmp_path, monkeypatch, request):
     if needs_data(page):
@@ -245,6 +247,7 @@ def is_a_test(name: str) -> bool:
     return not function or re.search(rf"^def {function}\(", source, re.MULTILINE) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_a_page_names_is_there(page):
     """Commands, experiments, files and tests of the project, in quotes."""
@@ -280,6 +283,32 @@ def test_links_of_pages_outside_of_the_site_lead_somewhere(name):
             assert anchor in slugs, target
 
 
+def markers(source: str, function: str) -> set[str]:
+    """Return what a test is marked by, itself or with its whole file."""
+    body = ast.parse(source).body
+    marked = [
+        node.value
+        for node in body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "pytestmark"
+    ]
+    for node in body:
+        if isinstance(node, ast.FunctionDef) and node.name == function:
+            marked += node.decorator_list
+    return set(re.findall(r"pytest\.mark\.(\w+)", " ".join(map(ast.unparse, marked))))
+
+
+def test_guarantees_are_among_the_tests_of_what_users_rely_on():
+    (left_out,) = re.findall(r'^USERS := -m "not \((.*)\)"$', MAKEFILE, re.MULTILINE)
+    page = (ROOT / "docs" / "guarantees.md").read_text(encoding="utf-8")
+    held = page[page.index("## Guaranteed") : page.index("\n## ", page.index("## Guaranteed") + 1)]
+    names = re.findall(r"`(test_\w+\.py)::(\w+)`", held)
+    assert len(names) > 20
+    for file, function in names:
+        if file != "test_parallel.py":  # `make mpi`
+            source = (ROOT / "tests" / file).read_text(encoding="utf-8")
+            assert not markers(source, function) & set(left_out.split(" or ")), (file, function)
+
+
 def test_warnings_of_the_site_are_errors():
     """--quiet hides them from --strict, too: then nothing would be one."""
     (command,) = re.findall(r"mkdocs build.*", MAKEFILE)
@@ -287,6 +316,7 @@ def test_warnings_of_the_site_are_errors():
     assert "--quiet" not in command
 
 
+@pytest.mark.slow
 def test_a_site_that_loads_something_from_elsewhere_is_refused(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     links = importlib.import_module("links")
@@ -307,6 +337,7 @@ def test_the_house_is_drawn_as_it_is_built():
     assert drawn == [re.findall(r"\w+", layer) for layer in layers]
 
 
+@pytest.mark.slow
 def test_pages_that_the_program_writes(monkeypatch):
     """Every command with its options, and every key with what it may be."""
     monkeypatch.syspath_prepend(str(ROOT / "docs"))

@@ -17,6 +17,8 @@ from livepde.errors import ConfigurationError
 from livepde.linalg import Pattern, choose, in_use, using
 from livepde.parallel.team import world
 
+pytestmark = pytest.mark.process
+
 HERE = Path(__file__).parent
 MISSING = shutil.which("mpirun") is None or find_spec("petsc4py") is None
 needs_mpi = pytest.mark.skipif(MISSING, reason="petsc4py or mpirun is missing: see .ci/run")

@@ -163,6 +163,7 @@ def test_the_extra_is_named(written, monkeypatch):
         read_parquet(path, COLUMNS, CLOCK)
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded_before_a_file_is_read():
     code = "import sys, livepde.streams.parquet; sys.exit('pyarrow.parquet' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -15,6 +15,8 @@ from livepde.cases.preview import preview
 from livepde.cases.template import write_template
 from livepde.cli import app
 
+pytestmark = pytest.mark.slow
+
 START = {"initial": "20 degC"}
 LAYERS = {
     "unknowns.alpha.regions.near": ["0 cm", "20 cm"],

@@ -77,12 +77,14 @@ def drawn(figure: Figure) -> Figure:
     return figure
 
 
+@pytest.mark.slow
 def test_import_of_livepde_loads_no_matplotlib() -> None:
     code = "import sys, livepde, livepde.plots; print('matplotlib' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
 
 
+@pytest.mark.slow
 def test_figures_leave_pyplot_alone() -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from test_plots import *;"

@@ -52,6 +52,7 @@ def test_exports_are_complete_and_sorted():
     assert set(livepde.__all__) <= set(dir(livepde))
 
 
+@pytest.mark.slow
 def test_parts_are_there_without_being_imported():
     """`livepde.fem.Moment` does not depend on what else a program has used before."""
     parts = sorted({".errors", *(name for name in DOCUMENTED if name.count(".") == 1)})
@@ -100,6 +101,7 @@ def test_import_loads_nothing():
     assert not {"numpy", "scipy", "skfem"} & modules
 
 
+@pytest.mark.slow
 def test_what_a_script_uses_is_light():
     """Beside SciPy and scikit-fem, a model and an identifier load nothing but the library's core.
 
@@ -117,6 +119,7 @@ def test_what_a_script_uses_is_light():
     assert not {f"livepde.{name}" for name in above.split()} & more
 
 
+@pytest.mark.study
 def test_the_benchmark_of_the_import():
     outcome = startup(rounds=1)
     assert [check.name for check in outcome.checks] == ["import livepde", SCRIPT]
@@ -148,6 +151,7 @@ def test_every_module_imports():
             importlib.import_module(module.name)
 
 
+@pytest.mark.slow
 def test_no_modules_import_each_other():
     """Imports for type checkers included: a module is understood after those that it imports."""
     root = Path(livepde.__file__).parent

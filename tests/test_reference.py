@@ -299,6 +299,7 @@ def test_jacobian_is_the_derivative(rule, nu):
     np.testing.assert_allclose(step.jacobian(r, None) @ direction, slope, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rule",
     [
@@ -332,6 +333,7 @@ def test_energy_is_lost_to_damping_and_to_implicit_Euler_only():
     np.testing.assert_allclose(np.diff(levels), -damping[1:] - Euler, atol=1e-12 * levels[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [300.0, 1e5])
 @pytest.mark.parametrize("error", [0.0, 1e-3])
 def test_estimates_of_q_do_not_depend_on_the_size_of_the_state(size, error):
@@ -353,6 +355,7 @@ def test_sigma_alone_lets_q_fade():
     np.testing.assert_allclose(found.Q, fading[:, None] * found.q_true, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_every_setting_is_solved(name):
     found = run(replace(SETTINGS[name], steps=15))
@@ -386,6 +389,7 @@ def test_a_step_can_have_three_solutions():
 # --- numbers -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nodes", "nu", "of_q", "of_u"),
     [
@@ -404,6 +408,7 @@ def test_errors_with_cut_elements_do_not_depend_on_the_mesh(nodes, nu, of_q, of_
     assert error_u(found) == pytest.approx(of_u, rel=3e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "of_q"),
     [
@@ -418,6 +423,7 @@ def test_errors_with_whole_elements_at_nu_0_01(change, of_q):
     assert error_q(run(replace(PAPER, nu=0.01, **change))) == pytest.approx(of_q, rel=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "of_q"),
     [

@@ -14,6 +14,8 @@ from livepde.reproduce.experiment import track
 from livepde.runs.outcome import Outcome
 from livepde.streams import RelativeNoise, Twin
 
+pytestmark = pytest.mark.study
+
 
 @pytest.fixture(scope="module")
 def discrete() -> Outcome:

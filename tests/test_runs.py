@@ -241,6 +241,7 @@ def test_runs_that_cannot_be_opened(tmp_path, driven):
             _ = runs.open(tmp_path).checks
 
 
+@pytest.mark.slow
 def test_figures_are_drawn(tmp_path, driven):
     pytest.importorskip("matplotlib")
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")

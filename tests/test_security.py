@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import io
 import json
-import logging
 import pickle
 import socket
 import threading
@@ -126,6 +125,7 @@ def call(*arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.slow
 def test_a_run_of_somebody_else_runs_nothing(hostile):
     trace = Path("trace")
     assert call("report", str(hostile))[0] == 0
@@ -141,6 +141,7 @@ def test_a_run_of_somebody_else_runs_nothing(hostile):
     assert trace.exists()  # who allows it gets it
 
 
+@pytest.mark.slow
 def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
     mine = tmp_path / "mine.txt"
     mine.write_text("mine")
@@ -153,6 +154,7 @@ def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
     assert mine.read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_damaged_dataset_is_one_sentence(hostile):
     path = hostile / "estimates.nc"
     whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
@@ -168,6 +170,7 @@ def test_a_damaged_dataset_is_one_sentence(hostile):
     assert refused > 100
 
 
+@pytest.mark.slow
 def test_a_case_cannot_allow_its_own_code(hostile):
     path = hostile / "case.toml"
     path.write_text("allow_code = true\n" + path.read_text())
@@ -232,6 +235,7 @@ def test_a_long_message_is_refused():
     assert json_row(b"[" * 100_000).broken
 
 
+@pytest.mark.slow
 def test_an_event_repeats_no_long_text(tmp_path):
     row = {"t": "x" * 500_000, "a": 1.0}
     run = live(tmp_path, Rows([row, *rows(2)]))
@@ -341,17 +345,7 @@ def test_tokens_that_are_none(host, token):
         Address(host, token=token)
 
 
-@pytest.fixture
-def logs():
-    """Leave logging as it was."""
-    root = logging.getLogger()
-    before, level = list(root.handlers), root.level
-    yield
-    root.handlers[:] = before
-    root.setLevel(level)
-    logging.getLogger("livepde").setLevel(logging.NOTSET)
-
-
+@pytest.mark.slow
 def test_a_given_token_is_shown_nowhere(serving, tmp_path, monkeypatch, logs):
     server = serving(token=TOKEN)
     assert TOKEN in server.url

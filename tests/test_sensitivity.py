@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from problems import excited, excited_q, excited_u, laplace, line, truth
+from factories import excited, excited_q, excited_u, laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
@@ -219,6 +219,7 @@ def test_a_sensor_that_sees_a_parameter():
     np.testing.assert_allclose(estimate.innovation, 0.0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay(first=3))])
 @pytest.mark.parametrize("scheme", [lp.ImplicitEuler(), lp.Alexander2()])
 def test_passes_the_shipped_check(law, scheme):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from factories import observe
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from problems import observe
 from skfem import (
     ElementLineHermite,
     ElementLineP1,
@@ -282,6 +282,7 @@ def sensors_of_any_kind(draw):
     return draw(st.sampled_from(base))
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(sensors=sensors_of_any_kind(), position=inside, seed=st.integers(0, 2**31))
 def test_any_sensor_passes_the_checks(sensors, position, seed):
@@ -343,6 +344,7 @@ def test_a_boundary_flux_and_one_point_find_the_conductivity():
     identified(heated(), sensors, {"k": 0.6}, 0.01)
 
 
+@pytest.mark.slow
 def test_a_moving_sensor_finds_the_conductivity():
     def inputs(t):
         return {"x": np.nan if t < 0.3 else 0.5 + 0.6 * np.sin(t)}  # out of the rod at times
@@ -350,6 +352,7 @@ def test_a_moving_sensor_finds_the_conductivity():
     identified(heated(), lp.Moving({"T": "x"}, noise=0.01), {"k": 0.6}, 0.01, inputs)
 
 
+@pytest.mark.slow
 def test_offsets_by_direct_and_gain_by_calibration():
     model = heated(a=lp.Scalar(0.0, std=0.3), b=lp.Scalar(0.0, std=0.3))
     direct = {"A": lambda q, x: q.a, "B": lambda q, x: q.b}

@@ -24,6 +24,8 @@ from livepde.runs import JOURNAL, Journal
 from livepde.runs.feeds import Paced, Samples
 from livepde.streams.sources import Rows
 
+pytestmark = pytest.mark.process
+
 CASE = """
 title = "A rod beside its process"
 equation = "heat"

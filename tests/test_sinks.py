@@ -19,18 +19,6 @@ from livepde.runs.sinks import JsonLinesSink
 from livepde.streams.sources import Rows
 
 
-@pytest.fixture
-def logs():
-    """Leave logging as it was."""
-    root = logging.getLogger()
-    before, level = list(root.handlers), root.level
-    yield
-    root.handlers[:] = before
-    root.setLevel(level)
-    for name in ("livepde", "asyncua"):
-        logging.getLogger(name).setLevel(logging.NOTSET)
-
-
 def test_each_estimate_is_a_line(tmp_path):
     stream = io.StringIO()
     run = live(tmp_path, Rows(rows(4)), sinks=[JsonLinesSink(stream)])
@@ -78,6 +66,7 @@ def child(folder: Path, output) -> str:
     return ended.stderr
 
 
+@pytest.mark.process
 def test_a_closed_pipe_ends_the_sink_and_not_the_run(tmp_path):
     reading, writing = os.pipe()
     os.close(reading)
@@ -88,6 +77,7 @@ def test_a_closed_pipe_ends_the_sink_and_not_the_run(tmp_path):
     assert "Exception ignored" not in told
 
 
+@pytest.mark.process
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_ends_the_sink_and_not_the_run(tmp_path):
     with Path("/dev/full").open("w") as full:

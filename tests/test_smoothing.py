@@ -72,6 +72,7 @@ def test_smoothers_are_causal(stage):
     assert np.all(first[30] != second[30])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES, ids=repr)
 def test_std_and_d_rate_are_those_of_the_smoothed_noise(stage):
     """Over 4000 independent channels, at the last of 40 irregular times."""
@@ -86,6 +87,7 @@ def test_std_and_d_rate_are_those_of_the_smoothed_noise(stage):
     assert stream.norm_d_rate(4 * np.eye(4000)) == pytest.approx(2 * stream.norm_d_rate())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", STAGES, ids=repr)
 def test_sigma_is_learned_from_the_data(stage):
     times = 0.02 * np.arange(1000)

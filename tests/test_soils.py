@@ -9,6 +9,8 @@ import pytest
 
 from benchmarks.cases import jobs_of, run_job
 
+pytestmark = pytest.mark.study
+
 CASES = Path(__file__).parents[1] / "cases"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import CASES, laplace, line, product, reaction
+from factories import CASES, laplace, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -21,6 +21,7 @@ def test_spaces_of_all_elements(name, inner):
         check_space(space).raise_if_failed()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("zero", [False, True])
 def test_adjoint_identity(name, zero):
@@ -198,6 +199,7 @@ def test_prior_variances_are_the_diagonal_of_the_inverse():
         assert model.Q.variance == pytest.approx(exact)
 
 
+@pytest.mark.slow
 def test_prior_variances_of_large_fields_are_interpolated(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(spaces, "SOLVED", 250)
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (24, 24))

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from problems import Cubic, Point, Slope, laplace, line, product, rates, reaction, truth
+from factories import laplace, line, product, rates, reaction, truth
 from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -47,6 +47,7 @@ def cubic(**options):
     return model, exact
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "order"), [("euler", 1), ("alexander", 2)])
 def test_order_in_time_with_moving_boundary_data(name, order):
     """The solution lies in the space, so all of the error is the scheme's."""
@@ -204,6 +205,42 @@ def test_equal_steps_are_one_number():
         advance(lp.Advance(lp.ImplicitEuler()), stage, np.zeros(1), t0, t1)
     assert len(widths) <= 8
     np.testing.assert_allclose(list(widths), 0.6, rtol=1e-12)
+
+
+class Slope:
+    """The factor of a single number."""
+
+    def __init__(self, slope):
+        self.slope = slope
+
+    def solve(self, b):
+        return b / self.slope
+
+
+class Cubic:
+    """x^3 = x for x = y - 5, as an equation of `Newton`: roots at 4, 5 and 6."""
+
+    def __init__(self):
+        self.factors = 0
+
+    def evaluate(self, y):
+        x = y - 5.0
+        return Point(y, x**3 - x, 6.0)
+
+    def factor(self, at, last=None):
+        self.factors += 1
+        return Slope(3.0 * (at.y[0] - 5.0) ** 2 - 1.0)
+
+    def limited(self, at, allowed):
+        return at.size <= 1e-16
+
+
+class Point:
+    """A point of an equation, with the size of its residual relative to a scale."""
+
+    def __init__(self, y, residual, scale=1.0, resolved=True):
+        self.y, self.residual, self.resolved = y, residual, resolved
+        self.size = float(np.max(np.abs(residual) / scale))
 
 
 class Equation:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import excited, excited_q, excited_u, line, observe, product
+from factories import excited, excited_q, excited_u, line, observe, product
 from skfem import ElementLineHermite, ElementLineP1, ElementLineP2
 from typer.testing import CliRunner
 
@@ -130,6 +130,7 @@ def papers_constants(spaces):
     return dg.constants(spaces, model.parameter_space.interpolate(seed.q_true), [u])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("D", [1.0, -1.0, 0.1])
 @pytest.mark.parametrize("nodes", HERMITE_NODES)
 def test_the_papers_lipschitz_constant_is_one_on_every_mesh(nodes, D):
@@ -284,6 +285,7 @@ def constants_of(twin, gain):
     return dg.constants(spaces, twin.q, twin.states[::10], gain=gain)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("u0", [0.0, lambda x: seed_excited.u_true(x, 0.0)], ids=["zero", "exact"])
 @pytest.mark.parametrize("data", ["exact", "noisy", "smoothed"])
 def test_all_propositions_hold_on_the_excited_twin(u0, data):
@@ -299,6 +301,7 @@ def test_all_propositions_hold_on_the_excited_twin(u0, data):
     assert np.all(np.diff(energies) <= 1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nu", [0.0, None], ids=["nu = 0", "nu of the paper"])
 def test_all_propositions_hold_on_the_papers_twin(nu):
     """Partial data: with gains that satisfy the conditions on mu (and nu)."""
@@ -318,6 +321,7 @@ def test_all_propositions_hold_on_the_papers_twin(nu):
     assert met.lines[-1].ok == (nu > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 100.0, 1e4])
 def test_the_energy_never_grows_with_the_default_rule(gain):
     """ResidualDamping leaves out the part of the bound with p; bound 1 holds all the same."""
@@ -389,6 +393,7 @@ def test_trackers_refuse_an_empty_run():
 # --- T* online ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [0, 3, 4])
 def test_the_surrogate_of_T_star_is_within_a_factor_of_two(row):
     """Mean of five seeds, where noise (not the smoothing's own error) decides."""
@@ -600,6 +605,7 @@ def test_the_page_of_a_run_without_any_measurement():
     assert any("no sample of the run holds a measurement" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_report_theory_of_a_run_directory(tmp_path):
     from livepde.cli import app
 
@@ -624,6 +630,7 @@ def test_report_theory_of_a_run_directory(tmp_path):
 # --- experiments ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_oracle_satisfies_the_bounds():
     oracle = experiment("oracle")
     plain, bound, with_mu, with_nu = oracle.run(samples=8)

@@ -77,6 +77,7 @@ def test_decay_on_the_way():
     assert np.abs(u - exact)[mesh.p[0] < 29].max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inlet", ["flux", "fixed"])
 @pytest.mark.parametrize(("phi", "omega"), [(0.7, 0.3), (0.5, 0.05), (0.8, 3.0)])
 def test_immobile_water_against_the_laplace_transform(inlet, phi, omega):
@@ -102,6 +103,7 @@ def test_nothing_is_lost():
     assert stored == pytest.approx(V * 6.0, rel=1e-9)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=10)
 @given(
     dispersion=st.floats(0.02, 5.0),
@@ -144,6 +146,7 @@ def test_what_is_refused():
         advection_dispersion(mesh, ONE, ONE, R=0.0)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("curve", "depth", "v", "dispersion"),
     [(0, 11.0, 2.45, 0.154), (1, 17.0, 2.51, 0.126), (2, 23.0, 2.51, 0.110)],

@@ -129,6 +129,7 @@ def test_same_seed_same_noise() -> None:
     assert np.array_equal(data(twin()), noisy.exact_data)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("observation", [SENSORS, MIDDLE, lp.Full()])
 def test_relative_noise_has_its_level_in_the_norm_of_Z(observation: lp.Observation) -> None:
     level, squares = 0.05, []
@@ -159,6 +160,7 @@ def test_weights_are_the_norm_of_the_observed_part() -> None:
     assert np.array_equal(twin(observation=SENSORS).weights, np.eye(2))
 
 
+@pytest.mark.slow
 def test_absolute_noise() -> None:
     draws = [
         data(twin(observation=SENSORS, noise=AbsoluteNoise([0.1, 2.0]), seed=seed))

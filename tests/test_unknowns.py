@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import conduction, driven_rod, readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -25,27 +26,15 @@ SENSORS = [0.25, 0.5, 0.75]
 mesh = lp.interval(0.0, 1.0, 20)
 
 
-def swinging(x: Any, t: float) -> Any:
-    return np.sin(3.0 * t) + 0.0 * x[0]
-
-
 def rod(parameter: Any, A: Any = None, **options: Any) -> lp.Model:
     """Return a rod heated and cooled at its left end; the diffusivity is `a` unless A is given."""
-    state = lp.Field(mesh, ElementLineP1(), dirichlet={"left": swinging, "right": 0.0})
-    A = A or (lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
-    return lp.Model(state, parameter, A, **options)
+    return driven_rod(parameter, lambda t: np.sin(3.0 * t), mesh, A or conduction, **options)
 
 
 def data(a: Any, times: Any, noise: float = NOISE, seed: int = 0) -> list[tuple[float, Any]]:
     """Return noisy samples of the sensors for a diffusivity a(t)."""
-    model, rng = rod({"a": lp.Scalar(1.0)}), np.random.default_rng(seed)
-    observed = lp.Points(SENSORS).bind(model.state_space, model.X, model.parameter_space)
-    forward, u = ForwardStage(model), model.initial(0.0)
-    samples = [(float(times[0]), observed.G @ u)]
-    for t0, t1 in itertools.pairwise(times):
-        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
-        samples.append((float(t1), observed.G @ u + noise * rng.standard_normal(len(SENSORS))))
-    return samples
+    found = readings(rod({"a": lp.Scalar(1.0)}), lp.Points(SENSORS), a, times, noise, seed)
+    return [(float(times[0]), np.zeros(len(SENSORS))), *found]
 
 
 def estimates(model: lp.Model, law: Any, samples: Any, **options: Any) -> list[lp.Estimate]:
@@ -109,6 +98,7 @@ def test_models_in_latent_coefficients_pass_the_checks(name: str):
     check_model(rod({"a": UNKNOWNS[name]}), u=1.0).raise_if_failed()
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.2, 3.0), st.floats(0.2, 3.0), st.integers(0, 100))
 def test_residuals_nonlinear_in_q_pass_the_checks(k: float, s: float, seed: int):
@@ -181,6 +171,7 @@ def test_positive_unknowns_are_found_and_stay_positive():
     assert found[-1].q_std is not None
 
 
+@pytest.mark.slow
 def test_the_gradient_law_learns_a_positive_field_and_a_nonlinear_unknown():
     model = rod({"a": UNKNOWNS["field"], "c": lp.Scalar(2.0, 1.0)}, A=None)
     assert model.latent.dim == 22
@@ -216,6 +207,7 @@ def rms(found: list[lp.Estimate], a: Any, after: float) -> tuple[float, float]:
     return float(np.sqrt((errors**2).mean())), float(np.sqrt(((errors / values[:, 1]) ** 2).mean()))
 
 
+@pytest.mark.slow
 def test_a_periodic_unknown_is_followed_without_delay():
     def a(t: float) -> float:
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -230,6 +222,7 @@ def test_a_periodic_unknown_is_followed_without_delay():
     assert 3 * error < slower < 0.03
 
 
+@pytest.mark.slow
 def test_a_random_walk_is_followed_with_an_honest_deviation():
     times, rate = np.arange(0.0, 60.0, 0.05), 0.02
     rng = np.random.default_rng(3)
@@ -242,6 +235,7 @@ def test_a_random_walk_is_followed_with_an_honest_deviation():
     assert error < 0.5 * np.sqrt(((walk - 0.4) ** 2).mean())
 
 
+@pytest.mark.slow
 def test_the_gradient_law_rotates_a_periodic_unknown():
     def a(t: float) -> float:
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -260,6 +254,7 @@ def test_the_gradient_law_rotates_a_periodic_unknown():
     assert 3 * errors["periodic"] < errors["constant"]
 
 
+@pytest.mark.slow
 def test_an_unknown_initial_state_is_found_with_the_diffusivity():
     start = lp.Field(
         mesh,

@@ -12,6 +12,8 @@ import livepde as lp
 from livepde.linalg import Array
 from livepde.stepping import Advance, simulate
 
+pytestmark = pytest.mark.slow
+
 TIMES = 0.05 * np.arange(201)
 CELLS, FINE = 30, 60
 SENSORS = np.linspace(0.5, 0.9, 13)

@@ -2,9 +2,12 @@
 
 from dataclasses import replace
 
+import factories
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from factories import laplace, reaction
+from skfem import ElementTriP1
 
 import livepde as lp
 from livepde.errors import LinearAlgebraError
@@ -25,12 +28,11 @@ H = 0.1
 
 def square(cells=50, wind=0.0):
     """Heat conduction with an unknown reaction, and with wind if that is not 0."""
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
-    return lp.Model(
-        lp.Field(mesh, lp.linear(mesh), dirichlet={"left": 0.0}),
-        lp.Field(mesh, lp.linear(mesh), inner="H1"),
-        A=lambda q, u, v, x: q * u * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)) + wind * lp.grad(u)[0] * v,
+    return reaction(
+        factories.square(cells),
+        ElementTriP1(),
+        dirichlet={"left": 0.0},
+        B=lambda u, v, x: laplace(u, v, x) + wind * lp.grad(u)[0] * v,
         f=lambda x, t: 1.0 + t,
     )
 
@@ -75,6 +77,7 @@ def go(model, parameters, tolerance=1e-8, kept_from_start=True):
     return found, forward, kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wind", [0.0, 5.0])
 def test_a_kept_factor_gives_what_one_for_each_parameter_gives(wind):
     model = square(wind=wind)
@@ -201,6 +204,7 @@ ENGINES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
     model, engine, monkeypatch
@@ -246,6 +250,7 @@ def transport(share):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", list(ENGINES))
 @pytest.mark.parametrize(
     ("share", "claimed"),
@@ -286,6 +291,7 @@ def test_units_of_components_do_not_hide_what_is_not_symmetric():
     assert not ForwardStage(two).symmetric
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-157, 1e-158, 1e-159, 1e-160])
 def test_a_state_may_fade_until_its_squares_underflow(model, size):
     kept, directions = Kept.none(), np.ones((model.Q.dim, 1))

@@ -14,6 +14,8 @@ from livepde import paper
 from livepde.reproduce import EXPERIMENTS, exact, reference
 from livepde.reproduce.reference_settings import SETTINGS
 
+pytestmark = pytest.mark.study
+
 CHOSEN = (
     "partial, gain 1, c_1 = 0.1",
     "partial",

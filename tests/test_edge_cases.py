@@ -1,11 +1,11 @@
-"""Defects that a review found once, each by its smallest example."""
+"""Edge cases of models, samples and checkpoints, each by its smallest example."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from problems import diffusion, laplace, line, observe, product, truth
+from factories import diffusion, laplace, line, observe, product, truth
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -131,6 +131,7 @@ def test_a_checkpoint_of_other_options_is_refused_and_changes_nothing(tmp_path):
     assert (many.t, many._state) == before
 
 
+@pytest.mark.slow
 def test_a_checkpoint_from_before_the_start_starts_again(tmp_path):
     one, two = (lp.Identifier(conduction(), lp.Full(), lp.GradientLaw()) for _ in range(2))
     z = np.full(one.observed.size, 0.1)

@@ -15,6 +15,8 @@ import livepde as lp
 from livepde.fem import line, linear
 from livepde.models import EQUATIONS, Option
 
+pytestmark = pytest.mark.slow
+
 REGIONS = {"inner": lambda x: x[0] < 0.5, "outer": lambda x: x[0] >= 0.5}
 Range = tuple[float, float]
 

@@ -13,6 +13,8 @@ from benchmarks import coverage
 from benchmarks.__main__ import app
 from benchmarks.coverage import PROBLEMS, twin
 
+pytestmark = pytest.mark.study
+
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_twin_is_the_same_for_the_same_seed(name: str):

@@ -1,4 +1,4 @@
-"""Defects of moving and transformed unknowns found in review, each with the case that showed it."""
+"""Moving and transformed unknowns: the Kalman filter, replays, checkpoints, the theory."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import driven_rod, line, readings
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
@@ -116,12 +117,19 @@ class Dense:
         return V @ self.x[self.n :], np.sqrt(variance)
 
 
-@pytest.mark.parametrize("substeps", [1, 4])
-@pytest.mark.parametrize("replay", [None, lp.Replay(first=4), lp.Replay(first=4, window=11)])
-@pytest.mark.parametrize("name", EVOLUTIONS)
-def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: Any, substeps: int):
+REPLAYS = {"none": None, "all": lp.Replay(first=4), "window": lp.Replay(first=4, window=11)}
+PAIRS = list(itertools.product(EVOLUTIONS, REPLAYS))
+
+
+# Each evolution with each replay, and each of both with one substep and with several.
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "replay", "substeps"),
+    [(*pair, (1, 4)[k % 2]) for k, pair in enumerate(PAIRS)],
+)
+def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, substeps: int):
     model = linear_model(EVOLUTIONS[name])
-    law = lp.SensitivityLaw(modes=7, rank=30, replay=replay)
+    law = lp.SensitivityLaw(modes=7, rank=30, replay=REPLAYS[replay])
     # Samples at equal distances: dt_max then divides each step alike.
     stream = [(0.1 * k, z) for k, (_, z) in enumerate(samples())]
     identifier = lp.Identifier(model, sensors(), law, dt_max=0.1 / substeps)
@@ -139,6 +147,7 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: Any, subste
         np.testing.assert_allclose(np.sqrt((factor**2).sum(axis=1)), std, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 @pytest.mark.parametrize("replay", [None, lp.Replay(first=3, window=9)])
 def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
@@ -198,29 +207,22 @@ def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
     assert abs(value - 5.0) < std < 0.01
 
 
+@pytest.mark.slow
 def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
     def a(t: float) -> float:
         return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
     def rod(unknown: lp.Scalar) -> lp.Model:
-        fine = lp.interval(0.0, 1.0, 20)
-        left = lambda x, t: np.sin(3.0 * t) + 0.0 * x[0]  # noqa: E731
-        state = lp.Field(fine, ElementLineP1(), dirichlet={"left": left, "right": 0.0})
-        return lp.Model(
-            state, {"a": unknown}, lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v))
-        )
+        return driven_rod({"a": unknown}, lambda t: np.sin(3.0 * t), line(20))
 
-    truth, rng = rod(lp.Scalar(1.0)), np.random.default_rng(0)
     model = rod(lp.Scalar(0.2, 0.2, evolution=lp.Periodic(10.0)))
+    points = lp.Points(SENSORS, noise=0.01)
     law = lp.SensitivityLaw(replay=lp.Replay(first=8))
-    identifier = lp.Identifier(model, lp.Points(SENSORS, noise=0.01), law)
-    forward, u = ForwardStage(truth), truth.initial(0.0)
+    identifier = lp.Identifier(model, points, law)
     errors = []
-    for t0, t1 in itertools.pairwise(np.arange(0.0, 20.0, 0.05).tolist()):
-        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
-        estimate = identifier.step(t1, identifier.observed.G @ u + 0.01 * rng.standard_normal(3))
-        value, std = estimate.parameters["a"]
-        errors.append([value - a(t1), std])
+    for t, z in readings(rod(lp.Scalar(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
+        value, std = identifier.step(t, z).parameters["a"]
+        errors.append([value - a(t), std])
     late = np.array(errors[200:])
     assert np.sqrt((late[:, 0] ** 2).mean()) < 0.002
     assert np.sqrt(((late[:, 0] / late[:, 1]) ** 2).mean()) < 2.0
@@ -324,6 +326,7 @@ def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
     assert other.posterior == pytest.approx(row.posterior, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: Any):
     placed, count = replay_slices.placed, []
@@ -340,6 +343,7 @@ def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: 
     assert 3 <= len(count) <= 15  # three doublings
 
 
+@pytest.mark.slow
 def test_replays_find_the_most_probable_parameter():
     left = lambda x, t: np.sin(3 * t) + 0 * x[0]  # noqa: E731
     state = lp.Field(mesh, ElementLineP1(), dirichlet={"left": left})
@@ -401,6 +405,7 @@ def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
         assert strength == pytest.approx([0.5 * 3.0 * slope * 0.5])
 
 
+@pytest.mark.slow
 def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
     """A logarithm that sensors see directly: the first samples overshot, and widened all."""
     model = lp.Model(

@@ -119,6 +119,7 @@ def livepde(command: Sequence[str], monkeypatch, capsys) -> tuple[int, str, str]
     return code, *capsys.readouterr()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_is_one_sentence_with_its_remedy(mistake, home, monkeypatch, capsys):
     prepare, command = MISTAKES[mistake]
@@ -170,6 +171,7 @@ NOTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mistake", "prepare"), NOTED.items())
 def test_what_is_no_mistake_gets_a_note(mistake, prepare, home, monkeypatch, capsys):
     prepare()

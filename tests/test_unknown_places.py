@@ -13,6 +13,8 @@ import livepde as lp
 from livepde.diagnostics import check_model
 from livepde.stepping import ForwardStage
 
+pytestmark = pytest.mark.slow
+
 NOISE = 0.01
 MESH = lp.interval(0.0, 1.0, 24)
 TIMES = 0.05 * np.arange(161)

@@ -71,6 +71,7 @@ def test_burgers_scales_with_its_advection():
     assert error(model, [nu], scaled, np.linspace(0, 3, 61)) < 2e-5
 
 
+@pytest.mark.slow
 def test_a_soliton_keeps_its_height():
     a, b = 6.0, 1.0
     coarse, fine = orders(
@@ -111,6 +112,7 @@ def unknowns(mesh, *values):
     return *(lp.Scalar(v, v, transform="log") for v in values), start
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=6)
 @given(st.floats(1e-3, 2.0), st.floats(0.1, 6.0), st.floats(0.1, 3.0))
 def test_checks_pass_for_random_parameters(small, one, other):
@@ -176,6 +178,7 @@ def test_the_reader_adds_noise_to_all_and_hides_some(data_dir):
     assert np.nanmax(np.abs(rare - u)) == 0.0
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("noise", "share", "bound"), [(0, 1, 1e-3), (0.1, 1, 0.029), (0.05, 0.2, 0.032)]
 )
@@ -197,6 +200,7 @@ def test_burgers_from_a_published_field(data_dir, noise, share, bound):
 CASES = ("burgers", "burgers_shock", "kdv", "kdv_pde_find", "allen_cahn")
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_cases_are_short_and_fit_their_equations(name):
     path = Path(__file__).parents[1] / "cases" / f"{name}.toml"
@@ -206,6 +210,7 @@ def test_cases_are_short_and_fit_their_equations(name):
         load(path, allow_code=True, settings=job.settings)
 
 
+@pytest.mark.study
 def test_a_shock_from_few_noisy_points(data_dir, monkeypatch):
     """The hardest variant of the case: 10 % noise on 2000 of the 25600 points."""
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1
+from factories import driven_rod, readings
 
 import livepde as lp
 from livepde.cases import load
 from livepde.cases.template import write_template
 from livepde.laws import MemberReports
 from livepde.laws.guess import GUESSED, PATIENCE, first_guess
-from livepde.stepping import ForwardStage
+
+pytestmark = pytest.mark.slow
 
 POINTS = [0.25, 0.5, 0.75]
 NOISE = 0.01
@@ -31,26 +32,15 @@ def rod(
     **unknown: Any,
 ) -> lp.Model:
     """Return a rod in units that are u, x and t times smaller."""
-    mesh = lp.interval(0.0, x, cells)
-    ends = {"left": lambda X, s: u * np.sin(3 * s / t) + 0.0 * X[0], "right": 0.0}
     unit = x**2 / t
-    return lp.Model(
-        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
-        {"a": lp.Scalar(0.2 * unit, std * unit, **unknown)},
-        A=lambda q, w, v, X: q.a * lp.dot(lp.grad(w), lp.grad(v)),
-    )
+    a = {"a": lp.Scalar(0.2 * unit, std * unit, **unknown)}
+    return driven_rod(a, lambda s: u * np.sin(3 * s / t), lp.interval(0.0, x, cells))
 
 
 def samples(
     a: Any, count: int, seed: int = 0, noise: float = NOISE, dt: float = 0.05
 ) -> list[tuple[float, Any]]:
-    model, rng = rod(), np.random.default_rng(seed)
-    observed = lp.Points(POINTS).bind(model.state_space, model.X, model.parameter_space)
-    forward, u, found = ForwardStage(model), model.initial(0.0), []
-    for t0, t1 in pairwise((dt * np.arange(count + 1)).tolist()):
-        u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
-        found.append((t1, observed.G @ u + noise * rng.standard_normal(len(POINTS))))
-    return found
+    return readings(rod(), lp.Points(POINTS), a, dt * np.arange(count + 1), noise, seed)
 
 
 def build(
@@ -91,11 +81,24 @@ def still() -> list[tuple[float, Any]]:
     return samples(stays, 400)
 
 
+@cache
+def bank_moving(noise: float | None = NOISE) -> list[lp.Estimate]:
+    """Return the estimates of the bank for the unknown that moves."""
+    return run(build(noise=noise), moving())
+
+
+@cache
+def bank_still(noise: float | None = NOISE) -> list[lp.Estimate]:
+    """Return the estimates of the bank for the unknown that stays."""
+    return run(build(noise=noise), still())
+
+
 # --- what it finds -------------------------------------------------------------------------------
 
 
+@pytest.mark.study
 def test_an_unknown_that_moves_is_followed_as_with_the_best_drift_in_hindsight():
-    auto = run(build(), moving())
+    auto = bank_moving()
     hand = [
         missed(run(build(lp.SensitivityLaw(drift=drift)), moving()), wandering)
         for drift in (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -106,7 +109,7 @@ def test_an_unknown_that_moves_is_followed_as_with_the_best_drift_in_hindsight()
 
 
 def test_an_unknown_that_stays_is_found_as_by_a_law_that_knows_it():
-    auto = run(build(), still())
+    auto = bank_still()
     known = run(build(lp.SensitivityLaw(replay=lp.Replay())), still())
     (value, std), (expected, deviation) = (e[-1].parameters["a"] for e in (auto, known))
     assert abs(value - expected) <= 0.3 * deviation
@@ -115,7 +118,7 @@ def test_an_unknown_that_stays_is_found_as_by_a_law_that_knows_it():
 
 
 def test_members_that_are_not_needed_sleep():
-    awake = [estimate.notes["awake"] for estimate in run(build(), still())]
+    awake = [estimate.notes["awake"] for estimate in bank_still()]
     assert awake[0] == 6
     assert np.mean(awake[150:]) <= 3.5
     assert min(awake) <= 2
@@ -130,7 +133,7 @@ def test_a_prior_that_is_too_narrow_is_widened():
 
 
 def test_the_stated_noise_is_raised_but_not_lowered():
-    low, told, high = (run(build(noise=n), still())[-1] for n in (0.1 * NOISE, NOISE, 5 * NOISE))
+    low, told, high = (bank_still(n)[-1] for n in (0.1 * NOISE, NOISE, 5 * NOISE))
     assert low.notes["noise_level"] == pytest.approx(10.0, rel=0.1)
     assert high.notes["noise_level"] == pytest.approx(1.0)
     (value, std), (expected, deviation) = low.parameters["a"], told.parameters["a"]
@@ -140,7 +143,7 @@ def test_the_stated_noise_is_raised_but_not_lowered():
 
 
 def test_the_noise_need_not_be_stated():
-    told, silent = (run(build(noise=noise), still()) for noise in (NOISE, None))
+    told, silent = (bank_still(noise) for noise in (NOISE, None))
     (value, std), (expected, deviation) = (e[-1].parameters["a"] for e in (silent, told))
     assert abs(value - expected) <= deviation
     assert std <= 2.0 * deviation
@@ -183,15 +186,17 @@ def test_guesses_of_the_noise():
 # --- what does not matter ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("unit", [{"u": 300.0}, {"x": 0.07}, {"t": 3600.0}])
-@pytest.mark.parametrize("noise", [NOISE, None])
+@pytest.mark.parametrize(
+    ("unit", "noise"),
+    [({"u": 300.0}, NOISE), ({"u": 300.0}, None), ({"x": 0.07}, NOISE), ({"t": 3600.0}, None)],
+)
 def test_units_scale_out(unit: dict[str, float], noise: float | None):
     u, x, t = (unit.get(name, 1.0) for name in "uxt")
     stream = moving()[:150]
     points = [x * at for at in POINTS]
     scaled = build(None, rod(**unit), noise and u * noise, points=points)
     other = run(scaled, [(t * time, u * z) for time, z in stream])
-    for mine, theirs in zip(run(build(noise=noise), stream), other, strict=True):
+    for mine, theirs in zip(bank_moving(noise)[:150], other, strict=True):
         for k in range(2):
             ours, its = mine.parameters["a"][k], theirs.parameters["a"][k] * t / x**2
             assert its == pytest.approx(ours, rel=1e-6)
@@ -200,6 +205,7 @@ def test_units_scale_out(unit: dict[str, float], noise: float | None):
         )
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("a", [stays, wandering])
 def test_the_sampling_rate_hardly_matters(a: Any):
     slow = run(build(), samples(a, 300, dt=0.05))
@@ -213,6 +219,7 @@ def test_the_sampling_rate_hardly_matters(a: Any):
     assert missed([slow[-1], fast[-1]], lambda t: fast[-1].parameters["a"][0]) <= 3 * usual
 
 
+@pytest.mark.study
 def test_the_mesh_hardly_matters():
     coarse, fine = (run(build(model=rod(cells)), moving()) for cells in (32, 64))
     for one, two in zip(coarse[50:], fine[50:], strict=True):
@@ -230,18 +237,21 @@ def test_it_keeps_the_contract_of_a_law(noise: float | None):
 
 
 @pytest.mark.parametrize("noise", [NOISE, None])
-@pytest.mark.parametrize("stop", [5, 45, 190, 260])
-def test_a_resumed_run_gives_the_same_numbers(noise: float | None, stop: int, tmp_path: Any):
-    whole, first, second = (build(noise=noise) for _ in range(3))
-    run(whole, still()[:300])
-    run(first, still()[:stop])
-    first.save(tmp_path / "state.npz")
-    second.load(tmp_path / "state.npz")
-    run(second, still()[stop:300])
-    ours, its = whole.latent_belief(), second.latent_belief()
-    np.testing.assert_array_equal(ours.q, its.q)
-    np.testing.assert_array_equal(ours.u, its.u)
-    np.testing.assert_array_equal(ours.q_factor, its.q_factor)
+def test_a_resumed_run_gives_the_same_numbers(noise: float | None, tmp_path: Any):
+    """Saved before, at and after a replay, as often as the run goes on from there."""
+    stops, first = (5, 45, 190, 260), build(noise=noise)
+    for begin, stop in pairwise((0, *stops)):
+        run(first, still()[begin:stop])
+        first.save(tmp_path / f"{stop}.npz")
+    expected = bank_still(noise)[299]
+    for stop in stops:
+        second = build(noise=noise)
+        second.load(tmp_path / f"{stop}.npz")
+        found = run(second, still()[stop:300])[-1]
+        np.testing.assert_array_equal(found.q, expected.q)
+        np.testing.assert_array_equal(found.u, expected.u)
+        assert found.belief.q_factor is not None
+        np.testing.assert_array_equal(found.belief.q_factor, expected.belief.q_factor)
 
 
 def test_missing_samples_are_no_error():

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1
+from factories import driven_rod, line
 
 import livepde as lp
 from livepde.reproduce import seed_excited
@@ -19,14 +19,9 @@ TIMES = 0.05 * np.arange(401)
 
 
 def rod(a: Any, loss: float = 0.0) -> lp.Model:
-    mesh = lp.interval(0.0, 1.0, 20)
-    ends = {"left": lambda x, t: 5 * np.sin(t) + 0.0 * x[0], "right": 0.0}
-    return lp.Model(
-        lp.Field(mesh, ElementLineP1(), dirichlet=ends),
-        a if isinstance(a, dict) else {"a": a},
-        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
-        B=lambda u, v, x: loss * (u - 2.0) * v,
-    )
+    unknowns = a if isinstance(a, dict) else {"a": a}
+    loses = lambda u, v, x: loss * (u - 2.0) * v  # noqa: E731
+    return driven_rod(unknowns, lambda t: 5 * np.sin(t), line(20), B=loses)
 
 
 def run(model: lp.Model, truth: lp.Model, shift: Any = 0.0, **options: Any) -> Any:
@@ -50,6 +45,7 @@ def as_tuple(item: Any) -> tuple[float, Any]:
     return (item.t, item.z) if isinstance(item, lp.Sample) else (item[0], item[1])
 
 
+@pytest.mark.slow
 def test_the_right_model_raises_no_doubts():
     model = rod(lp.Scalar(0.2, 0.1))
     data = run(model, model)
@@ -62,6 +58,7 @@ def test_a_process_that_is_missing_is_said():
     assert "The model does not explain the data" in found[0]
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_always_off_is_named():
     model = rod(lp.Scalar(0.2, 0.1))
     found = doubts(run(model, model, shift=[0.0, 1.0, 0.0], replay=lp.Replay()))
@@ -77,6 +74,7 @@ def test_an_estimate_at_its_bound_is_said():
     assert any("a ends at its bound 0.25" in sentence for sentence in found)
 
 
+@pytest.mark.slow
 def test_an_unknown_that_nothing_shows_is_said():
     unseen = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
     data = run(rod(unseen), rod(lp.Scalar(0.2)))
@@ -96,6 +94,7 @@ def test_the_gradient_law_has_no_innovations_to_judge():
     assert doubts(identifier.run([]).to_xarray()) == []
 
 
+@pytest.mark.slow
 def test_a_replay_that_did_not_converge_is_said():
     far = rod(lp.Scalar(3.0, 3.0, transform="log"))
     once = lp.Replay(first=300, iterations=1)
@@ -103,6 +102,7 @@ def test_a_replay_that_did_not_converge_is_said():
     assert any("The last replay has not converged" in sentence for sentence in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "said"), [(5, False), (50, True)])
 def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
     model = rod(lp.Scalar(0.5, 0.3))
@@ -134,6 +134,7 @@ def reaction(cells: int) -> lp.Model:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [60, 180])
 def test_an_equation_error_that_is_no_noise_does_not_drive_a_field_out_of_its_prior(cells: int):
     """Data of 180 cells: 60 leave an error of the mesh, and q does not take it up."""
@@ -161,6 +162,7 @@ def test_an_equation_error_that_is_no_noise_does_not_drive_a_field_out_of_its_pr
     assert not doubts(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("last", "said"), [(0.9, False), (1.1, True)])
 def test_only_the_end_counts_for_what_has_left_its_prior(last: float, said: bool):
     model = rod(lp.Scalar(0.5, 0.3))

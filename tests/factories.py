@@ -1,9 +1,10 @@
-"""Meshes, elements and models that several tests use."""
+"""Meshes, models and measurements that several test files use."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,16 @@ from skfem import (
 )
 
 import livepde as lp
+from livepde.stepping import ForwardStage
 
 
 def line(cells: int = 12) -> Any:
     return lp.interval(0.0, 1.0, cells)
+
+
+def square(cells: int) -> MeshTri:
+    """Return the unit square of twice `cells` squared triangles, its sides named."""
+    return lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,22 @@ def diffusion(q: Any, u: Any, v: Any, x: Any) -> Any:
 
 def laplace(u: Any, v: Any, x: Any) -> Any:
     return lp.dot(lp.grad(u), lp.grad(v))
+
+
+def conduction(q: Any, u: Any, v: Any, x: Any) -> Any:
+    return q.a * lp.dot(lp.grad(u), lp.grad(v))
+
+
+def driven_rod(
+    unknowns: Any, left: Callable[[float], float], mesh: Any, A: Any = conduction, **options: Any
+) -> lp.Model:
+    """Return a rod whose left end is driven in time and whose right end is zero, P1.
+
+    Without `A`, the conductivity is the unknown `a`: u_t - (a u_x)_x = 0.
+    """
+    ends = {"left": lambda x, t: left(t) + 0.0 * x[0], "right": 0.0}
+    state = lp.Field(mesh, ElementLineP1(), dirichlet=ends)
+    return lp.Model(state, unknowns, A, **options)
 
 
 def reaction(
@@ -137,37 +160,18 @@ def rates(errors: Any) -> np.ndarray:
     return np.log2(errors[:-1] / errors[1:])
 
 
-class Slope:
-    """The factor of a single number."""
-
-    def __init__(self, slope):
-        self.slope = slope
-
-    def solve(self, b):
-        return b / self.slope
-
-
-class Cubic:
-    """x^3 = x for x = y - 5, as an equation of `Newton`: roots at 4, 5 and 6."""
-
-    def __init__(self):
-        self.factors = 0
-
-    def evaluate(self, y):
-        x = y - 5.0
-        return Point(y, x**3 - x, 6.0)
-
-    def factor(self, at, last=None):
-        self.factors += 1
-        return Slope(3.0 * (at.y[0] - 5.0) ** 2 - 1.0)
-
-    def limited(self, at, allowed):
-        return at.size <= 1e-16
-
-
-class Point:
-    """A point of an equation, with the size of its residual relative to a scale."""
-
-    def __init__(self, y, residual, scale=1.0, resolved=True):
-        self.y, self.residual, self.resolved = y, residual, resolved
-        self.size = float(np.max(np.abs(residual) / scale))
+def readings(
+    model: lp.Model,
+    sensors: lp.Observation,
+    q: Callable[[float], float],
+    times: Iterable[float],
+    noise: float,
+    seed: int = 0,
+) -> list[tuple[float, np.ndarray]]:
+    """Return noisy samples of a process that starts at zero, with one unknown q(t)."""
+    rng, observed = np.random.default_rng(seed), observe(model, sensors)
+    forward, u, found = ForwardStage(model), model.initial(0.0), []
+    for t0, t1 in pairwise(float(t) for t in times):
+        u = forward.solve(u, np.array([q(t1)]), t1 - t0, lp.Moment(t1))
+        found.append((t1, observed.G @ u + noise * rng.standard_normal(observed.size)))
+    return found

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from problems import excited, excited_q, excited_u, laplace, reaction
+from factories import excited, excited_q, excited_u, laplace, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -37,6 +37,7 @@ def identifier(model: lp.Model, observation: lp.Observation, law: Any) -> lp.Ide
     return lp.Identifier(model, observation, law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "observation"),
     [
@@ -130,6 +131,7 @@ def test_no_sensor_of_the_parameter(kind: Any) -> None:
         lp.Identifier(model, sensors, kind())
 
 
+@pytest.mark.study
 def test_reproduction() -> None:
     from livepde.reproduce import EXPERIMENTS
 

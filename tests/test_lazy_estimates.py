@@ -42,6 +42,7 @@ UNKNOWNS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unknown", UNKNOWNS)
 @pytest.mark.parametrize(
     "law",
@@ -105,6 +106,7 @@ def test_an_estimate_is_copied_with_its_belief():
         estimate.velocity  # noqa: B018
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unknown", UNKNOWNS)
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.AutoLaw(), lp.GradientLaw()])
 def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
@@ -122,6 +124,7 @@ def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
         np.testing.assert_array_equal(readout(estimate.belief), wanted)
 
 
+@pytest.mark.slow
 def test_a_result_keeps_little_more_than_its_numbers():
     identifier = rod(withheld=lp.Points({"T_0": 0.4}))
     count = 3000

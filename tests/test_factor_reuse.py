@@ -12,6 +12,8 @@ from benchmarks.step import problem
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.linalg import SuperLUSolver
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def plate():

@@ -6,6 +6,8 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from factories import laplace, reaction, square
+from skfem import ElementTriP1
 
 import livepde as lp
 from benchmarks import scale
@@ -24,13 +26,12 @@ def inside(x):
     return (x[0] < 0.6) | (x[1] < 0.6)
 
 
-def plane(cells=16, *, A=lambda q, u, v, x: q * u * v, inner="H1", diffusion=1.0, **options):
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
-    return lp.Model(
-        state=lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 2.0}),
-        parameter=lp.Field(mesh, lp.linear(mesh), inner=inner),
-        A=A,
-        B=lambda u, v, x: diffusion * lp.dot(lp.grad(u), lp.grad(v)),
+def plane(cells=16, *, diffusion=1.0, **options):
+    return reaction(
+        square(cells),
+        ElementTriP1(),
+        dirichlet={"boundary": 2.0},
+        B=lambda u, v, x: diffusion * laplace(u, v, x),
         f=lambda x, t: 10 * (1 + x[0]) * (1 + 0.3 * np.sin(3 * t)),
         **options,
     )
@@ -86,6 +87,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_blocks_do_not_change_the_result(name, monkeypatch):
     form, sensors, options = CASES[name]
@@ -98,6 +100,7 @@ def test_blocks_do_not_change_the_result(name, monkeypatch):
     np.testing.assert_allclose(blocks, direct, rtol=0, atol=1e-8 * abs(direct).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1e3, "auto"])
 @pytest.mark.parametrize("sensors", [lp.Full(), lp.Subdomain(inside)], ids=["full", "part"])
 def test_blocks_serve_a_step_in_which_nothing_is_measured(sensors, gain, monkeypatch):
@@ -115,6 +118,7 @@ def test_a_law_that_tunes_itself_trusts_no_rate_of_another_metric(monkeypatch):
     np.testing.assert_allclose(blocks, direct, rtol=0, atol=1e-9 * abs(direct).max())
 
 
+@pytest.mark.slow
 def test_a_law_that_tunes_itself_learns_little_from_what_blocks_leave(monkeypatch):
     model, law = plane(), lp.GradientLaw("auto")
     q = model.initial_parameter(lambda x: 1 + np.sin(np.pi * x[0]) ** 2 * x[1])
@@ -125,6 +129,7 @@ def test_a_law_that_tunes_itself_learns_little_from_what_blocks_leave(monkeypatc
     assert errors[1] < 1.03 * errors[0]
 
 
+@pytest.mark.slow
 def test_blocks_serve_the_second_order_scheme_and_averages(monkeypatch):
     model = plane()
     sensors = lp.Averages({f"z{k}": lambda x, k=k: abs(x[0] - 0.2 * k) < 0.1 for k in range(1, 5)})
@@ -152,6 +157,7 @@ def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
     return stage.solver, data, c
 
 
+@pytest.mark.slow
 def test_iterations_with_new_factors(monkeypatch):
     """To 1e-8, on two meshes: they hardly depend on the mesh."""
     monkeypatch.setattr(blocks, "LARGE", 1)
@@ -172,6 +178,7 @@ FORMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("sensors", [lp.Full(), lp.Subdomain(inside)], ids=["full", "part"])
 @pytest.mark.parametrize("c1", [0.0, 1.0])
@@ -240,6 +247,7 @@ def stream(monkeypatch):
     return model, sensors, samples, fresh
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [10.0, "auto"])
 def test_a_run_resumed_gives_the_same_numbers(gain, stream, tmp_path):
     model, sensors, samples, fresh = stream
@@ -268,6 +276,7 @@ def test_a_jump_of_the_process_renews_the_factors(stream):
     assert all(estimate.status.ok for estimate in estimates)
 
 
+@pytest.mark.slow
 def test_nothing_of_the_size_of_the_square_is_made(monkeypatch):
     """64 times the unknowns may take at most 100 times the memory of a step."""
     monkeypatch.setattr(blocks, "LARGE", 1)
@@ -288,6 +297,7 @@ def test_nothing_of_the_size_of_the_square_is_made(monkeypatch):
     assert peak(64) < 100 * peak(8)
 
 
+@pytest.mark.slow
 def test_a_system_that_does_not_converge_is_a_status(monkeypatch):
     solver, data, c = first_stage(plane(), 1e6, monkeypatch)
     at = solver.evaluate(data, 1.1 * c)
