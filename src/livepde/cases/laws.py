@@ -46,7 +46,7 @@ def _gradient(spec: GradientSpec) -> GradientLaw:
 
 def _auto(frame: Frame, spec: AutoSpec) -> AutoLaw:
     noise = None if spec.noise is None else _level(frame, spec.noise)
-    return AutoLaw(spec.modes, noise, gate=spec.gate or np.inf)
+    return AutoLaw(spec.modes, noise, gate=spec.gate)
 
 
 def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
@@ -55,7 +55,7 @@ def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
         memory = frame.positive(spec.memory, time, "law.memory")
     drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
     more: dict[str, Any] = {
-        "gate": spec.gate or np.inf,
+        "gate": spec.gate,
         "jumps": _chosen(Jumps, spec.jumps),
         "guards": _chosen(Guards, spec.guards),
     }

@@ -27,7 +27,7 @@ from livepde.cases.values import (
     Quantity,
     TimeFormat,
 )
-from livepde.laws import Guards, Jumps, Replay
+from livepde.laws import Guards, Jumps, Replay, SensitivityLaw
 from livepde.streams.csvfile import UTF_8
 
 __all__ = [
@@ -319,7 +319,7 @@ class SensitivitySpec(Spec):
     drift: Quantity = 0.0
     memory: Quantity | None = None
     replay: StrictBool | ReplaySpec = False
-    gate: PositiveFloat | None = None
+    gate: PositiveFloat = SensitivityLaw.gate
     jumps: StrictBool | JumpsSpec = False
     guards: StrictBool | GuardsSpec = True
 
@@ -330,7 +330,7 @@ class AutoSpec(Spec):
     kind: Literal["auto"]
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
-    gate: PositiveFloat | None = None
+    gate: PositiveFloat = SensitivityLaw.gate
 
 
 class TikhonovSpec(Spec):

@@ -112,7 +112,7 @@ class UpdateOptions:
         likelihood is kept then, too.
     """
 
-    gate: float = np.inf
+    gate: float = math.inf
     patience: int = 10
     adaptive: bool = False
 
@@ -154,18 +154,20 @@ def _absorbed(
     Y, d = Y / noise[:, None], d / noise
     largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
     e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
-    refused, count = x.refused, np.zeros(len(x))
-    if options.gate < math.inf:
-        far = used & ~(np.abs(e) <= options.gate)
+    refused, count, newest = x.refused, np.zeros(len(x)), None
+    far = _far(x, e, used, options.gate)
+    if far is not None:
         refused = np.where(far, refused + 1, np.where(used, 0, refused))
         kept = used & ~(far & (refused <= options.patience))
         count = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
+        # One value alone is no change of the process; a second one in a row may be.
+        newest = np.where(kept | (refused > 1), e, np.nan)
         used, whole = kept, bool(kept.all())
         e = np.where(used, e, np.nan)
     if not whole:  # zeros tell nothing: what is missing takes part as such
         Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
     new, made = filter_.update(x, Y, d)
-    parts = {"innovations": x.innovations.add(e, measured), "refused": refused}
+    parts = {"innovations": x.innovations.add(e, measured, newest), "refused": refused}
     if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
     # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
@@ -173,6 +175,19 @@ def _absorbed(
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
     finite = np.isfinite(sums + largest * largest)
     return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
+
+
+def _far(x: FilterState, e: Array, used: Mask, gate: float) -> Mask | None:
+    """Return which normalised innovations lie beyond the gate; None if none does or has just done.
+
+    It is as much wider as the innovations are usually larger than expected, so that a noise that is
+    stated too small does not close it.
+    """
+    if gate == math.inf:
+        return None
+    limit = gate * np.sqrt(np.maximum(x.innovations.ratio, 1.0))
+    far = used & ~(np.abs(e) <= limit[:, None])
+    return far if far.any() or x.refused.any() else None
 
 
 def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -> dict[str, Array]:

@@ -100,7 +100,7 @@ class AutoLaw(Law[Bank, AutoState]):
     modes: int | str | dict[str, int] = "auto"
     noise: float | None = None
     replay: Replay = field(default_factory=Replay)
-    gate: float = np.inf
+    gate: float = SensitivityLaw.gate
     gate_patience: int = 10
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme

@@ -41,7 +41,8 @@ class Innovations:
         the exponential average of e over `SLOW` samples (`slow`); the variance of that for white
         noise of size 1 (`slow_variance`).
     newest
-        e of the last sample, shape (members, sensors), NaN where missing.
+        e of the last sample, shape (members, sensors), NaN where missing; also of values that a
+        gate has refused twice in a row.
     """
 
     sums: Array
@@ -54,12 +55,16 @@ class Innovations:
         never = np.full((members, sensors), np.nan)
         return cls(np.zeros((members, len(FADES))), np.zeros((members, 4, sensors)), never)
 
-    def add(self, e: Array, measured: Mask | None = None) -> Innovations:
+    def add(
+        self, e: Array, measured: Mask | None = None, newest: Array | None = None
+    ) -> Innovations:
         """Return the value after innovations of shape (members, sensors), NaN where missing.
 
         Members that were not `measured`, shape (members,), stay as they are; default all were.
+        `newest` are those with some that were not used; default e.
         """
-        seen, before, newest = np.isfinite(e), self.sensors, e
+        seen, before = np.isfinite(e), self.sensors
+        newest = e if newest is None else newest
         if seen.all():
             counted = sensors = DECAY * before + (SHARE * e[:, None] + GAINED)
         else:
@@ -70,7 +75,7 @@ class Innovations:
         sums = FADES * self.sums + products.reshape(len(e), -1)[:, TERMS]
         if measured is not None and not measured.all():
             sums = np.where(measured[:, None], sums, self.sums)
-            newest = np.where(measured[:, None], e, self.newest)
+            newest = np.where(measured[:, None], newest, self.newest)
         return Innovations(sums, sensors, newest)
 
     @property

@@ -53,6 +53,7 @@ from livepde.stepping import (
 
 __all__ = ["SensitivityLaw", "without_factors"]
 
+GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
 GUESS = 2.0  # samples that the first guess of the noise counts for
 
@@ -100,7 +101,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Columns of the factor while unknowns move; default the number of coordinates and five times
         that of those that move.
     gate
-        Innovations of more than this many expected deviations are not used; default all are.
+        Innovations of more than this many expected standard deviations, times the usual size of
+        normalised innovations where that exceeds 1, are not used; infinity: all are.
     gate_patience
         After so many refusals in a row a sensor is believed again: something has really changed.
     jumps
@@ -119,7 +121,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     memory: float = np.inf
     replay: Replay | None = None
     rank: int | None = None
-    gate: float = np.inf
+    gate: float = GATE
     gate_patience: int = 10
     jumps: Jumps | None = None
     start_window: int = 64

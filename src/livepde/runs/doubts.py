@@ -29,6 +29,7 @@ WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 TELLING = "longer data, with larger changes nearer to the sensors, would tell more."
 LEAVES = 1.0  # squared distance from the prior over what model and prior allow
+REFUSED = 0.02  # share of the readings that a gate refuses
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 
 
@@ -37,18 +38,20 @@ def doubts(data: xr.Dataset) -> list[str]:
 
     The model does not explain the data if at the end the mean square of the innovations, over the
     last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
-    bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The last replay
-    ended more than one deviation away from where it has to end. Guards had to give up samples or to
-    restart, or to hold unknowns that nothing excited. With gain='auto' the unknowns ended farther
-    from their prior than, with a right model, they do in one of a million cases. With a fixed gain
-    an estimate wanders, in the last half of a run, by more than 0.3 of what it has learned. In more
-    than 0.03 of the samples a bank believes that unknowns drift. Something jumped.
+    bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The gate has
+    refused more than 2 % of the readings. The last replay ended more than one deviation away from
+    where it has to end. Guards had to give up samples or to restart, or to hold unknowns that
+    nothing excited. With gain='auto' the unknowns ended farther from their prior than, with a right
+    model, they do in one of a million cases. With a fixed gain an estimate wanders, in the last
+    half of a run, by more than 0.3 of what it has learned. In more than 0.03 of the samples a bank
+    believes that unknowns drift. Something jumped.
     """
     if not data.sizes["time"]:
         return []
     return [
         *_model_error(data),
         *_replays(data),
+        *_refused(data),
         *_unknowns(data),
         *([*_rests(data), *_lost(data)] if "residual" in data else _guards(data)),
         *_drifts(data),
@@ -111,6 +114,20 @@ def _replays(data: xr.Dataset) -> list[str]:
         f"The last replay has not converged: estimate and reference are {left[-1]:.1f} deviations "
         "apart, so that the deviations do not hold. Give law.replay more iterations, let it begin "
         "later (first), or start from a better prior."
+    ]
+
+
+def _refused(data: xr.Dataset) -> list[str]:
+    if "refused" not in data:
+        return []
+    refused = float(np.nansum(data["refused"].values))
+    share = refused / max(int(np.isfinite(data["innovation"].values).sum()), 1)
+    if share <= REFUSED:
+        return []
+    return [
+        f"{share:.1%} of the readings were not used ({refused:.0f}): they lie more than law.gate "
+        "standard deviations from what was expected. Look at these sensors, state a larger noise, "
+        "or open the gate."
     ]
 
 

@@ -1,0 +1,82 @@
+"""The gate of the sensitivity law: on by default, harmless where nothing is wrong."""
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.models import heat
+from livepde.runs.doubts import doubts
+
+NOISE = 0.05
+LAWS = {"sensitivity": lp.SensitivityLaw, "auto": lp.AutoLaw}
+
+
+def rod(law):
+    model = heat(lp.interval(0.0, 1.0, 12), lp.Scalar(0.05, 0.03))
+    start = lambda x: 10.0 * np.sin(np.pi * x[0])  # noqa: E731
+    return lp.Identifier(model, lp.Points([0.3, 0.7], noise=NOISE), law, u0=start)
+
+
+def readings(count=200, seed=0, noise=NOISE):
+    """The first mode of a rod whose ends are insulated decays: with its mean it is a cosine."""
+    rng, at, alpha = np.random.default_rng(seed), np.array([0.3, 0.7]), 0.06
+    k = 2 * np.arange(1, 40)
+    weights = -40.0 / np.pi / (k**2 - 1)
+    for t in 0.01 * np.arange(1, count + 1):
+        modes = weights * np.exp(-alpha * (k * np.pi) ** 2 * t)
+        z = 20.0 / np.pi + (modes[:, None] * np.cos(np.pi * np.outer(k, at))).sum(axis=0)
+        yield t, z + noise * rng.standard_normal(2)
+
+
+def spoiled(samples, at, value):
+    return [
+        (t, np.array([value, z[1]])) if k in at else (t, z) for k, (t, z) in enumerate(samples)
+    ]
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("at", [3, 20, 150])
+def test_one_bad_value_changes_next_to_nothing(law, at):
+    clean = rod(LAWS[law]()).run(readings()).last
+    spiked = rod(LAWS[law]()).run(spoiled(readings(), {at}, 9999.0)).last
+    (value, std), (expected, wanted) = (e.parameters["alpha"] for e in (spiked, clean))
+    assert abs(value - expected) < 0.5 * wanted
+    assert std < 1.5 * wanted
+
+
+def test_without_the_gate_one_bad_value_spoils_all():
+    law = lp.SensitivityLaw(gate=np.inf, guards=None, start_window=0)
+    value, _ = rod(law).run(spoiled(readings(), {150}, 9999.0)).last.parameters["alpha"]
+    assert abs(value - 0.06) > 1.0
+
+
+def test_nothing_is_refused_where_nothing_is_wrong():
+    for seed in range(4):
+        data = rod(lp.SensitivityLaw()).run(readings(seed=seed)).to_xarray()
+        assert float(data["refused"].sum()) == 0.0
+
+
+def test_a_noise_that_is_stated_too_small_does_not_close_the_gate():
+    result = rod(lp.SensitivityLaw()).run(readings(400, noise=20 * NOISE))
+    refused = result.to_xarray()["refused"].values
+    assert refused[100:].sum() <= 0.02 * 600
+    value, std = result.last.parameters["alpha"]
+    assert abs(value - 0.06) < 3 * std < 0.06
+
+
+def test_what_lasts_is_believed():
+    identifier = rod(lp.SensitivityLaw(gate_patience=5))
+    found = [identifier.step(t, z) for t, z in spoiled(readings(), set(range(100, 120)), 40.0)]
+    refused = [estimate.notes["refused"] for estimate in found]
+    assert refused[100:105] == [1.0] * 5
+    assert refused[105] == 0.0
+
+
+def test_many_refusals_are_said():
+    bad = set(range(10, 200, 15))
+    data = rod(lp.SensitivityLaw()).run(spoiled(readings(), bad, 500.0)).to_xarray()
+    assert float(data["refused"].sum()) == len(bad)
+    (said,) = (text for text in doubts(data) if "were not used" in text)
+    assert said.startswith("3.2% of the readings")
+    quiet = rod(lp.SensitivityLaw()).run(spoiled(readings(), {50}, 500.0)).to_xarray()
+    assert not any("were not used" in text for text in doubts(quiet))
