@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 import livepde as lp
 from livepde.observation import Discrepancy, Tikhonov
@@ -43,7 +44,7 @@ def try_out(twin: Twin, law: lp.GradientLaw, gains: tuple[float, ...]) -> Tried:
         if not estimate.status.ok:
             return Tried(gains, np.inf, np.nan)
         squares.append(X.norm(R @ (estimate.u - twin.u(sample.t))) ** 2)
-    return Tried(gains, float(np.trapezoid(squares, twin.times)), twin.error(estimate.q))
+    return Tried(gains, float(trapezoid(squares, twin.times)), twin.error(estimate.q))
 
 
 def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = STEPS) -> list[Tried]:
