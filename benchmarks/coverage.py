@@ -30,7 +30,7 @@ from livepde.progress import watched
 from livepde.result import Estimate
 from livepde.runs import unexplained
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.stepping import Advance, ForwardStage, ImplicitEuler, Interval, advance
+from livepde.stepping import Advance, Alexander2, ForwardStage, Interval, advance
 
 __all__ = ["PROBLEMS", "Problem", "Twin", "coverage", "twin"]
 
@@ -288,7 +288,7 @@ def _path(model: Model, times: Array, rng: np.random.Generator) -> Array:
 
 def _states(model: Model, path: Array, times: Array) -> Iterator[Array]:
     """Yield the states of the truth, whose parameter may change from sample to sample."""
-    forward, control = ForwardStage(model), Advance(ImplicitEuler())
+    forward, control = ForwardStage(model), Advance(Alexander2())
     nothing, none = Inputs({}), np.zeros(0)
     u = model.initial(0.0, Moment(times[0], nothing))
     yield u
