@@ -295,6 +295,9 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
         results[1].add(runs[1].step(sample.t, sample.z, sample.inputs))
         if count == WARM_UP:
             seconds = frozen.seconds = 0.0
+    for run, result in zip(runs, results, strict=True):
+        if result.last is not None:
+            result.settle(run.settled(result.last))
     datasets = [result.to_xarray() for result in results]
     ratio = seconds / frozen.seconds if frozen.seconds else math.nan
     return datasets[0], datasets[1], ratio

@@ -28,7 +28,7 @@ class Replay:
     A replay takes `slice` stored samples again for each new one, so that no step takes much longer
     than others. Until it has caught up, estimates are linear about the reference of before. Where
     it ends does not depend on the slices: its references come from the samples that were there
-    when it began.
+    when it began. A run ends with what the replay under way finds (`Identifier.settled`).
 
     Parameters
     ----------
