@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.errors import ModelError
+from livepde.errors import ModelError, NameClashError
 from livepde.fem import (
     START,
     Channel,
@@ -26,6 +26,7 @@ from livepde.fem import (
     On,
     Sobolev,
     Unknown,
+    cells,
     compose,
     dot,
     grad,
@@ -33,6 +34,7 @@ from livepde.fem import (
 )
 from livepde.linalg import Array, IntArray
 from livepde.operators import DualOperator
+from livepde.records import Layout, name_clashes
 from livepde.spaces import BorderedSpace, HilbertSpace, product
 
 __all__ = ["Model", "Source", "h1_form", "mass_form"]
@@ -200,12 +202,26 @@ class Model:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
         if both and not self.state_space.single:
             raise ModelError(f"state and unknowns are both called {sorted(both)}: rename one.")
+        self._check_names()
         for name, block in self.parameter_space.fields.items():
             if any(value != 0.0 for value in block.field.dirichlet.values()):
                 raise ModelError(
                     f"parameter '{name}': only zero boundary values are possible; write a known "
                     "boundary part of q into B."
                 )
+
+    def _check_names(self) -> None:
+        """Refuse names that a run's dataset could not tell apart."""
+        state, parameter = self.state_space, self.parameter_space
+        axes = "xyz"[: self.mesh.dim()]
+        clashes = name_clashes(
+            Layout.own_names(axes, cells(self.mesh)),
+            [key for name, block in state.fields.items() for key in block.variables(name)],
+            parameter.labels,
+            parameter.fields,
+        )
+        if clashes:
+            raise NameClashError(f"Model: {clashes[0]}")
 
     @cached_property
     def order(self) -> int:

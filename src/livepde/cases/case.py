@@ -36,10 +36,13 @@ from livepde.records import Layout
 from livepde.result import layout_of
 from livepde.runs import Journal
 from livepde.runs.outcome import Bound, Sense
+from livepde.runs.summary import ROLES, TOTALS
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, Table
 
 __all__ = ["Case", "Prepared", "load"]
+
+SOURCE = "source"  # of the references, beside them
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +201,19 @@ class Case:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
         _ = self.scheme, self.dt_max, self.references
+        self._check_names()
+
+    def _check_names(self) -> None:
+        """Refuse names of unknowns and channels that are those of other numbers of a run."""
+        kinds = (
+            ("unknowns", "unknown", self.model.parameter_space.labels, (*TOTALS, SOURCE)),
+            ("channels", "channel", self.frame.roles("sensor", "withheld"), ROLES),
+        )
+        for key, kind, given, taken in kinds:
+            for name in given:
+                if name in taken:
+                    text = f"'{name}' is another number in [expect] or [reference]; give the "
+                    raise self.frame.error(f"{key}.{name}", f"{text}{kind} another name.")
 
     @property
     def name(self) -> str:
@@ -215,7 +231,7 @@ class Case:
         frame, space = self.frame, self.model.parameter_space
         found = {}
         for label, value in frame.spec.reference.items():
-            if label == "source" and label not in space.labels:
+            if label == SOURCE:
                 continue
             if label not in space.labels:
                 text = f"there is no unknown number '{label}'; "
@@ -227,8 +243,8 @@ class Case:
     @property
     def source(self) -> str:
         """Where the references come from."""
-        given = self.frame.spec.reference.get("source", "")
-        return given if isinstance(given, str) and "source" not in self.references else ""
+        given = self.frame.spec.reference.get(SOURCE, "")
+        return given if isinstance(given, str) else ""
 
     @property
     def variants(self) -> tuple[VariantSpec, ...]:
@@ -327,11 +343,8 @@ class Case:
             *labels,
             *(f"{label}.std" for label in labels),
             *(f"{label}.{of}" for label in self.references for of in ("error", "deviations")),
-            "rmse",
-            *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
-            "innovation_ratio",
-            "jumps",
-            "failed_steps",
+            *TOTALS,
+            *(f"rmse.{name}" for name in (*ROLES, *scored)),
         ]
         return [
             f"expect.{name}: a run of this case has no such number; {did_you_mean(name, known)}"

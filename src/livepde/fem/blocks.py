@@ -250,6 +250,11 @@ class FieldBlock(Block):
         """True if the function has values in R^d."""
         return np.ndim(self._one) > 2
 
+    def variables(self, name: str) -> list[str]:
+        """Return names of its components: itself, or one for each direction of a vector."""
+        axes = "xyz"[: self.field.mesh.dim()]
+        return [f"{name}_{axis}" for axis in axes] if self.vector else [name]
+
     @property
     def bends(self) -> bool:
         """True if the element has second derivatives."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.diagnostics.identifiability import FLAT
-from livepde.plots.dataset import scalars
+from livepde.plots.dataset import note, scalars
 from livepde.runs.dates import when
 from livepde.runs.summary import digits, jumps, scored
 
@@ -50,7 +50,7 @@ def doubts(data: xr.Dataset) -> list[str]:
         *_model_error(data),
         *_replays(data),
         *_unknowns(data),
-        *([*_rests(data), *_lost(data)] if "residual" in data else _guards(data)),
+        *([*_rests(data), *_lost(data)] if note(data, "residual") is not None else _guards(data)),
         *_drifts(data),
         *_departure(data),
         *_gain(data),
@@ -60,15 +60,15 @@ def doubts(data: xr.Dataset) -> list[str]:
 
 def unexplained(data: xr.Dataset) -> bool:
     """Return whether a run says that its model does not explain the data: see `doubts`."""
-    if "innovation_ratio" not in data or not data.sizes["time"]:
-        return False
-    return bool(data["innovation_ratio"].values[-1] > MODEL_ERROR)
+    ratio = note(data, "innovation_ratio")
+    return ratio is not None and len(ratio) > 0 and bool(ratio[-1] > MODEL_ERROR)
 
 
 def _model_error(data: xr.Dataset) -> list[str]:
-    if not unexplained(data):
+    ratios = note(data, "innovation_ratio")
+    if ratios is None or not unexplained(data):
         return []
-    ratio = float(data["innovation_ratio"].values[-1])
+    ratio = float(ratios[-1])
     found = [
         "The model does not explain the data: the sensors miss what is expected of them by "
         f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
@@ -101,9 +101,9 @@ def _model_error(data: xr.Dataset) -> list[str]:
 
 
 def _replays(data: xr.Dataset) -> list[str]:
-    if "replay_left" not in data:
+    left = note(data, "replay_left")
+    if left is None:
         return []
-    left = data["replay_left"].values
     left = left[np.isfinite(left)]
     if not len(left) or left[-1] <= LEFT:
         return []
@@ -162,8 +162,8 @@ def _jumps(data: xr.Dataset) -> list[str]:
 
 def _guards(data: xr.Dataset) -> list[str]:
     def times(name: str) -> Any:
-        noted = data[name].values == 1.0 if name in data else np.zeros(data.sizes["time"], bool)
-        return data["time"].values[noted]
+        values = note(data, name)
+        return data["time"].values[[] if values is None else values == 1.0]
 
     tempered, held = times("tempered"), times("held")
     restarted, runaway = times("restarted"), times("runaway")
@@ -192,9 +192,10 @@ def _guards(data: xr.Dataset) -> list[str]:
 
 def _rests(data: xr.Dataset) -> list[str]:
     """Return when the gradient law has held q."""
-    if "at_rest" not in data:
+    noted = note(data, "at_rest")
+    if noted is None:
         return []
-    held = data["at_rest"].values == 1.0
+    held = noted == 1.0
     begin = np.flatnonzero(held & ~np.append(False, held[:-1]))
     if held[-1]:
         at = when(data, float(data["time"][begin[-1]]))
@@ -210,9 +211,10 @@ def _rests(data: xr.Dataset) -> list[str]:
 
 def _lost(data: xr.Dataset) -> list[str]:
     """Return where a gradient law could not learn from a sample, because no step converged."""
-    if "held" not in data:
+    noted = note(data, "held")
+    if noted is None:
         return []
-    held = data["held"].values == 1.0
+    held = noted == 1.0
     last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
     return [
         f"In {held.sum()} samples, last at {last}, no step converged with the unknowns: they were "
@@ -222,9 +224,10 @@ def _lost(data: xr.Dataset) -> list[str]:
 
 def _drifts(data: xr.Dataset) -> list[str]:
     """Return whether a bank has believed for long that unknowns drift: nobody has said so."""
-    if "drifting" not in data:
+    weights = note(data, "drifting")
+    if weights is None:
         return []
-    drifting = data["drifting"].values > BELIEVED
+    drifting = weights > BELIEVED
     if not drifting.mean() > DRIFTING:
         return []
     last = when(data, float(data["time"][np.flatnonzero(drifting)[-1]]))
@@ -238,9 +241,9 @@ def _drifts(data: xr.Dataset) -> list[str]:
 
 def _departure(data: xr.Dataset) -> list[str]:
     """Return whether a law that has a prior, and no innovations to judge, has left it."""
-    if "departure" not in data:
+    ratios = note(data, "departure")
+    if ratios is None:
         return []
-    ratios = data["departure"].values
     ratios = ratios[np.isfinite(ratios)]
     if not len(ratios) or ratios[-1] <= LEAVES:
         return []
@@ -255,7 +258,7 @@ def _departure(data: xr.Dataset) -> list[str]:
 
 def _gain(data: xr.Dataset) -> list[str]:
     """Return what there is to say of a law with a fixed gain, which has no covariance."""
-    if "residual" not in data or "gain" in data:
+    if note(data, "residual") is None or note(data, "gain") is not None:
         return []
     names = [*scalars(data), *str(data.attrs.get("fields", "")).split()]
     wandering = [name for name in names if name in data and _wanders(data[name].values)]
