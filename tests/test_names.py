@@ -193,7 +193,6 @@ def case(folder: Path, name: str = "k", sensor: str = "T") -> cases.Case:
         ({"name": "status"}, "unknowns: Model: in tables and datasets of a run 'status' would be"),
         ({"name": "u"}, "unknowns: Model: in tables and datasets of a run 'u' would be the state"),
         ({"name": "jumps"}, r"unknowns.jumps: 'jumps' is another number in \[expect\]"),
-        ({"name": "source"}, "unknowns.source: 'source' is another number"),
         ({"sensor": "withheld"}, "channels.withheld: 'withheld' is another number"),
     ],
 )

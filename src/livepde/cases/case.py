@@ -42,8 +42,6 @@ from livepde.streams import Clock, Column, Table
 
 __all__ = ["Case", "Prepared", "load"]
 
-SOURCE = "source"  # of the references, beside them
-
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
@@ -206,13 +204,13 @@ class Case:
     def _check_names(self) -> None:
         """Refuse names of unknowns and channels that are those of other numbers of a run."""
         kinds = (
-            ("unknowns", "unknown", self.model.parameter_space.labels, (*TOTALS, SOURCE)),
+            ("unknowns", "unknown", self.model.parameter_space.labels, TOTALS),
             ("channels", "channel", self.frame.roles("sensor", "withheld"), ROLES),
         )
         for key, kind, given, taken in kinds:
             for name in given:
                 if name in taken:
-                    text = f"'{name}' is another number in [expect] or [reference]; give the "
+                    text = f"'{name}' is another number in [expect]; give the "
                     raise self.frame.error(f"{key}.{name}", f"{text}{kind} another name.")
 
     @property
@@ -231,7 +229,7 @@ class Case:
         frame, space = self.frame, self.model.parameter_space
         found = {}
         for label, value in frame.spec.reference.items():
-            if label == SOURCE:
+            if label == "source" and label not in space.labels:
                 continue
             if label not in space.labels:
                 text = f"there is no unknown number '{label}'; "
@@ -243,8 +241,8 @@ class Case:
     @property
     def source(self) -> str:
         """Where the references come from."""
-        given = self.frame.spec.reference.get(SOURCE, "")
-        return given if isinstance(given, str) else ""
+        given = self.frame.spec.reference.get("source", "")
+        return given if isinstance(given, str) and "source" not in self.references else ""
 
     @property
     def variants(self) -> tuple[VariantSpec, ...]:

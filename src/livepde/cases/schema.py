@@ -298,6 +298,7 @@ class JumpsSpec(Spec):
     window: PositiveInt = Jumps.window
     size: PositiveFloat = Jumps.size
     settle: NonNegativeInt = Jumps.settle
+    unknowns: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
 
 
 class GuardsSpec(Spec):
@@ -320,7 +321,7 @@ class SensitivitySpec(Spec):
     memory: Quantity | None = None
     replay: StrictBool | ReplaySpec = False
     gate: PositiveFloat | None = None
-    jumps: StrictBool | JumpsSpec = False
+    jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | JumpsSpec = False
     guards: StrictBool | GuardsSpec = True
 
 

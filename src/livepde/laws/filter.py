@@ -233,15 +233,16 @@ class Filter:
             return changed(x, u=u, q=q, du=np.where(rows, x.du, du), da=np.where(rows, x.da, da))
         return changed(x, u=u, q=estimate, du=du, da=da)
 
-    def inflated(self, x: FilterState, size: float) -> FilterState:
+    def inflated(self, x: FilterState, size: float, chosen: Mask | None = None) -> FilterState:
         """Return the state with `size` prior deviations added to the uncertainty of each unknown.
 
-        Independent of what is known of u: that is as well known as before.
+        Independent of what is known of u: that is as well known as before. With `chosen`, shape
+        (k,), of these coordinates only.
         """
         members, _, k = x.C.shape
-        unit = np.broadcast_to(size * np.eye(k), (members, k, k))
-        C = np.concatenate([x.C, unit], axis=1)
-        U = np.concatenate([x.U, np.zeros((members, k, x.U.shape[2]))], axis=1)
+        new = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
+        C = np.concatenate([x.C, np.broadcast_to(new, (members, *new.shape))], axis=1)
+        U = np.concatenate([x.U, np.zeros((members, len(new), x.U.shape[2]))], axis=1)
         if C.shape[1] > self.rank:
             U, C = self._compressed(U, C)
         return changed(x, U=U, C=C)

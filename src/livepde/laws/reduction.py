@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -113,6 +114,23 @@ class Reduction:
         for evolution in self.evolutions:
             still[evolution.part] = not evolution.model.moves
         return still
+
+    def named(self, names: Sequence[str] | None, who: str) -> Mask:
+        """Return which coordinates belong to some unknowns, shape (k,); None stands for all.
+
+        Raises
+        ------
+        LawError
+            There is no unknown of that name; the message begins with `who`.
+        """
+        parts = list(self.problem.model.latent.parts)
+        missing = [name for name in names or () if name not in parts]
+        if missing:
+            raise LawError(f"{who}: there is no unknown '{missing[0]}'; there are {parts}.")
+        chosen = np.zeros(self.size, dtype=bool)
+        for name, evolution in zip(parts, self.evolutions, strict=True):
+            chosen[evolution.part] = names is None or name in names
+        return chosen
 
     def moving(self, drift: float) -> int:
         """Return how many coordinates gain variance."""

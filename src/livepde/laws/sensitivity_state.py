@@ -58,6 +58,12 @@ class SensitivityWork:
         return bool(self.back or self.replay)
 
     @cached_property
+    def jumping(self) -> Mask:
+        """Coordinates of the unknowns that may jump, shape (k,)."""
+        names = self.jumps.unknowns if self.jumps is not None else ()
+        return self.filter.reduction.named(names, "Jumps: unknowns")
+
+    @cached_property
     def most(self) -> int:
         """Largest number of samples in a window of a replay."""
         return self.replay.window if self.replay is not None else 0
