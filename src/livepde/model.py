@@ -150,6 +150,7 @@ class Model:
         self.parameter_space = FunctionSpace.of(parameter, "q")
         self.inputs = tuple(inputs)
         self._check_parameter()
+        _ = self.state_space.fixed  # refuses boundary values that do not fit their field
         x, q = self.state_space, self.parameter_space
         pair, triple = {"u": x, "v": x}, {"q": q, "u": x, "v": x}
         self.form_M = self._form("M", _product(x) if M is None else M, pair)
@@ -204,7 +205,7 @@ class Model:
             raise ModelError(f"state and unknowns are both called {sorted(both)}: rename one.")
         self._check_names()
         for name, block in self.parameter_space.fields.items():
-            if any(value != 0.0 for value in block.field.dirichlet.values()):
+            if any(value != 0.0 for value in block.field.boundary_values):
                 raise ModelError(
                     f"parameter '{name}': only zero boundary values are possible; write a known "
                     "boundary part of q into B."
@@ -243,7 +244,7 @@ class Model:
     def channels(self) -> tuple[str, ...]:
         """Names of all channels the model needs: inputs of forms and Dirichlet channels."""
         fields = [block.field for block in self.state_space.fields.values()]
-        values = [value for field in fields for value in field.dirichlet.values()]
+        values = [value for field in fields for value in field.boundary_values]
         boundary = [value.name for value in values if isinstance(value, Channel)]
         return tuple(dict.fromkeys([*self.inputs, *boundary]))
 
@@ -369,7 +370,7 @@ class Model:
     def homogeneous(self) -> bool:
         """True if every Dirichlet value is the number 0: what is zero there stays so."""
         fields = [block.field for block in self.state_space.fields.values()]
-        values = [value for field in fields for value in field.dirichlet.values()]
+        values = [value for field in fields for value in field.boundary_values]
         return all(isinstance(value, int | float) and value == 0.0 for value in values)
 
     def impose(self, u: Array, moment: Moment) -> Array:

@@ -181,7 +181,7 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
             raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     prior_of: dict[str, Any] = {"prior": prior, "std": std, "bounds": (low, high), "unit": unit}
-    prior_of["transform"] = spec.transform
+    prior_of |= {"transform": spec.transform, "within": spec.within}
     if spec.evolution is not None:
         prior_of["evolution"] = _evolution(frame, spec, spec.evolution, unit, f"{key}.evolution")
     if spec.field:

@@ -27,6 +27,7 @@ from livepde.cases.values import (
     Quantity,
     TimeFormat,
 )
+from livepde.fem import Scalar
 from livepde.laws import Guards, Jumps, Replay
 from livepde.streams.csvfile import UTF_8
 
@@ -211,6 +212,7 @@ class UnknownSpec(Spec):
     length: Quantity | None = None
     transform: Literal["log", "logit"] | None = None
     evolution: EvolutionSpec | None = None
+    within: PositiveFloat = Scalar.within
 
     @model_validator(mode="after")
     def _one_kind(self) -> UnknownSpec:

@@ -213,8 +213,9 @@ class Filter:
 
         Members in `kept`, shape (members,), keep theirs.
 
-        Bounds hold for linearisation points and for what is reported, not for the linear filter:
-        what lies beyond them stays in da and du, so that nothing the data said is lost.
+        Bounds (`Reduction.ends`) hold for linearisation points and for what is reported, not for
+        the linear filter: what lies beyond them stays in da and du, so that nothing the data said
+        is lost.
         """
         estimate = self.estimate(x)
         within = self.reduction.bounded(estimate)

@@ -186,9 +186,46 @@ class Reduction:
         a: Array = dq @ self._dual
         return a
 
+    @cached_property
+    def ends(self) -> tuple[Array, Array]:
+        """Least and largest latent parameters: bounds, and what is too far from the prior, (m,).
+
+        Too far is by more than `within` prior deviations (of a field those of each coefficient in
+        the modes; what no mode moves is free).
+        """
+        latent = self.problem.model.latent
+        deviation = np.linalg.norm(self.Phi, axis=1)
+        reach = np.concatenate(
+            [
+                np.full(item.part.stop - item.part.start, item.unknown.reach)
+                for item in latent.parts.values()
+            ]
+        )
+        farthest = np.where(deviation > 0.0, reach, np.inf) * np.where(
+            deviation > 0.0, deviation, 1.0
+        )
+        lower, upper = latent.bounds
+        return (
+            np.maximum(lower, latent.prior - farthest),
+            np.minimum(upper, latent.prior + farthest),
+        )
+
     def bounded(self, q: Array) -> Array:
-        """Return latent parameters within their bounds, shape (..., m)."""
-        return self.problem.model.latent.clipped(q)
+        """Return latent parameters within their `ends`, shape (..., m): q itself if they are."""
+        lower, upper = self.ends
+        inside = (q >= lower) & (q <= upper)
+        return q if inside.all() else np.minimum(np.maximum(q, lower), upper)
+
+    def held(self, q: Array) -> Array:
+        """Return how many latent parameters would lie too far from the prior, (...) for (..., m).
+
+        Bounds that a user has set do not count.
+        """
+        lower, upper = self.ends
+        bounds = self.problem.model.latent.bounds
+        return np.asarray(
+            (((q < lower) & (lower > bounds[0])) | ((q > upper) & (upper < bounds[1]))).sum(axis=-1)
+        )
 
     def directions(self, q: Array, C: Array) -> Array:
         """Return how the physical parameter changes along rows of a, (members, r, m).

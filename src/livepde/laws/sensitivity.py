@@ -65,8 +65,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     columns at each substep, independent of what the state remembers of older values; the factor is
     then compressed to `rank` columns, so that nothing has to be forgotten by hand.
 
-    Bounds of numbers hold for the reference about which the filter is linear, and for what is
-    reported; the filter itself stays linear.
+    Bounds of numbers, and those of latent values (`within` of an unknown), hold for the reference
+    about which the filter is linear, and for what is reported; the filter itself stays linear.
 
     Parameters
     ----------

@@ -42,7 +42,8 @@ def doubts(data: xr.Dataset) -> list[str]:
     restart, or to hold unknowns that nothing excited. With gain='auto' the unknowns ended farther
     from their prior than, with a right model, they do in one of a million cases. With a fixed gain
     an estimate wanders, in the last half of a run, by more than 0.3 of what it has learned. In more
-    than 0.03 of the samples a bank believes that unknowns drift. Something jumped.
+    than 0.03 of the samples a bank believes that unknowns drift. Latent values were held where they
+    would have left their prior. Something jumped.
     """
     if not data.sizes["time"]:
         return []
@@ -50,6 +51,7 @@ def doubts(data: xr.Dataset) -> list[str]:
         *_model_error(data),
         *_replays(data),
         *_unknowns(data),
+        *_held(data),
         *([*_rests(data), *_lost(data)] if note(data, "residual") is not None else _guards(data)),
         *_drifts(data),
         *_departure(data),
@@ -131,6 +133,20 @@ def _unknowns(data: xr.Dataset) -> list[str]:
                 f"that of the prior; {TELLING}"
             )
     return found
+
+
+def _held(data: xr.Dataset) -> list[str]:
+    """Return whether latent values were held at their ends, `within` prior deviations away."""
+    counts = note(data, "bounded")
+    if counts is None or not (counts > 0.0).any():
+        return []
+    at = np.flatnonzero(counts > 0.0)
+    last = when(data, float(data["time"][at[-1]]))
+    return [
+        f"In {len(at)} samples, last at {last}, the data asked for unknowns farther from the prior "
+        "than its deviations allow (within, by default 10 of them), and they were held there: the "
+        "prior is much too narrow, or a unit, a sensor or the model is wrong."
+    ]
 
 
 def _jumps(data: xr.Dataset) -> list[str]:
