@@ -103,7 +103,8 @@ class Model:
         It is evaluated once for each set of inputs if it reads no time.
     M
         Integrand (u, v, x) of the mass term, symmetric positive; default u v, or the sum of these
-        products over the components.
+        products over the components. A component that it leaves out is algebraic: its equation
+        holds at every moment, and has to determine it (index 1). `GradientLaw` needs all of them.
     dA, dB
         Optional integrands of the derivatives in u, (q, u, du, v, x) and (u, du, v, x). Without
         them a complex step is taken (exact for analytic integrands).
@@ -121,7 +122,8 @@ class Model:
     Raises
     ------
     ModelError
-        A form cannot be evaluated, has the wrong number of components, or the mass is singular.
+        A form cannot be evaluated, has the wrong number of components; the mass depends on time;
+        or a name stands for something else in a run's dataset.
     """
 
     def __init__(
@@ -252,6 +254,14 @@ class Model:
     def mass(self) -> sp.csr_array:
         """Matrix of M, shape (n, n)."""
         return self.form_M.matrix("v", "u")
+
+    @cached_property
+    def algebraic(self) -> IntArray:
+        """Free coefficients without a mass term: the algebraic components of the state."""
+        mass = np.asarray(abs(self.mass).sum(axis=1)).ravel()
+        free = np.ones(self.state_space.dim, dtype=bool)
+        free[self.state_space.fixed] = False
+        return np.flatnonzero(free & (mass == 0.0))
 
     @cached_property
     def state_mass(self) -> sp.csr_array:
