@@ -20,7 +20,6 @@ from livepde import cases, runs
 from livepde.cases.template import NOISE, TRUE_ALPHA, write_template
 from livepde.cli import app
 from livepde.diagnostics import identifiability
-from livepde.laws.innovations import Innovations
 from livepde.models import heat
 from livepde.runs import doubts, measures, tables
 
@@ -147,25 +146,24 @@ def test_many_jumps_are_counted_and_dates_are_dates():
 
 def test_what_settles_is_not_looked_at():
     rng, jumps = np.random.default_rng(0), lp.Jumps(settle=50)
-    watch = jumps.start()
+    watch = jumps.start(2)
     for k in range(200):
-        e = (10.0 if k < 50 else 1.0) * rng.standard_normal((1, 2))
-        watch, alarm = jumps.add(watch, e, Innovations.start(2))
+        e = (3.0 if k < 50 else 1.0) * rng.standard_normal((1, 2))
+        watch, alarm = jumps.add(watch, e)
         assert not alarm
-    _, alarm = jumps.add(watch, np.full((1, 2), 10.0), Innovations.start(2))
+    _, alarm = jumps.add(watch, np.full((1, 2), 10.0))
     assert alarm
 
 
 def test_slow_errors_below_the_noise_hide_no_jump():
-    rng, usual = np.random.default_rng(0), Innovations.start(2)
+    rng, jumps = np.random.default_rng(0), lp.Jumps(settle=0)
+    watch, alarm = jumps.start(2), False
     for k in range(2000):
-        usual = usual.add(rng.standard_normal((1, 2)) + 0.3 * np.sin(0.01 * k))
-    assert usual.inflation > 1.5
-    assert usual.scatter < 1.25
-    jumps = lp.Jumps(settle=0)
-    watch, alarm = jumps.start(), False
+        watch, _ = jumps.add(watch, rng.standard_normal((1, 2)) + 0.3 * np.sin(0.01 * k))
+    assert watch.usual.inflation > 1.5
+    assert watch.usual.scatter < 1.25
     for k in range(30):
-        watch, alarm = jumps.add(watch, rng.standard_normal((1, 2)) + 2.0 * np.sin(k), usual)
+        watch, alarm = jumps.add(watch, rng.standard_normal((1, 2)) + 2.0 * np.sin(k))
         if alarm:
             break
     assert alarm

@@ -29,9 +29,7 @@ def readings(count=200, seed=0, noise=NOISE):
 
 
 def spoiled(samples, at, value):
-    return [
-        (t, np.array([value, z[1]])) if k in at else (t, z) for k, (t, z) in enumerate(samples)
-    ]
+    return [(t, np.array([value, z[1]])) if k in at else (t, z) for k, (t, z) in enumerate(samples)]
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -65,10 +65,17 @@ def test_bounds_cut_an_interval_off():
 
 
 def test_where_rounding_hides_the_latent_value_the_interval_is_open():
-    unknown = lp.Scalar(0.3, 0.1, bounds=(0.0, 1.0), transform="logit")
-    assert unknown.interval(1.0, 0.0) == (0.0, 1.0)
-    positive = lp.Scalar(0.3, 0.1, transform="log")
+    free = {"transform": "logit", "bounds": (0.0, 1.0), "within": np.inf}
+    assert lp.Scalar(0.3, 0.1, **free).interval(1.0, 0.0) == (0.0, 1.0)
+    positive = lp.Scalar(0.3, 0.1, transform="log", within=np.inf)
     assert positive.interval(0.0, 0.0) == (0.0, np.inf)
+
+
+def test_an_interval_ends_where_latent_values_do():
+    positive = lp.Scalar(0.3, 0.1, transform="log", within=4.0)
+    ends = (0.3 * np.exp(-4 / 3), 0.3 * np.exp(4 / 3))
+    assert positive.interval(0.3, 1e6) == pytest.approx(ends)
+    assert positive.interval(0.0, 0.0) == pytest.approx((0.0, ends[1]))  # it holds the value
 
 
 def test_fields_have_an_interval_for_each_coefficient():

@@ -6,6 +6,7 @@
     ├── ConfigurationError          what was built or asked for does not fit together
     │   ├── SpaceError              mesh, element, inner product, prior
     │   ├── ModelError              weak forms and their arguments
+    │   │   └── NameClashError      a name that stands for two things in a run's dataset
     │   ├── ObservationError        sensors, subdomains, matrices
     │   ├── LawError                an update law on a problem it cannot serve
     │   └── CaseError               a case file: wrong key, value, unit, range
@@ -30,6 +31,7 @@ __all__ = [
     "LivepdeError",
     "MissingInputError",
     "ModelError",
+    "NameClashError",
     "ObservationError",
     "RunError",
     "SampleError",
@@ -52,6 +54,10 @@ class SpaceError(ConfigurationError):
 
 class ModelError(ConfigurationError):
     """A weak form that cannot be evaluated or is not linear where it must be."""
+
+
+class NameClashError(ModelError):
+    """Unknowns or components with names that stand for something else in a run's dataset."""
 
 
 class ObservationError(ConfigurationError):

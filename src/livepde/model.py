@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.errors import ModelError
+from livepde.errors import ModelError, NameClashError
 from livepde.fem import (
     START,
     Channel,
@@ -26,6 +26,7 @@ from livepde.fem import (
     On,
     Sobolev,
     Unknown,
+    cells,
     compose,
     dot,
     grad,
@@ -33,6 +34,7 @@ from livepde.fem import (
 )
 from livepde.linalg import Array, IntArray
 from livepde.operators import DualOperator
+from livepde.records import Layout, name_clashes
 from livepde.spaces import BorderedSpace, HilbertSpace, product
 
 __all__ = ["Model", "Source", "h1_form", "mass_form"]
@@ -101,7 +103,8 @@ class Model:
         It is evaluated once for each set of inputs if it reads no time.
     M
         Integrand (u, v, x) of the mass term, symmetric positive; default u v, or the sum of these
-        products over the components.
+        products over the components. A component that it leaves out is algebraic: its equation
+        holds at every moment, and has to determine it (index 1). `GradientLaw` needs all of them.
     dA, dB
         Optional integrands of the derivatives in u, (q, u, du, v, x) and (u, du, v, x). Without
         them a complex step is taken (exact for analytic integrands).
@@ -119,7 +122,8 @@ class Model:
     Raises
     ------
     ModelError
-        A form cannot be evaluated, has the wrong number of components, or the mass is singular.
+        A form cannot be evaluated, has the wrong number of components; the mass depends on time;
+        or a name stands for something else in a run's dataset.
     """
 
     def __init__(
@@ -148,6 +152,7 @@ class Model:
         self.parameter_space = FunctionSpace.of(parameter, "q")
         self.inputs = tuple(inputs)
         self._check_parameter()
+        _ = self.state_space.fixed  # refuses boundary values that do not fit their field
         x, q = self.state_space, self.parameter_space
         pair, triple = {"u": x, "v": x}, {"q": q, "u": x, "v": x}
         self.form_M = self._form("M", _product(x) if M is None else M, pair)
@@ -200,12 +205,26 @@ class Model:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
         if both and not self.state_space.single:
             raise ModelError(f"state and unknowns are both called {sorted(both)}: rename one.")
+        self._check_names()
         for name, block in self.parameter_space.fields.items():
-            if any(value != 0.0 for value in block.field.dirichlet.values()):
+            if any(value != 0.0 for value in block.field.boundary_values):
                 raise ModelError(
                     f"parameter '{name}': only zero boundary values are possible; write a known "
                     "boundary part of q into B."
                 )
+
+    def _check_names(self) -> None:
+        """Refuse names that a run's dataset could not tell apart."""
+        state, parameter = self.state_space, self.parameter_space
+        axes = "xyz"[: self.mesh.dim()]
+        clashes = name_clashes(
+            Layout.own_names(axes, cells(self.mesh)),
+            [key for name, block in state.fields.items() for key in block.variables(name)],
+            parameter.labels,
+            parameter.fields,
+        )
+        if clashes:
+            raise NameClashError(f"Model: {clashes[0]}")
 
     @cached_property
     def order(self) -> int:
@@ -227,7 +246,7 @@ class Model:
     def channels(self) -> tuple[str, ...]:
         """Names of all channels the model needs: inputs of forms and Dirichlet channels."""
         fields = [block.field for block in self.state_space.fields.values()]
-        values = [value for field in fields for value in field.dirichlet.values()]
+        values = [value for field in fields for value in field.boundary_values]
         boundary = [value.name for value in values if isinstance(value, Channel)]
         return tuple(dict.fromkeys([*self.inputs, *boundary]))
 
@@ -235,6 +254,14 @@ class Model:
     def mass(self) -> sp.csr_array:
         """Matrix of M, shape (n, n)."""
         return self.form_M.matrix("v", "u")
+
+    @cached_property
+    def algebraic(self) -> IntArray:
+        """Free coefficients without a mass term: the algebraic components of the state."""
+        mass = np.asarray(abs(self.mass).sum(axis=1)).ravel()
+        free = np.ones(self.state_space.dim, dtype=bool)
+        free[self.state_space.fixed] = False
+        return np.flatnonzero(free & (mass == 0.0))
 
     @cached_property
     def state_mass(self) -> sp.csr_array:
@@ -353,7 +380,7 @@ class Model:
     def homogeneous(self) -> bool:
         """True if every Dirichlet value is the number 0: what is zero there stays so."""
         fields = [block.field for block in self.state_space.fields.values()]
-        values = [value for field in fields for value in field.dirichlet.values()]
+        values = [value for field in fields for value in field.boundary_values]
         return all(isinstance(value, int | float) and value == 0.0 for value in values)
 
     def impose(self, u: Array, moment: Moment) -> Array:

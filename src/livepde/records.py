@@ -20,9 +20,31 @@ from livepde.linalg import Array
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["STATUS_CODES", "Layout", "Record", "RecordArrays", "Records", "Snapshot", "bare"]
+__all__ = [
+    "DATE",
+    "FIELD_ENDS",
+    "NOTE",
+    "NUMBER_ENDS",
+    "STATE_ENDS",
+    "STATUS_CODES",
+    "Layout",
+    "Record",
+    "RecordArrays",
+    "Records",
+    "Snapshot",
+    "bare",
+    "name_clashes",
+]
 
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
+
+NOTE = "note_"  # what a note is called whose own name is taken
+DATE = "date"  # column of an exported table, beside the variables of the dataset
+# What stands beside an unknown or a component of the state: end of the variable's name -> meaning.
+STATE_ENDS = {"_std": "the standard deviation"}
+INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
+NUMBER_ENDS = {**STATE_ENDS, **INTERVAL_ENDS, "_left": "the share left of the prior deviation"}
+FIELD_ENDS = {**STATE_ENDS, **INTERVAL_ENDS, "_modes": "the number of modes told"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,16 +353,21 @@ class Layout:
         """
         import xarray as xr
 
-        rows = RecordArrays.of(records)
+        return xr.Dataset(*self._contents(RecordArrays.of(records), last))
+
+    def _contents(
+        self, rows: RecordArrays, last: Snapshot | None
+    ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """Return variables, coordinates and attributes of the dataset."""
         times = rows.t
         kept = [(times[k], snapshot) for k, snapshot in rows.snapshots()]
         if last is not None:
             kept.append((times[-1], last))
         coords: dict[str, Any] = {
             "time": ("time", times, {"units": self.time_unit}),
-            "snapshot": np.array([t for t, _ in kept]),
-            "sensor": list(self.sensors),
-            "withheld": list(self.withheld or ()),
+            "snapshot": ("snapshot", np.array([t for t, _ in kept])),
+            "sensor": ("sensor", list(self.sensors)),
+            "withheld": ("withheld", list(self.withheld or ())),
             **{
                 axis: ("vertex", np.array(x), {"units": self.length_unit})
                 for axis, x in self.coordinates.items()
@@ -355,7 +382,7 @@ class Layout:
             data[name] = ("time", values, dict(attrs))
         data |= self._snapshots([snapshot for _, snapshot in kept])
         if "correlation" in data:
-            coords["unknown"] = list(self.scalars)
+            coords["unknown"] = ("unknown", list(self.scalars))
         data |= self._errors(rows)
         flags = {
             "flag_values": list(range(len(STATUS_CODES))),
@@ -364,15 +391,35 @@ class Layout:
         data["status"] = ("time", rows.status, flags)
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
-            key = f"note_{name}" if name in data or name in coords else name  # of an unknown, say
-            data[key] = ("time", values)
+            taken = name in data or name in coords  # by an unknown, say
+            data[f"{NOTE}{name}" if taken else name] = ("time", values)
         about = {
             **self.attrs,
             "fields": " ".join(self.fields),
             "scalars": "\n".join(self.scalars),
             "state": " ".join(self.state),
         }
-        return xr.Dataset(data, coords, about)
+        return data, coords, about
+
+    @classmethod
+    def own_names(cls, axes: Iterable[str], cells: Iterable[str]) -> set[str]:
+        """Return the names of dimensions, coordinates and variables that every dataset has.
+
+        Parameters
+        ----------
+        axes, cells
+            Coordinates and kinds of cells of the mesh.
+        """
+        pair = ["1", "2"]  # two unknown numbers, so that they have a correlation
+        grid, none = {axis: [0.0] for axis in axes}, {kind: [[0]] for kind in cells}
+        blank = cls("", "", grid, none, ["z"], ["w"], {}, {}, pair, [], [])
+        rows, snapshot = RecordArrays(), Snapshot({}, {}, np.eye(2))
+        rows.append(Record(0.0, np.zeros(0), np.zeros(1), np.zeros(1), 0, 1, {}, snapshot))
+        data, coords, _ = blank._contents(rows, None)
+        found = {DATE}
+        for name, (dimensions, *_) in {**data, **coords}.items():
+            found |= {name, *([dimensions] if isinstance(dimensions, str) else dimensions)}
+        return found
 
     def _snapshots(self, kept: Sequence[Snapshot]) -> dict[str, Any]:
         """Return the variables of the fields."""
@@ -381,15 +428,14 @@ class Layout:
             return data
         for name in kept[0].profiles:
             values = np.array([snapshot.profiles[name] for snapshot in kept])
-            unit = {"units": self.units.get(bare(name), "")}
+            unit = {"units": self.units.get(name, self.units.get(bare(name), ""))}
             data[name] = (("snapshot", "vertex"), values, unit)
         for name, (_, count) in kept[-1].told.items():
             told = np.array([snapshot.told[name][0] for snapshot in kept])
             about = {"long_name": "modes that the data have told of", "of": count}
             data[f"{name}_modes"] = ("snapshot", told, about)
         last = kept[-1].correlation
-        taken = "correlation" in data or "correlation" in self.numbers
-        if last is not None and len(self.scalars) > 1 and not taken:
+        if last is not None and len(self.scalars) > 1:
             data["correlation"] = (("unknown", "other"), last)
         return data
 
@@ -406,6 +452,39 @@ class Layout:
 
 def bare(name: str) -> str:
     """Return what a variable beside an unknown belongs to."""
-    for end in ("_std", "_low", "_high"):
+    for end in (*STATE_ENDS, *INTERVAL_ENDS):
         name = name.removesuffix(end)
     return name
+
+
+def name_clashes(
+    own: Iterable[str], state: Iterable[str], numbers: Iterable[str], fields: Iterable[str]
+) -> list[str]:
+    """Return a sentence for each name that would stand for two things in a run's dataset.
+
+    Parameters
+    ----------
+    own
+        Names of the dataset itself: `Layout.own_names`.
+    state, numbers, fields
+        Variables of the state, labels of scalar unknowns, names of unknown fields.
+    """
+    uses: dict[str, list[str]] = {name: ["a name of the dataset itself"] for name in own}
+    kinds = (
+        (state, "the state", STATE_ENDS),
+        (numbers, "the unknown", NUMBER_ENDS),
+        (fields, "the unknown", FIELD_ENDS),
+    )
+    for names, kind, ends in kinds:
+        for name in names:
+            uses.setdefault(name, []).append(f"{kind} '{name}'")
+            if name.startswith(NOTE):
+                uses[name].append("a note of the law")
+            for end, meaning in ends.items():
+                uses.setdefault(f"{name}{end}", []).append(f"{meaning} of '{name}'")
+    return [
+        f"in tables and datasets of a run '{name}' would be {' and '.join(both)}: give the "
+        f"{'unknown' if any('unknown' in use for use in both) else 'component'} another name."
+        for name, both in uses.items()
+        if len(both) > 1
+    ]

@@ -26,7 +26,6 @@ __all__ = [
     "interval_ends",
     "layout_of",
     "unknown_of",
-    "variables",
     "vertex_order",
 ]
 
@@ -358,7 +357,7 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         units=_units(model),
         scalars=list(model.parameter_space.labels),
         fields=list(model.parameter_space.fields),
-        state=[key for name, block in components for key in variables(name, block)],
+        state=[key for name, block in components for key in block.variables(name)],
     )
 
 
@@ -372,20 +371,13 @@ def _units(model: Model) -> dict[str, str]:
     unknowns = {**model.state_space.unknowns, **model.parameter_space.unknowns}
     found = {name: unknown.unit for name, unknown in unknowns.items()}
     for name, block in model.state_space.fields.items():
-        found |= dict.fromkeys(variables(name, block), found[name])
+        found |= dict.fromkeys(block.variables(name), found[name])
     return found
-
-
-def variables(name: str, block: FieldBlock) -> list[str]:
-    """Return the variables of a component: itself, or one for each direction of a vector."""
-    if not block.vector:
-        return [name]
-    return [f"{name}_{axis}" for axis in "xyz"[: block.field.mesh.dim()]]
 
 
 def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
     """Return the variables of a component with their values at the vertices."""
-    names = variables(name, block)
+    names = block.variables(name)
     rows = values.reshape(len(names), -1)
     return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
 

@@ -36,6 +36,7 @@ from livepde.records import Layout
 from livepde.result import layout_of
 from livepde.runs import Journal
 from livepde.runs.outcome import Bound, Sense
+from livepde.runs.summary import ROLES, TOTALS
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, Table
 
@@ -198,6 +199,19 @@ class Case:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
         _ = self.scheme, self.dt_max, self.references
+        self._check_names()
+
+    def _check_names(self) -> None:
+        """Refuse names of unknowns and channels that are those of other numbers of a run."""
+        kinds = (
+            ("unknowns", "unknown", self.model.parameter_space.labels, TOTALS),
+            ("channels", "channel", self.frame.roles("sensor", "withheld"), ROLES),
+        )
+        for key, kind, given, taken in kinds:
+            for name in given:
+                if name in taken:
+                    text = f"'{name}' is another number in [expect]; give the "
+                    raise self.frame.error(f"{key}.{name}", f"{text}{kind} another name.")
 
     @property
     def name(self) -> str:
@@ -328,11 +342,8 @@ class Case:
             *labels,
             *(f"{label}.std" for label in labels),
             *(f"{label}.{of}" for label in self.references for of in ("error", "deviations")),
-            "rmse",
-            *(f"rmse.{name}" for name in ("assimilated", "withheld", *scored)),
-            "innovation_ratio",
-            "jumps",
-            "failed_steps",
+            *TOTALS,
+            *(f"rmse.{name}" for name in (*ROLES, *scored)),
         ]
         return [
             f"expect.{name}: a run of this case has no such number; {did_you_mean(name, known)}"

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.frame import Frame
+from livepde.cases.instruments import unknowns_of
+from livepde.cases.read import did_you_mean
 from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
 from livepde.cases.sensors import noise_of
 from livepde.errors import LawError
@@ -56,11 +58,26 @@ def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
     drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
     more: dict[str, Any] = {
         "gate": spec.gate,
-        "jumps": _chosen(Jumps, spec.jumps),
+        "jumps": _jumps(frame, spec),
         "guards": _chosen(Guards, spec.guards),
     }
     replay = _chosen(Replay, spec.replay)
     return SensitivityLaw(spec.modes, _noise(frame, spec), drift, memory, replay, **more)
+
+
+def _jumps(frame: Frame, spec: SensitivitySpec) -> Jumps | None:
+    """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
+    given = spec.jumps
+    found: Jumps | None = (
+        Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
+    )
+    names = (found.unknowns if found is not None else None) or ()
+    known = [*frame.spec.unknowns, *unknowns_of(frame)]
+    for name in names:
+        if name not in known:
+            key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
+            raise frame.error(key, f"there is no unknown '{name}'; {did_you_mean(name, known)}")
+    return found
 
 
 def _chosen(kind: Any, given: Any) -> Any:

@@ -12,7 +12,7 @@ from livepde.cases.instruments import unknowns_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
-from livepde.errors import ModelError, SpaceError
+from livepde.errors import ModelError, NameClashError, SpaceError
 from livepde.fem import (
     Channel,
     Evolution,
@@ -109,7 +109,10 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
         if name not in inputs and not variable.optional:
             raise frame.missing(f"channels.{name}", f"the {variable.text}, with role = 'input'.")
     unknowns = _unknowns(frame, mesh)
-    model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
+    try:
+        model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
+    except NameClashError as error:
+        raise frame.error("unknowns", str(error)) from None
     for name in model.inputs:
         if name not in inputs:
             known = frame.equation.inputs.get(name)
@@ -178,7 +181,7 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
             raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     prior_of: dict[str, Any] = {"prior": prior, "std": std, "bounds": (low, high), "unit": unit}
-    prior_of["transform"] = spec.transform
+    prior_of |= {"transform": spec.transform, "within": spec.within}
     if spec.evolution is not None:
         prior_of["evolution"] = _evolution(frame, spec, spec.evolution, unit, f"{key}.evolution")
     if spec.field:

@@ -27,6 +27,7 @@ from livepde.cases.values import (
     Quantity,
     TimeFormat,
 )
+from livepde.fem import Scalar
 from livepde.laws import Guards, Jumps, Replay, SensitivityLaw
 from livepde.streams.csvfile import UTF_8
 
@@ -211,6 +212,7 @@ class UnknownSpec(Spec):
     length: Quantity | None = None
     transform: Literal["log", "logit"] | None = None
     evolution: EvolutionSpec | None = None
+    within: PositiveFloat = Scalar.within
 
     @model_validator(mode="after")
     def _one_kind(self) -> UnknownSpec:
@@ -298,6 +300,7 @@ class JumpsSpec(Spec):
     window: PositiveInt = Jumps.window
     size: PositiveFloat = Jumps.size
     settle: NonNegativeInt = Jumps.settle
+    unknowns: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
 
 
 class GuardsSpec(Spec):
@@ -320,7 +323,7 @@ class SensitivitySpec(Spec):
     memory: Quantity | None = None
     replay: StrictBool | ReplaySpec = False
     gate: PositiveFloat = SensitivityLaw.gate
-    jumps: StrictBool | JumpsSpec = False
+    jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | JumpsSpec = False
     guards: StrictBool | GuardsSpec = True
 
 

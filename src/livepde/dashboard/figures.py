@@ -13,7 +13,7 @@ from livepde.dashboard.canvas import MARKS, band, empty, over_time, show, text, 
 from livepde.dashboard.times import TimeAxis, at_time
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE
-from livepde.plots.dataset import MOST_LINES, interval_95, scalars, scored_from
+from livepde.plots.dataset import MOST_LINES, interval_95, note, scalars, scored_from
 from livepde.runs.summary import shown
 
 __all__ = ["correlation", "open_shares", "ratio", "residuals", "told", "unknowns"]
@@ -30,8 +30,9 @@ def _bounded(data: xr.Dataset) -> xr.Dataset:
     kept = np.zeros(count, dtype=bool)
     kept[np.linspace(0, count - 1, MOST_POINTS).round().astype(int)] = True
     notable = data["status"].values != 0
-    if "jump" in data:
-        notable |= data["jump"].values > 0.0
+    alarms = note(data, "jump")
+    if alarms is not None:
+        notable |= alarms > 0.0
     kept[np.flatnonzero(notable)[:MOST_POINTS]] = True
     return data.isel(time=kept)
 
@@ -160,7 +161,7 @@ def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
     """Draw the squared misses of the sensors over what is expected of them."""
     data = _bounded(data)
     figure, axis = over_time(data, "", at)
-    t, values = axis.values(data["time"].values), data["innovation_ratio"].values
+    t, values = axis.values(data["time"].values), note(data, "innovation_ratio")
     figure.add_scatter(
         x=t,
         y=values,

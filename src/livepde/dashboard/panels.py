@@ -22,7 +22,7 @@ from livepde.dashboard.figures import (
     unknowns,
 )
 from livepde.dashboard.times import at_time, when_axis
-from livepde.plots.dataset import MOST_LINES, groups
+from livepde.plots.dataset import MOST_LINES, groups, note
 
 __all__ = ["SECTIONS", "Panel", "panels"]
 
@@ -72,7 +72,7 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
     for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
         if variable in data and data.sizes.get(dimension):
             found.append(_residual_panel(data, variable, dimension, at))
-    if "innovation_ratio" in data:
+    if note(data, "innovation_ratio") is not None:
         about = (
             "Misses of the sensors, squared, over what noise and uncertainty allow: about 1 or "
             "less is well. Above 4 the model does not explain the data."
@@ -138,7 +138,7 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, at: float |
             "Measured minus what the model expected before it saw the sample. Well if it scatters "
             "about zero; a curve that stays on one side speaks of an offset or a missing process."
         )
-        if "residual" in data:
+        if note(data, "residual") is not None:
             about = "Measured minus what the model says after the step. Well if about zero."
         title = "Sensors: measured − expected"
         return Panel(variable, "sensors", title, about + _crowd(data, dimension), figure)

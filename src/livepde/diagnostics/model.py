@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.diagnostics.space import definite, largest, relative
-from livepde.errors import ModelError
+from livepde.errors import LinearAlgebraError, ModelError
 from livepde.fem import Composed, Form, Inputs, Moment
-from livepde.linalg import Array
+from livepde.linalg import Array, Pattern, analyse
 from livepde.model import Model
+from livepde.spaces import HilbertSpace
 
 __all__ = ["check_model"]
 
@@ -21,6 +23,7 @@ ROUNDING = 1e-12  # of identities between sums of products
 LINEARITY = 1e-10  # of the integrand, which may hold functions such as exp
 STEPS = 0.5 ** np.arange(2, 22)  # of the Taylor tests
 FLOOR = 1e-11  # remainders below this share of the function are rounding
+LARGEST_INVERSE = 1e12  # of the equations of algebraic components, scaled to rows of size 1
 SLOWEST = 1.8  # rate of a remainder of second order
 
 
@@ -39,7 +42,8 @@ def check_model(
     Linearity in q and in the test function v, transpose and adjoint
     (A(u)* r, xi)_Q = <A(u) xi, r>, derivatives by Taylor tests (the remainder
     f(u + s du) - f(u) - s f'(u) du falls like s^2, or vanishes for affine forms), the assembled
-    matrices against plain quadrature of the integrand, and the mass.
+    matrices against plain quadrature of the integrand, and the mass. Where components have no mass
+    term, that their equations determine them.
 
     Parameters
     ----------
@@ -83,6 +87,7 @@ def check_model(
         *_adjoint(model, point),
         *_derivatives(model, point),
         *_mass(model),
+        *_algebraic(model, point),
     ]
     return CheckReport("model", tuple(lines), ModelError)
 
@@ -344,11 +349,42 @@ def _taylor(
 
 
 def _mass(model: Model) -> list[CheckLine]:
-    M = model.mass
-    line = definite(model.X)
+    """Check the mass, on the components that have one."""
+    M, space = model.mass, model.X
+    if len(model.algebraic):
+        rest = np.setdiff1d(np.flatnonzero(model.X.free), model.algebraic)
+        space = HilbertSpace(sp.csr_array(M[rest][:, rest]), "X")
+    line = definite(space)
     return [
         CheckLine.at_most(
             "M = M^T", relative(M - M.T, M), ROUNDING, "M(u, v, x) must be symmetric in u and v."
         ),
         CheckLine.at_most("M positive definite (failures)", line.value, 0, line.remedy),
+    ]
+
+
+def _algebraic(model: Model, at: _Point) -> list[CheckLine]:
+    """Check that the equations of components without a mass determine them (index 1)."""
+    rows = model.algebraic
+    if not len(rows):
+        return []
+    u, q, moment = at.u, at.q, at.moment
+    slope = model.form_B.matrix("v", "u", moment, u=u)
+    slope = slope + model.form_A.matrix("v", "u", moment, u=u, q=q)
+    block = sp.csr_array(sp.csr_array(slope)[rows][:, rows])
+    size = np.maximum(np.asarray(abs(block).max(axis=1).todense()).ravel(), 1e-300)
+    scaled = sp.csr_array(sp.diags_array(1.0 / size) @ block)
+    try:
+        x = analyse(Pattern.of(scaled)).factorise(scaled.data).solve(np.ones(len(rows)))
+        condition = float(np.abs(x).max())
+    except LinearAlgebraError:
+        condition = np.inf
+    return [
+        CheckLine.at_most(
+            "algebraic components: size of their inverse",
+            condition if np.isfinite(condition) else np.inf,
+            LARGEST_INVERSE,
+            "a component has no mass term, and its own equation does not determine it at given "
+            "other components: fix its level by a Dirichlet value, or give M a term for it.",
+        )
     ]

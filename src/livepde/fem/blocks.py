@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from typing import Any
@@ -250,6 +251,11 @@ class FieldBlock(Block):
         """True if the function has values in R^d."""
         return np.ndim(self._one) > 2
 
+    def variables(self, name: str) -> list[str]:
+        """Return names of its components: itself, or one for each direction of a vector."""
+        axes = "xyz"[: self.field.mesh.dim()]
+        return [f"{name}_{axis}" for axis in axes] if self.vector else [name]
+
     @property
     def bends(self) -> bool:
         """True if the element has second derivatives."""
@@ -375,6 +381,32 @@ class FieldBlock(Block):
         )
         return found
 
+    def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
+        """Return the conditions for the values on a boundary, of a vector for each component."""
+        dofs = self._value_dofs(name)
+        if not (isinstance(value, tuple) or (callable(value) and self.vector)):
+            return [(dofs, value)]
+        names = self.field.element.dofnames or []
+        axes = [k for k in range(3) if f"u^{k + 1}" in names]
+        facets = None if name == "boundary" else name
+        where = f"dirichlet: '{name}'"
+        if not (self.vector and axes):
+            what = "has no components" if self.vector else "is no vector"
+            raise SpaceError(
+                f"{where} has a value for each component, and the field {what}: give a number."
+            )
+        if isinstance(value, tuple) and len(value) != len(axes):
+            raise SpaceError(
+                f"{where} has {len(value)} values; expected {len(axes)}, one for each component, "
+                "None where it is free."
+            )
+        found = []
+        for k in axes:
+            part = value[k] if isinstance(value, tuple) else _Component(value, k, len(axes), where)
+            if part is not None:
+                found.append((np.unique(self._tied(self.at(facets, [f"u^{k + 1}"]))), part))
+        return found
+
     def _slope_dofs(self, name: str, axis: int) -> IntArray:
         """Return the unknowns of the derivative along a boundary, on its sides along an axis."""
         if not isinstance(self.field.element, ElementQuadBFS):
@@ -398,7 +430,7 @@ class FieldBlock(Block):
         """
         found: list[tuple[IntArray, Any]] = []
         for name, value in self.field.dirichlet.items():
-            found.append((self._value_dofs(name), value))
+            found += self._valued(name, value)
             for axis in range(0 if self.field.clamped else self.field.mesh.dim()):
                 dofs = self._slope_dofs(name, axis)
                 if len(dofs):
@@ -508,6 +540,30 @@ class FieldBlock(Block):
             values = sp.csr_array(entries, shape=(len(dofs), int(self.dofs.N)))
             return sp.csr_array(values @ self._spread)
         return self.probe(mesh.p, "vertex")
+
+
+@dataclass(frozen=True)
+class _Component:
+    """One component of boundary values g(x, t) of a vector.
+
+    g returns a sequence or an array with a row for each component, or one row for all of them.
+    """
+
+    g: Callable[[Array, float], Any]
+    axis: int
+    count: int
+    where: str
+
+    def __call__(self, x: Array, t: float) -> Any:
+        values = self.g(x, t)
+        if not isinstance(values, list | tuple) and np.ndim(values) < 2:
+            return values
+        if len(values) != self.count:
+            raise SpaceError(
+                f"{self.where}: g(x, t) has {len(values)} components; expected {self.count}, as in "
+                "lambda x, t: (t * x[1], 0.0)."
+            )
+        return values[self.axis]
 
 
 def _jet(function: DiscreteField, name: str) -> Any:

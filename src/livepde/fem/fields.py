@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,7 +13,7 @@ from skfem import Mesh, MeshLine
 from skfem.element import Element
 
 from livepde.errors import SpaceError
-from livepde.fem.evolution import CONSTANT, Evolution
+from livepde.fem.evolution import CONSTANT, Evolution, RandomWalk
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.transforms import Transform, transform_of
 from livepde.linalg import Array
@@ -30,6 +32,8 @@ __all__ = [
     "line",
 ]
 
+WITHIN = 10.0  # prior standard deviations: by chance it is passed once in 1e23 cases
+
 Integrand: TypeAlias = Callable[..., Any]
 """A weak form's integrand; see `Model` for the arguments."""
 
@@ -44,7 +48,8 @@ class Channel:
     name: str
 
 
-BoundaryValue: TypeAlias = float | Callable[[Any, float], Any] | Channel
+PlainValue: TypeAlias = float | Callable[[Any, float], Any] | Channel
+BoundaryValue: TypeAlias = PlainValue | Sequence[PlainValue | None]
 
 
 @dataclass(frozen=True)
@@ -152,6 +157,7 @@ class _Prior:
     bounds: tuple[float, float]
     transform: str | None
     evolution: Evolution
+    within: float
 
     @property
     def map(self) -> Transform:
@@ -174,6 +180,26 @@ class _Prior:
         return self.bounds if self.transform is None else (-np.inf, np.inf)
 
     @property
+    def reach(self) -> float:
+        """How many prior deviations a latent value may lie from its prior mean; inf for a walk."""
+        return np.inf if isinstance(self.evolution, RandomWalk) else self.within
+
+    @property
+    def point_std(self) -> float:
+        """Largest prior deviation of a latent value at a point; inf where it is not known."""
+        return self.latent_std
+
+    @cached_property
+    def _ends(self) -> tuple[Array, Array]:
+        """Values that belong to latent ones `reach` prior deviations from their mean."""
+        farthest = self.reach * self.point_std
+        with np.errstate(over="ignore"):
+            low, high = (
+                self.map.value(np.array(self.latent_prior + s)) for s in (-farthest, farthest)
+            )
+        return low, high
+
+    @property
     def symmetric(self) -> bool:
         """True if intervals are value +- deviations: neither a transform nor bounds."""
         return self.transform is None and not np.isfinite(self.bounds).any()
@@ -182,7 +208,7 @@ class _Prior:
         """Return the ends of the central interval that holds the unknown with probability `level`.
 
         Quantiles of the Gaussian belief about the latent values, mapped through the transform and
-        cut off at the bounds.
+        cut off at the bounds; with a transform also at the ends of the latent values (`within`).
 
         Parameters
         ----------
@@ -196,6 +222,11 @@ class _Prior:
         z = NormalDist().inv_cdf(0.5 + 0.5 * level)
         value, std = np.asarray(value, dtype=float), np.asarray(std, dtype=float)
         low, high = (np.clip(self.map.shifted(value, std, s), *self.bounds) for s in (-z, z))
+        if self.transform is not None:
+            # A value that lies beyond, of another law say, stays inside of its interval.
+            least, largest = self._ends
+            low = np.maximum(low, np.minimum(least, value))
+            high = np.minimum(high, np.maximum(largest, value))
         return low, high
 
     def _check(self) -> None:
@@ -206,6 +237,8 @@ class _Prior:
                 "MeanReverting(time) or Periodic(period), or nothing."
             )
         _check_prior(what, self.std, self.bounds, self.prior, self.transform)
+        if not self.within > 0:
+            raise SpaceError(f"{what}: within must be a positive number; got {self.within}.")
         if self.evolution.copies > 1 and (self.transform or np.isfinite(self.bounds).any()):
             raise SpaceError(
                 f"{what}: bounds or a transform together with Periodic are not possible; choose."
@@ -226,14 +259,16 @@ class Field(_Prior):
         or a symmetric bilinear form (u, v, x).
     dirichlet
         Essential boundary values: name of a boundary ("boundary" for all of it) -> a number, a
-        function g(x, t), or a `Channel` of the stream. For a parameter only 0 (H^1_0).
+        function g(x, t), or a `Channel` of the stream. For a parameter only 0 (H^1_0). For a vector
+        these hold for all components; a sequence has one of them for each component, None where it
+        is free, and g may return one array for each.
     clamped
         With `dirichlet`, all coefficients on these boundaries are zero: those of slopes, too. Else
         only values are given there.
     std
         Prior deviation of a parameter: the inner product is divided by std**2, so that the
         prior covariance is the inverse Gram matrix.
-    bounds, transform, evolution
+    bounds, transform, evolution, within
         As for `Scalar`; bounds need a transform, and a transform an element of first order.
     unit, name
         For tables and plots.
@@ -256,6 +291,18 @@ class Field(_Prior):
     evolution: Evolution = CONSTANT
     periodic: Sequence[tuple[str, str]] = ()
     clamped: bool = False
+    within: float = WITHIN
+
+    @property
+    def boundary_values(self) -> list[Any]:
+        """The plain Dirichlet values: numbers, functions, channels."""
+        return [item for value in self.dirichlet.values() for item in _each_value(value)]
+
+    @property
+    def point_std(self) -> float:
+        """Largest prior deviation of a latent value at a point; inf where it is not known."""
+        pointwise = isinstance(self.inner, Sobolev) and self.inner.factor != 1.0
+        return math.sqrt(2.0) * self.latent_std if pointwise else math.inf
 
     def __post_init__(self) -> None:
         if isinstance(self.inner, str) and self.inner not in ("L2", "H1", "H2"):
@@ -269,12 +316,16 @@ class Field(_Prior):
                 raise SpaceError(
                     f"dirichlet: the mesh has no boundary '{name}'; it has {sorted(known)}."
                 )
-            if isinstance(value, _Prior):
+            if any(isinstance(item, _Prior) for item in _each_value(value)):
                 raise SpaceError(
                     f"dirichlet: the value on '{name}' is unknown; let it enter weakly, by a "
                     f"penalty: On('{name}', lambda q, u, v, x: 100 * D / x.h * (u - q.value) * v)."
                 )
-        values = list(self.dirichlet.values())
+        # Arrays compare entry by entry; everyone else reads plain values or tuples of them.
+        given: Mapping[str, Any] = self.dirichlet
+        plain = {name: v if _is_plain(v) else tuple(v) for name, v in given.items()}
+        object.__setattr__(self, "dirichlet", plain)
+        values = list(plain.values())
         if self.clamped and (not values or any(value != 0.0 for value in values)):
             raise SpaceError(
                 'clamped=True fixes values and slopes to zero: give dirichlet={"boundary": 0.0}, '
@@ -300,6 +351,16 @@ class Field(_Prior):
             )
 
 
+def _is_plain(value: Any) -> bool:
+    """Return true if a boundary value is not a sequence with one for each component."""
+    return callable(value) or isinstance(value, Channel | _Prior) or np.ndim(value) == 0
+
+
+def _each_value(value: Any) -> Sequence[Any]:
+    """Return the plain values of a boundary value."""
+    return [value] if _is_plain(value) else [item for item in value if item is not None]
+
+
 @dataclass(frozen=True, eq=False)
 class Scalar(_Prior):
     """One unknown number with a Gaussian prior; bounds are never left by an estimate.
@@ -315,6 +376,11 @@ class Scalar(_Prior):
         the logarithm is std / prior. "logit": strictly between two finite bounds.
     evolution
         How the unknown moves by itself: `RandomWalk`, `MeanReverting`, `Periodic`; default not.
+    within
+        So many prior deviations its latent value (q itself, its logarithm or its logit) may lie
+        from the prior mean in the sensitivity law: neither the point of linearisation nor what is
+        reported goes beyond, and the note "bounded" tells how many values are held there. inf: no
+        such end. Of a `RandomWalk` there is none: the prior says nothing of later values.
     """
 
     prior: float = 0.0
@@ -323,6 +389,7 @@ class Scalar(_Prior):
     unit: str = ""
     transform: str | None = None
     evolution: Evolution = CONSTANT
+    within: float = WITHIN
 
     def __post_init__(self) -> None:
         self._check()
@@ -337,7 +404,7 @@ class Piecewise(_Prior):
     regions
         Name -> predicate on x, or the name of a subdomain of the mesh. A point in no region sees
         the value zero; in two regions, the sum.
-    prior, std, bounds, unit, transform, evolution
+    prior, std, bounds, unit, transform, evolution, within
         As for `Scalar`.
     """
 
@@ -348,6 +415,7 @@ class Piecewise(_Prior):
     unit: str = ""
     transform: str | None = None
     evolution: Evolution = CONSTANT
+    within: float = WITHIN
 
     def __post_init__(self) -> None:
         if not self.regions:
@@ -365,7 +433,7 @@ class Scalars(_Prior):
     ----------
     names
         Their names.
-    prior, std, bounds, unit, transform, evolution
+    prior, std, bounds, unit, transform, evolution, within
         As for `Scalar`.
     """
 
@@ -376,6 +444,7 @@ class Scalars(_Prior):
     unit: str = ""
     transform: str | None = None
     evolution: Evolution = CONSTANT
+    within: float = WITHIN
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) != len(self.names):

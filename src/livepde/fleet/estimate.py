@@ -8,17 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from livepde.errors import ConfigurationError
 from livepde.fem import FunctionSpace
 from livepde.fleet.engine import Beliefs
 from livepde.laws import Belief, Status
 from livepde.linalg import Array, IntArray, Mask
-from livepde.records import STATUS_CODES, Layout
+from livepde.records import NOTE, STATUS_CODES, Layout
 from livepde.result import Estimate
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["FleetEstimate", "FleetResult"]
+
+MEMBER = "member"  # dimension of the dataset
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +124,11 @@ class FleetResult:
     """Estimates of a fleet, as they are added: numbers, innovations and statuses of all samples."""
 
     def __init__(self, members: Sequence[str], layout: Layout) -> None:
+        if MEMBER in layout.scalars:
+            raise ConfigurationError(
+                f"Fleet: in its dataset '{MEMBER}' would be the dimension of the members and the "
+                f"unknown '{MEMBER}': give the unknown another name."
+            )
         self.members = tuple(members)
         self.layout = layout
         self.last: FleetEstimate | None = None
@@ -158,11 +166,11 @@ class FleetResult:
         """
         import xarray as xr
 
-        rows, layout, both = self._rows, self.layout, ("member", "time")
+        rows, layout, both = self._rows, self.layout, (MEMBER, "time")
         times = np.array([row.t for row in rows])
         data = xr.Dataset(
             coords={
-                "member": list(self.members),
+                MEMBER: list(self.members),
                 "time": ("time", times, {"units": layout.time_unit}),
                 "sensor": list(layout.sensors),
                 "withheld": list(layout.withheld or ()),
@@ -192,7 +200,7 @@ class FleetResult:
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
         nothing = np.full(len(self.members), np.nan)
         for name in dict.fromkeys(name for row in rows for name in row.notes):
-            key = f"note_{name}" if name in data else name
+            key = f"{NOTE}{name}" if name in data else name
             data[key] = (both, table([row.notes.get(name, nothing) for row in rows]))
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data

@@ -13,7 +13,7 @@ from livepde.fleet.estimate import FleetEstimate
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.records import STATUS_CODES, Record, Snapshot
-from livepde.result import interval_ends, unknown_of, variables, vertex_order
+from livepde.result import interval_ends, unknown_of, vertex_order
 
 __all__ = ["Kept"]
 
@@ -126,7 +126,7 @@ class Kept:
         members, _, r = factors.u.shape
         order = vertex_order(self.model)
         for name, block in self.model.state_space.fields.items():
-            part, names = self.model.state_space.part(name), variables(name, block)
+            part, names = self.model.state_space.part(name), block.variables(name)
             columns = factors.u[:, part].transpose(1, 0, 2).reshape(-1, members * r)
             squares = ((block.at_vertices @ columns) ** 2).reshape(-1, members, r).sum(axis=2)
             deviations = np.sqrt(squares)

@@ -180,7 +180,7 @@ class AutoLaw(Law[Bank, AutoState]):
             0,
             2 * TRIAL,
             2 * TRIAL,
-            JUMPS.start(),
+            JUMPS.start(len(noise)),
         )
 
     def begin(self, work: Bank, state: AutoState, interval: Interval) -> AutoState:
@@ -261,8 +261,7 @@ class AutoLaw(Law[Bank, AutoState]):
             return state, False
         at = state.at(state.leader)
         innovations = state.members.now.innovations.newest[[at]]
-        usual = take(before.members.now.innovations, before.at(state.leader))
-        watch, alarms = JUMPS.add(state.watch, innovations, usual)
+        watch, alarms = JUMPS.add(state.watch, innovations)
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
         stayed, stays = (work.candidates[s.leader].drift == 0.0 for s in (before, state))
         if stayed and not stays and state.count >= 2 * TRIAL:

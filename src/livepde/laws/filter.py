@@ -237,8 +237,9 @@ class Filter:
 
         Members in `kept`, shape (members,), keep theirs.
 
-        Bounds hold for linearisation points and for what is reported, not for the linear filter:
-        what lies beyond them stays in da and du, so that nothing the data said is lost.
+        Bounds (`Reduction.ends`) hold for linearisation points and for what is reported, not for
+        the linear filter: what lies beyond them stays in da and du, so that nothing the data said
+        is lost.
         """
         estimate = self.estimate(x)
         within = self.reduction.bounded(estimate)
@@ -257,15 +258,16 @@ class Filter:
             return changed(x, u=u, q=q, du=np.where(rows, x.du, du), da=np.where(rows, x.da, da))
         return changed(x, u=u, q=estimate, du=du, da=da)
 
-    def inflated(self, x: FilterState, size: float) -> FilterState:
+    def inflated(self, x: FilterState, size: float, chosen: Mask | None = None) -> FilterState:
         """Return the state with `size` prior deviations added to the uncertainty of each unknown.
 
-        Independent of what is known of u: that is as well known as before.
+        Independent of what is known of u: that is as well known as before. With `chosen`, shape
+        (k,), of these coordinates only.
         """
         members, _, k = x.C.shape
-        unit = np.broadcast_to(size * np.eye(k), (members, k, k))
-        C = np.concatenate([x.C, unit], axis=1)
-        new = changed(x, U=_extended(x.U, k), C=C, past=_extended(x.past, k))
+        rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
+        C = np.concatenate([x.C, np.broadcast_to(rows, (members, *rows.shape))], axis=1)
+        new = changed(x, U=_extended(x.U, len(rows)), C=C, past=_extended(x.past, len(rows)))
         return self._compressed(new) if C.shape[1] > self.rank else new
 
     def with_prior(self, x: FilterState) -> FilterState:

@@ -123,6 +123,11 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 raise LawError(f"GradientLaw: {name} must be a number >= 0; got {value}.")
 
     def prepare(self, problem: Problem) -> GradientParts:
+        if len(problem.model.algebraic):
+            raise LawError(
+                "GradientLaw: a component of the state has no mass term, so that M is no inner "
+                "product of X: use SensitivityLaw, or give M a term for each component."
+            )
         if self.gain == "auto":
             return tuned_parts(problem, self.nu, self.N_op, self.newton)
         return constant_parts(

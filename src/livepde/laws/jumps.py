@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,9 +11,12 @@ import scipy
 
 from livepde.errors import LawError
 from livepde.laws.innovations import Innovations
+from livepde.laws.members import where
 from livepde.linalg import Array, IntArray, Mask
 
 __all__ = ["Jumps", "Watch"]
+
+LARGEST = 3.0  # Huber's bound: of Gaussian innovations it cuts off 0.3 %, and 1 % of their variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,22 +28,39 @@ class Watch:
     squares, counts
         Sum of e^2 and number of innovations e of each of the last samples, newest first, shapes
         (members, samples).
-    seen
-        Samples since the start or the last alarm, shape (members,).
+    seen, resting
+        Samples since the start, and samples that are not looked at yet, shape (members,).
+    usual
+        Statistics of the innovations, with which new ones are compared: none counts for more than
+        `LARGEST` times the usual size, so that a jump hardly changes by what it is measured.
     """
 
     squares: Array
     counts: Array
     seen: IntArray
+    resting: IntArray
+    usual: Innovations
 
-    def add(self, e: Array) -> Watch:
-        """Return the value after normalised innovations (members, sensors), NaN where missing."""
+    def add(self, e: Array, opening: Mask) -> Watch:
+        """Return the value after normalised innovations (members, sensors), NaN where missing.
+
+        Parameters
+        ----------
+        opening
+            Members that still have to find the usual size, shape (members,): there any innovation
+            counts, while those after an alarm, which learn anew, are left out.
+        """
         seen = np.isfinite(e)
         square = (np.where(seen, e, 0.0) ** 2).sum(axis=1)
         squares = np.concatenate([square[:, None], self.squares[:, :-1]], axis=1)
         count = seen.sum(axis=1).astype(float)
         counts = np.concatenate([count[:, None], self.counts[:, :-1]], axis=1)
-        return Watch(squares, counts, self.seen + 1)
+        most = LARGEST * np.sqrt(np.where(opening, np.inf, self.usual.ratio))[:, None]
+        counted = seen.any(axis=1) & (opening | (self.resting == 0))
+        usual = self.usual
+        if counted.any():
+            usual = where(counted, usual.add(np.clip(e, -most, most)), usual)
+        return Watch(squares, counts, self.seen + 1, np.maximum(self.resting - 1, 0), usual)
 
 
 @dataclass(frozen=True)
@@ -49,8 +70,13 @@ class Jumps:
     The innovations of the last 1, 2, 4, ... samples, normalised by what is expected of them and by
     their usual size and correlation, are compared with the chi-square distribution. After an alarm
     the law goes back to where the innovations most likely became too large, adds `size` prior
-    deviations to the uncertainty of every unknown there, and takes the samples since again: so it
-    learns anew without a restart, and what was known of the state before the jump is kept.
+    standard deviations to the uncertainty of the unknowns that may jump, and takes the samples
+    since again: so it learns anew without a restart, and what was known of the state and of the
+    other unknowns before the jump is kept.
+
+    The usual size and correlation are those of the last 500 samples that were looked at, with the
+    first `settle`; after these none counts for more than three times the usual size. So a jump
+    hardly changes by what the next one is measured.
 
     Parameters
     ----------
@@ -62,12 +88,16 @@ class Jumps:
         What an alarm adds, in prior deviations.
     settle
         So many samples after the start, and after an alarm, are not looked at.
+    unknowns
+        Names of the unknowns that may jump; default all. A material constant that is not among them
+        keeps what is known of it.
     """
 
     probability: float = 1e-5
     window: int = 32
     size: float = 1.0
     settle: int = 50
+    unknowns: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.probability < 1:
@@ -78,62 +108,69 @@ class Jumps:
             raise LawError(f"Jumps: size must be a positive number; got {self.size}.")
         if self.settle < 0:
             raise LawError(f"Jumps: settle must be at least 0; got {self.settle}.")
+        if self.unknowns is not None:
+            names = self.unknowns
+            if isinstance(names, str) or not (names and all(isinstance(n, str) for n in names)):
+                raise LawError(
+                    f"Jumps: unknowns must be names, as ('v',), or None for all; got {names!r}."
+                )
+            object.__setattr__(self, "unknowns", tuple(names))
 
     @cached_property
     def _lengths(self) -> IntArray:
         """Numbers of samples that are looked at, less one."""
         return 2 ** np.arange(int(np.log2(self.window)) + 1) - 1
 
-    def start(self, members: int = 1) -> Watch:
+    def start(self, sensors: int, members: int = 1) -> Watch:
         """Return the value before any innovation."""
-        zero = np.zeros((members, self.window))
-        return Watch(zero, zero, np.zeros(members, dtype=np.int64))
+        zero, none = np.zeros((members, self.window)), np.zeros(members, dtype=np.int64)
+        usual = Innovations.start(sensors, members)
+        return Watch(zero, zero, none, none + self.settle, usual)
 
-    def add(self, watch: Watch, e: Array, usual: Innovations) -> tuple[Watch, Mask]:
+    def add(self, watch: Watch, e: Array) -> tuple[Watch, Mask]:
         """Return the value after a sample, and for which members there is an alarm.
 
         Parameters
         ----------
         e
             Normalised innovations, shape (members, sensors), NaN where missing.
-        usual
-            Their statistics before this sample.
         """
-        early = watch.seen < self.settle  # the first linearisations are poor: what they miss
-        new = watch.add(e)  # is no jump
+        new = watch.add(e, watch.seen < self.settle)
+        early = watch.resting > 0  # the first linearisations are poor: what they miss is no jump
         if early.any():
             kept = early[:, None]
             squares = np.where(kept, watch.squares, new.squares)
             counts = np.where(kept, watch.counts, new.counts)
-            new = Watch(squares, counts, new.seen)
+            new = replace(new, squares=squares, counts=counts)
             if early.all():
                 return new, np.zeros(len(e), dtype=bool)
         lengths = self._lengths
         sums = np.cumsum(new.squares, axis=1)[:, lengths]
         freedom = np.cumsum(new.counts, axis=1)[:, lengths]
-        scatter = usual.scatter[:, None]
+        scatter = watch.usual.scatter[:, None]
         with np.errstate(invalid="ignore"):  # no freedom, no chance
             chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums / scatter**2)
         chance = np.where(freedom > 0.0, chance, 1.0).min(axis=1)
         unlikely = chance * len(lengths) < self.probability
         alarm: Mask = ~early & (new.counts[:, 0] > 0.0) & unlikely
         if alarm.any():
-            again, clear = self.start(len(e)), alarm[:, None]
-            new = Watch(
-                np.where(clear, again.squares, new.squares),
-                np.where(clear, again.counts, new.counts),
-                np.where(alarm, again.seen, new.seen),
+            clear = alarm[:, None]
+            new = replace(
+                new,
+                squares=np.where(clear, 0.0, new.squares),
+                counts=np.where(clear, 0.0, new.counts),
+                resting=np.where(alarm, self.settle, new.resting),
             )
         return new, alarm
 
-    def onset(self, watch: Watch, e: Array, usual: Innovations) -> int:
+    def onset(self, watch: Watch, e: Array) -> int:
         """Return of how many samples, up to this one, innovations are most likely too large.
 
         The number n that maximises the likelihood ratio n (r - 1 - log r)/2 of innovations of mean
         square r > 1 since n samples against 1. Parameters as for `add`, of one member.
         """
-        new = watch.add(e)
+        new = watch.add(e, watch.seen < self.settle)
         freedom = np.cumsum(new.counts[0])
-        ratio = np.cumsum(new.squares[0]) / usual.scatter[0] ** 2 / np.maximum(freedom, 1.0)
-        ratio = np.maximum(ratio, 1.0)
+        size = watch.usual.scatter[0] ** 2 * np.maximum(freedom, 1.0)
+        ratio = np.maximum(np.cumsum(new.squares[0]) / size, 1.0)
         return 1 + int(np.argmax(freedom * (ratio - 1.0 - np.log(ratio))))

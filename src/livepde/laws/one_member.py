@@ -236,20 +236,20 @@ def _watched(
     """
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
         return new, replace(report, notes={**report.notes, "jump": 0.0})
-    usual, e = state.now.innovations, new.now.innovations.newest
-    watch, alarms = jumps.add(state.watch, e, usual)
+    e = new.now.innovations.newest
+    watch, alarms = jumps.add(state.watch, e)
     alarm, new = bool(alarms[0]), changed(new, watch=watch)
     if alarm:
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
-        before = max(len(known) - jumps.onset(state.watch, e, usual), 0)
+        before = max(len(known) - jumps.onset(state.watch, e), 0)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
         for earlier in known[:before]:
             x, found = _filtered(work, x, earlier)
             x, status = work.filter.relinearised(x), found.status
             if not status.ok:
                 break
-        start = work.filter.inflated(x, jumps.size)
+        start = work.filter.inflated(x, jumps.size, work.jumping)
         taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
         at = row + int(taken[before])
         again, found = _retaken(work, new, start, at, known[before:])
@@ -257,5 +257,5 @@ def _watched(
             new = again
         else:
             now = work.filter.relinearised(new.now)
-            new = new_window(work, work.filter.inflated(now, jumps.size), new)
+            new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)
     return new, replace(report, notes={**report.notes, "jump": float(alarm)})

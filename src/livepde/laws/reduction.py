@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -114,6 +115,23 @@ class Reduction:
             still[evolution.part] = not evolution.model.moves
         return still
 
+    def named(self, names: Sequence[str] | None, who: str) -> Mask:
+        """Return which coordinates belong to some unknowns, shape (k,); None stands for all.
+
+        Raises
+        ------
+        LawError
+            There is no unknown of that name; the message begins with `who`.
+        """
+        parts = list(self.problem.model.latent.parts)
+        missing = [name for name in names or () if name not in parts]
+        if missing:
+            raise LawError(f"{who}: there is no unknown '{missing[0]}'; there are {parts}.")
+        chosen = np.zeros(self.size, dtype=bool)
+        for name, evolution in zip(parts, self.evolutions, strict=True):
+            chosen[evolution.part] = names is None or name in names
+        return chosen
+
     def moving(self, drift: float) -> int:
         """Return how many coordinates gain variance."""
         return sum(
@@ -183,9 +201,46 @@ class Reduction:
         a: Array = dq @ self._dual
         return a
 
+    @cached_property
+    def ends(self) -> tuple[Array, Array]:
+        """Least and largest latent parameters: bounds, and what is too far from the prior, (m,).
+
+        Too far is by more than `within` prior deviations (of a field those of each coefficient in
+        the modes; what no mode moves is free).
+        """
+        latent = self.problem.model.latent
+        deviation = np.linalg.norm(self.Phi, axis=1)
+        reach = np.concatenate(
+            [
+                np.full(item.part.stop - item.part.start, item.unknown.reach)
+                for item in latent.parts.values()
+            ]
+        )
+        farthest = np.where(deviation > 0.0, reach, np.inf) * np.where(
+            deviation > 0.0, deviation, 1.0
+        )
+        lower, upper = latent.bounds
+        return (
+            np.maximum(lower, latent.prior - farthest),
+            np.minimum(upper, latent.prior + farthest),
+        )
+
     def bounded(self, q: Array) -> Array:
-        """Return latent parameters within their bounds, shape (..., m)."""
-        return self.problem.model.latent.clipped(q)
+        """Return latent parameters within their `ends`, shape (..., m): q itself if they are."""
+        lower, upper = self.ends
+        inside = (q >= lower) & (q <= upper)
+        return q if inside.all() else np.minimum(np.maximum(q, lower), upper)
+
+    def held(self, q: Array) -> Array:
+        """Return how many latent parameters would lie too far from the prior, (...) for (..., m).
+
+        Bounds that a user has set do not count.
+        """
+        lower, upper = self.ends
+        bounds = self.problem.model.latent.bounds
+        return np.asarray(
+            (((q < lower) & (lower > bounds[0])) | ((q > upper) & (upper < bounds[1]))).sum(axis=-1)
+        )
 
     def directions(self, q: Array, C: Array) -> Array:
         """Return how the physical parameter changes along rows of a, (members, r, m).

@@ -76,8 +76,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     columns at each substep, independent of what the state remembers of older values; the factor is
     then compressed to `rank` columns, so that nothing has to be forgotten by hand.
 
-    Bounds of numbers hold for the reference about which the filter is linear, and for what is
-    reported; the filter itself stays linear.
+    Bounds of numbers, and those of latent values (`within` of an unknown), hold for the reference
+    about which the filter is linear, and for what is reported; the filter itself stays linear.
 
     Parameters
     ----------
@@ -171,7 +171,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 "observation (one number, or one for each sensor) or to the law."
             )
         reduction = Reduction.of(problem, self.modes)
-        moving = reduction.size if self.jumps is not None else reduction.moving(self.drift)
+        moving = reduction.moving(self.drift)
+        if self.jumps is not None:
+            jumping = int(reduction.named(self.jumps.unknowns, "Jumps: unknowns").sum())
+            moving = max(moving, jumping)
         rank = self.rank if self.rank is not None else reduction.size + 5 * moving
         if rank < reduction.size:
             raise LawError(
@@ -233,7 +236,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             since_older=zero,
             since_newer=zero,
             log=empty_log(1, sensors, len(problem.channels)),
-            watch=(self.jumps or Jumps()).start(),
+            watch=(self.jumps or Jumps()).start(sensors),
             scale=Scale.start(sensors),
         )
 
@@ -374,7 +377,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
         if (jumps := self.jumps) is not None and present.any():
             e = x.innovations.newest
-            seen, alarm = jumps.add(watch, e, before.innovations)
+            seen, alarm = jumps.add(watch, e)
             watch = where(np.broadcast_to(present, alarm.shape), seen, watch)
             usual = usual & ~(alarm & present)
         if not replays.all():

@@ -60,6 +60,12 @@ class SensitivityWork:
         return bool(self.back or self.replay or self.start_window)
 
     @cached_property
+    def jumping(self) -> Mask:
+        """Coordinates of the unknowns that may jump, shape (k,)."""
+        names = self.jumps.unknowns if self.jumps is not None else ()
+        return self.filter.reduction.named(names, "Jumps: unknowns")
+
+    @cached_property
     def most(self) -> int:
         """Largest number of samples in a window of a replay."""
         return self.replay.window if self.replay is not None else 0
@@ -184,7 +190,9 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
 
 def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
     """Return what the members report after a sample."""
-    members, innovations, level = len(now), now.innovations, now.level  # not all of the filter
+    # Not all of the filter is kept for what may never be read.
+    members, innovations, level, q, da = len(now), now.innovations, now.level, now.q, now.da
+    reduction = work.filter.reduction
 
     def notes() -> dict[str, Array]:
         found = {
@@ -197,6 +205,9 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
             found["refused"] = told.refused
         if work.jumps is not None:
             found["jump"] = np.zeros(members)
+        held = reduction.held(q + da @ reduction.Phi.T)
+        if held.any():
+            found["bounded"] = np.where(held > 0, held, np.nan)
         return found
 
     steps = np.full(members, told.steps)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from livepde.linalg import Array
+from livepde.records import NOTE
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -17,6 +18,7 @@ __all__ = [
     "groups",
     "interval_95",
     "labelled",
+    "note",
     "scalars",
     "scored_from",
     "time_scale",
@@ -30,6 +32,20 @@ CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))  # span from w
 def scalars(data: xr.Dataset) -> list[str]:
     """Return the labels of the scalar unknowns."""
     return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
+
+
+def note(data: xr.Dataset, name: str) -> Array | None:
+    """Return a note of the law over time, shape (samples,); None if the run has none.
+
+    A note whose name is that of an unknown, say, is kept under another one: see `Layout.dataset`.
+    """
+    key = f"{NOTE}{name}" if f"{NOTE}{name}" in data else name
+    about = (str(data.attrs.get(kind, "")) for kind in ("fields", "state"))
+    unknown = {*scalars(data), *" ".join(about).split()}
+    if key not in data or key in unknown or data[key].dims != ("time",):
+        return None
+    values: Array = data[key].values
+    return values
 
 
 def groups(data: xr.Dataset) -> dict[str, list[str]]:

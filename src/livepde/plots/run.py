@@ -11,7 +11,15 @@ import numpy as np
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 from livepde.plots.curves import profiles
-from livepde.plots.dataset import MOST_LINES, groups, interval_95, labelled, scored_from, time_scale
+from livepde.plots.dataset import (
+    MOST_LINES,
+    groups,
+    interval_95,
+    labelled,
+    note,
+    scored_from,
+    time_scale,
+)
 from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish
 
 if TYPE_CHECKING:
@@ -119,9 +127,10 @@ def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
 
 def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
     """Draw a line at each alarm of the test for jumps."""
-    if "jump" not in data or data["jump"].dims != ("time",):
+    alarms = note(data, "jump")
+    if alarms is None:
         return
-    times = data["time"].values[data["jump"].values > 0.0] / time_scale(data)[0]
+    times = data["time"].values[alarms > 0.0] / time_scale(data)[0]
     for k, t in enumerate(times):
         label = f"jump at {t:.4g}" if len(times) == 1 else f"{len(times)} jumps"
         if k:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.diagnostics.identifiability import FLAT
-from livepde.plots.dataset import scalars
+from livepde.plots.dataset import note, scalars
 from livepde.runs.dates import when
 from livepde.runs.summary import digits, jumps, scored
 
@@ -44,7 +44,8 @@ def doubts(data: xr.Dataset) -> list[str]:
     nothing excited. With gain='auto' the unknowns ended farther from their prior than, with a right
     model, they do in one of a million cases. With a fixed gain an estimate wanders, in the last
     half of a run, by more than 0.3 of what it has learned. In more than 0.03 of the samples a bank
-    believes that unknowns drift. Something jumped.
+    believes that unknowns drift. Latent values were held where they would have left their
+    prior. Something jumped.
     """
     if not data.sizes["time"]:
         return []
@@ -53,7 +54,8 @@ def doubts(data: xr.Dataset) -> list[str]:
         *_replays(data),
         *_refused(data),
         *_unknowns(data),
-        *([*_rests(data), *_lost(data)] if "residual" in data else _guards(data)),
+        *_held(data),
+        *([*_rests(data), *_lost(data)] if note(data, "residual") is not None else _guards(data)),
         *_drifts(data),
         *_departure(data),
         *_gain(data),
@@ -63,15 +65,15 @@ def doubts(data: xr.Dataset) -> list[str]:
 
 def unexplained(data: xr.Dataset) -> bool:
     """Return whether a run says that its model does not explain the data: see `doubts`."""
-    if "innovation_ratio" not in data or not data.sizes["time"]:
-        return False
-    return bool(data["innovation_ratio"].values[-1] > MODEL_ERROR)
+    ratio = note(data, "innovation_ratio")
+    return ratio is not None and len(ratio) > 0 and bool(ratio[-1] > MODEL_ERROR)
 
 
 def _model_error(data: xr.Dataset) -> list[str]:
-    if not unexplained(data):
+    ratios = note(data, "innovation_ratio")
+    if ratios is None or not unexplained(data):
         return []
-    ratio = float(data["innovation_ratio"].values[-1])
+    ratio = float(ratios[-1])
     found = [
         "The model does not explain the data: the sensors miss what is expected of them by "
         f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
@@ -104,9 +106,9 @@ def _model_error(data: xr.Dataset) -> list[str]:
 
 
 def _replays(data: xr.Dataset) -> list[str]:
-    if "replay_left" not in data:
+    left = note(data, "replay_left")
+    if left is None:
         return []
-    left = data["replay_left"].values
     left = left[np.isfinite(left)]
     if not len(left) or left[-1] <= LEFT:
         return []
@@ -118,9 +120,10 @@ def _replays(data: xr.Dataset) -> list[str]:
 
 
 def _refused(data: xr.Dataset) -> list[str]:
-    if "refused" not in data:
+    values = note(data, "refused")
+    if values is None:
         return []
-    refused = float(np.nansum(data["refused"].values))
+    refused = float(np.nansum(values))
     share = refused / max(int(np.isfinite(data["innovation"].values).sum()), 1)
     if share <= REFUSED:
         return []
@@ -148,6 +151,20 @@ def _unknowns(data: xr.Dataset) -> list[str]:
                 f"that of the prior; {TELLING}"
             )
     return found
+
+
+def _held(data: xr.Dataset) -> list[str]:
+    """Return whether latent values were held at their ends, `within` prior deviations away."""
+    counts = note(data, "bounded")
+    if counts is None or not (counts > 0.0).any():
+        return []
+    at = np.flatnonzero(counts > 0.0)
+    last = when(data, float(data["time"][at[-1]]))
+    return [
+        f"In {len(at)} samples, last at {last}, the data asked for unknowns farther from the prior "
+        "than its deviations allow (within, by default 10 of them), and they were held there: the "
+        "prior is much too narrow, or a unit, a sensor or the model is wrong."
+    ]
 
 
 def _jumps(data: xr.Dataset) -> list[str]:
@@ -179,8 +196,8 @@ def _jumps(data: xr.Dataset) -> list[str]:
 
 def _guards(data: xr.Dataset) -> list[str]:
     def times(name: str) -> Any:
-        noted = data[name].values == 1.0 if name in data else np.zeros(data.sizes["time"], bool)
-        return data["time"].values[noted]
+        values = note(data, name)
+        return data["time"].values[[] if values is None else values == 1.0]
 
     tempered, held = times("tempered"), times("held")
     restarted, runaway = times("restarted"), times("runaway")
@@ -209,9 +226,10 @@ def _guards(data: xr.Dataset) -> list[str]:
 
 def _rests(data: xr.Dataset) -> list[str]:
     """Return when the gradient law has held q."""
-    if "at_rest" not in data:
+    noted = note(data, "at_rest")
+    if noted is None:
         return []
-    held = data["at_rest"].values == 1.0
+    held = noted == 1.0
     begin = np.flatnonzero(held & ~np.append(False, held[:-1]))
     if held[-1]:
         at = when(data, float(data["time"][begin[-1]]))
@@ -227,9 +245,10 @@ def _rests(data: xr.Dataset) -> list[str]:
 
 def _lost(data: xr.Dataset) -> list[str]:
     """Return where a gradient law could not learn from a sample, because no step converged."""
-    if "held" not in data:
+    noted = note(data, "held")
+    if noted is None:
         return []
-    held = data["held"].values == 1.0
+    held = noted == 1.0
     last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
     return [
         f"In {held.sum()} samples, last at {last}, no step converged with the unknowns: they were "
@@ -239,9 +258,10 @@ def _lost(data: xr.Dataset) -> list[str]:
 
 def _drifts(data: xr.Dataset) -> list[str]:
     """Return whether a bank has believed for long that unknowns drift: nobody has said so."""
-    if "drifting" not in data:
+    weights = note(data, "drifting")
+    if weights is None:
         return []
-    drifting = data["drifting"].values > BELIEVED
+    drifting = weights > BELIEVED
     if not drifting.mean() > DRIFTING:
         return []
     last = when(data, float(data["time"][np.flatnonzero(drifting)[-1]]))
@@ -255,9 +275,9 @@ def _drifts(data: xr.Dataset) -> list[str]:
 
 def _departure(data: xr.Dataset) -> list[str]:
     """Return whether a law that has a prior, and no innovations to judge, has left it."""
-    if "departure" not in data:
+    ratios = note(data, "departure")
+    if ratios is None:
         return []
-    ratios = data["departure"].values
     ratios = ratios[np.isfinite(ratios)]
     if not len(ratios) or ratios[-1] <= LEAVES:
         return []
@@ -272,7 +292,7 @@ def _departure(data: xr.Dataset) -> list[str]:
 
 def _gain(data: xr.Dataset) -> list[str]:
     """Return what there is to say of a law with a fixed gain, which has no covariance."""
-    if "residual" not in data or "gain" in data:
+    if note(data, "residual") is None or note(data, "gain") is not None:
         return []
     names = [*scalars(data), *str(data.attrs.get("fields", "")).split()]
     wandering = [name for name in names if name in data and _wanders(data[name].values)]

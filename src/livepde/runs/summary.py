@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.diagnostics.identifiability import TRADED, Known
-from livepde.plots.dataset import interval_95, scalars
+from livepde.plots.dataset import interval_95, note, scalars
 from livepde.runs.dates import when
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
+    "ROLES",
+    "TOTALS",
     "Jump",
     "checks_of",
     "digits",
@@ -32,9 +34,11 @@ __all__ = [
 ]
 
 MOST_ROWS = 40
+TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
+ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, too
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
 JUMP = "jump"  # what the law notes of each sample
-CHANNELS = (("innovation", "sensor", "assimilated"), ("withheld_error", "withheld", "withheld"))
+CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", ROLES[1]))
 
 
 def digits(value: float, std: float) -> tuple[str, str]:
@@ -119,9 +123,10 @@ class Jump:
 
 def jumps(data: xr.Dataset) -> list[Jump]:
     """Return the alarms of a run, in time order; none without the test for jumps."""
-    if JUMP not in data or data[JUMP].dims != ("time",):
+    alarms = note(data, JUMP)
+    if alarms is None:
         return []
-    at = np.flatnonzero(data[JUMP].values > 0.0)
+    at = np.flatnonzero(alarms > 0.0)
     ends = np.append(at, data.sizes["time"])[1:] - 1
     found = []
     for k, end in zip(at, ends, strict=True):
@@ -178,15 +183,16 @@ def measures(data: xr.Dataset) -> dict[str, float]:
     channels = scored(data)
     parts = [errors for _, errors in channels.values()]
     found["rmse"] = _rmse(np.concatenate(parts)) if parts else math.nan
-    for role in ("assimilated", "withheld"):
+    for role in ROLES:
         some = [errors for kind, errors in channels.values() if kind == role]
         if some:
             found[f"rmse.{role}"] = _rmse(np.concatenate(some))
     for name, (_, errors) in channels.items():
         found[f"rmse.{name}"] = _rmse(errors)
-    if "innovation_ratio" in data and data.sizes["time"]:
-        found["innovation_ratio"] = float(data["innovation_ratio"].values[-1])
-    if JUMP in data:
+    ratios = note(data, "innovation_ratio")
+    if ratios is not None and len(ratios):
+        found["innovation_ratio"] = float(ratios[-1])
+    if note(data, JUMP) is not None:
         found["jumps"] = float(len(jumps(data)))
     found["failed_steps"] = float((data["status"].values != 0).sum())
     return found

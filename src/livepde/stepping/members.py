@@ -181,7 +181,7 @@ class BandedStage(MemberStage):
         self.model = model
         form, zero, free = model.physical_A, np.zeros(model.X.dim), model.X.free
         fields = [block.field for block in model.state_space.fields.values()]
-        values = [value for field in fields for value in field.dirichlet.values()]
+        values = [value for field in fields for value in field.boundary_values]
         fixed_in_time = all(isinstance(value, int | float | Channel) for value in values)
         units = np.eye(model.parameter_space.dim)
         self.pattern, maps = _analysed(model)
