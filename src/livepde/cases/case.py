@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of
+from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import expanded
@@ -51,11 +51,14 @@ class Prepared:
     first
         The first sample, which describes the start.
     stream
-        All samples. A `Table` can be iterated again, standard input cannot.
+        All samples. A `Table` can be iterated again, standard input cannot. Gaps of its boundary
+        and input channels are interpolated, and spikes refused.
     assimilate_from
         Model time from which sensors are assimilated; scores count from here, too.
     origin
         Date of t = 0, if the data have dates.
+    raw
+        A finished record as it was read, with its gaps.
     """
 
     case: Case
@@ -63,6 +66,7 @@ class Prepared:
     stream: Iterable[Sample]
     assimilate_from: float
     origin: datetime | None
+    raw: Table | None = None
 
     @cached_property
     def identifier(self) -> Identifier:
@@ -358,14 +362,16 @@ class Case:
 
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return the case with its data, as `prepare` does, before an identifier is built."""
-        data = read_data(self.frame, self.columns, self.clock, source)
+        raw = read_data(self.frame, self.columns, self.clock, source)
+        data = without_gaps(self.frame, raw) if isinstance(raw, Table) else raw
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
         if first is None:
             raise DataError(f"{self.frame.path}: the data hold no sample between start and stop.")
         start = assimilation_start(self.frame, self.clock, data.origin)
-        stream = data if isinstance(data, Table) else chain([first], samples)
-        return Prepared(self, first, stream, start, data.origin)
+        if isinstance(data, Table) and isinstance(raw, Table):
+            return Prepared(self, first, data, start, data.origin, raw)
+        return Prepared(self, first, chain([first], samples), start, data.origin)
 
     @property
     def live(self) -> bool:

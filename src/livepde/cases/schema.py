@@ -249,7 +249,23 @@ class ChannelSpec(Spec):
     wait: Quantity | None = None
     repeated: Literal["first", "last"] | None = None
     valid: Pair | None = None
-    missing: Literal["hold", "skip"] = "hold"
+    missing: Literal["interpolate", "hold", "skip"] | None = None
+    spikes: Literal["refuse", "keep"] | None = None
+
+    @property
+    def drives(self) -> bool:
+        """Whether the channel drives the model: a boundary value or another input."""
+        return self.role in ("boundary", "input")
+
+    @property
+    def gaps(self) -> Literal["interpolate", "hold", "skip"]:
+        """What becomes of gaps."""
+        return self.missing or ("interpolate" if self.drives else "hold")
+
+    @property
+    def screened(self) -> bool:
+        """Whether spikes are refused."""
+        return self.drives and self.spikes != "keep"
 
     @model_validator(mode="after")
     def _consistent(self) -> ChannelSpec:
@@ -273,6 +289,11 @@ class ChannelSpec(Spec):
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
         if self.of is not None and self.role not in ("sensor", "withheld"):
             raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
+        if not self.drives and (self.missing == "interpolate" or self.spikes is not None):
+            raise ValueError(
+                'missing = "interpolate" and spikes belong to boundary and input channels; '
+                "values of sensors that are far off are refused by law.gate"
+            )
         if self.role not in ("sensor", "withheld") and self.noise is not None:
             raise ValueError(f"noise belongs to sensors, not to a channel of role {self.role}")
         return self

@@ -41,7 +41,7 @@ def columns_of(frame: Frame) -> dict[str, Column]:
         valid = (-np.inf, np.inf)
         if channel.valid is not None:
             valid = frame.pair(channel.valid, unit, f"channels.{name}.valid")
-        needed = channel.missing == "skip"
+        needed = channel.gaps == "skip"
         found[name] = Column(
             channel.sources,
             rule.factor,

@@ -26,7 +26,7 @@ __all__ = ["Block", "blocks"]
 WAITING = 2**23  # numbers that wait to be written
 ALONE = "no other one has their settings and sample times"
 # Members may differ in how a channel is read, and in what is said about a run.
-READ = {"column", "columns", "unit", "valid", "missing", "wait", "repeated"}
+READ = {"column", "columns", "unit", "valid", "missing", "spikes", "wait", "repeated"}
 TOLD = {"title", "initial", "data", "intake", "reference", "expect", "variants"}
 
 
