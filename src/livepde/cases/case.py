@@ -21,7 +21,14 @@ from livepde.cases.laws import law_of
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import VariantSpec
-from livepde.cases.sensors import columns_of, initial_of, observation_of, sensor_notes
+from livepde.cases.sensors import (
+    columns_of,
+    initial_of,
+    initial_weights,
+    input_noise_of,
+    observation_of,
+    sensor_notes,
+)
 from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
@@ -86,7 +93,18 @@ class Prepared:
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=self.assimilate_from,
+            **self.uncertain(law),
         )
+
+    def uncertain(self, law: AnyLaw) -> dict[str, Any]:
+        """Return what an identifier is told of noise beside that of its sensors."""
+        case = self.case
+        if isinstance(law, GradientLaw):  # it has no covariance
+            return {}
+        weights = {}
+        if self.u0 is not None:
+            weights = initial_weights(case.frame, case.mesh, self.first)
+        return {"input_noise": input_noise_of(case.frame), "u0_from": weights}
 
     @cached_property
     def u0(self) -> Any:
@@ -201,7 +219,7 @@ class Case:
     def check(self) -> None:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
-        _ = self.scheme, self.dt_max, self.references
+        _ = self.scheme, self.dt_max, self.references, input_noise_of(self.frame)
 
     @property
     def name(self) -> str:

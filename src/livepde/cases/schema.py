@@ -294,8 +294,8 @@ class ChannelSpec(Spec):
                 'missing = "interpolate" and spikes belong to boundary and input channels; '
                 "values of sensors that are far off are refused by law.gate"
             )
-        if self.role not in ("sensor", "withheld") and self.noise is not None:
-            raise ValueError(f"noise belongs to sensors, not to a channel of role {self.role}")
+        if self.role == "position" and self.noise is not None:
+            raise ValueError("noise of a channel of role position is not possible: leave it out")
         return self
 
     @property

@@ -123,6 +123,11 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 raise LawError(f"GradientLaw: {name} must be a number >= 0; got {value}.")
 
     def prepare(self, problem: Problem) -> GradientParts:
+        if problem.input_noise or problem.initial_weights:
+            raise LawError(
+                "GradientLaw has no covariance that input_noise or u0_from could enter: leave them "
+                "out, or use SensitivityLaw."
+            )
         if self.gain == "auto":
             return tuned_parts(problem, self.nu, self.N_op, self.newton)
         return constant_parts(
