@@ -111,6 +111,9 @@ class Identifier:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
         if not np.isfinite(t0):
             raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
+        known = model.parameter_space.unknowns
+        own = {name: item for name, item in observation.unknowns.items() if name not in known}
+        model = model.with_unknowns(own) if own else model
         self.model = model
         self.law = law
         spaces = (model.state_space, model.X, model.parameter_space)

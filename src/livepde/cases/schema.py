@@ -235,6 +235,7 @@ class ChannelSpec(Spec):
     column: Name | None = None
     columns: tuple[Name, ...] | None = None
     at: Quantity | tuple[Quantity, ...] | None = None
+    at_std: Quantity | None = None
     over: Pair | Box | Name | None = None
     along: tuple[Point, Point] | None = None
     follows: Name | tuple[Name, ...] | None = None
@@ -284,7 +285,9 @@ class ChannelSpec(Spec):
             )
         if self.each is not None and "{}" not in (self.column or ""):
             raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
-        own = {"offset", "gain", "correlated"} & self.model_fields_set
+        if self.at_std is not None and self.at is None and self.each is None:
+            raise ValueError("at_std belongs to at = position")
+        own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
         if own and self.role != "sensor":
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
         if self.of is not None and self.role not in ("sensor", "withheld"):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.frame import Frame
-from livepde.cases.instruments import calibrated
+from livepde.cases.instruments import calibrated, positions_of
 from livepde.cases.process import sides_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
@@ -163,7 +163,8 @@ def _part(
         for name, item in channels.items()
         if item.quantity is not None
     }
-    return Points(points, direct, **common)
+    uncertain = positions_of(frame, channels)
+    return Points(points, direct, uncertain or None, **common)
 
 
 def _reconstruction(frame: Frame) -> Reconstruction:

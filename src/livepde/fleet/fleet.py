@@ -111,7 +111,7 @@ class Fleet:
             input_noise=input_noise,
             u0_from=u0_from,
         )
-        self.model = model
+        self.model = model = self._one.model
         self.law = law
         self.problem = self._one.problem
         self._work = law.prepare(self.problem)
