@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from livepde.laws.members import changed
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.stepping import Span, StepFailed
-
-if TYPE_CHECKING:
-    from livepde.laws.filter import Filter
 
 __all__ = ["initial_rows", "input_rank", "with_initial_rows", "with_input_noise"]
 
@@ -119,10 +116,11 @@ def initial_rows(
     return np.vstack([unknown, *own]), C
 
 
-def with_initial_rows(filter_: Filter, x: FilterState, moment: Moment) -> FilterState:
+def with_initial_rows(
+    x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
+) -> FilterState:
     """Return the state at the start with the uncertainty of the readings that it was made of."""
-    if not filter_.problem.initial_weights:
+    if not problem.initial_weights:
         return x
-    parts = (filter_.problem, filter_.reduction, filter_.noise)
-    U, C = initial_rows(*parts, x.q[0], x.u[0], moment)
+    U, C = initial_rows(problem, reduction, noise, x.q[0], x.u[0], moment)
     return changed(x, U=U[None], C=C[None])

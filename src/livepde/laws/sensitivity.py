@@ -219,7 +219,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> SensitivityState:
         state, model = self.init(work, q0, u0), work.filter.problem.model
         if model.form_initial is None:
-            x = with_initial_rows(work.filter, state.start, moment)
+            filter_ = work.filter
+            parts = (filter_.problem, filter_.reduction, filter_.noise)
+            x = with_initial_rows(state.start, *parts, moment)
             return state if x is state.start else changed(state, start=x, now=x, older=x, newer=x)
         U = model.initial_directions(q0, work.filter.reduction.Phi, moment).T[None]
         x = changed(state.start, U=U)

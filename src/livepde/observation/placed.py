@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,11 +11,8 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Moment
 from livepde.linalg import Array
-from livepde.observation.base import Observed
+from livepde.observation.base import Observation, Observed
 from livepde.spaces import HilbertSpace
-
-if TYPE_CHECKING:
-    from livepde.observation.sensors import Points
 
 __all__ = ["POSITION", "PlacedObserved", "shift_names"]
 
@@ -78,20 +75,30 @@ class _Shift:
 
 
 class PlacedObserved(Observed):
-    """The bound observation: linear in u, quadratic in the shifts."""
+    """Bound point sensors at uncertain positions: linear in u, quadratic in the shifts.
 
-    observation: Points
+    Parameters
+    ----------
+    observation, state, X, parameter
+        As for `Observed`.
+    at
+        Stated coordinates of all sensors, shape (sensors, d).
+    uncertain, std
+        Names of the sensors whose positions are uncertain, and the standard deviation of a shift.
+    """
 
     def __init__(
         self,
-        observation: Points,
+        observation: Observation,
         state: FunctionSpace,
         X: HilbertSpace,
         parameter: FunctionSpace,
+        at: Array,
+        uncertain: Sequence[str],
+        std: float,
     ) -> None:
         super().__init__(observation, state, X, parameter)
         block, _ = state.component(observation.of)
-        std, at = observation.shift_std, observation.positions
         labels = parameter.labels
 
         def difference(point: Array, start: Array) -> sp.csr_array:
@@ -99,7 +106,7 @@ class PlacedObserved(Observed):
             return sp.csr_array(values[[1]] - values[[0]])
 
         self.shifts = []
-        for name in observation.uncertain:
+        for name in uncertain:
             sensor = self.names.index(name)
             for axis, shift in enumerate(shift_names(name, at.shape[1])):
                 label = f"{POSITION}[{shift}]"

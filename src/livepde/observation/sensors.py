@@ -95,8 +95,10 @@ class Points(Observation):
         return {POSITION: Scalars(names, 0.0, self.shift_std)}
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
-        kind = Observed if self.position_std is None else PlacedObserved
-        return kind(self, state, X, parameter)
+        if self.position_std is None:
+            return Observed(self, state, X, parameter)
+        at, uncertain = self.positions, self.uncertain
+        return PlacedObserved(self, state, X, parameter, at, uncertain, self.shift_std)
 
     def names(self, count: int) -> tuple[str, ...]:
         if isinstance(self.points, Mapping):
