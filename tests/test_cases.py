@@ -491,7 +491,7 @@ REFUSED = [
     ('at = "left"', 'at = "lft"', "did you mean 'left'?"),
     ('at = "left"', "at = 0.0", "needs at = the name of a boundary"),
     ('at = "left"', 'at = "right"', "has a value already"),
-    ('at = "left"', 'at = "left", noise = 1', "noise belongs to sensors"),
+    ('at = "left"', 'at = "left", noise = "0 K"', "T_left.noise: got '0 K'"),
     ('role = "boundary", column = "T_left", at = "left"', 'role = "input", column = "T_left"',
      "has no 'T_left' here"),
     ('role = "boundary", column = "T_left", at = "left"',

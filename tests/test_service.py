@@ -339,7 +339,7 @@ def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
         ('file = "rows.csv"', 'wait = "1 m"', "", "intake.wait: 'm' cannot be converted to 's'"),
         ('file = "rows.csv"', "queue = 0", "", "queue"),
         ('file = "rows.csv"', "", ', valid = ["1 degC", "0 degC"]', "the lower one first"),
-        ('file = "rows.csv"', "", ', missing = "guess"', "expected one of hold, skip"),
+        ('file = "rows.csv"', "", ', missing = "guess"', "expected one of interpolate, hold, skip"),
     ],
 )
 def test_a_wiring_that_makes_no_sense_says_so(here, data, intake, habit, text):

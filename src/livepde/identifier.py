@@ -68,6 +68,13 @@ class Identifier:
     hold
         Whether inputs are held between samples at what the later one brings, as an actuator that
         is set anew at each sample leaves them; else they change linearly.
+    input_noise
+        Channel of the model -> standard deviation of its noise, independent from sample to sample:
+        it makes the state less certain, for laws that have a covariance.
+    u0_from
+        Channel -> how u0 changes with its reading at t0, as u0 is given (a function of x, say): for
+        a u0 that was made of readings. Their noise is that of the start then, and they are not
+        assimilated once more.
 
     Raises
     ------
@@ -90,6 +97,8 @@ class Identifier:
         halvings: int = Advance.halvings,
         assimilate_from: float = -np.inf,
         hold: bool = False,
+        input_noise: Mapping[str, float] | None = None,
+        u0_from: Mapping[str, Any] | None = None,
     ) -> None:
         given = (model, Model), (observation, Observation), (law, Law)
         for part, kind in given:
@@ -103,13 +112,19 @@ class Identifier:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
         if not np.isfinite(t0):
             raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
+        known = model.parameter_space.unknowns
+        own = {name: item for name, item in observation.unknowns.items() if name not in known}
+        model = model.with_unknowns(own) if own else model
         self.model = model
         self.law = law
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
         control = Advance(scheme or law.scheme, dt_max, halvings, hold)
-        self.problem = Problem(model, self.observed, control)
+        self.problem = Problem(
+            model, self.observed, control, self._input_noise(input_noise or {}), {}
+        )
+        self._made_of(u0, u0_from or {})
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
@@ -144,6 +159,35 @@ class Identifier:
         begun = zip(self.inputs, inputs.tolist(), strict=True) if state is not None else ()
         other._inputs = Inputs(dict(begun))
         return other
+
+    def _input_noise(self, given: Mapping[str, float]) -> dict[str, float]:
+        """Return the noise of input channels, checked."""
+        for name, std in given.items():
+            if name not in self.model.channels:
+                raise ConfigurationError(
+                    f"input_noise: the model has no channel '{name}'; it has "
+                    f"{list(self.model.channels)}. Noise of sensors belongs to the observation."
+                )
+            if not (math.isfinite(std) and std > 0.0):
+                raise ConfigurationError(
+                    f"input_noise of '{name}' must be a positive number; got {std!r}."
+                )
+        return dict(given)
+
+    def _made_of(self, u0: Any, given: Mapping[str, Any]) -> None:
+        """Tell the problem which readings the initial state was made of."""
+        known = {*self.observed.names, *self.model.channels}
+        for name in given:
+            if name not in known:
+                raise ConfigurationError(
+                    f"u0_from: '{name}' is no assimilated sensor and no channel of the model; "
+                    f"those are {sorted(known)}."
+                )
+        if given and u0 is None:
+            raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
+        space = self.model.state_space
+        weights = {name: space.interpolate(weight) for name, weight in given.items()}
+        self.problem = replace(self.problem, initial_weights=weights)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
         """Return an identifier that goes on by itself; model, law and matrices are shared."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of
+from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import expanded
@@ -21,7 +21,14 @@ from livepde.cases.laws import law_of
 from livepde.cases.process import mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import VariantSpec
-from livepde.cases.sensors import columns_of, initial_of, observation_of, sensor_notes
+from livepde.cases.sensors import (
+    columns_of,
+    initial_of,
+    initial_weights,
+    input_noise_of,
+    observation_of,
+    sensor_notes,
+)
 from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
@@ -52,11 +59,14 @@ class Prepared:
     first
         The first sample, which describes the start.
     stream
-        All samples. A `Table` can be iterated again, standard input cannot.
+        All samples. A `Table` can be iterated again, standard input cannot. Gaps of its boundary
+        and input channels are interpolated, and spikes refused.
     assimilate_from
         Model time from which sensors are assimilated; scores count from here, too.
     origin
         Date of t = 0, if the data have dates.
+    raw
+        A finished record as it was read, with its gaps.
     """
 
     case: Case
@@ -64,6 +74,7 @@ class Prepared:
     stream: Iterable[Sample]
     assimilate_from: float
     origin: datetime | None
+    raw: Table | None = None
 
     @cached_property
     def identifier(self) -> Identifier:
@@ -83,7 +94,18 @@ class Prepared:
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=self.assimilate_from,
+            **self.uncertain(law),
         )
+
+    def uncertain(self, law: AnyLaw) -> dict[str, Any]:
+        """Return what an identifier is told of noise beside that of its sensors."""
+        case = self.case
+        if isinstance(law, GradientLaw):  # it has no covariance
+            return {}
+        weights = {}
+        if self.u0 is not None:
+            weights = initial_weights(case.frame, case.mesh, self.first)
+        return {"input_noise": input_noise_of(case.frame), "u0_from": weights}
 
     @cached_property
     def u0(self) -> Any:
@@ -198,7 +220,7 @@ class Case:
     def check(self) -> None:
         """Build all that needs no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
-        _ = self.scheme, self.dt_max, self.references
+        _ = self.scheme, self.dt_max, self.references, input_noise_of(self.frame)
         self._check_names()
 
     def _check_names(self) -> None:
@@ -370,14 +392,16 @@ class Case:
 
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return the case with its data, as `prepare` does, before an identifier is built."""
-        data = read_data(self.frame, self.columns, self.clock, source)
+        raw = read_data(self.frame, self.columns, self.clock, source)
+        data = without_gaps(self.frame, raw) if isinstance(raw, Table) else raw
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
         if first is None:
             raise DataError(f"{self.frame.path}: the data hold no sample between start and stop.")
         start = assimilation_start(self.frame, self.clock, data.origin)
-        stream = data if isinstance(data, Table) else chain([first], samples)
-        return Prepared(self, first, stream, start, data.origin)
+        if isinstance(data, Table) and isinstance(raw, Table):
+            return Prepared(self, first, data, start, data.origin, raw)
+        return Prepared(self, first, chain([first], samples), start, data.origin)
 
     @property
     def live(self) -> bool:

@@ -19,10 +19,18 @@ from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
 from livepde.streams.clock import since_1970
+from livepde.streams.gaps import fill_table
 from livepde.streams.names import no_file
 from livepde.streams.table import JSON_LINES
 
-__all__ = ["assimilation_start", "clock_of", "data_file", "read_data", "reader_of"]
+__all__ = [
+    "assimilation_start",
+    "clock_of",
+    "data_file",
+    "read_data",
+    "reader_of",
+    "without_gaps",
+]
 
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
@@ -91,6 +99,14 @@ def read_data(
         separator=spec.separator,
         encoding=spec.encoding,
     )
+
+
+def without_gaps(frame: Frame, table: Table) -> Table:
+    """Return a finished record without gaps and spikes of the channels that drive the model."""
+    channels = frame.spec.channels
+    interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
+    screened = [name for name, item in channels.items() if item.screened]
+    return fill_table(table, interpolated, screened)
 
 
 def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any:

@@ -11,8 +11,9 @@ from livepde.cases.frame import Frame
 from livepde.cases.schema import CaseSpec, ChannelSpec
 from livepde.fem import MeanReverting, Scalars, Unknown
 from livepde.observation import Calibrated, Observation
+from livepde.observation.placed import POSITION, shift_names
 
-__all__ = ["calibrated", "expanded", "unknowns_of"]
+__all__ = ["calibrated", "expanded", "positions_of", "unknowns_of"]
 
 
 def expanded(frame: Frame) -> Frame:
@@ -35,7 +36,7 @@ def expanded(frame: Frame) -> Frame:
 
 
 def unknowns_of(frame: Frame) -> dict[str, Unknown]:
-    """Return the unknowns of the sensors: offset, gain, correlated, one number for each."""
+    """Return the unknowns of the sensors: offset, gain, position, correlated: numbers for each."""
     unit = frame.equation.state.unit
     found: dict[str, Unknown] = {}
     offsets = {
@@ -51,6 +52,15 @@ def unknowns_of(frame: Frame) -> dict[str, Unknown]:
     }
     if gains:
         found["gain"] = Scalars(tuple(gains), 1.0, _common(frame, gains, "gain"))
+    shifts = positions_of(frame, frame.roles("sensor"))
+    if shifts:
+        std = _common(frame, shifts, "at_std")
+        names = [
+            shift
+            for name in shifts
+            for shift in shift_names(name, _dimension(frame.spec.channels[name]))
+        ]
+        found[POSITION] = Scalars(names, 0.0, std, unit=frame.equation.length_unit)
     errors = {}
     for name, item in frame.roles("sensor").items():
         if item.correlated is not None:
@@ -65,6 +75,20 @@ def unknowns_of(frame: Frame) -> dict[str, Unknown]:
             tuple(errors), 0.0, std, unit=_difference(unit), evolution=fades
         )
     return found
+
+
+def positions_of(frame: Frame, channels: Mapping[str, ChannelSpec]) -> dict[str, float]:
+    """Return the deviation of the position of each sensor that states one."""
+    unit = frame.equation.length_unit
+    return {
+        name: frame.positive(item.at_std, unit, f"channels.{name}.at_std")
+        for name, item in channels.items()
+        if item.at_std is not None
+    }
+
+
+def _dimension(channel: ChannelSpec) -> int:
+    return len(channel.at) if isinstance(channel.at, tuple) else 1
 
 
 def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:

@@ -20,6 +20,7 @@ from livepde.runs.feeds import Feed, Gathered, Paced, Samples
 from livepde.runs.journal import Journal
 from livepde.runs.live import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
+from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather
 
 __all__ = ["Wiring"]
@@ -222,6 +223,7 @@ class Wiring:
             origin=None if journal is None else _seconds(begun),
             dates=None if journal is None else begun is not None,
             last=last,
+            recent=[(one.t, one.values) for one in journal.recent(RECENT)] if journal else (),
         )
         position = "" if journal is None else journal.position
         return Gathered(source_of(case.frame, data, position), self._intake)

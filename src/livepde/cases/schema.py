@@ -237,6 +237,7 @@ class ChannelSpec(Spec):
     column: Name | None = None
     columns: tuple[Name, ...] | None = None
     at: Quantity | tuple[Quantity, ...] | None = None
+    at_std: Quantity | None = None
     over: Pair | Box | Name | None = None
     along: tuple[Point, Point] | None = None
     follows: Name | tuple[Name, ...] | None = None
@@ -251,7 +252,23 @@ class ChannelSpec(Spec):
     wait: Quantity | None = None
     repeated: Literal["first", "last"] | None = None
     valid: Pair | None = None
-    missing: Literal["hold", "skip"] = "hold"
+    missing: Literal["interpolate", "hold", "skip"] | None = None
+    spikes: Literal["refuse", "keep"] | None = None
+
+    @property
+    def drives(self) -> bool:
+        """Whether the channel drives the model: a boundary value or another input."""
+        return self.role in ("boundary", "input")
+
+    @property
+    def gaps(self) -> Literal["interpolate", "hold", "skip"]:
+        """What becomes of gaps."""
+        return self.missing or ("interpolate" if self.drives else "hold")
+
+    @property
+    def screened(self) -> bool:
+        """Whether spikes are refused."""
+        return self.drives and self.spikes != "keep"
 
     @model_validator(mode="after")
     def _consistent(self) -> ChannelSpec:
@@ -270,13 +287,20 @@ class ChannelSpec(Spec):
             )
         if self.each is not None and "{}" not in (self.column or ""):
             raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
-        own = {"offset", "gain", "correlated"} & self.model_fields_set
+        if self.at_std is not None and self.at is None and self.each is None:
+            raise ValueError("at_std belongs to at = position")
+        own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
         if own and self.role != "sensor":
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
         if self.of is not None and self.role not in ("sensor", "withheld"):
             raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
-        if self.role not in ("sensor", "withheld") and self.noise is not None:
-            raise ValueError(f"noise belongs to sensors, not to a channel of role {self.role}")
+        if not self.drives and (self.missing == "interpolate" or self.spikes is not None):
+            raise ValueError(
+                'missing = "interpolate" and spikes belong to boundary and input channels; '
+                "values of sensors that are far off are refused by law.gate"
+            )
+        if self.role == "position" and self.noise is not None:
+            raise ValueError("noise of a channel of role position is not possible: leave it out")
         return self
 
     @property

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.frame import Frame
-from livepde.cases.instruments import calibrated
+from livepde.cases.instruments import calibrated, positions_of
 from livepde.cases.process import sides_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
@@ -29,7 +29,15 @@ from livepde.observation import (
 )
 from livepde.streams import Column
 
-__all__ = ["columns_of", "initial_of", "noise_of", "observation_of", "sensor_notes"]
+__all__ = [
+    "columns_of",
+    "initial_of",
+    "initial_weights",
+    "input_noise_of",
+    "noise_of",
+    "observation_of",
+    "sensor_notes",
+]
 
 
 def columns_of(frame: Frame) -> dict[str, Column]:
@@ -41,7 +49,7 @@ def columns_of(frame: Frame) -> dict[str, Column]:
         valid = (-np.inf, np.inf)
         if channel.valid is not None:
             valid = frame.pair(channel.valid, unit, f"channels.{name}.valid")
-        needed = channel.missing == "skip"
+        needed = channel.gaps == "skip"
         found[name] = Column(
             channel.sources,
             rule.factor,
@@ -155,7 +163,8 @@ def _part(
         for name, item in channels.items()
         if item.quantity is not None
     }
-    return Points(points, direct, **common)
+    uncertain = positions_of(frame, channels)
+    return Points(points, direct, uncertain or None, **common)
 
 
 def _reconstruction(frame: Frame) -> Reconstruction:
@@ -240,6 +249,15 @@ def noise_of(frame: Frame, role: str) -> dict[str, float] | None:
     return levels or None
 
 
+def input_noise_of(frame: Frame) -> dict[str, float]:
+    """Return the noise of the boundary and input channels that state one."""
+    return {
+        name: frame.positive(channel.noise, frame.unit(name), f"channels.{name}.noise")
+        for name, channel in frame.roles("boundary", "input").items()
+        if channel.noise is not None
+    }
+
+
 def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
     """Return the initial state: a number (of each component), or the first sample interpolated.
 
@@ -258,19 +276,40 @@ def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
         return frame.convert(initial, frame.equation.state.unit, "initial")
     if len(mesh.p) != 1:
         raise frame.error("initial", "'interpolate' needs an interval; give a number.")
+    at, level, _ = _initial_readings(frame, mesh, first)
+    return lambda x: np.interp(x[0], at, level)
+
+
+def initial_weights(frame: Frame, mesh: Any, first: Sample) -> dict[str, Any]:
+    """Return channel -> how an interpolated initial state changes with its reading, as x -> u."""
+    if frame.spec.initial != "interpolate" or len(mesh.p) != 1:
+        return {}
+    at, _, names = _initial_readings(frame, mesh, first)
+    if len(set(at)) < len(at):  # np.interp takes one of two readings at one place
+        return {}
+    unit = np.eye(len(at))
+    return {
+        name: lambda x, weight=unit[k]: np.interp(x[0], at, weight) for k, name in enumerate(names)
+    }
+
+
+def _initial_readings(
+    frame: Frame, mesh: Any, first: Sample
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
+    """Return positions, values and channels that the initial state is interpolated from."""
     ends = {"left": float(mesh.p.min()), "right": float(mesh.p.max())}
     values = dict(first.z) if isinstance(first.z, Mapping) else {}
-    pairs = []
+    found = []
     for name, channel in frame.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:
-            pairs.append((ends[str(channel.at)], values[name]))
+            found.append((ends[str(channel.at)], values[name], name))
         elif channel.role == "sensor" and channel.at is not None:
-            pairs.append((_position(frame, mesh, name, channel), values[name]))
-    present = sorted(pair for pair in pairs if np.isfinite(pair[1]))
+            found.append((_position(frame, mesh, name, channel), values[name], name))
+    present = sorted(item for item in found if np.isfinite(item[1]))
     if not present:
         raise MissingInputError(
             f"{frame.where('initial')}: 'interpolate' found no sensor or boundary with a value in "
             "the first sample; start later, or give a number."
         )
-    at, level = zip(*present, strict=True)
-    return lambda x: np.interp(x[0], at, level)
+    at, level, names = zip(*present, strict=True)
+    return at, level, names

@@ -133,7 +133,8 @@ def policy_of(frame: Frame) -> Policy:
         wait = 0.0
         if channel.wait is not None:
             wait = duration(channel.wait, f"channels.{name}.wait")
-        habits[name] = Habit(wait, channel.repeated)
+        interpolated = channel.gaps == "interpolate"
+        habits[name] = Habit(wait, channel.repeated, interpolated, channel.screened)
     leap = frame.convert(LEAP, unit, "intake.leap") if unit else math.inf
     if spec.leap is not None:
         leap = frame.positive(spec.leap, unit, "intake.leap")

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 __all__ = ["check"]
 
-HELD = ("boundary", "input")  # roles of which a missing value is the last one
 MOST_CHANNELS = 40  # rows of the table of channels
 
 
@@ -64,10 +63,10 @@ def check(
         console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
         return
     prepared = loaded.prepare(data)
-    samples: Samples = prepared.stream  # type: ignore[assignment]
+    samples: Samples = prepared.raw  # type: ignore[assignment]
     _show_data(console, loaded, prepared, samples)
     failed = _show_checks(console, prepared)
-    notes = [*loaded.notes, *_show_preview(console, prepared)]
+    notes = [*loaded.notes, *_refused(prepared), *_show_preview(console, prepared)]
     if advise:
         _show_advice(console, prepared)
     for note in notes:
@@ -75,6 +74,17 @@ def check(
     if failed:
         raise typer.Exit(CHECK_FAILED)
     console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
+
+
+def _refused(prepared: Prepared) -> list[str]:
+    """Return sentences on values of input channels that a run will refuse."""
+    remarks = getattr(prepared.stream, "remarks", {})
+    return [
+        f"{number} values of {name} are far off those before and after: a run refuses them as "
+        'spikes; channels.NAME.spikes = "keep" takes them.'
+        for (kind, name), number in remarks.items()
+        if kind == "spike"
+    ]
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
@@ -148,7 +158,7 @@ def _show_wiring(console: Console, case: Case) -> None:
                 "" if math.isinf(high - low) else f"{low:g} to {high:g} {case.frame.unit(name)}",
                 f"{max(policy.wait, habit.wait):g} {unit}".rstrip(),
                 policy.keeps(name),
-                "skip" if column.needed else "hold" if spec.role in HELD else "go on",
+                "skip" if column.needed else spec.gaps if spec.drives else "go on",
             )
         )
     columns = ("channel", "role", "column", "valid", "waits", "of two", "missing")

@@ -268,12 +268,13 @@ def concluded(
         With figures.
     """
     from livepde.linalg import in_use
-    from livepde.runs import arrivals, checks_of, doubts, tables
+    from livepde.runs import arrivals, checks_of, doubts, input_notes, tables
 
     dataset = driven.result.to_xarray()
     shown = [*tables(dataset), *arrivals(driven.journal)]
     checks = checks_of(loaded.expected, dataset)
-    notes = [*loaded.notes, *doubts(dataset)]
+    driving = loaded.frame.roles("boundary", "input")
+    notes = [*loaded.notes, *doubts(dataset), *input_notes(driven.journal, driving)]
     if (engine := in_use()) is not None:
         notes.append(f"Large systems were solved by {engine.reason}.")
         if "resumed" in writer.record:

@@ -55,7 +55,7 @@ class Fleet:
         How many, or their names.
     q0, u0
         As for `Identifier`, for all members; or a list with one for each.
-    t0, withheld, scheme, dt_max, assimilate_from
+    t0, withheld, scheme, dt_max, assimilate_from, input_noise, u0_from
         As for `Identifier`.
 
     Raises
@@ -87,6 +87,8 @@ class Fleet:
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
         assimilate_from: float = -np.inf,
+        input_noise: Mapping[str, float] | None = None,
+        u0_from: Mapping[str, Any] | None = None,
     ) -> None:
         names = [str(k) for k in range(members)] if isinstance(members, int) else list(members)
         if not names:
@@ -106,8 +108,10 @@ class Fleet:
             scheme=scheme,
             dt_max=dt_max,
             assimilate_from=assimilate_from,
+            input_noise=input_noise,
+            u0_from=u0_from,
         )
-        self.model = model
+        self.model = model = self._one.model
         self.law = law
         self.problem = self._one.problem
         self._work = law.prepare(self.problem)

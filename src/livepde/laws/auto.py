@@ -129,7 +129,10 @@ class AutoLaw(Law[Bank, AutoState]):
 
     def prepare(self, problem: Problem) -> Bank:
         stated = self.noise is not None or problem.observed.noise is not None
-        law = self.member if stated else replace(self.member, noise=1.0)  # until it is guessed
+        law = self.member
+        if not stated:  # until it is guessed; nor is that of an initial state known
+            law = replace(self.member, noise=1.0)
+            problem = replace(problem, initial_weights={})
         work = law.prepare(problem)
         reduction = work.filter.reduction
         # A factor costs in proportion to its columns, and a field that drifts is the exception.

@@ -179,8 +179,10 @@ def numbered(state: SensitivityState, number: int, due: int) -> SensitivityState
 
 
 def scaled(state: SensitivityState, scale: float) -> SensitivityState:
-    """Return a filter before the first sample with another prior deviation."""
-    x = replace(state.start, U=scale * state.start.U, C=scale * state.start.C)
+    """Return a filter before the first sample with another prior deviation of the unknowns."""
+    start = state.start
+    unknown = start.C.any(axis=2, keepdims=True)  # other rows are the noise of readings at first
+    x = replace(start, U=np.where(unknown, scale * start.U, start.U), C=scale * start.C)
     return replace(state, start=x, now=x, older=x, newer=x, replay=ReplayState.none(x))
 
 

@@ -69,16 +69,33 @@ class Status:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A model and what is observed of it: where the two meet."""
+    """A model and what is observed of it: where the two meet.
+
+    Attributes
+    ----------
+    model, observed, control
+        The process, its sensors, and how steps are taken.
+    input_noise
+        Channel of the model -> standard deviation of its noise.
+    initial_weights
+        Channel -> how the initial state changes with its reading at the initial time, shape (n,).
+    """
 
     model: Model
     observed: Observed
     control: Advance
+    input_noise: Mapping[str, float] = field(default_factory=dict)
+    initial_weights: Mapping[str, Array] = field(default_factory=dict)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
         """Names of all input channels: those of the model, then those the sensors read."""
         return tuple(dict.fromkeys([*self.model.channels, *self.observed.observation.inputs]))
+
+    def unread(self, interval: Interval) -> Interval:
+        """Return an interval without the readings that the initial state was made of."""
+        used = [name in self.initial_weights for name in self.observed.names]
+        return replace(interval, z1=np.where(used, np.nan, interval.z1)) if any(used) else interval
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         """Return what the sensors are expected to show, for state u and latent parameter q."""

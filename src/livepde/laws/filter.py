@@ -25,6 +25,7 @@ from scipy.linalg import lapack
 
 from livepde.laws.base import Problem
 from livepde.laws.filter_state import FilterState, along
+from livepde.laws.input_noise import with_input_noise
 from livepde.laws.members import changed
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensors import MemberSensors
@@ -155,6 +156,15 @@ class Filter:
 
         What unknowns gain in one substep is independent of what they gain in the next.
         """
+        end, taken, failure = self._propagated(x, span)
+        if failure is None and self.problem.input_noise:
+            end, failure = with_input_noise(self._propagated, self.problem, x, end, span)
+        if failure is not None:
+            return x, taken, failure
+        return self._faded(end, span), taken, None
+
+    def _propagated(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+        """Return the state at the end of a span whose inputs are known exactly."""
         length = span.t1 - span.start
         count = self.problem.control.count(length) if self.moves else 1
         at = [span.start + k / count * length for k in range(count)] + [span.t1]
@@ -164,7 +174,7 @@ class Filter:
             taken += steps
             if failure is not None:
                 return x, taken, failure
-        return self._faded(x, span), taken, None
+        return x, taken, None
 
     def _faded(self, x: FilterState, span: Span) -> FilterState:
         """Return the state without what has faded of the past in a span."""

@@ -128,6 +128,11 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 "GradientLaw: a component of the state has no mass term, so that M is no inner "
                 "product of X: use SensitivityLaw, or give M a term for each component."
             )
+        if problem.input_noise or problem.initial_weights:
+            raise LawError(
+                "GradientLaw has no covariance that input_noise or u0_from could enter: leave them "
+                "out, or use SensitivityLaw."
+            )
         if self.gain == "auto":
             return tuned_parts(problem, self.nu, self.N_op, self.newton)
         return constant_parts(

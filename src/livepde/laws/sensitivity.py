@@ -25,6 +25,7 @@ from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_referenc
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
+from livepde.laws.input_noise import input_rank, with_initial_rows
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed, join, put, take, where
 from livepde.laws.one_member import step_alone
@@ -176,6 +177,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             jumping = int(reduction.named(self.jumps.unknowns, "Jumps: unknowns").sum())
             moving = max(moving, jumping)
         rank = self.rank if self.rank is not None else reduction.size + 5 * moving
+        rank += input_rank(problem) if self.rank is None else 0
         if rank < reduction.size:
             raise LawError(
                 f"SensitivityLaw: rank must be at least the {reduction.size} reduced coordinates; "
@@ -245,16 +247,20 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> SensitivityState:
         state, model = self.init(work, q0, u0), work.filter.problem.model
         if model.form_initial is None:
-            return state
+            filter_ = work.filter
+            parts = (filter_.problem, filter_.reduction, filter_.noise)
+            x = with_initial_rows(state.start, *parts, moment)
+            return state if x is state.start else _started(state, x)
         U = model.initial_directions(q0, work.filter.reduction.Phi, moment).T[None]
         x = changed(state.start, U=U)
-        return changed(state, start=x, now=x, older=x, newer=x, initial=np.ones(1, dtype=bool))
+        return changed(_started(state, x), initial=np.ones(1, dtype=bool))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such a sample is not used
     def begin(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
     ) -> SensitivityState:
-        filter_, x, span = work.filter, state.now, work.filter.span(interval)
+        filter_, x, interval = work.filter, state.now, work.filter.problem.unread(interval)
+        span = filter_.span(interval)
         state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool)))
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
         if not filter_.sensors.observe(x, span.end)[1].any():
@@ -418,6 +424,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             reduction.Phi,
             reduction.rest(float(now.age[k]), drift),
         )
+
+
+def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
+    """Return one member at the start with another filter."""
+    return changed(state, start=x, now=x, older=x, newer=x, replay=ReplayState.none(x))
 
 
 def without_factors(x: FilterState) -> FilterState:

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
-from livepde.fem import FunctionSpace, Moment, Named, Place, Scalars
+from livepde.fem import FunctionSpace, Moment, Named, Place, Scalars, Unknown
 from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.observation.reconstruction import (
     Pseudoinverse,
@@ -94,6 +94,11 @@ class Observation:
     @property
     def directs(self) -> Mapping[str, Direct]:
         """Sensor name -> what it sees of the parameter directly, linear in q."""
+        return {}
+
+    @property
+    def unknowns(self) -> Mapping[str, Unknown]:
+        """Unknowns of the sensors themselves, which an identifier adds to those of the model."""
         return {}
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FunctionSpace, Moment, Place
+from livepde.fem import FunctionSpace, Moment, Place, Unknown
 from livepde.linalg import Array, Mask
 from livepde.observation.base import STEP, Observation, Observed, numbers
 from livepde.spaces import HilbertSpace
@@ -54,6 +54,10 @@ class Combined(Observation):
         return frozenset().union(*(part.optional for part in self.parts)) - required
 
     @property
+    def unknowns(self) -> Mapping[str, Unknown]:
+        return _all_unknowns(self.parts)
+
+    @property
     def nodal(self) -> bool:
         return all(part.nodal for part in self.parts)
 
@@ -70,6 +74,19 @@ class Combined(Observation):
         self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
     ) -> CombinedObserved:
         return CombinedObserved(self, state, X, parameter)
+
+
+def _all_unknowns(parts: Sequence[Observation]) -> dict[str, Unknown]:
+    """Return the unknowns of all parts, each name of one part only."""
+    found: dict[str, Unknown] = {}
+    for part in parts:
+        for name, unknown in part.unknowns.items():
+            if name in found:
+                raise ObservationError(
+                    f"Combined: two parts have the unknown '{name}'; put their sensors together."
+                )
+            found[name] = unknown
+    return found
 
 
 class CombinedObserved(Observed):
@@ -164,6 +181,10 @@ class Calibrated(Observation):
     def __post_init__(self) -> None:
         self._sees_all("give of= to the observations it is made of.")
         self._shows(self.base)
+
+    @property
+    def unknowns(self) -> Mapping[str, Unknown]:
+        return self.base.unknowns
 
     @property
     def optional(self) -> frozenset[str]:

@@ -76,6 +76,11 @@ class Transformed(Observation):
     def __post_init__(self) -> None:
         self._sees_all("give of= to the observations it is made of.")
         self._shows(self.base)
+        if self.base.unknowns:
+            raise ObservationError(
+                "Transformed: its base has uncertain positions; write the function into "
+                "Calibrated, which keeps them."
+            )
         if self.iterations < 1:
             raise ObservationError(
                 f"Transformed: iterations must be at least 1; got {self.iterations}."

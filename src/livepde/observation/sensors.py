@@ -10,10 +10,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, FunctionSpace, Predicate
+from livepde.fem import FieldBlock, FunctionSpace, Predicate, Scalars, Unknown
 from livepde.fem.measure import Measure
 from livepde.linalg import Array
-from livepde.observation.base import Direct, Observation
+from livepde.observation.base import Direct, Observation, Observed
+from livepde.observation.placed import POSITION, PlacedObserved, shift_names
+from livepde.spaces import HilbertSpace
 
 __all__ = ["Averages", "LineIntegrals", "Matrix", "Points"]
 
@@ -31,6 +33,12 @@ class Points(Observation):
         Sensor name -> (q, x) for sensors that see a parameter directly, linear in q:
         z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b * x.inputs["Q"] / H}.
 
+    position_std
+        Standard deviation of where the sensors really are, along each coordinate: one number for
+        all, or sensor name -> number for some, which have it in common. Their shifts are unknowns
+        then, estimated with the rest: `position[NAME]`, in more than one dimension
+        `position[NAME.x]` and so on.
+
     Examples
     --------
     >>> Points({"TS_10": 0.10, "TS_20": 0.20}, noise=0.1, unit="degC").names(2)
@@ -39,10 +47,58 @@ class Points(Observation):
 
     points: Mapping[str, Any] | Sequence[Any]
     direct: Mapping[str, Direct] = field(default_factory=dict)
+    position_std: float | Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         if len(self.points) == 0:
             raise ObservationError("Points: give at least one position.")
+        given = self.position_std
+        if given is None:
+            return
+        if isinstance(given, Mapping):
+            for name in given:
+                if name not in self.names(len(self.points)):
+                    raise ObservationError(f"Points: position_std: no sensor is called '{name}'.")
+        levels = set(given.values()) if isinstance(given, Mapping) else {given}
+        if len(levels) != 1 or not all(np.isfinite(std) and std > 0.0 for std in levels):
+            raise ObservationError(
+                "Points: position_std must be one positive number, which all sensors named have in "
+                f"common; got {given!r}."
+            )
+
+    @property
+    def uncertain(self) -> tuple[str, ...]:
+        """Names of the sensors whose positions are uncertain."""
+        if isinstance(self.position_std, Mapping):
+            return tuple(self.position_std)
+        return () if self.position_std is None else self.names(len(self.points))
+
+    @property
+    def shift_std(self) -> float:
+        """Standard deviation of a shift, 0 if positions are certain."""
+        if isinstance(self.position_std, Mapping):
+            return float(next(iter(self.position_std.values())))
+        return float(self.position_std or 0.0)
+
+    @property
+    def positions(self) -> Array:
+        """Coordinates of the sensors, shape (sensors, d)."""
+        given = self.points.values() if isinstance(self.points, Mapping) else self.points
+        return np.array([np.atleast_1d(p) for p in given], dtype=float)
+
+    @property
+    def unknowns(self) -> Mapping[str, Unknown]:
+        if self.position_std is None:
+            return {}
+        dimension = self.positions.shape[1]
+        names = [shift for name in self.uncertain for shift in shift_names(name, dimension)]
+        return {POSITION: Scalars(names, 0.0, self.shift_std)}
+
+    def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
+        if self.position_std is None:
+            return Observed(self, state, X, parameter)
+        at, uncertain = self.positions, self.uncertain
+        return PlacedObserved(self, state, X, parameter, at, uncertain, self.shift_std)
 
     def names(self, count: int) -> tuple[str, ...]:
         if isinstance(self.points, Mapping):
@@ -60,10 +116,8 @@ class Points(Observation):
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block, _ = state.component(self.of)
         mapping = isinstance(self.points, Mapping)
-        positions = list(self.points.values()) if isinstance(self.points, Mapping) else self.points
-        array = np.array([np.atleast_1d(p) for p in positions], dtype=float).T
         what = f"sensors {list(self.points)}: number" if mapping else "sensor"
-        return state.widen(sp.csr_array(block.probe(array, what)), self.of)
+        return state.widen(sp.csr_array(block.probe(self.positions.T, what)), self.of)
 
 
 @dataclass(frozen=True, eq=False)

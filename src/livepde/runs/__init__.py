@@ -9,7 +9,7 @@ from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_si
 from livepde.runs.journal import Journal
 from livepde.runs.live import Backlog, Live, Retention, Sink
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.runs.summary import Jump, arrivals, checks_of, jumps, measures, tables
+from livepde.runs.summary import Jump, arrivals, checks_of, input_notes, jumps, measures, tables
 
 __all__ = [
     "JOURNAL",
@@ -32,6 +32,7 @@ __all__ = [
     "doubts",
     "drive",
     "free_path",
+    "input_notes",
     "journal_of",
     "jumps",
     "measures",

@@ -353,6 +353,11 @@ class Journal:
         with sound(self.path):
             return float(rows[0][0]) if rows else -np.inf
 
+    def recent(self, count: int) -> list[Taken]:
+        """Return the last accepted samples, oldest first."""
+        rows = self._read("SELECT id, t, channels FROM samples ORDER BY id DESC LIMIT ?", count)
+        return [self._taken(*row) for row in reversed(rows)]
+
     @property
     def position(self) -> str:
         """Where the source stood after the last accepted sample, or what came after it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from livepde.streams.clock import Clock
 from livepde.streams.csvfile import read_csv
+from livepde.streams.gaps import FillGaps
 from livepde.streams.smoothing import (
     Exponential,
     LocalPolynomial,
@@ -26,6 +27,7 @@ __all__ = [
     "Clock",
     "Column",
     "Exponential",
+    "FillGaps",
     "Follow",
     "JsonLines",
     "Lines",

@@ -8,6 +8,7 @@ so long rows may come in any order.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -15,6 +16,7 @@ from typing import Any, Literal
 
 from livepde.errors import DataError, SampleError
 from livepde.streams.clock import Clock, origin_at, since_1970
+from livepde.streams.gaps import BEYOND, RECENT, Series, decided
 from livepde.streams.table import Column, channel_value, row_time
 
 __all__ = ["Habit", "Intake", "Outcome", "Policy", "Ready", "Remark", "gather"]
@@ -30,10 +32,17 @@ class Habit:
         A sample without this channel waits so long for it, if that is longer than `Policy.wait`.
     repeated
         Which value counts that comes twice for one moment; default that of the policy.
+    interpolated
+        A sample without this channel takes a value interpolated from the next one, if that comes
+        while the sample waits; it waits no longer then.
+    screened
+        A spike is refused, if two later values have come while the sample waited.
     """
 
     wait: float = 0.0
     repeated: Literal["first", "last"] | None = None
+    interpolated: bool = False
+    screened: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,6 +89,7 @@ class Policy:
 
 
 PLAIN = Habit()
+NAN = math.nan
 
 
 @dataclass(frozen=True)
@@ -90,9 +100,10 @@ class Remark:
     ----------
     kind
         Not used: "malformed" (not what it should be), "invalid" (a value outside of what is
-        valid), "late", "leap" (a time too far ahead), "repeated", "outside" (not between start and
-        stop), "skipped" (a sample without what it must have). Used all the same: "disordered" (came
-        after a later one), "missing" (a sample without this channel).
+        valid), "spike", "late", "leap" (a time too far ahead), "repeated", "outside" (not between
+        start and stop), "skipped" (a sample without what it must have). Used all the same:
+        "disordered" (came after a later one), "missing" (a sample without this channel),
+        "interpolated" (the same, and its value lies between known ones).
     channel
         Of the value; '' for a whole row.
     message
@@ -177,6 +188,9 @@ class Intake:
         Whether times are dates; default as in the first row.
     last
         Time of the last sample that was taken before, to go on after it.
+    recent
+        Times and values of the last samples that were taken before, for channels that are
+        interpolated or screened.
     """
 
     def __init__(
@@ -189,6 +203,7 @@ class Intake:
         origin: float | None = None,
         dates: bool | None = None,
         last: float = -math.inf,
+        recent: Iterable[tuple[float, Mapping[str, float]]] = (),
     ) -> None:
         self.columns = dict(columns)
         self.clock = clock
@@ -200,6 +215,7 @@ class Intake:
         self._newest = last
         self._doubted = math.inf
         self._open: dict[float, _Open] = {}
+        self._recent = deque(recent, maxlen=RECENT)
 
     @property
     def start(self) -> datetime | None:
@@ -331,6 +347,7 @@ class Intake:
                 return
             sample = self._open.pop(t)
             self._last = t
+            self._bridge(t, sample, found)
             lacking = [c for c in self.columns if math.isnan(sample.values.get(c, math.nan))]
             for channel in lacking:
                 found.remark("missing", channel, f"no value for t = {t:g}", sample.tokens[-1])
@@ -339,15 +356,52 @@ class Intake:
                 found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
                 found.spent += sample.tokens
             else:
+                self._recent.append((t, sample.values))
                 found.ready.append(Ready(t, sample.values, tuple(sample.tokens)))
+
+    def _bridge(self, t: float, sample: _Open, found: Outcome) -> None:
+        """Interpolate gaps of a sample, and refuse its spikes, where later values are known."""
+        for channel in self.columns:
+            habit = self.policy.habit(channel)
+            waited = max(self.policy.wait, habit.wait) > 0.0
+            if not (waited and (habit.interpolated or habit.screened)):
+                continue
+            later = self._later(t, channel)
+            past = [(s, v[channel]) for s, v in self._recent if math.isfinite(v.get(channel, NAN))]
+            given = sample.values.get(channel, NAN)
+            beyond = BEYOND if habit.screened else math.inf
+            value, kinds = decided(t, given, past, later, beyond)
+            if "spike" in kinds:
+                text = f"t = {t:g}: {given:g} is far off the values before and after"
+                found.remark("spike", channel, text, sample.tokens[-1])
+            if "interpolated" in kinds and habit.interpolated:
+                text = f"t = {t:g}: between the values before and after"
+                found.remark("interpolated", channel, text, sample.tokens[-1])
+            elif kinds:
+                value = NAN
+            if kinds:
+                sample.values[channel] = value
+
+    def _later(self, t: float, channel: str) -> Series:
+        """Return the known values of a channel in samples that are still open."""
+        values = ((s, self._open[s].values.get(channel, NAN)) for s in sorted(self._open) if s > t)
+        return [pair for pair in values if math.isfinite(pair[1])]
 
     def _ripe(self, t: float) -> bool:
         """Return whether nothing that a sample may wait for can still come."""
-        absent = [channel for channel in self.columns if channel not in self._open[t].values]
-        if self.policy.wait == 0.0 and not absent:
+        values, policy = self._open[t].values, self.policy
+        absent = [channel for channel in self.columns if self._awaited(t, channel, values)]
+        if policy.wait == 0.0 and not absent:
             return True
-        waits = [self.policy.wait, *(self.policy.habit(channel).wait for channel in absent)]
-        return t + self.policy.tolerance + max(waits) < self._newest
+        waits = [policy.wait, *(policy.habit(channel).wait for channel in absent)]
+        return t + policy.tolerance + max(waits) < self._newest
+
+    def _awaited(self, t: float, channel: str, values: Mapping[str, float]) -> bool:
+        """Return whether a sample lacks a channel that may still come, or be interpolated."""
+        habit = self.policy.habit(channel)
+        if not (habit.interpolated and max(self.policy.wait, habit.wait) > 0.0):
+            return channel not in values
+        return math.isnan(values.get(channel, NAN)) and not self._later(t, channel)
 
 
 def _microseconds(stamp: float) -> float:

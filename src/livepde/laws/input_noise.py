@@ -1,0 +1,128 @@
+"""Noise of input channels and of readings that an initial state was made of, as rows of [U; C]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+
+from livepde.fem import Moment
+from livepde.laws.base import Problem
+from livepde.laws.filter_state import FilterState
+from livepde.laws.members import changed
+from livepde.laws.reduction import Reduction
+from livepde.linalg import Array
+from livepde.stepping import Span, StepFailed
+
+__all__ = ["initial_rows", "input_rank", "with_initial_rows", "with_input_noise"]
+
+Propagate: TypeAlias = Callable[[FilterState, Span], tuple[FilterState, int, StepFailed | None]]
+
+# Rows of the square root for each noisy channel: with 10 the standard deviation of a state near the
+# boundary is that of all rows to 1 %: tests/test_input_noise.py.
+ROWS = 10
+
+
+def input_rank(problem: Problem) -> int:
+    """Return how many rows of the square root the noise of inputs and initial readings needs."""
+    return ROWS * len(problem.input_noise) + len(problem.initial_weights)
+
+
+def with_input_noise(
+    propagate: Propagate, problem: Problem, x: FilterState, end: FilterState, span: Span
+) -> tuple[FilterState, StepFailed | None]:
+    """Return the state after a span with one more row for each noisy channel.
+
+    The error of a channel is taken as constant in a span and as independent from one to the next:
+    its integral over many has the variance of the straight lines between readings. Where a state
+    follows its boundary within a span it is more than what the lines give, by up to a quarter.
+    The row is the difference to the state whose input is one standard deviation off, exact where
+    the model is affine in it.
+
+    Parameters
+    ----------
+    propagate
+        Takes a state over a span.
+    x, end
+        The state before and after the span.
+    """
+    members, _, n = x.U.shape
+    k = x.C.shape[2]
+    bare = changed(
+        x,
+        du=np.zeros_like(x.du),
+        da=np.zeros_like(x.da),
+        U=np.zeros((members, 0, n)),
+        C=np.zeros((members, 0, k)),
+        past=x.past[:, :0],
+    )
+    rows = []
+    for name, std in problem.input_noise.items():
+        off, _, failure = propagate(bare, _moved(span, name, std))
+        if failure is not None:
+            return end, failure
+        rows.append(off.u - end.u)
+    U = np.concatenate([end.U, np.stack(rows, axis=1)], axis=1)
+    C = np.concatenate([end.C, np.zeros((members, len(rows), k))], axis=1)
+    past = np.concatenate([end.past, np.zeros((members, len(rows), end.past.shape[2]))], axis=1)
+    return changed(end, U=U, C=C, past=past), None
+
+
+def _moved(span: Span, name: str, change: float) -> Span:
+    """Return a span with another value of one channel at both ends."""
+    shift = np.zeros(len(span.channels))
+    shift[span.channels.index(name)] = change
+    last = span.inputs1 + shift
+    first = last if span.inputs0 is span.inputs1 else span.inputs0 + shift
+    return replace(span, inputs0=first, inputs1=last, interval=None)
+
+
+def initial_rows(
+    problem: Problem, reduction: Reduction, noise: Array, q: Array, u: Array, moment: Moment
+) -> tuple[Array, Array]:
+    """Return what the readings that u0 was made of leave uncertain: rows of U and of C.
+
+    With u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise of each
+    reading is a row of its own, and what the sensors see of the unknowns, an offset say, stands in
+    the rows of those unknowns. So the readings tell nothing more of them.
+
+    Parameters
+    ----------
+    noise
+        Standard deviation of each sensor, shape (sensors,).
+    q, u, moment
+        Latent parameter, state, time and inputs at the start.
+
+    Returns
+    -------
+    U, C
+        Shapes (k + readings, n) and (k + readings, k).
+    """
+    observed, k = problem.observed, reduction.size
+    free = problem.model.X.free
+    own, unknown = [], np.zeros((k, len(u)))
+    _, H_q = observed.jacobian(u, problem.model.latent.value(q), moment)
+    seen = np.zeros((k, observed.size))
+    if H_q is not None:
+        seen = reduction.directions(q[None], np.eye(k)[None])[0] @ H_q.T
+    for name, weight in problem.initial_weights.items():
+        if name in observed.names:
+            sensor = observed.names.index(name)
+            own.append(noise[sensor] * free * weight)
+            unknown -= np.outer(seen[:, sensor], free * weight)
+        else:
+            own.append(problem.input_noise.get(name, 0.0) * free * weight)
+    C = np.vstack([np.eye(k), np.zeros((len(own), k))])
+    return np.vstack([unknown, *own]), C
+
+
+def with_initial_rows(
+    x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
+) -> FilterState:
+    """Return the state at the start with the uncertainty of the readings that it was made of."""
+    if not problem.initial_weights:
+        return x
+    U, C = initial_rows(problem, reduction, noise, x.q[0], x.u[0], moment)
+    return changed(x, U=U[None], C=C[None], past=np.zeros((1, len(C), 0)))

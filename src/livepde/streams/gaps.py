@@ -1,0 +1,390 @@
+"""Gaps and spikes of input and boundary channels, which are measurements, too.
+
+A gap is interpolated between its neighbours: by PCHIP where two values on each side are known, else
+by a straight line. At the end of a record, where no next value is known, nothing is filled in: the
+identifier holds the last value and says so.
+
+A spike is a single value far off the cubic through two neighbours on each side of it. It is refused
+and leaves a gap. Where leaving out one value does not explain what is far off, the channel has
+really changed, as an actuator does, and all values stay.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import median_filter
+
+from livepde.errors import ConfigurationError, SampleError
+from livepde.linalg import Array, Mask
+from livepde.samples import Sample, number, sample_of
+from livepde.streams.table import Table
+
+__all__ = ["RECENT", "FillGaps", "Filled", "Series", "bridged", "fill_table", "find_spikes"]
+
+# With 12 of 1000 records of smooth signals and white noise lose a value, and all spikes of more
+# than 40 standard deviations are found: tests/test_gaps.py.
+BEYOND = 12.0
+LOCAL = 31  # residuals whose median is the local scale
+FEWEST = 8  # residuals from which a scale is taken
+RECENT = 64  # values of a channel that are kept to tell the scale of the next ones
+CENTRE, NEIGHBOURS = 2, 5  # of the five values that make a residual
+LEFT = 0.2  # of a residual that may be left without a spike; of that of a step 0.3 is left
+ABOUT = 3  # values on each side that have to be plausible without a spike
+GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian noise
+
+Series = Sequence[tuple[float, float]]
+"""Times and known values of a channel, in order."""
+
+
+class _Residuals(NamedTuple):
+    """How far values lie off the cubic through two neighbours on each side.
+
+    Attributes
+    ----------
+    size
+        Residuals, shape (values - 4,), less where the neighbours are far away.
+    weights
+        What each of the five values adds to them, shape (values - 4, 5).
+    """
+
+    size: Array
+    weights: Array
+
+
+def _residuals(t: Array, x: Array) -> _Residuals:
+    """Return the residuals of at least five values."""
+    window = np.lib.stride_tricks.sliding_window_view
+    times, values = window(t, NEIGHBOURS), window(x, NEIGHBOURS)
+    weights = np.ones(times.shape)
+    others = [k for k in range(NEIGHBOURS) if k != CENTRE]
+    for i in others:
+        for j in others:
+            if j != i:
+                weights[:, i] *= (times[:, CENTRE] - times[:, j]) / (times[:, i] - times[:, j])
+        weights[:, i] *= -1.0
+    # The error of a cubic grows with the product of the distances: beside a gap it says little.
+    reach = np.abs(np.prod([times[:, CENTRE] - times[:, i] for i in others], axis=0))
+    weights /= np.maximum(1.0, reach / np.median(reach))[:, None]
+    return _Residuals((weights * values).sum(axis=1), weights)
+
+
+def _threshold(x: Array, size: Array, beyond: float) -> Array:
+    """Return above which size a residual is implausible: global and local scale."""
+    absolute = np.abs(size)
+    local = median_filter(absolute, size=LOCAL)
+    half = LOCAL // 2
+    if len(local) > LOCAL:  # at the ends the window lies inside: a spike does not fill it
+        local[:half], local[-half:] = local[half], local[-half - 1]
+    else:
+        local[:] = np.median(absolute)
+    steps = np.abs(np.diff(x))
+    # Values that mostly repeat have a residual of zero: one step of their resolution is no spike.
+    resolution = steps[steps > 0.0].min(initial=math.inf)
+    return np.asarray(beyond * np.maximum(GAUSS * (np.median(absolute) + local), resolution))
+
+
+def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
+    """Return which known values of a channel are spikes, shape (values,).
+
+    Parameters
+    ----------
+    t, x
+        Times and finite values, in order.
+    beyond
+        How many robust standard deviations, the global and the local one together, a value lies off
+        the cubic through its neighbours.
+    """
+    spikes = np.zeros(len(x), dtype=bool)
+    if len(x) < FEWEST + NEIGHBOURS - 1:
+        return spikes
+    size, weights = _residuals(t, x)
+    threshold = _threshold(x, size, beyond)
+    excess = np.abs(size) / threshold
+    for row in np.argsort(-excess)[: int((excess > 1.0).sum())].tolist():
+        if excess[row] <= 1.0:  # explained, or found to be a change, in the meantime
+            continue
+        suspect = _suspect(size, weights, row)
+        spikes[suspect] = _explains(t, x, suspect, LEFT * float(abs(size[row])))
+        excess[max(suspect - NEIGHBOURS + 1, 0) : suspect + 1] = 0.0
+        excess[row] = 0.0
+    return spikes
+
+
+def _suspect(size: Array, weights: Array, row: int) -> int:
+    """Return the value whose change makes the residuals about a row what they are."""
+    best, most = row + CENTRE, -1.0
+    for value in range(row, row + NEIGHBOURS):
+        rows = np.arange(max(value - NEIGHBOURS + 1, 0), min(value + 1, len(size)))
+        column = weights[rows, value - rows]
+        match = float(column @ size[rows]) ** 2 / float(column @ column)
+        if match > most * (1.0 + 1e-9):
+            best, most = value, match
+    return best
+
+
+def _explains(t: Array, x: Array, suspect: int, largest: float) -> bool:
+    """Return whether the values about a suspect have small residuals without it."""
+    if not CENTRE <= suspect < len(x) - CENTRE:  # it may as well be the first one of a change
+        return False
+    first = max(suspect - ABOUT, 0)
+    about = np.delete(np.arange(first, min(suspect + ABOUT + 1, len(x))), suspect - first)
+    if len(about) < NEIGHBOURS:
+        return False
+    return bool((np.abs(_residuals(t[about], x[about]).size) <= largest).all())
+
+
+def bridged(t: float, past: Series, later: Series) -> float:
+    """Return the value of a channel in a gap, NaN if it is not between known values.
+
+    PCHIP where two values on each side are known, else a straight line.
+
+    >>> bridged(1.0, [(0.0, 2.0)], [(2.0, 4.0)])
+    3.0
+    """
+    if not (past and later):
+        return math.nan
+    (t0, x0), (t1, x1) = past[-1], later[0]
+    if len(past) < 2 or len(later) < 2:
+        return x0 + (t - t0) / (t1 - t0) * (x1 - x0)
+    times, values = zip(*past[-2:], *later[:2], strict=True)
+    return float(PchipInterpolator(times, values)(t))
+
+
+def is_spike(past: Series, now: tuple[float, float], later: Series, beyond: float) -> bool:
+    """Return whether a value is a spike, judged by at least two known ones after it."""
+    if len(later) < CENTRE or not math.isfinite(beyond):
+        return False
+    t, x = np.array([*past, now, *later]).T
+    return bool(find_spikes(t, x, beyond)[len(past)])
+
+
+def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Mask, Mask]:
+    """Return a channel without gaps, where it was interpolated, and where a spike was refused.
+
+    Gaps before the first value and after the last stay.
+    """
+    known = np.flatnonzero(np.isfinite(x))
+    spikes = np.zeros(len(x), dtype=bool)
+    if math.isfinite(beyond):
+        spikes[known] = find_spikes(t[known], x[known], beyond)
+    known = known[~spikes[known]]
+    new, gaps = np.where(spikes, math.nan, x), np.zeros(len(x), dtype=bool)
+    if len(known) < 2:
+        return new, gaps, spikes
+    gaps[known[0] : known[-1]] = ~np.isfinite(new[known[0] : known[-1]])
+    new[gaps] = np.interp(t[gaps], t[known], x[known])
+    if len(known) >= 4:
+        inner = gaps & (t > t[known[1]]) & (t < t[known[-2]])
+        new[inner] = PchipInterpolator(t[known], x[known])(t[inner])
+    return new, gaps, spikes
+
+
+def fill_table(
+    table: Table, interpolated: Iterable[str], screened: Iterable[str], beyond: float = BEYOND
+) -> Table:
+    """Return a finished record whose channels have no gaps between known values, and no spikes.
+
+    What was done is counted in its remarks as "interpolated" and "spike", what is left as
+    "missing".
+
+    Parameters
+    ----------
+    interpolated, screened
+        Channels whose gaps are filled, and those whose spikes are refused.
+    """
+    values, remarks = table.values.copy(), dict(table.remarks)
+    fills, screens = set(interpolated), set(screened)
+    for k, name in enumerate(table.names):
+        if name not in fills | screens:
+            continue
+        limit = beyond if name in screens else math.inf
+        column, gaps, spikes = filled_column(table.t, values[:, k], limit)
+        if name not in fills:
+            column[gaps], gaps = math.nan, np.zeros_like(gaps)
+        values[:, k] = column
+        left = np.isnan(column).sum()
+        counts = {"spike": spikes.sum(), "interpolated": gaps.sum(), "missing": left}
+        remarks |= {(kind, name): int(number) for kind, number in counts.items() if number}
+    return replace(table, values=values, remarks=remarks)
+
+
+@dataclass(frozen=True)
+class FillGaps:
+    """Interpolation of gaps of input channels, and refusal of spikes, as a stage of a stream.
+
+    A sample without a value of one of the channels waits until the next value has come, at most for
+    `wait` or `samples`; then it is passed on as it is. While spikes are refused every sample waits
+    for the next two values of each channel: a lag of two samples.
+
+    Parameters
+    ----------
+    channels
+        Names of the input and boundary channels.
+    wait
+        Longest time that a sample waits, in the unit of the stream.
+    samples
+        Largest number of samples that it waits for.
+    spikes
+        How many robust standard deviations off its neighbours a value is refused; infinity: none is
+        looked for, and only samples with gaps wait.
+
+    Examples
+    --------
+    >>> stage = FillGaps(["T_left"], spikes=math.inf)
+    >>> stream = [(k, {"T_left": x}) for k, x in enumerate([1.0, None, 3.0])]
+    >>> [sample.z["T_left"] for sample in stage(stream)]
+    [1.0, 2.0, 3.0]
+    """
+
+    channels: Sequence[str]
+    wait: float = math.inf
+    samples: int | None = None
+    spikes: float = BEYOND
+
+    def __post_init__(self) -> None:
+        if isinstance(self.channels, str) or not self.channels:
+            raise ConfigurationError(
+                f"FillGaps: channels must be a sequence of names; got {self.channels!r}."
+            )
+        if not self.wait >= 0.0:
+            raise ConfigurationError(f"FillGaps: wait must be a time >= 0; got {self.wait}.")
+        if self.samples is not None and self.samples < 0:
+            raise ConfigurationError(f"FillGaps: samples must be >= 0; got {self.samples}.")
+        if not self.spikes > 0.0:
+            raise ConfigurationError(f"FillGaps: spikes must be positive; got {self.spikes}.")
+
+    def __call__(self, stream: Iterable[Any]) -> Filled:
+        """Return the stream without gaps; items are `Sample`, (t, z) or (t, z, inputs)."""
+        return Filled(self, stream)
+
+
+class Filled(Iterable[Sample]):
+    """A stream without gaps in its input channels.
+
+    Attributes
+    ----------
+    counts
+        (kind, channel) -> how many values were "interpolated", how many refused as a "spike", and
+        how many "missing" ones were passed on as such, in the last iteration.
+    """
+
+    def __init__(self, stage: FillGaps, stream: Iterable[Any]) -> None:
+        self.stage = stage
+        self.stream = stream
+        self.counts: Counter[tuple[str, str]] = Counter()
+
+    def __iter__(self) -> Iterator[Sample]:
+        self.counts = Counter()
+        recent: dict[str, deque[tuple[float, float]]] = {
+            name: deque(maxlen=RECENT) for name in self.stage.channels
+        }
+        waiting: deque[tuple[Sample, dict[str, float]]] = deque()
+        before = -math.inf
+        for item in self.stream:
+            sample = sample_of(item)
+            if not sample.t > before:
+                raise SampleError(
+                    f"FillGaps: the sample at t = {sample.t!r} is not later than the one before at "
+                    f"t = {before!r}; sort the stream and drop repeated samples."
+                )
+            before = sample.t
+            waiting.append((sample, self._values(sample)))
+            while waiting and self._decided(waiting):
+                yield self._released(waiting, recent)
+        while waiting:
+            yield self._released(waiting, recent)
+
+    def _values(self, sample: Sample) -> dict[str, float]:
+        """Return the values of the channels in a sample, NaN where missing."""
+        named = dict(sample.z) if isinstance(sample.z, Mapping) else {}
+        named |= dict(sample.inputs or {})
+        return {name: number(named.get(name), f"input '{name}'") for name in self.stage.channels}
+
+    def _later(self, waiting: deque[tuple[Sample, dict[str, float]]], name: str) -> Series:
+        """Return the known values of a channel after the first sample that waits."""
+        found = [(float(sample.t), values[name]) for sample, values in list(waiting)[1:]]
+        return [pair for pair in found if math.isfinite(pair[1])]
+
+    def _decided(self, waiting: deque[tuple[Sample, dict[str, float]]]) -> bool:
+        """Return whether the first sample that waits has waited enough."""
+        stage, (first, values) = self.stage, waiting[0]
+        expired = waiting[-1][0].t - first.t > stage.wait
+        if expired or (stage.samples is not None and len(waiting) > stage.samples):
+            return True
+        screens = math.isfinite(stage.spikes)
+        for name in stage.channels:
+            needed = CENTRE if screens else int(math.isnan(values[name]))
+            if len(self._later(waiting, name)) < needed:
+                return False
+        return True
+
+    def _released(
+        self,
+        waiting: deque[tuple[Sample, dict[str, float]]],
+        recent: Mapping[str, deque[tuple[float, float]]],
+    ) -> Sample:
+        """Return the first sample that waits, without gaps as far as possible."""
+        sample, values = waiting[0]
+        t, changed = float(sample.t), {}
+        for name in self.stage.channels:
+            later, past = self._later(waiting, name), recent[name]
+            value, kind = decided(t, values[name], list(past), later, self.stage.spikes)
+            for each in kind:
+                self.counts[each, name] += 1
+            if math.isfinite(value):
+                past.append((t, value))
+            if kind:
+                changed[name] = value
+        waiting.popleft()
+        return sample if not changed else _with(sample, changed)
+
+
+def decided(
+    t: float, value: float, past: Series, later: Series, beyond: float = BEYOND
+) -> tuple[float, tuple[str, ...]]:
+    """Return the value that a sample takes of a channel, and what was done: kinds of remarks.
+
+    Parameters
+    ----------
+    t, value
+        Time of the sample and its value, NaN if it is missing.
+    past, later
+        Known values before and after.
+    beyond
+        As for `find_spikes`; infinity: spikes stay.
+    """
+    kinds: tuple[str, ...] = ()
+    if math.isfinite(value):
+        if not is_spike(past, (t, value), later, beyond):
+            return value, ()
+        kinds = ("spike",)
+    found = bridged(t, past, _plausible(past, later, beyond))
+    return found, (*kinds, "interpolated" if math.isfinite(found) else "missing")
+
+
+def _plausible(past: Series, later: Series, beyond: float) -> Series:
+    """Return the values after a gap without those that are spikes."""
+    if not math.isfinite(beyond) or len(later) < CENTRE:
+        return later
+    t, x = np.array([*past, *later]).T
+    spikes = find_spikes(t, x, beyond)[len(past) :]
+    return [pair for pair, spike in zip(later, spikes.tolist(), strict=True) if not spike]
+
+
+def _with(sample: Sample, values: Mapping[str, float]) -> Sample:
+    """Return a sample with other values of some channels, where they stood before."""
+    inputs = None if sample.inputs is None else dict(sample.inputs)
+    if not isinstance(sample.z, Mapping):
+        return Sample(sample.t, sample.z, {**(inputs or {}), **values})
+    named = dict(sample.z)
+    for name, value in values.items():
+        target = inputs if inputs is not None and name in inputs else named
+        target[name] = value
+    return Sample(sample.t, named, inputs)

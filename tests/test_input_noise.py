@@ -1,0 +1,271 @@
+"""Noise of input channels, and of readings that an initial state is made of, in the intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from skfem import ElementLineP1
+
+import livepde as lp
+from livepde import cases
+from livepde.laws.input_noise import ROWS
+from livepde.stepping import Alexander2, ImplicitEuler
+
+H, STEPS = 0.01, 40
+SENSORS = {"T_1": 0.1, "T_5": 0.5}
+
+
+def rod(std: float = 0.3, flux: bool = False, cube: float = 0.0) -> lp.Model:
+    """Return a rod whose left end or source arrives with the stream."""
+    sources = [0.0, lp.On("right", lambda x, t: x.inputs["Q"])] if flux else 0.0
+    return lp.Model(
+        state=lp.Field(
+            lp.interval(0.0, 1.0, 20),
+            ElementLineP1(),
+            dirichlet={"left": lp.Channel("left")} if not flux else {},
+        ),
+        parameter={"k": lp.Scalar(1.0, std=std)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + cube * u**3 * v,
+        f=sources,
+        inputs=["Q"] if flux else [],
+    )
+
+
+def channel(k: int) -> float:
+    return 1.0 + np.sin(0.3 * k)
+
+
+def states(model, inputs, scheme) -> np.ndarray:
+    """Return what the sensors see of a run with these inputs and the unknowns of the prior."""
+    name = model.channels[0]
+    points = lp.Points(SENSORS, noise=1.0)
+    one = lp.Identifier(model, points, lp.SensitivityLaw(), u0=0.0, scheme=scheme)
+    for k, value in enumerate(inputs):
+        one.step(H * k, {name: value})
+    belief = one.latent_belief()
+    return one.observed.predict(belief.u, belief.q, None)
+
+
+@pytest.mark.parametrize("flux", [False, True])
+@pytest.mark.parametrize(("scheme", "tolerance"), [(ImplicitEuler(), 0.01), (Alexander2(), 0.05)])
+def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tolerance):
+    """Each reading one standard deviation off moves the state; squares add up."""
+    model, noise = rod(std=1e-9, flux=flux), 0.2
+    name = model.channels[0]
+    inputs = np.array([channel(k) for k in range(STEPS + 1)])
+    known = states(model, inputs, scheme)
+    square = np.zeros(len(SENSORS))
+    for k in range(1, STEPS + 1):
+        off = inputs.copy()
+        off[k] += noise
+        square += (states(model, off, scheme) - known) ** 2
+    one = lp.Identifier(
+        model,
+        lp.Points(SENSORS, noise=1.0),
+        lp.SensitivityLaw(),
+        u0=0.0,
+        scheme=scheme,
+        input_noise={name: noise},
+    )
+    for k, value in enumerate(inputs):
+        one.step(H * k, {name: value})
+    factor = one.observed.G @ one.latent_belief().u_factor
+    assert factor.shape[1] <= 2 + ROWS
+    ratio = np.sqrt((factor**2).sum(axis=1) / square)
+    assert ratio[1] == pytest.approx(1.0, rel=tolerance)
+    near = 1.0 if flux or isinstance(scheme, ImplicitEuler) else 1.25
+    assert 1.0 - tolerance <= ratio[0] <= near + tolerance
+
+
+def test_a_model_that_is_not_linear_has_it_too():
+    model, noise = rod(std=1e-9, cube=5.0), 1e-3
+    inputs = np.array([channel(k) for k in range(6)])
+    known = states(model, inputs, ImplicitEuler())
+    square = 0.0
+    for k in range(1, 6):
+        off = inputs.copy()
+        off[k] += noise
+        square = square + (states(model, off, ImplicitEuler()) - known) ** 2
+    one = lp.Identifier(
+        model,
+        lp.Points(SENSORS, noise=1.0),
+        lp.SensitivityLaw(),
+        u0=0.0,
+        input_noise={"left": noise},
+    )
+    for k, value in enumerate(inputs):
+        one.step(H * k, {"left": value})
+    factor = one.observed.G @ one.latent_belief().u_factor
+    assert np.sqrt((factor**2).sum(axis=1)) == pytest.approx(np.sqrt(square), rel=0.01)
+
+
+def truth(seed: int, noise: float, sensor: float) -> tuple[float, list[tuple[float, dict]]]:
+    """Return k from the prior, and what a rod with a noisy boundary channel shows."""
+    rng = np.random.default_rng(seed)
+    k = 1.0 + 0.3 * float(np.clip(rng.standard_normal(), -2.0, 2.0))
+    inputs = [channel(j) for j in range(STEPS + 1)]
+    one = lp.Identifier(
+        rod(), lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(), u0=0.0, q0={"k": k}
+    )
+    samples = []
+    for j, value in enumerate(inputs):
+        one.step(H * j, {"left": value})
+        belief = one.latent_belief()
+        z = one.observed.predict(belief.u, belief.q, None) + sensor * rng.standard_normal(2)
+        read = {"left": value + noise * rng.standard_normal()}
+        samples.append((H * j, {**dict(zip(SENSORS, z.tolist(), strict=True)), **read}))
+    return k, samples
+
+
+def test_an_interval_with_the_noise_of_the_boundary_holds():
+    inside = {True: 0, False: 0}
+    for seed in range(40):
+        k, samples = truth(seed, 0.1, 0.01)
+        for stated in inside:
+            one = lp.Identifier(
+                rod(),
+                lp.Points(SENSORS, noise=0.01),
+                lp.SensitivityLaw(),
+                u0=0.0,
+                input_noise={"left": 0.1} if stated else None,
+            )
+            belief = one.run(samples).last.belief
+            std = np.sqrt((belief.q_factor[0] ** 2).sum())  # not inflated afterwards
+            inside[stated] += abs(belief.q[0] - k) < 1.96 * std
+    assert inside[True] >= 35
+    assert inside[False] <= 25
+
+
+# --- initial states ----------------------------------------------------------------------------
+
+
+def made_of_readings(law, errors, u_true, **unknowns):
+    at = np.array([0.0, 0.3, 0.7, 1.0])
+    names = [f"T_{k}" for k in range(4)]
+    model = lp.Model(
+        state=lp.Field(lp.interval(0.0, 1.0, 20), ElementLineP1()),
+        parameter={"k": lp.Scalar(1.0, std=0.3), **unknowns},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    z = u_true(at) + errors
+    unit = np.eye(4)
+    weights = {
+        name: lambda x, row=unit[k]: np.interp(x[0], at, row) for k, name in enumerate(names)
+    }
+    direct = {"T_1": lambda q, x: q.offset} if unknowns else {}
+    sensors = lp.Points(dict(zip(names, at.tolist(), strict=True)), direct, noise=0.1)
+    one = lp.Identifier(model, sensors, law, u0=lambda x: np.interp(x[0], at, z), u0_from=weights)
+    one.step(0.0, z)
+    return one, z
+
+
+def test_the_readings_of_the_start_count_once():
+    one, z = made_of_readings(lp.SensitivityLaw(), np.zeros(4), lambda x: 1.0 + x)
+    belief = one.latent_belief()
+    seen = one.observed.G @ belief.u_factor
+    assert np.sqrt((seen**2).sum(axis=1)) == pytest.approx(np.full(4, 0.1), rel=1e-9)
+    assert one.observed.G @ belief.u == pytest.approx(z)
+    assert np.sqrt((belief.q_factor**2).sum()) == pytest.approx(0.3)  # nothing is learned of k
+
+
+def test_an_offset_is_not_learned_from_the_state_that_was_made_with_it():
+    extra = {"offset": lp.Scalar(0.0, std=0.5)}
+    one, _ = made_of_readings(lp.SensitivityLaw(), np.zeros(4), lambda x: 1.0 + x, **extra)
+    belief = one.latent_belief()
+    assert np.sqrt((belief.q_factor[1] ** 2).sum()) == pytest.approx(0.5)
+    seen = one.observed.G @ belief.u_factor
+    assert np.sqrt((seen**2).sum(axis=1)) == pytest.approx([0.1, np.hypot(0.1, 0.5), 0.1, 0.1])
+
+
+@pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay())])
+def test_a_wrong_start_does_not_end_in_the_unknowns(law):
+    """Means of squared errors over expected variances: of order one with the noise of the start."""
+    scores = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        one, _ = made_of_readings(law, 0.1 * rng.standard_normal(4), lambda x: 1.0 + x)
+        true = lp.Identifier(
+            one.model, one.observed.observation, lp.SensitivityLaw(), u0=lambda x: 1.0 + x[0]
+        )
+        times = 0.01 * np.arange(1, 21)
+        expected = true.forecast(times)
+        for k, t in enumerate(times):
+            z = np.array([expected[name][k] for name in one.observed.names])
+            estimate = one.step(t, z + 0.1 * rng.standard_normal(4))
+        belief = estimate.belief
+        scores.append((belief.q[0] - 1.0) ** 2 / (belief.q_factor[0] ** 2).sum())
+    assert np.mean(scores) < 2.0
+
+
+# --- what is refused ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"input_noise": {"rigth": 0.1}}, "the model has no channel 'rigth'"),
+        ({"input_noise": {"left": 0.0}}, "must be a positive number"),
+        ({"u0_from": {"T_9": 1.0}, "u0": 0.0}, "'T_9' is no assimilated sensor"),
+        ({"u0_from": {"T_1": 1.0}}, "give u0, too"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(options, text):
+    points = lp.Points(SENSORS, noise=1.0)
+    with pytest.raises(lp.ConfigurationError, match=text):
+        lp.Identifier(rod(), points, lp.SensitivityLaw(), **options)
+
+
+def test_the_gradient_law_has_no_covariance():
+    with pytest.raises(lp.LawError, match="has no covariance"):
+        lp.Identifier(rod(), lp.Points(SENSORS), lp.GradientLaw(), input_noise={"left": 0.1})
+
+
+# --- cases and fleets --------------------------------------------------------------------------
+
+CASE = """
+equation = "heat"
+initial = "interpolate"
+[mesh]
+from = 0
+to = "1 m"
+cells = 10
+[data]
+file = "rows.csv"
+time = "t"
+time_unit = "s"
+[boundary]
+right = "20 degC"
+[unknowns.alpha]
+prior = "2e-5 m^2/s"
+std = "1e-5 m^2/s"
+[channels]
+left = { role = "boundary", column = "left", at = "left", unit = "degC", noise = "0.2 K" }
+T = { role = "sensor", column = "T", at = "0.3 m", unit = "degC", noise = "0.1 K" }
+[law]
+kind = "sensitivity"
+"""
+
+
+def test_a_case_states_the_noise_of_its_channels(tmp_path):
+    rows = [f"{300 * k},{20 + k % 3},{20 + 0.1 * k}" for k in range(5)]
+    (tmp_path / "rows.csv").write_text("\n".join(["t,left,T", *rows, ""]))
+    (tmp_path / "case.toml").write_text(CASE)
+    prepared = cases.load(tmp_path / "case.toml").prepare()
+    problem = prepared.identifier.problem
+    assert problem.input_noise == {"left": 0.2}
+    assert list(problem.initial_weights) == ["left", "T"]
+    result = prepared.identifier.run(prepared.stream)
+    assert result.last.belief.u_factor[3].any()
+
+
+def test_a_fleet_steps_as_its_members_do():
+    model, points = rod(), lp.Points(SENSORS, noise=0.01)
+    options = {"u0": 0.0, "input_noise": {"left": 0.1}}
+    fleet = lp.Fleet(model, points, lp.SensitivityLaw(), 2, **options)
+    ones = [lp.Identifier(model, points, lp.SensitivityLaw(), **options) for _ in range(2)]
+    assert fleet.together
+    for k in range(8):
+        z = {"T_1": np.array([0.1, 0.2]) * k, "T_5": np.zeros(2), "left": np.array([1.0, 1.1])}
+        found = fleet.step(H * k, z)
+        each = [one.step(H * k, {n: v[j] for n, v in z.items()}) for j, one in enumerate(ones)]
+    assert np.asarray(found.q)[:, 0] == pytest.approx([one.belief.q[0] for one in each], rel=1e-9)
