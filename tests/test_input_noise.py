@@ -8,6 +8,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.preview import StatedNoise
 from livepde.laws.input_noise import ROWS
 from livepde.stepping import Alexander2, ImplicitEuler
 
@@ -91,6 +92,7 @@ def test_a_model_that_is_not_linear_has_it_too():
         lp.Points(SENSORS, noise=1.0),
         lp.SensitivityLaw(),
         u0=0.0,
+        scheme=ImplicitEuler(),
         input_noise={"left": noise},
     )
     for k, value in enumerate(inputs):
@@ -125,12 +127,12 @@ def test_an_interval_with_the_noise_of_the_boundary_holds():
             one = lp.Identifier(
                 rod(),
                 lp.Points(SENSORS, noise=0.01),
-                lp.SensitivityLaw(),
+                StatedNoise(),
                 u0=0.0,
                 input_noise={"left": 0.1} if stated else None,
             )
             belief = one.run(samples).last.belief
-            std = np.sqrt((belief.q_factor[0] ** 2).sum())  # not inflated afterwards
+            std = np.sqrt((belief.q_factor[0] ** 2).sum())
             inside[stated] += abs(belief.q[0] - k) < 1.96 * std
     assert inside[True] >= 35
     assert inside[False] <= 25

@@ -71,7 +71,9 @@ def test_two_large_jumps_do_not_hide_a_third_one(noise: float):
 @pytest.mark.parametrize("replay", [None, lp.Replay()])
 def test_what_does_not_jump_keeps_what_is_known_of_it(replay: Any):
     found, alarms = run(THREE, 1e-3, FLUX, replay)
-    assert alarms == list(JUMPS)
+    # One value beyond the gate may be a fault of its sensor: the next one makes it a jump.
+    late = {alarm - jump for alarm, jump in zip(alarms, JUMPS, strict=True)}
+    assert late <= {0, 1}
     before = found[199].parameters["k"]
     for estimate in found[199:]:
         k, std = estimate.parameters["k"]

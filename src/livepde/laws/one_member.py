@@ -242,7 +242,9 @@ def _watched(
     if alarm:
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
-        before = max(len(known) - jumps.onset(state.watch, e), 0)
+        # Values that the gate has refused in a row do not count in the onset, and belong to it.
+        onset = max(jumps.onset(state.watch, e), int(new.now.refused.max()))
+        before = max(len(known) - onset, 0)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
         for earlier in known[:before]:
             x, found = _filtered(work, x, earlier)
