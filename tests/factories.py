@@ -25,7 +25,7 @@ from skfem import (
 )
 
 import livepde as lp
-from livepde.stepping import ForwardStage
+from livepde.stepping import ForwardStage, advance
 
 
 def line(cells: int = 12) -> Any:
@@ -150,6 +150,24 @@ def truth(
     return [u for _, u in lp.simulate(model, q, u0, list(times), control, inputs)]
 
 
+def advanced(
+    forward: ForwardStage,
+    u: np.ndarray,
+    q: Any,
+    t0: float,
+    t1: float,
+    scheme: lp.Scheme = lp.SensitivityLaw.scheme,
+) -> np.ndarray:
+    """Return the state of the forward model at t1; q are coefficients, or a function of time."""
+
+    def stage(c: np.ndarray, t: float, h: float) -> np.ndarray:
+        return forward.solve(c, q(t) if callable(q) else q, h, lp.Moment(t))
+
+    u, _, failure = advance(lp.Advance(scheme), stage, u, t0, t1)
+    assert failure is None
+    return u
+
+
 def observe(model: lp.Model, observation: lp.Observation) -> Any:
     return observation.bind(model.state_space, model.X, model.parameter_space)
 
@@ -168,10 +186,13 @@ def readings(
     noise: float,
     seed: int = 0,
 ) -> list[tuple[float, np.ndarray]]:
-    """Return noisy samples of a process that starts at zero, with one unknown q(t)."""
+    """Return noisy samples of a process that starts at zero, with one unknown q(t).
+
+    The process steps as a sensitivity law does.
+    """
     rng, observed = np.random.default_rng(seed), observe(model, sensors)
     forward, u, found = ForwardStage(model), model.initial(0.0), []
     for t0, t1 in pairwise(float(t) for t in times):
-        u = forward.solve(u, np.array([q(t1)]), t1 - t0, lp.Moment(t1))
+        u = advanced(forward, u, lambda t: np.array([q(t)]), t0, t1)
         found.append((t1, observed.G @ u + noise * rng.standard_normal(observed.size)))
     return found

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import driven_rod, line, readings
+from factories import advanced, driven_rod, line, readings
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
@@ -201,7 +201,7 @@ def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
     if first:
         identifier.step(0.0, identifier.observed.G @ u)
     for k in range(1, 20):
-        u = forward.solve(u, truth, 0.1, lp.Moment(0.1 * k))
+        u = advanced(forward, u, truth, 0.1 * (k - 1), 0.1 * k)
         estimate = identifier.step(0.1 * k, identifier.observed.G @ u)
     value, std = estimate.parameters["u0"]
     assert abs(value - 5.0) < std < 0.01
@@ -364,7 +364,7 @@ def test_replays_find_the_most_probable_parameter():
     def seen(a: Array) -> Array:
         u, rows = model.initial_state(a), []
         for k, t in enumerate(times):
-            u = forward.solve(u, a, 0.02, lp.Moment(t)) if k else u
+            u = advanced(forward, u, a, t - 0.02, t) if k else u
             rows.append(identifier.observed.predict(u, latent.value(a), lp.Moment(t)))
         return np.array(rows)
 

@@ -25,13 +25,14 @@ def source_model(**options):
     )
 
 
+SCHEME = lp.SensitivityLaw.scheme
 SENSORS = lp.Points([0.2, 0.5, 0.9], noise=[0.01, 0.02, 0.05])
 
 
 def noisy(model, q_true, times, seed=0, u0=0.0):
     rng = np.random.default_rng(seed)
     G = SENSORS.bind(model.state_space, model.X, model.parameter_space).G
-    states = truth(model, np.array(q_true), u0, times)
+    states = truth(model, np.array(q_true), u0, times, SCHEME)
     sizes = np.array(SENSORS.noise)
     return [(t, G @ u + sizes * rng.standard_normal(3)) for t, u in zip(times, states, strict=True)]
 
@@ -43,7 +44,7 @@ def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
     times = 0.1 * np.arange(21)
     data = noisy(model, [1.7, -0.4], times)
     G = SENSORS.matrix(model.state_space)
-    runs = [truth(model, np.array(q), 0.0, times) for q in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])]
+    runs = [truth(model, np.array(q), 0.0, times, SCHEME) for q in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])]
     zero, one, two = (np.concatenate([G @ u for u in run[1:]]) for run in runs)
     H = np.column_stack([one - zero, two - zero])
     z = np.concatenate([z for _, z in data[1:]])
@@ -58,7 +59,7 @@ def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
     np.testing.assert_allclose(estimate.q, batch, rtol=1e-8)
     factor = estimate.belief.q_factor
     np.testing.assert_allclose(factor @ factor.T, covariance, rtol=1e-8)
-    state = truth(model, batch, 0.0, times)[-1]
+    state = truth(model, batch, 0.0, times, SCHEME)[-1]
     np.testing.assert_allclose(estimate.u, state, atol=1e-9)
 
 
@@ -79,7 +80,7 @@ def stream(model, k, times, noise=0.0, seed=0):
     sensors = lp.Points({"T_1": 0.3, "T_2": 0.7}, noise=0.01)
     G = sensors.matrix(model.state_space)
     rng = np.random.default_rng(seed)
-    states = truth(model, np.array([k]), 0.0, times, inputs=warm)
+    states = truth(model, np.array([k]), 0.0, times, SCHEME, inputs=warm)
     samples = [
         (t, G @ u + noise * rng.standard_normal(2), warm(t))
         for t, u in zip(times, states, strict=True)
@@ -166,7 +167,7 @@ def test_a_field_by_modes_of_its_prior():
     model = excited(16)
     times = 0.05 * np.arange(200)
     q_true = model.initial_parameter(excited_q)
-    states = truth(model, q_true, lambda x: excited_u(x, 0.0), times)
+    states = truth(model, q_true, lambda x: excited_u(x, 0.0), times, SCHEME)
     law = lp.SensitivityLaw(modes=8, noise=1e-3)
     ident = lp.Identifier(model, lp.Full(), law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
     for t, u in zip(times[1:], states[1:], strict=True):
@@ -188,13 +189,13 @@ def test_a_field_beside_a_number():
     )
     q_true = model.initial_parameter({"c": 1.0, "s": lambda x: 1 + x[0]})
     times = 0.05 * np.arange(101)
-    states = truth(model, q_true, 0.0, times)
+    states = truth(model, q_true, 0.0, times, SCHEME)
     law = lp.SensitivityLaw(modes={"s": 6}, noise=1e-3)
     ident = lp.Identifier(model, lp.Full(), law)
     for t, u in zip(times[1:], states[1:], strict=True):
         estimate = ident.step(t, ident.observed.G @ u)
     assert ident._work.filter.reduction.Phi.shape == (14, 7)
-    predicted = truth(model, estimate.q, 0.0, times)[-1]
+    predicted = truth(model, estimate.q, 0.0, times, SCHEME)[-1]
     np.testing.assert_allclose(predicted, states[-1], atol=2e-3)
 
 
@@ -211,7 +212,7 @@ def test_a_sensor_that_sees_a_parameter():
     times = 0.1 * np.arange(41)
     q_true = np.array([1.5, 0.4])
     ident = lp.Identifier(model, sensors, lp.SensitivityLaw())
-    for t, u in zip(times[1:], truth(model, q_true, 0.0, times)[1:], strict=True):
+    for t, u in zip(times[1:], truth(model, q_true, 0.0, times, SCHEME)[1:], strict=True):
         moment = lp.Moment(t)
         estimate = ident.step(t, ident.observed.predict(u, q_true, moment))
     assert estimate.parameters["offset"][0] == pytest.approx(0.4, abs=1e-3)
@@ -241,7 +242,7 @@ def test_a_nonlinear_model_finds_its_rate():
     times = 0.1 * np.arange(31)
     sensors = lp.Points([0.2, 0.8], noise=0.001)
     G = sensors.matrix(model.state_space)
-    states = truth(model, np.array([1.6]), start, times)
+    states = truth(model, np.array([1.6]), start, times, SCHEME)
     ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=5)), u0=start)
     for t, u in zip(times[1:], states[1:], strict=True):
         estimate = ident.step(t, G @ u)

@@ -101,7 +101,7 @@ def found(model: lp.Model, sensors: lp.Observation, truth: Any, **law: Any) -> l
 
     estimate = identifier.step(0.0, sample(0.0))
     for t0, t1 in pairwise(TIMES.tolist()):
-        u = forward.solve(u, exact, t1 - t0, lp.Moment(t1))
+        u = advanced(forward, u, exact, t0, t1)
         estimate = identifier.step(t1, sample(t1))
         assert estimate.status.ok
     return estimate

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import conduction, driven_rod, readings
+from factories import advanced, conduction, driven_rod, readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
@@ -272,7 +272,7 @@ def test_an_unknown_initial_state_is_found_with_the_diffusivity():
     G, times = identifier.observed.G, np.arange(0.0, 4.0, 0.02)
     identifier.step(0.0, G @ u + NOISE * rng.standard_normal(3))
     for t0, t1 in itertools.pairwise(times):
-        u = forward.solve(u, truth, t1 - t0, lp.Moment(t1))
+        u = advanced(forward, u, truth, t0, t1)
         estimate = identifier.step(t1, G @ u + NOISE * rng.standard_normal(3))
     value, std = estimate.parameters["a"]
     assert abs(value - 0.1) < 4 * std < 0.01
@@ -366,7 +366,7 @@ def test_a_first_sample_at_the_start_says_what_is_unknown_there():
         assert first.parameters["u0"][0] == pytest.approx(2.0, abs=0.01)
         forward, u = ForwardStage(model), start
         for t in (0.1, 0.2, 0.3):
-            u = forward.solve(u, np.array([2.0]), 0.1, lp.Moment(t))
+            u = advanced(forward, u, np.array([2.0]), t - 0.1, t)
             estimate = identifier.step(t, identifier.observed.G @ u)
         value, std = estimate.parameters["u0"]
         assert abs(value - 2.0) < 3 * std < 0.03

@@ -375,6 +375,10 @@ class AutoLaw(Law[Bank, AutoState]):
         members = self.member.settled(filters, state.members)
         return state if members is state.members else changed(state, members=members)
 
+    def suspended(self, work: Bank, state: AutoState) -> AutoState:
+        filters = work.filters(state.tick, np.ones_like(state.noise))
+        return changed(state, members=self.member.suspended(filters, state.members))
+
     def belief(self, work: Bank, state: AutoState) -> Belief:
         return self.reader(work, state)()
 

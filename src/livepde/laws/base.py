@@ -311,6 +311,13 @@ class Law(ABC, Generic[Work, State]):
         """
         return state
 
+    def suspended(self, work: Work, state: State) -> State:
+        """Return the state without what `step` does in parts and has not ended; here the same.
+
+        For a forecast: it goes on from the estimate of now, as the next step does.
+        """
+        return state
+
     def stepped_alone(self, work: Work) -> str:
         """Return why the members of a fleet are stepped one by one; empty if as arrays.
 

@@ -399,6 +399,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
         return finish_replays(work, state)
 
+    def suspended(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
+        if work.replay is None:
+            return state
+        due = np.full_like(state.due, NEVER - 1)  # a replay is known as such, and none begins
+        return changed(state, replay=ReplayState.none(state.start), due=due)
+
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)
 
