@@ -194,9 +194,11 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
         notes["refused"] = told.refused
     if work.jumps is not None:
         notes["jump"] = np.zeros(len(now))
-    held = work.filter.reduction.held(work.filter.estimate(now))
-    if held.any():
-        notes["bounded"] = np.where(held > 0, held, np.nan)
+    reduction, estimate = work.filter.reduction, work.filter.estimate(now)
+    if reduction.bounded(estimate) is not estimate:
+        held = reduction.held(estimate)
+        if held.any():  # not only by bounds that a user has set
+            notes["bounded"] = np.where(held > 0, held, np.nan)
     steps = np.full(len(now), told.steps)
     return MemberReports((OK,) * len(now), told.predicted, steps, notes)
 
