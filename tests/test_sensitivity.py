@@ -44,7 +44,8 @@ def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
     times = 0.1 * np.arange(21)
     data = noisy(model, [1.7, -0.4], times)
     G = SENSORS.matrix(model.state_space)
-    runs = [truth(model, np.array(q), 0.0, times, SCHEME) for q in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0])]
+    units = [0.0, 0.0], [1.0, 0.0], [0.0, 1.0]
+    runs = [truth(model, np.array(q), 0.0, times, SCHEME) for q in units]
     zero, one, two = (np.concatenate([G @ u for u in run[1:]]) for run in runs)
     H = np.column_stack([one - zero, two - zero])
     z = np.concatenate([z for _, z in data[1:]])

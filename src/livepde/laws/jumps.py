@@ -59,7 +59,8 @@ class Watch:
         counted = seen.any(axis=1) & (opening | (self.resting == 0))
         usual = self.usual
         if counted.any():
-            usual = where(counted, usual.add(np.clip(e, -most, most)), usual)
+            new = usual.add(np.minimum(np.maximum(e, -most), most))
+            usual = new if counted.all() else where(counted, new, usual)
         return Watch(squares, counts, self.seen + 1, np.maximum(self.resting - 1, 0), usual)
 
 

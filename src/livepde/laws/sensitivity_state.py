@@ -205,9 +205,11 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
             found["refused"] = told.refused
         if work.jumps is not None:
             found["jump"] = np.zeros(members)
-        held = reduction.held(q + da @ reduction.Phi.T)
-        if held.any():
-            found["bounded"] = np.where(held > 0, held, np.nan)
+        estimate = q + da @ reduction.Phi.T
+        if reduction.bounded(estimate) is not estimate:
+            held = reduction.held(estimate)
+            if held.any():  # not only by bounds that a user has set
+                found["bounded"] = np.where(held > 0, held, np.nan)
         return found
 
     steps = np.full(members, told.steps)
