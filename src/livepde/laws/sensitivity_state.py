@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -51,6 +52,11 @@ class SensitivityWork:
     replay: Replay | None
     guards: Guards | None
     jumps: Jumps | None
+
+    def made_of(self, weights: Mapping[str, Array]) -> SensitivityWork:
+        """Return the same for a member whose initial state was made of some readings."""
+        problem = replace(self.filter.problem, initial_weights=weights)
+        return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property
     def keeps_log(self) -> bool:
