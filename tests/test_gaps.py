@@ -74,6 +74,16 @@ def test_single_values_far_off_are_found_and_no_others(size):
         assert np.flatnonzero(find_spikes(t, x)).tolist() == [k]
 
 
+def test_values_of_any_size_are_screened():
+    t, x = channel(0)
+    x[200:] = 1e300  # a change that stays
+    assert not find_spikes(t, x).any()
+    x[200:] = 10.0
+    x[100] = 1.7e308
+    assert np.flatnonzero(find_spikes(t, x)).tolist() == [100]
+    assert not find_spikes(t, np.zeros(len(t))).any()
+
+
 def test_a_cubic_has_no_spike_at_irregular_times():
     t = np.sort(np.random.default_rng(0).uniform(0.0, 10.0, 200))
     assert not find_spikes(t, t**3 - 20.0 * t**2 + 1e-6 * np.sin(50.0 * t)).any()

@@ -260,6 +260,20 @@ def test_a_case_states_the_noise_of_its_channels(tmp_path):
     assert result.last.belief.u_factor[3].any()
 
 
+def test_members_of_a_fleet_start_from_readings_of_their_own():
+    model, points = rod(), lp.Points(SENSORS, noise=0.05)
+    hats = [{"T_1": lambda x: 1.0 - x[0]}, {"T_1": lambda x: 1.0 - x[0], "T_5": lambda x: x[0]}, {}]
+    fleet = lp.Fleet(model, points, lp.SensitivityLaw(), 3, u0=1.0, u0_from=hats)
+    ones = [lp.Identifier(model, points, lp.SensitivityLaw(), u0=1.0, u0_from=hat) for hat in hats]
+    z = {"T_1": 0.9, "T_5": 1.1, "left": 1.0}
+    for k in range(6):
+        found = fleet.step(H * k, z)
+        each = [one.step(H * k, z) for one in ones]
+    for j, one in enumerate(each):
+        assert found.q[j] == pytest.approx(one.belief.q, rel=1e-9)
+        assert found.q_std[j] == pytest.approx(one.belief.q_std, rel=1e-9)
+
+
 def test_a_fleet_steps_as_its_members_do():
     model, points = rod(), lp.Points(SENSORS, noise=0.01)
     options = {"u0": 0.0, "input_noise": {"left": 0.1}}

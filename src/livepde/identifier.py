@@ -124,7 +124,9 @@ class Identifier:
         self.problem = Problem(
             model, self.observed, control, self._input_noise(input_noise or {}), {}
         )
-        self._made_of(u0, u0_from or {})
+        if u0_from and u0 is None:
+            raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
+        self.problem = replace(self.problem, initial_weights=self.weights(u0_from or {}))
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
@@ -174,20 +176,17 @@ class Identifier:
                 )
         return dict(given)
 
-    def _made_of(self, u0: Any, given: Mapping[str, Any]) -> None:
-        """Tell the problem which readings the initial state was made of."""
+    def weights(self, u0_from: Mapping[str, Any]) -> dict[str, Array]:
+        """Return how u0 changes with the readings that it was made of, as coefficients."""
         known = {*self.observed.names, *self.model.channels}
-        for name in given:
+        for name in u0_from:
             if name not in known:
                 raise ConfigurationError(
                     f"u0_from: '{name}' is no assimilated sensor and no channel of the model; "
                     f"those are {sorted(known)}."
                 )
-        if given and u0 is None:
-            raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
         space = self.model.state_space
-        weights = {name: space.interpolate(weight) for name, weight in given.items()}
-        self.problem = replace(self.problem, initial_weights=weights)
+        return {name: space.interpolate(weight) for name, weight in u0_from.items()}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
         """Return an identifier that goes on by itself; model, law and matrices are shared."""

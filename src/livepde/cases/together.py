@@ -41,7 +41,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[Block], dict[str, str]
     members
         Name -> case with its data.
     """
-    alike: dict[tuple[str, tuple[str, ...], float, bytes], dict[str, Prepared]] = {}
+    alike: dict[tuple[str, float, bytes], dict[str, Prepared]] = {}
     settings: dict[Case, str] = {}
     apart: dict[str, str] = {}
     for name, one in members.items():
@@ -50,7 +50,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[Block], dict[str, str]
             continue
         if one.case not in settings:
             settings[one.case] = _settings(one.case)
-        key = settings[one.case], _read_at_start(one), one.assimilate_from, one.stream.t.tobytes()
+        key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
         alike.setdefault(key, {})[name] = one
     found = []
     for group in alike.values():
@@ -72,14 +72,6 @@ def _settings(case: Case) -> str:
     """Return what members have in common if they step together, as text."""
     unread = {"channels": {"__all__": READ}}
     return case.frame.spec.model_dump_json(exclude={**dict.fromkeys(TOLD, True), **unread})
-
-
-def _read_at_start(one: Prepared) -> tuple[str, ...]:
-    """Return the channels that the initial state was made of; `_refuses` tells what is missing."""
-    try:
-        return tuple(one.uncertain(one.case.law).get("u0_from", ()))
-    except LivepdeError:
-        return ()
 
 
 def _refuses(one: Prepared) -> str:
@@ -121,7 +113,8 @@ class Block:
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=one.assimilate_from,
-            **one.uncertain(case.law),
+            input_noise=one.uncertain(case.law).get("input_noise"),
+            u0_from=[member.uncertain(case.law).get("u0_from", {}) for member in self._each],
         )
         self.status = "finished"
         self.error: DataError | None = None

@@ -53,9 +53,9 @@ class Fleet:
         As for `Identifier`.
     members
         How many, or their names.
-    q0, u0
+    q0, u0, u0_from
         As for `Identifier`, for all members; or a list with one for each.
-    t0, withheld, scheme, dt_max, assimilate_from, input_noise, u0_from
+    t0, withheld, scheme, dt_max, assimilate_from, input_noise
         As for `Identifier`.
 
     Raises
@@ -88,7 +88,7 @@ class Fleet:
         dt_max: float = np.inf,
         assimilate_from: float = -np.inf,
         input_noise: Mapping[str, float] | None = None,
-        u0_from: Mapping[str, Any] | None = None,
+        u0_from: Mapping[str, Any] | list[Mapping[str, Any]] | None = None,
     ) -> None:
         names = [str(k) for k in range(members)] if isinstance(members, int) else list(members)
         if not names:
@@ -97,6 +97,7 @@ class Fleet:
             raise ConfigurationError("the names of the members of a fleet must differ.")
         self.members = tuple(names)
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
+        made_of = [one or {} for one in self._each("u0_from", u0_from)]
         self._one = Identifier(
             model,
             observation,
@@ -109,7 +110,7 @@ class Fleet:
             dt_max=dt_max,
             assimilate_from=assimilate_from,
             input_noise=input_noise,
-            u0_from=u0_from,
+            u0_from=max(made_of, key=len),
         )
         self.model = model = self._one.model
         self.law = law
@@ -120,7 +121,12 @@ class Fleet:
         self._engine: Engine = Separately(law, self._work, self.problem)
         self.note = law.stepped_alone(self._work)
         if not self.note:
-            self._engine = Together(law, self._work)
+            self._engine = Together(law, self._work, [self._one.weights(one) for one in made_of])
+        elif any(one.keys() != made_of[0].keys() for one in made_of):
+            raise ConfigurationError(
+                "u0_from differs between members, which are stepped separately, as "
+                f"{self.note}: give all the same."
+            )
         count = len(names)
         self._state: Any = None
         self._t = np.full(count, float(t0))

@@ -20,23 +20,30 @@ __all__ = ["Together"]
 
 
 class Together:
-    """Steps all members of one model by `SensitivityLaw.step_members`."""
+    """Steps all members of one model by `SensitivityLaw.step_members`.
 
-    def __init__(self, law: Any, work: SensitivityWork) -> None:
+    `weights` say of each member which readings its initial state was made of.
+    """
+
+    def __init__(
+        self, law: Any, work: SensitivityWork, weights: Sequence[Mapping[str, Array]]
+    ) -> None:
         self.law = law
         self.work = work
+        self._begins = [work.made_of(one) for one in weights]
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
     ) -> SensitivityState:
-        starts = zip(q0, u0, moments, strict=True)
-        first: SensitivityState = join(
-            *(self.law.start(self.work, q, u, moment) for q, u, moment in starts)
-        )
+        starts = zip(self._begins, q0, u0, moments, strict=True)
+        first: SensitivityState = join(*(self.law.start(*start) for start in starts))
         return first
 
     def begin(self, state: SensitivityState, span: Span) -> SensitivityState:
-        begun: SensitivityState = self.law.begin_members(self.work, state, span)
+        each = enumerate(self._begins)
+        begun: SensitivityState = join(
+            *(self.law.begin(work, take(state, k), span.member(k)) for k, work in each)
+        )
         return begun
 
     def step(self, state: SensitivityState, span: Span) -> tuple[SensitivityState, MemberReports]:

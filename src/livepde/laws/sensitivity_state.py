@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -53,6 +54,11 @@ class SensitivityWork:
     guards: Guards | None
     jumps: Jumps | None
     start_window: int
+
+    def made_of(self, weights: Mapping[str, Array]) -> SensitivityWork:
+        """Return the same for a member whose initial state was made of some readings."""
+        problem = replace(self.filter.problem, initial_weights=weights)
+        return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property
     def keeps_log(self) -> bool:

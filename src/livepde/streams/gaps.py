@@ -36,6 +36,7 @@ FEWEST = 8  # residuals from which a scale is taken
 RECENT = 64  # values of a channel that are kept to tell the scale of the next ones
 CENTRE, NEIGHBOURS = 2, 5  # of the five values that make a residual
 LEFT = 0.2  # of a residual that may be left without a spike; of that of a step 0.3 is left
+ROUNDING = 1e-12  # of the largest value of a channel: less is no residual
 ABOUT = 3  # values on each side that have to be plausible without a spike
 GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian noise
 
@@ -104,8 +105,9 @@ def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
     spikes = np.zeros(len(x), dtype=bool)
     if len(x) < FEWEST + NEIGHBOURS - 1:
         return spikes
+    x = x / (np.abs(x).max() or 1.0)  # no size of values overflows
     size, weights = _residuals(t, x)
-    threshold = _threshold(x, size, beyond)
+    threshold = np.maximum(_threshold(x, size, beyond), ROUNDING)
     excess = np.abs(size) / threshold
     for row in np.argsort(-excess)[: int((excess > 1.0).sum())].tolist():
         if excess[row] <= 1.0:  # explained, or found to be a change, in the meantime
@@ -123,7 +125,7 @@ def _suspect(size: Array, weights: Array, row: int) -> int:
     for value in range(row, row + NEIGHBOURS):
         rows = np.arange(max(value - NEIGHBOURS + 1, 0), min(value + 1, len(size)))
         column = weights[rows, value - rows]
-        match = float(column @ size[rows]) ** 2 / float(column @ column)
+        match = abs(float(column @ size[rows])) / math.sqrt(float(column @ column))
         if match > most * (1.0 + 1e-9):
             best, most = value, match
     return best
