@@ -1,0 +1,158 @@
+"""The iterated start: exact for linear problems, and what it mends for others."""
+
+import numpy as np
+import pytest
+from factories import truth
+from skfem import ElementLineP1, ElementLineP2
+
+import livepde as lp
+from livepde.laws import iterated_smoother, one_member
+from livepde.models import heat
+
+SENSORS = lp.Points([0.2, 0.5, 0.8], noise=0.02)
+TIMES = 0.1 * np.arange(41)
+
+
+def sourced(evolution=None):
+    """Return a rod with an unknown source: linear in u and in what is unknown."""
+    strength = lp.Scalar(0.0, 2.0, evolution=evolution) if evolution else lp.Scalar(0.0, 2.0)
+    return lp.Model(
+        lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP1(), dirichlet={"left": 0.0}),
+        {"s": strength},
+        A=lambda q, u, v, x: -q.s * v,
+        B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
+def logistic(evolution):
+    """Return growth with a rate that moves beside a diffusivity that stays."""
+    return lp.Model(
+        lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP2(), quadrature=6),
+        {
+            "D": lp.Scalar(0.02, 0.02, transform="log"),
+            "r": lp.Scalar(1.0, 1.0, evolution=evolution),
+        },
+        A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) - q.r * u * (1.0 - u) * v,
+    )
+
+
+def readings(model, q, u0=0.0, seed=0):
+    rng, G = np.random.default_rng(seed), SENSORS.matrix(model.state_space)
+    states = truth(model, np.asarray(q), u0, TIMES, lp.SensitivityLaw.scheme)
+    for t, u in zip(TIMES[1:], states[1:], strict=True):
+        yield t, G @ u + 0.02 * rng.standard_normal(3)
+
+
+def ends(model, law, samples, u0=0.0):
+    identifier = lp.Identifier(model, SENSORS, law, u0=u0)
+    return [identifier.step(*sample) for sample in samples]
+
+
+@pytest.mark.parametrize("evolution", [None, lp.RandomWalk(0.5), lp.MeanReverting(2.0)])
+def test_nothing_changes_where_all_is_linear(evolution):
+    model = sourced(evolution)
+    samples = list(readings(model, [1.5]))
+    plain = ends(model, lp.SensitivityLaw(start_window=0), samples)
+    iterated = ends(model, lp.SensitivityLaw(), samples)
+    assert any("smoother_moved" in estimate.notes for estimate in iterated)
+    for one, other in zip(plain, iterated, strict=True):
+        np.testing.assert_allclose(other.q, one.q, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(other.q_std, one.q_std, rtol=1e-8)
+        np.testing.assert_allclose(other.u, one.u, rtol=1e-8, atol=1e-10)
+
+
+def test_a_poor_prior_leaves_no_error_behind():
+    """From priors far off on both sides the estimate is the same, within what is left uncertain."""
+    found = []
+    for mean in (0.02, 0.5):
+        model = heat(lp.interval(0.0, 1.0, 16), lp.Scalar(mean, 0.5 * mean, transform="log"))
+        start = lambda x: np.sin(2.0 * np.pi * x[0])  # noqa: E731
+        right = heat(lp.interval(0.0, 1.0, 16), lp.Scalar(0.1, 0.1))
+        samples = readings(right, [0.1], start)
+        end = ends(model, lp.SensitivityLaw(), samples, start)[-1]
+        found.append(end.parameters["alpha"])
+    (low, std), (high, _) = found
+    assert abs(high - low) < 0.25 * std
+
+
+def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
+    begun, descended = [], iterated_smoother._descended
+
+    def watched(samples, best):
+        end = descended(samples, best)
+        begun.append((best.misfit, end.misfit))
+        return end
+
+    monkeypatch.setattr(iterated_smoother, "_descended", watched)
+    model = logistic(lp.RandomWalk(0.3))
+    start = lambda x: 0.05 + 0.3 * np.exp(-(((x[0] - 0.3) / 0.15) ** 2))  # noqa: E731
+    samples = readings(model, model.latent.prior + np.array([0.5, 1.0]), start)
+    ends(model, lp.SensitivityLaw(), samples, start)
+    assert len(begun) >= 6
+    assert all(end <= first for first, end in begun)
+    assert any(end < first - 1.0 for first, end in begun)
+
+
+def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():
+    """The smoothed trajectory of a linear problem is the least squares solution."""
+    model = sourced(lp.RandomWalk(0.5))
+    samples = list(readings(model, [1.5]))[:8]
+    identifier = lp.Identifier(model, SENSORS, lp.SensitivityLaw(gate=np.inf), u0=0.0)
+    for sample in samples:
+        identifier.step(*sample)
+    work, state = identifier._work, identifier._state
+    log = state.log
+    taken = iterated_smoother._Samples(
+        work,
+        state,
+        iterated_smoother.first_interval(log, ()),
+        iterated_smoother.intervals_since(log, ()),
+    )
+    found = taken.about(np.zeros((9, 1))).smoothed[:, 0]
+
+    # Readings are linear in the source of each interval: superposition gives the matrix.
+    points = model.latent.prior
+    G, control = SENSORS.matrix(model.state_space), lp.Advance(lp.SensitivityLaw.scheme)
+    prior_std, growth = 2.0, 0.5 * np.sqrt(0.1)
+    columns = []
+    for on in range(1, 9):
+        u, column = np.zeros(model.X.dim), []
+        for k in range(1, 9):
+            q = points + (1.0 if k == on else 0.0) * prior_std
+            (_, _), (_, u) = lp.simulate(model, q, u, [TIMES[k - 1], TIMES[k]], control)
+            column.append(G @ u)
+        columns.append(np.concatenate(column))
+    A = np.array(columns).T / 0.02
+    z = np.concatenate([reading for _, reading in samples]) / 0.02
+    increments = (np.eye(8) - np.eye(8, k=-1)) * prior_std / growth
+    first = np.zeros((1, 8))
+    first[0, 0] = 1.0 / np.sqrt(1.0 + (growth / prior_std) ** 2)
+    increments[0] = first
+    exact = np.linalg.lstsq(
+        np.vstack([A, increments]), np.concatenate([z, np.zeros(8)]), rcond=None
+    )
+    # Within an interval the scheme sees part of the growth: the two differ by that.
+    np.testing.assert_allclose(found[1:], exact[0], atol=0.1 * growth / prior_std + 0.02)
+
+
+def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatch):
+    monkeypatch.setattr(one_member, "iterated_smoother", lambda work, state: None)
+    model = sourced()
+    samples = list(readings(model, [1.5]))
+    plain = ends(model, lp.SensitivityLaw(start_window=0), samples)[-1]
+    found = ends(model, lp.SensitivityLaw(), samples)
+    assert found[0].notes["smoother_moved"] == np.inf
+    np.testing.assert_array_equal(found[-1].q, plain.q)
+
+
+def test_a_settled_run_iterates_no_more():
+    model = sourced()
+    found = ends(model, lp.SensitivityLaw(start_window=8), readings(model, [1.5]))
+    moved = ["smoother_moved" in estimate.notes for estimate in found]
+    assert any(moved[:16])
+    assert not any(moved[32:])
+
+
+def test_a_window_that_is_negative_is_refused():
+    with pytest.raises(lp.LawError, match="start_window"):
+        lp.SensitivityLaw(start_window=-1)
