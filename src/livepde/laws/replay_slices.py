@@ -18,6 +18,8 @@ from livepde.linalg import Array
 
 __all__ = ["finish_replays", "replay_slice"]
 
+AT_ONCE = 32  # samples: a replay of so few is not divided
+
 
 def replay_slice(
     work: SensitivityWork, state: SensitivityState
@@ -47,7 +49,9 @@ def _advanced(
     """Return all members after at most so many stored samples of each, and notes."""
     ended: dict[int, bool] = {}
     taken = 0
-    while taken < most and state.replay.active.any():
+    while (active := state.replay.active).any():
+        if taken >= most and (state.replay.count[active] > AT_ONCE).all():
+            break
         state, failed = _one_sample(work, state)
         for k in np.flatnonzero(state.replay.active).tolist():
             state, ends = _turned(work, state, k, k in failed)
