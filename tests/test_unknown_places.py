@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import advanced
 from skfem import ElementLineP1
 
 import livepde as lp
