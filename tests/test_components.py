@@ -123,7 +123,8 @@ def test_both_laws_learn_an_exchange_rate(mesh, sparse):
     else:
         sensors = lp.Full(of="c")
         law = lp.GradientLaw(gain=1e3, damping=lp.ResidualDamping(c1=1.0))
-    twin = twin_of(model, sensors, {"k": 2.5}, times, u0=0.0, inputs=inflow)
+    options = {"u0": 0.0, "inputs": inflow, "scheme": law.scheme}
+    twin = twin_of(model, sensors, {"k": 2.5}, times, **options)
     ident = lp.Identifier(model, sensors, law)
     result = ident.run(twin)
     assert twin.error(result.last.q) < (0.01 if sparse else 0.05)

@@ -681,9 +681,9 @@ def slab(sensors):
 
 def measured(count=40):
     """Features and targets as a slab of k = 0.3 shows them."""
-    truth = lp.Identifier(
-        slab({"a": 0.3}).model, lp.Points({"a": 0.3, "b": 0.6}), lp.GradientLaw(), q0={"k": 0.3}
-    )
+    model, points = slab({"a": 0.3}).model, lp.Points({"a": 0.3, "b": 0.6})
+    scheme = lp.SensitivityLaw.scheme
+    truth = lp.Identifier(model, points, lp.GradientLaw(), q0={"k": 0.3}, scheme=scheme)
     for k in range(count):
         x = {"t": 0.05 * k, "T_left": float(np.sin(0.3 * k))}
         truth.step(x["t"], {}, {"T_left": x["T_left"]})

@@ -71,6 +71,7 @@ def test_an_overconfident_linearisation_is_iterated(noise: float):
         u_true=seed_excited.u_true,
         times=seed_excited.TIMES[:61],
         truth="discrete",
+        scheme=lp.SensitivityLaw.scheme,
     )
 
     def end(guards: Any) -> tuple[float, float]:
