@@ -141,8 +141,14 @@ class Problem(ABC):
         return np.stack(columns, axis=-1) / (2 * DIFFERENCE)
 
     @abstractmethod
-    def model(self) -> lp.Model:
-        """Return the process as a user of livepde writes it, mesh included."""
+    def model(self, refine: int = 1) -> lp.Model:
+        """Return the process as a user of livepde writes it, mesh included.
+
+        Parameters
+        ----------
+        refine
+            Into so many each cell is divided, to compare with the truth.
+        """
 
     def identifier(self, freed: str | None = None) -> lp.Identifier:
         """Return the identifier with its defaults.

@@ -53,11 +53,12 @@ def outcome(runs: Iterable[Run]) -> Outcome:
 
 NOTES = (
     "Coverage: share of truths in their 95 % interval, for a field of vertices; the columns 10 % "
-    "to 100 % are shares of the run. Widths and errors are those of the Gaussian coordinates of the "
-    "prior (the logarithm of what is positive). width/batch: median over that of the posterior of "
-    "a batch fit of the same samples, whose model is the code of the truth. error/fit: root mean "
-    "square at the end over that of the batch fit of all data. widest/prior: the widest interval "
-    "over the prior's.",
+    "to 100 % are shares of the run. Widths and errors are those of the Gaussian coordinates of "
+    "the prior (the logarithm of what is positive). width/batch: median over that of the posterior "
+    "of a batch fit of the same samples, whose model is the code of the truth. error/fit: root "
+    "mean square at the end over that of the batch fit of all data, of which the spike is left "
+    "out. widest/prior: the widest interval over the prior's. mean z: mean error at the end in "
+    "standard deviations of the estimate.",
     f"With fewer than {ENOUGH} twins the bounds of coverage are those that chance breaks with a "
     f"probability of {CHANCE:g} on each side if the promised bound just holds.",
 )

@@ -46,9 +46,9 @@ class Borehole(Problem):
         g = self.inputs(fine_times(self.times))
         return self.u0 + system.respond(g, self.length / self.intervals)
 
-    def model(self) -> lp.Model:
+    def model(self, refine: int = 1) -> lp.Model:
         return borehole(
-            lp.interval(WALL, FAR, 40, geometric=True),
+            lp.interval(WALL, FAR, 40 * refine, geometric=True),
             lp.Scalar(2.0, std=0.6, transform="log"),
             lp.Scalar(0.1, std=0.03, transform="log"),
             H=DEPTH,

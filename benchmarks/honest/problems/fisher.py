@@ -12,13 +12,13 @@ from benchmarks.honest.nonlinear import Array, Stiff
 from benchmarks.honest.problem import Problem, constant
 from livepde.models import fisher_kpp
 
-__all__ = ["Fisher"]
+__all__ = ["Fisher", "Population"]
 
 CELLS = 160
 WIDTH = 2.0
 
 
-class _Population(Stiff):
+class Population(Stiff):
     """u_t = D u_xx + r u (1 - u) without flux at the ends."""
 
     def __init__(self, D: float, r: float) -> None:
@@ -65,9 +65,9 @@ class Fisher(Problem):
     channels = MappingProxyType({})
     u0 = staticmethod(lambda x: _beginning(x[0]))  # type: ignore[assignment]
 
-    def process(self, theta: Array) -> _Population:
+    def process(self, theta: Array) -> Population:
         """Return the finite volumes."""
-        return _Population(*(np.exp(item.value(theta, 0)).item() for item in self.latents.values()))
+        return Population(*(np.exp(item.value(theta, 0)).item() for item in self.latents.values()))
 
     def _solved(self, theta: Array, tangents: bool) -> tuple[Array, Array]:
         at = [round(x / WIDTH * CELLS) for x in self.points.values()]
@@ -81,7 +81,7 @@ class Fisher(Problem):
     def jacobian(self, theta: Array) -> Array:
         return self._solved(theta, True)[1]
 
-    def model(self) -> lp.Model:
+    def model(self, refine: int = 1) -> lp.Model:
         D = lp.Scalar(0.02, std=0.008, transform="log")
         r = lp.Scalar(1.0, std=0.3, transform="log")
-        return fisher_kpp(lp.interval(0.0, WIDTH, 50), D, r)
+        return fisher_kpp(lp.interval(0.0, WIDTH, 50 * refine), D, r)

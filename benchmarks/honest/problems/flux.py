@@ -55,7 +55,7 @@ class _Drifting(Problem):
     def path(self, theta: Array) -> Array:
         """Return the flux at the substeps, straight between the samples."""
         flux = PRIOR + STD * theta[1] + self.increment * np.append(0.0, np.cumsum(theta[2:]))
-        return np.interp(fine_times(self.times), self.times, flux)
+        return np.asarray(np.interp(fine_times(self.times), self.times, flux))
 
     def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
         theta = np.zeros(self.coordinates)
@@ -73,8 +73,8 @@ class _Drifting(Problem):
         """Return what the sensors show for a conductivity and a flux at the substeps."""
         raise NotImplementedError
 
-    def model(self) -> lp.Model:
-        mesh = lp.interval(0.0, 1.0, 30)
+    def model(self, refine: int = 1) -> lp.Model:
+        mesh = lp.interval(0.0, 1.0, 30 * refine)
         growth = self.growth
         return lp.Model(
             lp.Field(mesh, lp.linear(mesh), dirichlet={"right": lp.Channel("T_right")}),
@@ -159,7 +159,7 @@ class NonlinearFlux(_Drifting):
 
     def shown(self, k: float, flux: Array) -> Array:
         states, _ = _DrivenRod(self, k, flux).solve(np.zeros(CELLS), self.times, False)
-        return states @ self._sensors.T
+        return np.asarray(states @ self._sensors.T)
 
     def jacobian(self, theta: Array) -> Array:
         rod = _DrivenRod(self, self.k(theta), self.path(theta))

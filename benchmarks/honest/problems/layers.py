@@ -64,13 +64,13 @@ class Wall(_Conduction):
         found: Array = layers[np.searchsorted(ENDS, x) - 1]
         return found
 
-    def model(self) -> lp.Model:
+    def model(self, refine: int = 1) -> lp.Model:
         def layer(n: int) -> Any:
             return lambda x: (x[0] > ENDS[n]) & (x[0] < ENDS[n + 1])
 
         regions = {name: layer(n) for n, name in enumerate(NAMES)}
         return lp.Model(
-            Rod.state(),
+            Rod.state(refine),
             {"k": lp.Piecewise(regions, prior=0.1, std=0.04, transform="log")},
             A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         )
@@ -100,9 +100,9 @@ class Profile(_Conduction):
         self.latents = {"k": Latent(float(np.log(self.PRIOR)), lambda at: at_vertices)}
 
     @staticmethod
-    def mesh() -> Any:
+    def mesh(refine: int = 1) -> Any:
         """Return livepde's mesh."""
-        return lp.interval(0.0, 1.0, 40)
+        return lp.interval(0.0, 1.0, 40 * refine)
 
     def _waves(self, x: Array) -> Array:
         factor = lp.Sobolev(2, self.LENGTH).pointwise(1).factor
@@ -114,8 +114,8 @@ class Profile(_Conduction):
     def conductivity(self, theta: Array, x: Array) -> Array:
         return np.asarray(self.PRIOR * np.exp(self._waves(x) @ theta))
 
-    def model(self) -> lp.Model:
-        mesh = self.mesh()
+    def model(self, refine: int = 1) -> lp.Model:
+        mesh = self.mesh(refine)
         prior = lp.Sobolev(2, self.LENGTH).pointwise(1)
         k = lp.Field(
             mesh, lp.linear(mesh), inner=prior, prior=self.PRIOR, std=self.STD, transform="log"

@@ -71,8 +71,8 @@ class Plate(Problem):
         system = Linear(decay, heat[:, None], C, np.zeros((len(C), 1)))
         return system.respond(self.inputs(fine_times(self.times)), self.length / self.intervals)
 
-    def model(self) -> lp.Model:
-        mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (14, 14))
+    def model(self, refine: int = 1) -> lp.Model:
+        mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (14 * refine, 14 * refine))
         bump = self._bump
         return lp.Model(
             lp.Field(mesh, lp.linear(mesh)),
@@ -123,9 +123,9 @@ class Reaction(Problem):
         self._sensors = _products(self.COUNT, at[:, 0], at[:, 1])
 
     @staticmethod
-    def mesh() -> Any:
+    def mesh(refine: int = 1) -> Any:
         """Return livepde's mesh."""
-        return lp.rectangle((0.0, 1.0), (0.0, 1.0), (12, 12))
+        return lp.rectangle((0.0, 1.0), (0.0, 1.0), (12 * refine, 12 * refine))
 
     @staticmethod
     def _shape(x: Any, y: Any) -> Any:
@@ -137,6 +137,10 @@ class Reaction(Problem):
         squares = (np.pi * self.LENGTH * np.arange(self.FIELD)) ** 2
         scale = 1.0 / (1.0 + squares[:, None] + squares[None, :]).ravel() / np.sqrt(factor)
         return np.asarray(_products(self.FIELD, x, y) * scale * self.STD / self.PRIOR)
+
+    def reaction(self, theta: Array, x: Array, y: Array) -> Array:
+        """Return q at points."""
+        return np.asarray(self.PRIOR * np.exp(self._expansion(x, y) @ theta))
 
     def predict(self, theta: Array) -> Array:
         q = self.PRIOR * np.exp(self._field @ theta)
@@ -152,8 +156,8 @@ class Reaction(Problem):
         g = self.inputs(fine_times(self.times))
         return system.respond(g, self.length / self.intervals, V.T @ start)
 
-    def model(self) -> lp.Model:
-        mesh, D, shape = self.mesh(), self.D, self._shape
+    def model(self, refine: int = 1) -> lp.Model:
+        mesh, D, shape = self.mesh(refine), self.D, self._shape
         prior = lp.Sobolev(2, self.LENGTH).pointwise(2)
         q = lp.Field(
             mesh, lp.linear(mesh), inner=prior, prior=self.PRIOR, std=self.STD, transform="log"

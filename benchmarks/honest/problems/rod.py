@@ -49,17 +49,17 @@ class Rod(Problem):
         g = np.column_stack([self.inputs(fine), np.ones(len(fine))])
         return system.respond(g, self.length / self.intervals)
 
-    def model(self) -> lp.Model:
+    def model(self, refine: int = 1) -> lp.Model:
         return lp.Model(
-            self.state(),
+            self.state(refine),
             {"k": lp.Scalar(0.1, std=0.03, transform="log")},
             A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         )
 
     @staticmethod
-    def state() -> lp.Field:
+    def state(refine: int = 1) -> lp.Field:
         """Return the temperature between the two channels."""
-        mesh = lp.interval(0.0, 1.0, 30)
+        mesh = lp.interval(0.0, 1.0, 30 * refine)
         ends = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
         return lp.Field(mesh, lp.linear(mesh), dirichlet=ends)
 
@@ -81,9 +81,9 @@ class LossyRod(Rod):
         k, loss, source = (item.value(theta, 0).item() for item in self.latents.values())
         return self.respond(np.exp(k), np.exp(loss), source)
 
-    def model(self) -> lp.Model:
+    def model(self, refine: int = 1) -> lp.Model:
         return lp.Model(
-            self.state(),
+            self.state(refine),
             {
                 "k": lp.Scalar(0.1, std=0.03, transform="log"),
                 "loss": lp.Scalar(0.3, std=0.1, transform="log"),

@@ -55,7 +55,8 @@ class Conduction(Stiff):
 
     def _flows(self, t: float, y: Array) -> Array:
         u = self._all(t, y)
-        return self.k * (1 + 0.5 * self.m * (u[1:] + u[:-1])) * (u[1:] - u[:-1]) / self.h
+        mean = self.k * (1 + 0.5 * self.m * (u[1:] + u[:-1]))
+        return np.asarray(mean * np.diff(u) / self.h)
 
     def rate(self, t: float, y: Array) -> Array:
         flows = self._flows(t, y)
@@ -119,9 +120,9 @@ class WarmRod(Problem):
     def jacobian(self, theta: Array) -> Array:
         return self._solved(theta, True)[1]
 
-    def model(self) -> lp.Model:
+    def model(self, refine: int = 1) -> lp.Model:
         return lp.Model(
-            Rod.state(),
+            Rod.state(refine),
             {"k": lp.Scalar(0.1, std=0.03, transform="log"), "m": lp.Scalar(0.3, std=0.15)},
             A=lambda q, u, v, x: q.k * (1.0 + q.m * u) * lp.dot(lp.grad(u), lp.grad(v)),
         )
