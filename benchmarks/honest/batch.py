@@ -45,7 +45,7 @@ class Batch:
     def std(self, latent: Latent, at: int) -> Array:
         """Return the standard deviations of an unknown, from the samples up to one."""
         rows = self.J[: at + 1].reshape(-1, self.J.shape[-1])
-        R: Array = np.linalg.qr(np.vstack([rows, np.eye(rows.shape[1])]), mode="r")
+        R = np.asarray(np.linalg.qr(np.vstack([rows, np.eye(rows.shape[1])]), mode="r"))
         factor = np.linalg.solve(R.T, latent.directions(at).T)
         found: Array = np.linalg.norm(factor, axis=0)
         return found

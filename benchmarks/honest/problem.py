@@ -19,7 +19,7 @@ Array = NDArray[Any]
 Signal = Callable[[Array], Array]
 """An input channel as a smooth function of the time; it is read at the samples only."""
 
-DIFFERENCE = 1e-4  # step of finite differences, in standard deviations of the prior
+DIFFERENCE = 1e-5  # step of finite differences, in standard deviations of the prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,7 @@ class Latent:
 
     def value(self, theta: Array, at: int) -> Array:
         """Return the Gaussian, shape (values,)."""
-        found: Array = self.mean + self.directions(at) @ theta
-        return found
+        return np.asarray(self.mean + self.directions(at) @ theta)
 
     def inverse(self, q: Any) -> Array:
         """Return the Gaussian of a physical value; -inf for what is not positive."""
@@ -52,7 +51,7 @@ class Latent:
         if not self.log:
             return q
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(q > 0.0, np.log(np.maximum(q, 0.0)), -np.inf)
+            return np.asarray(np.where(q > 0.0, np.log(np.maximum(q, 0.0)), -np.inf))
 
 
 def constant(
@@ -74,7 +73,7 @@ def waves(length: float, *parts: tuple[float, float]) -> Signal:
     parts
         Amplitude and number of periods in the run.
     """
-    return lambda t: sum(a * np.sin(2 * np.pi * n * t / length) for a, n in parts) + 0.0 * t
+    return lambda t: np.asarray(sum(a * np.sin(2 * np.pi * n * t / length) for a, n in parts))
 
 
 class Problem(ABC):
@@ -133,12 +132,12 @@ class Problem(ABC):
 
     def jacobian(self, theta: Array) -> Array:
         """Return the derivative of `predict`, shape (samples, sensors, coordinates)."""
-        columns = []
+        here, columns = self.predict(theta), []
         for k in range(self.coordinates):
             step = np.zeros(self.coordinates)
             step[k] = DIFFERENCE
-            columns.append(self.predict(theta + step) - self.predict(theta - step))
-        return np.stack(columns, axis=-1) / (2 * DIFFERENCE)
+            columns.append(self.predict(theta + step) - here)
+        return np.stack(columns, axis=-1) / DIFFERENCE
 
     @abstractmethod
     def model(self, refine: int = 1) -> lp.Model:

@@ -58,7 +58,7 @@ NOTES = (
     "of a batch fit of the same samples, whose model is the code of the truth. error/fit: root "
     "mean square at the end over that of the batch fit of all data, of which the spike is left "
     "out. widest/prior: the widest interval over the prior's. mean z: mean error at the end in "
-    "standard deviations of the estimate.",
+    "standard deviations of the estimate; of a field it has no sign.",
     f"With fewer than {ENOUGH} twins the bounds of coverage are those that chance breaks with a "
     f"probability of {CHANCE:g} on each side if the promised bound just holds.",
 )

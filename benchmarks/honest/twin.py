@@ -45,7 +45,8 @@ class Run:
         Root mean square of the errors, in standard deviations of the batch posterior; of the
         estimate and of the batch fit of all data, this one of shape (unknowns,).
     z
-        Mean error in the estimate's own standard deviations, with its sign.
+        Error in the estimate's own standard deviations, of a number with its sign, of a field the
+        root mean square.
     shift
         Of a run with a spike: root mean square distance to the run without, in that one's own
         standard deviations; NaN before the spike.
@@ -156,7 +157,8 @@ def _scored(problem: Problem, theta: Array, batch: Batch, seen: _Seen, fit: Arra
                 width[k, j] = np.median(half / std)
                 widest[k, j] = np.max(half / _prior(latent, at))
                 error[k, j] = _rms((centre - truth) / std)
-                z[k, j] = np.mean((centre - truth) / half)
+                score = (centre - truth) / half
+                z[k, j] = score.item() if len(score) == 1 else _rms(score)
     shift = np.full(shape, np.nan)
     found = Run("", "", 0, covered, width, widest, error, z, fitted, shift)
     found.missed, found.failure = seen.missed, seen.failure

@@ -33,7 +33,7 @@ class Population(Stiff):
         return np.asarray(found / self.volume / self.h**2)
 
     def rate(self, t: float, y: Array) -> Array:
-        return self.D * self._spread(y) + self.r * y * (1 - y)
+        return np.asarray(self.D * self._spread(y) + self.r * y * (1 - y))
 
     def jacobian(self, t: float, y: Array) -> Array:
         bands = np.zeros((3, len(y)))

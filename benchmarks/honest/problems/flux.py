@@ -164,7 +164,7 @@ class NonlinearFlux(_Drifting):
     def jacobian(self, theta: Array) -> Array:
         rod = _DrivenRod(self, self.k(theta), self.path(theta))
         _, tangents = rod.solve(np.zeros(CELLS), self.times, True)
-        return np.einsum("sn,tnc->tsc", self._sensors, tangents)
+        return np.asarray(np.einsum("sn,tnc->tsc", self._sensors, tangents))
 
     @property
     def _sensors(self) -> Array:

@@ -107,15 +107,18 @@ class Reaction(Problem):
     channels = MappingProxyType({"S": lambda t: 1.0 + waves(20.0, (0.5, 3.0), (0.3, 7.0))(t)})
     u0 = 1.0
     D = 0.05
-    COUNT, FIELD = 12, 6
+    COUNT, GRID = 10, 24  # cosines of the state, quadrature points; in each direction
     LENGTH, PRIOR, STD = 0.3, 1.0, 0.4
-    coordinates = FIELD**2
+    # Cosines of the field up to those that livepde's mesh of 12 x 12 cells can have. The data say
+    # nothing of most, but together they make a good part of the posterior's width.
+    FIELD = tuple((j, k) for j in range(13) for k in range(13) if j**2 + k**2 <= 12**2)
+    coordinates = len(FIELD)
 
     def __init__(self) -> None:
         x, y = self.mesh().p
         at_vertices = self._expansion(x, y)
         self.latents = {"q": Latent(float(np.log(self.PRIOR)), lambda at: at_vertices)}
-        x, y = _midpoints(48)
+        x, y = _midpoints(self.GRID)
         self._basis = _products(self.COUNT, x, y) / np.sqrt(len(x))
         self._field = self._expansion(x, y)
         self._shape_coefficients = self._basis.T @ self._shape(x, y) / np.sqrt(len(x))
@@ -134,9 +137,10 @@ class Reaction(Problem):
     def _expansion(self, x: Array, y: Array) -> Array:
         """Return the cosines with the standard deviations of the prior Sobolev(2, length)."""
         factor = lp.Sobolev(2, self.LENGTH).pointwise(2).factor
-        squares = (np.pi * self.LENGTH * np.arange(self.FIELD)) ** 2
-        scale = 1.0 / (1.0 + squares[:, None] + squares[None, :]).ravel() / np.sqrt(factor)
-        return np.asarray(_products(self.FIELD, x, y) * scale * self.STD / self.PRIOR)
+        j, k = np.array(self.FIELD).T
+        shapes = _waves(13, x)[:, j] * _waves(13, y)[:, k]
+        scale = 1.0 / (1.0 + (np.pi * self.LENGTH) ** 2 * (j**2 + k**2)) / np.sqrt(factor)
+        return np.asarray(shapes * scale * self.STD / self.PRIOR)
 
     def reaction(self, theta: Array, x: Array, y: Array) -> Array:
         """Return q at points."""
