@@ -87,7 +87,8 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
         law = law.member
     if not isinstance(law, SensitivityLaw):
         return None
-    return StatedNoise(law.modes, law.noise, law.drift, replay=Replay(NEVER, NEVER))
+    replay = Replay(NEVER, NEVER)
+    return StatedNoise(law.modes, law.noise, law.drift, replay=replay, gate=np.inf)
 
 
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:

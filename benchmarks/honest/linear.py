@@ -1,0 +1,189 @@
+"""Linear systems y' = A y + B g(t), solved by exponentials: no time step, no scheme.
+
+The inputs g are sampled at substeps and straight between them. The response to them is exact, of
+Van Loan (1978), so that the only errors are those of the substeps, which are far shorter than the
+samples, and of the space that A stands for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as sla
+from numpy.typing import NDArray
+
+__all__ = ["Chebyshev", "Linear", "diffusion", "fine_times"]
+
+Array = NDArray[Any]
+SUBSTEPS = 8  # of an interval between two samples
+SMALL = 1e-3  # |z| below which exp(z) - 1 - z is a series
+
+
+def fine_times(times: Array, substeps: int = SUBSTEPS) -> Array:
+    """Return the times of the substeps between evenly spaced samples."""
+    return np.linspace(times[0], times[-1], substeps * (len(times) - 1) + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The system y' = A y + B g, z = C y + D g.
+
+    Parameters
+    ----------
+    A
+        Shape (n, n), or (n,) where it is diagonal.
+    B, C, D
+        Shapes (n, inputs), (sensors, n) and (sensors, inputs).
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+    @classmethod
+    def symmetric(cls, main: Array, off: Array, B: Array, C: Array, D: Array) -> Linear:
+        """Return the system with a symmetric tridiagonal A in the coordinates of its modes."""
+        values, V = sla.eigh_tridiagonal(main, off)
+        return cls(values, V.T @ B, C @ V, D)
+
+    def respond(self, g: Array, step: float, start: Array | None = None) -> Array:
+        """Return z at the samples, shape (samples, sensors).
+
+        Parameters
+        ----------
+        g
+            Inputs at the substeps, shape (SUBSTEPS * intervals + 1, inputs).
+        step
+            Time between two samples.
+        start
+            y at the first sample; default zero.
+        """
+        delta, intervals = step / SUBSTEPS, (len(g) - 1) // SUBSTEPS
+        diagonal = self.A.ndim == 1
+        once, B0, B1 = self._diagonal_step(delta) if diagonal else self._dense_step(delta)
+        # The inputs of one interval act on its end by B0 and B1 and what follows of the interval.
+        weights = np.zeros((SUBSTEPS + 1, *self.B.shape))
+        power = np.ones_like(once) if diagonal else np.eye(len(once))
+        for j in reversed(range(SUBSTEPS)):
+            now = power[:, None] if diagonal else power
+            weights[j] += now * B0 if diagonal else now @ B0
+            weights[j + 1] += now * B1 if diagonal else now @ B1
+            power = power * once if diagonal else power @ once
+        windows = np.stack(
+            [g[j : j + SUBSTEPS * (intervals - 1) + 1 : SUBSTEPS] for j in range(SUBSTEPS + 1)]
+        )
+        forced = np.einsum("jni,jki->kn", weights, windows)
+        y = np.zeros((intervals + 1, len(self.B)))
+        y[0] = 0.0 if start is None else start
+        for k in range(intervals):
+            y[k + 1] = (power * y[k] if diagonal else power @ y[k]) + forced[k]
+        found: Array = y @ self.C.T + g[::SUBSTEPS] @ self.D.T
+        return found
+
+    def _dense_step(self, delta: float) -> tuple[Array, Array, Array]:
+        n, m = self.B.shape
+        block = np.zeros((n + 2 * m, n + 2 * m))
+        block[:n, :n], block[:n, n : n + m] = self.A * delta, self.B * delta
+        block[n : n + m, n + m :] = np.eye(m)
+        found = sla.expm(block)
+        last = found[:n, n + m :]
+        return found[:n, :n], found[:n, n : n + m] - last, last
+
+    def _diagonal_step(self, delta: float) -> tuple[Array, Array, Array]:
+        z = self.A * delta
+        safe = np.where(np.abs(z) < SMALL, 1.0, z)
+        first = np.where(np.abs(z) < SMALL, 1 + z / 2 + z**2 / 6, np.expm1(safe) / safe)
+        second = np.where(
+            np.abs(z) < SMALL, 0.5 + z / 6 + z**2 / 24, (np.expm1(safe) - safe) / safe**2
+        )
+        B1 = delta * second[:, None] * self.B
+        return np.exp(z), delta * first[:, None] * self.B - B1, B1
+
+
+class Chebyshev:
+    """Collocation in the Chebyshev points of (0, length), and interpolation between them.
+
+    Parameters
+    ----------
+    count
+        Polynomial degree.
+    length
+        Of the interval.
+    """
+
+    def __init__(self, count: int, length: float = 1.0) -> None:
+        k = np.arange(count + 1)
+        self.x = 0.5 * length * (1.0 - np.cos(np.pi * k / count))
+        self._weights = (-1.0) ** k
+        self._weights[[0, -1]] *= 0.5
+        distance = self.x[:, None] - self.x[None, :] + np.eye(count + 1)
+        D = self._weights[None, :] / self._weights[:, None] / distance
+        D -= np.diag(D.sum(axis=1))  # the derivative of a constant is zero
+        self.D1 = D
+        self.D2 = D @ D
+
+    def rows(self, points: Sequence[float]) -> Array:
+        """Return the matrix that interpolates to points, barycentric, shape (points, nodes)."""
+        found = np.zeros((len(points), len(self.x)))
+        for row, point in zip(found, points, strict=True):
+            gap = point - self.x
+            hit = np.abs(gap) < 1e-14
+            if hit.any():
+                row[hit] = 1.0
+            else:
+                row[:] = self._weights / gap
+                row /= row.sum()
+        return found
+
+    def system(
+        self, operator: Array, ends: Array, given: Array, source: Array, points: Sequence[float]
+    ) -> Linear:
+        """Return u_t = operator u + source g inside, with ends u = given g at the two end nodes.
+
+        Parameters
+        ----------
+        operator
+            On all nodes, shape (nodes, nodes).
+        ends
+            The two boundary conditions as rows, shape (2, nodes).
+        given
+            Their right-hand sides, shape (2, inputs).
+        source
+            Shape (nodes, inputs).
+        points
+            Of the sensors.
+        """
+        outer, inner = [0, -1], slice(1, -1)
+        inverse = np.linalg.inv(ends[:, outer])
+        from_inner, from_inputs = -inverse @ ends[:, inner], inverse @ given
+        rows = self.rows(points)
+        return Linear(
+            operator[inner, inner] + operator[inner][:, outer] @ from_inner,
+            operator[inner][:, outer] @ from_inputs + source[inner],
+            rows[:, inner] + rows[:, outer] @ from_inner,
+            rows[:, outer] @ from_inputs,
+        )
+
+
+def diffusion(
+    conductance: Array, capacity: Array, loss: Array, B: Array, C: Array, D: Array
+) -> Linear:
+    """Return finite volumes: capacity y' = differences of conductance times differences of y + B g.
+
+    Parameters
+    ----------
+    conductance
+        Between a volume and the next, shape (volumes - 1,).
+    capacity, loss
+        Of the volumes; loss is what else acts on the diagonal, such as a conductance to an input.
+    """
+    root = np.sqrt(capacity)
+    main = -loss.astype(float)
+    main[:-1] -= conductance
+    main[1:] -= conductance
+    off = conductance / (root[:-1] * root[1:])
+    return Linear.symmetric(main / capacity, off, B / root[:, None], C / root, D)

@@ -1,0 +1,190 @@
+"""One twin: a truth from the prior, its data in several kinds, and what livepde makes of them."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+import livepde as lp
+from benchmarks.honest.batch import Batch
+from benchmarks.honest.noise import KINDS, Data, disturbed
+from benchmarks.honest.problem import Latent, Problem
+from benchmarks.honest.problems import PROBLEMS
+from livepde.plots import NORMAL_95
+from livepde.stepping import StepFailed
+
+__all__ = ["SHARES", "Run", "twins"]
+
+Array = NDArray[Any]
+SHARES = (0.10, 0.25, 0.50, 0.75, 1.00)
+"""Of the run, after which intervals are looked at."""
+
+
+@dataclass(eq=False)
+class Run:
+    """Scores of one run; arrays have the shape (shares, unknowns).
+
+    All but `covered` are in the latent coordinates of the prior, where it is Gaussian. A field has
+    a value at each vertex of livepde's mesh.
+
+    Attributes
+    ----------
+    covered
+        Share of the values whose 95 % interval holds the truth.
+    width
+        Median width over that of the batch posterior from the same samples.
+    widest
+        Largest width over that of the prior.
+    error, fit
+        Root mean square of the errors, in standard deviations of the batch posterior; of the
+        estimate and of the batch fit of all data, this one of shape (unknowns,).
+    z
+        Error in the estimate's own standard deviations, of a number with its sign, of a field the
+        root mean square.
+    shift
+        Of a run with a spike: root mean square distance to the run without, in that one's own
+        standard deviations; NaN before the spike.
+    missed
+        Steps that were not taken.
+    failure
+        What ended the run, if anything did.
+    """
+
+    problem: str
+    kind: str
+    seed: int
+    covered: Array
+    width: Array
+    widest: Array
+    error: Array
+    z: Array
+    fit: Array
+    shift: Array
+    missed: int = 0
+    failure: str = ""
+
+
+@dataclass(eq=False)
+class _Seen:
+    """Latent estimate and interval of each unknown: (share, label) -> centre, low, high."""
+
+    values: dict[tuple[int, str], tuple[Array, Array, Array]] = field(default_factory=dict)
+    missed: int = 0
+    failure: str = ""
+
+
+def twins(name: str, seed: int, kinds: Sequence[str]) -> list[Run]:
+    """Return the scores of one truth in several kinds; the same seed gives the same numbers."""
+    problem = PROBLEMS[name]
+    with threadpool_limits(1):
+        rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
+        theta, shown = problem.draw(rng)
+        state = rng.bit_generator.state
+        batch = Batch.of(problem, theta)
+        runs, white = [], None
+        for kind in kinds:
+            if KINDS[kind].channels and not problem.channels:
+                continue
+            rng.bit_generator.state = state
+            data = disturbed(kind, problem, shown, rng)
+            seen = _identified(problem, data, KINDS[kind].freed)
+            if kind == "spike" and white is None:
+                rng.bit_generator.state = state
+                without = disturbed("white", problem, shown, rng)
+                white = _identified(problem, without, freed=False)
+            if kind == "white":
+                white = seen
+            fit = batch.fit(data.z) if KINDS[kind].right else batch.linear(data.right)
+            run = _scored(problem, theta, batch, seen, fit)
+            run.problem, run.kind, run.seed = name, kind, seed
+            if data.spike is not None and white is not None:
+                run.shift = _shift(problem, seen, white, data.spike)
+            runs.append(run)
+    return runs
+
+
+def _identified(problem: Problem, data: Data, freed: bool) -> _Seen:
+    """Run the identifier with its defaults and keep what it says after each share of the run."""
+    times, seen = problem.times, _Seen()
+    at = {round(share * problem.intervals): k for k, share in enumerate(SHARES)}
+    moments = {float(times[n]): k for n, k in at.items()}
+
+    def look(estimate: lp.Estimate) -> None:
+        seen.missed += not estimate.status.taken
+        k = moments.get(estimate.t)
+        if k is None:
+            return
+        space = estimate.space
+        for label, latent in problem.latents.items():
+            part = space.labels[label] if label in space.labels else space.part(label)
+            found = (estimate.q[part], *estimate.interval(label))
+            seen.values[k, label] = tuple(latent.inverse(item) for item in found)  # type: ignore[assignment]
+
+    names = tuple(problem.channels)
+    rows = zip(times.tolist(), data.z, data.inputs.tolist(), strict=True)
+    stream = ((t, z, dict(zip(names, values, strict=True))) for t, z, values in rows)
+    identifier = problem.identifier(data.biased if freed else None)
+    try:
+        identifier.run(stream, on_estimate=look, fields_every=problem.intervals)
+    except (lp.errors.LivepdeError, StepFailed, ArithmeticError, np.linalg.LinAlgError) as error:
+        seen.failure = f"{type(error).__name__}: {error}"
+    return seen
+
+
+def _scored(problem: Problem, theta: Array, batch: Batch, seen: _Seen, fit: Array) -> Run:
+    shape = (len(SHARES), len(problem.latents))
+    covered, width, widest = np.zeros(shape), np.full(shape, np.nan), np.full(shape, np.nan)
+    error, z = np.full(shape, np.nan), np.full(shape, np.nan)
+    fitted = np.zeros(shape[1])
+    for j, (label, latent) in enumerate(problem.latents.items()):
+        for k, share in enumerate(SHARES):
+            at = round(share * problem.intervals)
+            truth, std = latent.value(theta, at), batch.std(latent, at)
+            if k == len(SHARES) - 1:
+                fitted[j] = _rms((latent.value(fit, at) - truth) / std)
+            if (k, label) not in seen.values:
+                continue
+            centre, low, high = seen.values[k, label]
+            covered[k, j] = np.mean((low <= truth) & (truth <= high))
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+                half = 0.5 * (high - low) / NORMAL_95
+                width[k, j] = np.median(half / std)
+                widest[k, j] = np.max(half / _prior(latent, at))
+                error[k, j] = _rms((centre - truth) / std)
+                score = (centre - truth) / half
+                z[k, j] = score.item() if len(score) == 1 else _rms(score)
+    shift = np.full(shape, np.nan)
+    found = Run("", "", 0, covered, width, widest, error, z, fitted, shift)
+    found.missed, found.failure = seen.missed, seen.failure
+    return found
+
+
+def _prior(latent: Latent, at: int) -> Array:
+    found: Array = np.linalg.norm(latent.directions(at), axis=1)
+    return found
+
+
+def _shift(problem: Problem, seen: _Seen, white: _Seen, spike: int) -> Array:
+    found = np.full((len(SHARES), len(problem.latents)), np.nan)
+    for k, share in enumerate(SHARES):
+        if round(share * problem.intervals) < spike:
+            continue
+        for j, label in enumerate(problem.latents):
+            if (k, label) not in white.values:
+                continue
+            centre, low, high = white.values[k, label]
+            half = 0.5 * (high - low) / NORMAL_95
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+                reached = seen.values[k, label][0] if (k, label) in seen.values else np.inf
+                found[k, j] = _rms((reached - centre) / half)
+    return found
+
+
+def _rms(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,301 @@
+"""Honest twins: their truths against closed forms and against livepde refined, and their scores."""
+
+import json
+
+import numpy as np
+import pytest
+from typer import Typer
+from typer.testing import CliRunner
+
+import livepde as lp
+from benchmarks.honest import KINDS, PROBLEMS, honest
+from benchmarks.honest.__main__ import main
+from benchmarks.honest.batch import Batch
+from benchmarks.honest.linear import Chebyshev, Linear, fine_times
+from benchmarks.honest.noise import disturbed
+from benchmarks.honest.problems.fisher import CELLS, Population
+from benchmarks.honest.problems.flux import NonlinearFlux, RodFlux
+from benchmarks.honest.problems.warm import WarmRod
+from benchmarks.honest.report import outcome
+from benchmarks.honest.twin import SHARES, Run
+from livepde.fem import Inputs, Moment
+
+SMALL = 0.15  # of the noise, root mean square: that much truth and refined livepde may differ
+
+
+# --- truths against closed forms -----------------------------------------------------------------
+
+
+def test_the_answer_to_straight_inputs_is_exact():
+    """y' = -a y + t has y = (t - (1 - exp(-a t))/a)/a, for any step."""
+    a, times = 3.0, np.linspace(0.0, 2.0, 5)
+    exact = (times - -np.expm1(-a * times) / a) / a
+    one, nothing = np.ones((1, 1)), np.zeros((1, 1))
+    for A in (np.array([-a]), np.array([[-a]])):
+        found = Linear(A, one, one, nothing).respond(fine_times(times)[:, None], 0.5)
+        np.testing.assert_allclose(found[:, 0], exact, rtol=1e-12)
+
+
+def test_slow_modes_take_the_series():
+    """A diagonal system next to zero is an integral of its input."""
+    one, times = np.ones((1, 1)), np.linspace(0.0, 1.0, 3)
+    for rate in (0.0, -1e-6, -1e-2):
+        found = Linear(np.array([rate]), one, one, 0 * one).respond(np.ones((17, 1)), 0.5)
+        exact = times if rate == 0.0 else np.expm1(rate * times) / rate
+        np.testing.assert_allclose(found[:, 0], exact, rtol=1e-9)
+
+
+def test_collocation_decays_as_the_first_sine():
+    space, k = Chebyshev(24), 0.1
+    ends, none = np.eye(25)[[0, -1]], np.zeros((25, 1))
+    system = space.system(k * space.D2, ends, np.zeros((2, 1)), none, [0.3])
+    times = np.linspace(0.0, 2.0, 9)
+    start = np.sin(np.pi * space.x[1:-1])
+    found = system.respond(np.zeros((65, 1)), 0.25, start)[:, 0]
+    exact = np.exp(-k * np.pi**2 * times) * np.sin(0.3 * np.pi)
+    np.testing.assert_allclose(found, exact, atol=1e-11)
+
+
+def test_a_population_without_differences_grows_logistically_with_its_tangent():
+    r, times = 1.3, np.linspace(0.0, 4.0, 41)
+    start = np.full(CELLS + 1, 0.1)
+    y, Y = Population(0.02, r).solve(start, times, tangents=True)
+    growth = 0.1 * np.exp(r * times)
+    exact = growth / (0.9 + growth)
+    np.testing.assert_allclose(y[:, 7], exact, atol=2e-5)
+    np.testing.assert_allclose(Y[:, 7, 0], 0.0, atol=1e-12)
+    by_r = times * exact * (1.0 - exact) * r * 0.3  # in standard deviations of log r
+    np.testing.assert_allclose(Y[:, 7, 1], by_r, atol=2e-5)
+
+
+# --- truths against livepde, refined -------------------------------------------------------------
+
+
+def simulated(problem, theta, refine, substeps):
+    """Return what the sensors show in livepde, with second order and inputs at each substep."""
+    model = problem.model(refine)
+    sensors = lp.Points(dict(problem.points), direct=dict(problem.direct))
+    observed = sensors.bind(model.state_space, model.X, model.parameter_space)
+    space = model.parameter_space
+    q = np.zeros(space.dim)
+    for label, latent in problem.latents.items():
+        if label in space.labels:
+            value = latent.value(theta, 0).item()
+            q[space.labels[label]] = np.exp(value) if latent.log else value
+        else:
+            x = problem.mesh(refine).p
+            shape = getattr(problem, "reaction", None) or problem.conductivity
+            q[space.part(label)] = shape(theta, *x)
+
+    def inputs(t):
+        return {name: float(signal(np.array(t))) for name, signal in problem.channels.items()}
+
+    times = np.linspace(0.0, problem.length, substeps * problem.intervals + 1).tolist()
+    control = lp.Advance(lp.Alexander2())
+    run = lp.simulate(model, model.latent.inverse(q), problem.u0, times, control, inputs)
+    return np.array(
+        [
+            observed.predict(u, q, Moment(t, Inputs(inputs(t))))
+            for n, (t, u) in enumerate(run)
+            if n % substeps == 0
+        ]
+    )
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_truths_agree_with_livepde_refined(name):
+    problem = PROBLEMS[name]
+    theta = 0.7 * np.random.default_rng(5).standard_normal(problem.coordinates)
+    if name in ("flux", "warm-flux"):
+        theta[2:] = 0.0  # the flux stays as it is, so that `simulate` knows it
+    nonlinear = name in ("warm-flux", "warm-rod", "fisher")
+    refined = simulated(problem, theta, 2, 1 if nonlinear or name in ("plate", "reaction") else 2)
+    difference = (refined - problem.predict(theta)) / problem.noise
+    assert np.sqrt(np.mean(difference**2)) < SMALL
+    assert np.ptp(refined) > 10 * problem.noise
+
+
+# --- priors and derivatives ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_truths_are_drawn_from_the_prior_of_the_estimator(name):
+    problem = PROBLEMS[name]
+    model = problem.model()
+    covariance = np.linalg.inv(model.Q.gram.toarray())
+    space = model.parameter_space
+    for label, latent in problem.latents.items():
+        part = space.labels[label] if label in space.labels else space.part(label)
+        indices = np.atleast_1d(np.arange(space.dim)[part])
+        D = latent.directions(0)
+        np.testing.assert_allclose(latent.mean, model.latent.prior[indices], rtol=1e-12)
+        exact, drawn = np.diag(covariance)[indices], (D**2).sum(axis=1)
+        # The field's cosines end where less than a hundredth of the variance is left.
+        np.testing.assert_allclose(drawn, exact, rtol=1e-12 if len(indices) == 1 else 0.03)
+
+
+def differences(problem, theta, columns):
+    found = []
+    for k in columns:
+        step = np.zeros(problem.coordinates)
+        step[k] = 1e-4
+        found.append((problem.predict(theta + step) - problem.predict(theta - step)) / 2e-4)
+    return np.stack(found, axis=-1)
+
+
+class ShortWarmRod(WarmRod):
+    length, intervals = 2.0, 40
+
+
+class ShortFlux(RodFlux):
+    length, intervals = 2.0, 40
+
+
+class ShortNonlinearFlux(NonlinearFlux):
+    length, intervals = 2.0, 20
+
+
+@pytest.mark.parametrize("kind", [ShortWarmRod, ShortFlux, ShortNonlinearFlux])
+def test_derivatives_of_the_truth(kind):
+    problem = kind()
+    theta = 0.5 * np.random.default_rng(2).standard_normal(problem.coordinates)
+    columns = [k for k in (0, 1, 2, 9) if k < problem.coordinates]
+    exact = problem.jacobian(theta)[..., columns]
+    expected = differences(problem, theta, columns)
+    np.testing.assert_allclose(exact, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_the_flux_of_the_truth_walks_as_the_estimator_believes():
+    problem = ShortFlux()
+    rng = np.random.default_rng(3)
+    ends = np.array([problem.latents["J"].value(problem.draw(rng)[0], 40) for _ in range(400)])
+    model = problem.model()
+    (walk,) = [p for p in model.latent.parts.values() if p.evolution.moves]
+    gained = walk.evolution.growth(problem.length, walk.unknown.latent_std)[0]
+    expected = walk.unknown.latent_std * np.sqrt(1.0 + gained)
+    assert ends.std() == pytest.approx(expected, rel=0.1)
+    assert np.linalg.norm(problem.latents["J"].directions(40)) == pytest.approx(expected)
+
+
+# --- data ----------------------------------------------------------------------------------------
+
+
+def test_kinds_of_data():
+    problem = PROBLEMS["rod"]
+    shown = np.zeros((problem.intervals + 1, 300))
+
+    def noise(kind):
+        data = disturbed(kind, problem, shown[:, :3], np.random.default_rng(0))
+        return data, data.z / problem.noise
+
+    def many(kind):
+        return disturbed(kind, problem, shown, np.random.default_rng(0)).z / problem.noise
+
+    white = noise("white")[1]
+    for kind, share in (("ar100", 0.01), ("ar10", 0.1)):
+        e = many(kind)
+        rho = np.mean(e[1:] * e[:-1])
+        assert rho == pytest.approx(np.exp(-1.0 / (share * problem.intervals)), abs=0.02)
+        assert e.std() == pytest.approx(1.0, abs=0.03)
+    student = many("student")
+    assert np.median(np.abs(student)) == pytest.approx(0.765 / np.sqrt(3.0), rel=0.02)
+    data, e = noise("spike")
+    assert np.count_nonzero(e != white) == 1
+    assert np.abs(e[data.spike]).max() > 40.0
+    np.testing.assert_array_equal(data.right / problem.noise, white)
+    data, e = noise("gaps")
+    np.testing.assert_array_equal(e, white)
+    assert np.isnan(data.inputs).mean() == pytest.approx(0.3, abs=0.05)
+    assert np.isfinite(data.inputs[0]).all()
+    data, e = noise("bias")
+    shift = np.abs(e - white)
+    np.testing.assert_allclose(sorted(shift.mean(axis=0)), [0.0, 0.0, 2.0], atol=1e-9)
+    assert list(problem.points)[int(shift[0].argmax())] == data.biased
+
+
+# --- batch and scores ----------------------------------------------------------------------------
+
+
+def test_the_batch_posterior_holds_its_truths():
+    """Errors of the batch fit in its own standard deviations are standard normal."""
+    problem, errors = PROBLEMS["column"], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        theta, shown = problem.draw(rng)
+        batch = Batch.of(problem, theta)
+        fit = batch.fit(shown + problem.noise * rng.standard_normal(shown.shape))
+        for latent in problem.latents.values():
+            std = batch.std(latent, problem.intervals)
+            errors.append(((latent.value(fit, 0) - latent.value(theta, 0)) / std).item())
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(1.0, abs=0.25)
+
+
+def scores(seed, covered, width=1.0, error=1.0, shift=0.1):
+    shape = (len(SHARES), 1)
+    return Run(
+        "rod",
+        "spike" if seed < 40 else "white",
+        seed,
+        covered=np.full(shape, covered),
+        width=np.full(shape, width),
+        widest=np.full(shape, 0.2 * width),
+        error=np.full(shape, error),
+        z=np.full(shape, error),
+        fit=np.ones(1),
+        shift=np.full(shape, shift),
+    )
+
+
+def failed(runs):
+    return {check.name for check in outcome(runs).checks if not check.ok}
+
+
+def test_checks_find_what_is_wrong():
+    good = [scores(seed, 0.0 if seed % 20 == 0 else 1.0) for seed in range(80)]
+    assert failed(good) == set()
+    everywhere = {f"all problems, white: coverage after {share:.0%} of the run" for share in SHARES}
+    least = "rod, white: least coverage of one unknown at one time"
+    narrow = [*good[:40], *(scores(seed, float(seed % 3 == 0)) for seed in range(40, 80))]
+    assert failed(narrow) == {"rod, white: coverage", least, *everywhere}
+    wide = [*good[:40], *(scores(seed, 1.0, width=8.0) for seed in range(40, 80))]
+    too_wide = {"rod, white: median width / batch", "rod, white: widest interval / prior"}
+    assert failed(wide) == {"rod, white: coverage", *too_wide, *everywhere}
+    far = [*good[:79], scores(79, 1.0, error=9.0)]
+    assert failed(far) == {"rod, white: error / batch fit"}
+    moved = [scores(0, 0.0, shift=3.0), *good[1:]]
+    assert failed(moved) == {"rod, spike: largest shift by the spike, in standard deviations"}
+    good[0].failure = "StepFailed: at t = 1"
+    assert failed(good) == {"rod, spike: runs that ended early"}
+    assert outcome(good).notes[-1] == "rod, spike, seed 0: StepFailed: at t = 1"
+
+
+def test_twins_are_scored_in_every_kind():
+    found = honest(["borehole"], seeds=1, workers=1)
+    overview, details = found.tables
+    assert [row[1] for row in overview.rows] == list(KINDS)
+    assert {(row[0], row[2]) for row in details.rows} == {("borehole", "k"), ("borehole", "R_b")}
+    assert len(details.rows) == 2 * len(KINDS)
+    names = [check.name for check in found.checks]
+    assert len(set(names)) == len(names)
+    for kind, about in KINDS.items():
+        assert (f"borehole, {kind}: coverage" in names) == (about.coverage is not None)
+        assert f"borehole, {kind}: widest interval / prior" in names
+    assert "borehole, spike: largest shift by the spike, in standard deviations" in names
+    again = honest(["borehole"], ["white"], seeds=1, workers=1)
+    white = [row for row in overview.rows if row[1] == "white"]
+    assert [row[:10] for row in again.tables[0].rows] == [row[:10] for row in white]
+
+
+def test_command():
+    app = Typer()
+    app.command()(main)
+    run = CliRunner().invoke(
+        app,
+        ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1", "--json"],
+    )
+    shown = json.loads(run.stdout)
+    assert run.exit_code == (0 if all(check["ok"] for check in shown["checks"]) else 1)
+    assert {row[0] for row in shown["tables"][0]["rows"]} == {"rod"}
+    assert set(shown["checks"][0]) == {"name", "value", "bound", "sense", "ok"}
+    wrong = CliRunner().invoke(app, ["--only", "rood"])
+    assert wrong.exit_code == 2
