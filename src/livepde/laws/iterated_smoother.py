@@ -65,8 +65,11 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     log = state.log[:, int(state.window[0]) :]
     opening = first_interval(log, problem.channels)
     samples = _Samples(work, state, opening, intervals_since(log, problem.channels))
-    begun = [samples.about(np.zeros((1 + len(samples.intervals), state.now.C.shape[2])))]
+    shape = (1 + len(samples.intervals), state.now.C.shape[2])
+    begun = [samples.about(np.zeros(shape))]
     plain = samples.relinearised()
+    if not work.filter.moves:  # where the filter has come to, with its safeguards
+        begun.append(samples.about(np.broadcast_to(samples.reached, shape)))
     if plain is not None:
         begun.append(samples.about(plain.smoothed))
     ends = [_descended(samples, one) for one in begun if one is not None]
@@ -132,6 +135,14 @@ class _Samples:
         self.opening = opening
         self.intervals = intervals
 
+    @property
+    def reached(self) -> Array:
+        """Reduced unknowns as the filter estimates them now, shape (k,)."""
+        filter_ = self.work.filter
+        estimate = filter_.estimate(self.state.now) - filter_.problem.model.latent.prior
+        reached: Array = filter_.reduction.reduced(estimate)[0]
+        return reached
+
     def about(self, trajectory: Array) -> _Pass | None:
         """Assimilate the samples, linear about a trajectory; None if that fails."""
         return self._run(trajectory)
@@ -186,7 +197,8 @@ class _Samples:
         predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
         noise = np.sqrt(x.level[0]) * filter_.noise
         e = np.abs((interval.z1 - predicted[0]) / noise)
-        return float(np.nansum(np.minimum(e, OUTLIER) ** 2))
+        beyond = 2.0 * OUTLIER**2 * np.log(np.maximum(e / OUTLIER, 1.0))
+        return float(np.nansum(np.minimum(e, OUTLIER) ** 2 + beyond))
 
     def _moved(self, before: Array, after: Array, h: float) -> float:
         """Return the squared increment of a trajectory in a time h, in units of what it gains."""
