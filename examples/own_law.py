@@ -69,7 +69,14 @@ def problem() -> tuple[lp.Model, lp.Subdomain]:
 def main() -> CheckReport:
     """Check the law on a short stream of made-up samples."""
     model, sensors = problem()
-    twin = Twin(model=model, observation=sensors, q_true=2.0, u0=0.0, times=0.05 * np.arange(13))
+    twin = Twin(
+        scheme=lp.ImplicitEuler(),
+        model=model,
+        observation=sensors,
+        q_true=2.0,
+        u0=0.0,
+        times=0.05 * np.arange(13),
+    )
     report = check_law(ExplicitLaw(), lambda law: lp.Identifier(model, sensors, law), list(twin))
     print(report)
     return report

@@ -30,8 +30,8 @@ def main():
     lp.check_model(model, u=600.0, inputs={"a": 300.0}).raise_if_failed()
     sensors = lp.Points({"T_2": 0.02, "T_5": 0.05, "T_9": 0.09}, noise=1.0, unit="K")
     truth = {"q_true": {"k": 21.0, "eps": 0.8}, "u0": 300.0, "inputs": lambda t: {"a": 300.0}}
-    how = {"times": 10.0 * np.arange(121), "noise": AbsoluteNoise(1.0), "scheme": lp.Alexander2()}
-    stream = Twin(model=model, observation=sensors, **how, **truth)  # yours here
+    times, noise = 10.0 * np.arange(121), AbsoluteNoise(1.0)
+    stream = Twin(model=model, observation=sensors, times=times, noise=noise, **truth)  # yours here
     law = lp.SensitivityLaw(replay=lp.Replay(first=10))
     return lp.Identifier(model, sensors, law, u0=300.0).run(stream).last.parameters
 

@@ -60,6 +60,7 @@ def main() -> dict[str, tuple[float, float]]:
     }.items():
         sensors = lp.Matrix(G, noise=NOISE, reconstruction=reconstruction)
         twin = Twin(
+            scheme=lp.ImplicitEuler(),
             model=model,
             observation=sensors,
             q_true=q_true,

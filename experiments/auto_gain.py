@@ -26,6 +26,7 @@ from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.observation import Discrepancy, Full, Subdomain, Tikhonov
 from livepde.reproduce import noisy, seed, seed_excited
+from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 LEVELS = (0.0, 0.01, 0.05, 0.10)
@@ -65,6 +66,7 @@ def compare(name: str, level: float, number: int) -> tuple[float, float]:
     """Print and return the error of the law that tunes itself, and the best of the grid."""
     module, (model, observation), gains, damping = EXAMPLES[name]
     twin = Twin(
+        scheme=ImplicitEuler(),
         model=model,
         observation=observation,
         q_true=module.q_true,

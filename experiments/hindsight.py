@@ -51,6 +51,7 @@ def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = STEPS) -
     """Search c_1 for the paper's first experiment."""
     model, omega = seed.build()
     twin = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=omega,
         q_true=seed.q_true,
@@ -74,6 +75,7 @@ def noisy(
         rule = Tikhonov("V", Discrepancy(level=level))
         omega = lp.Subdomain(omega.omega, reconstruction=rule)
     twin = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=omega,
         q_true=seed.q_true,

@@ -90,6 +90,7 @@ def run(gain: float = 100.0, samples: int = 41, level: float = 0.0) -> list[Foun
     model, omega = seed.build()
     noise = RelativeNoise(level) if level else None
     twin = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=omega,
         q_true=seed.q_true,
@@ -122,7 +123,12 @@ def main() -> None:
     found = run()[2]
     model, omega = seed.build()
     twin = Twin(
-        model=model, observation=omega, q_true=seed.q_true, u_true=seed.u_true, times=[0, 1]
+        scheme=lp.ImplicitEuler(),
+        model=model,
+        observation=omega,
+        q_true=seed.q_true,
+        u_true=seed.u_true,
+        times=[0, 1],
     )
     c = constants(Spaces(model, twin.observed), twin.q, twin.states, gain=100.0)
     print(f"\n{found.name}:")

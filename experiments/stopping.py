@@ -56,6 +56,7 @@ def twin(setting: Setting, seed: int, samples: int) -> Twin:
     rule: Any = Discrepancy(level=setting.level) if setting.alpha is None else setting.alpha
     full = lp.Full(reconstruction=Tikhonov("V", rule))
     return Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=full,
         q_true=excited.q_true,

@@ -115,7 +115,12 @@ def test_hexahedra_with_a_ball_observed():
     )
     sensors = lp.Subdomain(dimensions.ball)
     twin = lp.streams.Twin(
-        model=model, observation=sensors, q_true=2.0, u0=1.0, times=0.05 * np.arange(21)
+        scheme=lp.ImplicitEuler(),
+        model=model,
+        observation=sensors,
+        q_true=2.0,
+        u0=1.0,
+        times=0.05 * np.arange(21),
     )
     last = lp.Identifier(model, sensors, lp.GradientLaw(gain=1e4), u0=1.0).run(twin).last
     assert twin.error(last.q) < 0.05

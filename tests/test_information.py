@@ -53,6 +53,7 @@ def rod(
     dt = options.pop("dt", 0.1)
     times = t * dt * np.arange(round(10 / dt) + 1)
     return model, Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=options.pop("observation", lp.Full()),
         q_true=lambda at: q * (1 + np.sin(np.pi * at[0] / x) ** 2),
@@ -88,6 +89,7 @@ def run(
 def test_seed_reaches_its_floor_without_a_gain() -> None:
     model, omega = seed.build()
     twin = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=omega,
         times=seed.TIMES,
@@ -105,6 +107,7 @@ def test_seed_reaches_its_floor_without_a_gain() -> None:
 def test_excited_twin_with_exact_data() -> None:
     model, full = seed_excited.build()
     twin = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=full,
         times=seed_excited.TIMES[:201],
@@ -250,6 +253,7 @@ def test_what_was_learned_stays_without_excitation() -> None:
         lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
     )
     twin = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=lp.Full(),
         q_true=lambda x: 1 + x[0],
@@ -287,7 +291,14 @@ def test_averages_and_a_number() -> None:
         f=lambda x, t: np.sin(t) + 0 * x[0],
     )
     sensors = lp.Averages({"a": lambda x: x[0] < 0.5, "b": lambda x: x[0] > 0.5})
-    twin = Twin(model=model, observation=sensors, q_true=1.5, u0=0.0, times=0.1 * np.arange(101))
+    twin = Twin(
+        scheme=lp.ImplicitEuler(),
+        model=model,
+        observation=sensors,
+        q_true=1.5,
+        u0=0.0,
+        times=0.1 * np.arange(101),
+    )
     identifier = lp.Identifier(model, sensors, AUTO, u0=0.0)
     for s in twin:
         estimate = identifier.step(s.t, s.z)
@@ -355,6 +366,7 @@ def test_missing_sensors_are_no_noise_that_turns_back():
         lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - 5.0 * v,
     )
     twin = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=lp.Points(points),
         q_true=lambda x: 1.0 + np.sin(3.0 * x[0]),

@@ -25,6 +25,7 @@ TIMES = H * np.arange(60)
 
 def twin(model: lp.Model, observation: lp.Observation) -> Twin:
     return Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=observation,
         q_true=excited_q,

@@ -138,6 +138,7 @@ def test_seed_excited_reaches_its_bounds(excited: Outcome) -> None:
 def test_no_noise_level_told_to_the_filter_does_harm(level: float) -> None:
     model, full = seed_excited.build()
     stream = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=full,
         q_true=seed_excited.q_true,
@@ -179,6 +180,7 @@ def test_progress_shows_a_bar_for_every_run(monkeypatch: pytest.MonkeyPatch) -> 
 def test_track_counts_failed_and_divided_steps() -> None:
     model, omega = seed.build()
     stream = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=omega,
         q_true=seed.q_true,

@@ -165,6 +165,7 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
     found = []
     for one in (model, plain):
         twin = Twin(
+            scheme=lp.ImplicitEuler(),
             model=one,
             observation=lp.Full(),
             q_true=excited_q,
@@ -185,7 +186,14 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
 def test_both_laws_identify(law, inner):
     model = excited(16, ElementLineP1(), inner=inner)
     times = 0.05 * np.arange(101)
-    twin = Twin(model=model, observation=lp.Full(), q_true=excited_q, u_true=excited_u, times=times)
+    twin = Twin(
+        scheme=lp.ImplicitEuler(),
+        model=model,
+        observation=lp.Full(),
+        q_true=excited_q,
+        u_true=excited_u,
+        times=times,
+    )
     start = {"q0": 0.0, "u0": lambda x: excited_u(x, 0.0)}
     last = lp.Identifier(model, lp.Full(), law, **start).run(twin).last
     assert last.status.ok

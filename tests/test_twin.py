@@ -224,6 +224,7 @@ def test_inputs_travel_with_the_samples() -> None:
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     stream = Twin(
+        scheme=lp.ImplicitEuler(),
         model=model,
         observation=lp.Points([0.0, 0.5]),
         q_true=1.0,
@@ -272,6 +273,13 @@ def test_a_truth_that_cannot_be_computed_says_so() -> None:
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: -(1e6 + u**2) * v,  # blows up: no implicit step has a real root
     )
-    stream = Twin(model=model, observation=SENSORS, q_true=0.0, u0=0.0, times=[0.0, 1.0])
+    stream = Twin(
+        scheme=lp.ImplicitEuler(),
+        model=model,
+        observation=SENSORS,
+        q_true=0.0,
+        u0=0.0,
+        times=[0.0, 1.0],
+    )
     with pytest.raises(lp.ConfigurationError, match=r"truth .* cannot be computed"):
         list(stream)

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.problems.data import Problem, Process
 from livepde.reproduce import seed, seed_excited
+from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 __all__ = ["SEED", "SEED_EXCITED"]
@@ -19,6 +20,7 @@ def _twin(experiment: ModuleType, std: float) -> Process:
     """Return an experiment's own twin, with a prior deviation of q."""
     model, observation = experiment.build(std=std)
     twin = Twin(
+        scheme=ImplicitEuler(),
         model=model,
         observation=observation,
         q_true=experiment.q_true,

@@ -36,6 +36,7 @@ from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Experiment, Track, track
 from livepde.result import Result
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import ImplicitEuler
 from livepde.streams import RelativeNoise, Twin
 
 __all__ = ["BOIGER2016", "Ensemble", "NoisyTwin"]
@@ -214,6 +215,7 @@ def excited_case() -> NoisyTwin:
     model, full = seed_excited.build()
     times = 0.1 * np.arange(round(END / 0.1) + 1)
     twin = Twin(
+        scheme=ImplicitEuler(),
         model=model,
         observation=full,
         q_true=seed_excited.q_true,

@@ -36,6 +36,7 @@ from livepde.reproduce.manufactured import Manufactured
 from livepde.reproduce.seed_excited import q_true, u_true
 from livepde.result import Estimate, Result
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 __all__ = ["DEGENERATE"]
@@ -110,6 +111,7 @@ def identify(process: Process, nu: float, what: str = "", progress: bool = False
     model, sensors = build(process)
     times = process.h * np.arange(process.steps + 1)
     twin = Twin(
+        scheme=ImplicitEuler(),
         model=model,
         observation=sensors,
         q_true=q_true,

@@ -54,6 +54,7 @@ from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce.experiment import Experiment, track
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 from livepde.streams.twin import Truth
 
@@ -208,6 +209,7 @@ def identify(
     times = STEP * np.arange(round(end / STEP) + 1)
     model, sensors = build(setting, cells)
     twin = Twin(
+        scheme=ImplicitEuler(),
         model=model,
         observation=sensors,
         q_true=q_true,

@@ -31,6 +31,7 @@ from livepde.progress import watched
 from livepde.reproduce import seed_excited
 from livepde.reproduce.experiment import Experiment
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import ImplicitEuler
 from livepde.streams import LocalPolynomial, RelativeNoise, Twin
 
 __all__ = ["SEED_EXCITED_NOISE", "NoisyRun", "WhiteNoise", "noisy_run"]
@@ -90,6 +91,7 @@ class NoisyRun:
 def _problem() -> tuple[Model, Twin]:
     model, full = seed_excited.build()
     twin = Twin(
+        scheme=ImplicitEuler(),
         model=model,
         observation=full,
         q_true=seed_excited.q_true,

@@ -20,6 +20,7 @@ from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Experiment, Track, track
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 __all__ = ["RELATIVES"]
@@ -55,6 +56,7 @@ def compare(progress: bool = False) -> tuple[dict[Key, Track], list[list[Any]], 
         model, _ = source.build()
         start = partial(source.u_true, t=0.0)
         full = Twin(
+            scheme=ImplicitEuler(),
             model=model,
             observation=Full(),
             q_true=source.q_true,

@@ -27,6 +27,7 @@ from livepde.model import Model
 from livepde.observation import Subdomain
 from livepde.reproduce.experiment import Experiment, Track, track
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 __all__ = ["SEED"]
@@ -82,7 +83,7 @@ def twin_of(clamped: bool, **options: Any) -> Twin:
     """Return the paper's process in one of the two spaces; `options` of `Twin`."""
     model, omega = build(clamped=clamped)
     given = {"q_true": q_true, "u_true": u_true, "times": TIMES, **options}
-    return Twin(model=model, observation=omega, **given)
+    return Twin(model=model, observation=omega, scheme=ImplicitEuler(), **given)
 
 
 def identify(twin: Twin, gain: float, c1: float, progress: bool = False) -> Track:

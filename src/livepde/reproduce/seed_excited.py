@@ -24,6 +24,7 @@ from livepde.model import Model
 from livepde.observation import Full
 from livepde.reproduce.experiment import Experiment, Track, track
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 __all__ = ["SEED_EXCITED"]
@@ -72,6 +73,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     """Run both laws and return their errors with checks and figures."""
     model, full = build()
     twin = Twin(
+        scheme=ImplicitEuler(),
         model=model,
         observation=full,
         q_true=q_true,
@@ -86,7 +88,12 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
             model, full, gain=1000.0, damping=ResidualDamping(1.0), D=D, u0=start
         ),
         "sensitivity": Identifier(
-            model, full, SensitivityLaw(modes=12, noise=NOISE_LEVEL), q0=0.0, u0=start
+            model,
+            full,
+            SensitivityLaw(modes=12, noise=NOISE_LEVEL),
+            q0=0.0,
+            u0=start,
+            scheme=ImplicitEuler(),
         ),
     }
     tracks = {

@@ -22,7 +22,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate
-from livepde.stepping import Advance, ImplicitEuler, Scheme, StepFailed, simulate
+from livepde.stepping import Advance, Alexander2, Scheme, StepFailed, simulate
 
 __all__ = ["AbsoluteNoise", "Noise", "RelativeNoise", "Truth", "Twin"]
 
@@ -127,7 +127,8 @@ class Twin:
             `Subdomain`, `Full` or `Matrix`, whose channels belong to the coefficients of the
             estimator, it is projected onto them.
     scheme, dt_max
-        Time scheme of the truth, and for "discrete" its longest substep.
+        Time scheme of the truth, second order by default (for `GradientLaw`, whose scheme is
+        implicit Euler, state that one to have exact data), and for "discrete" its longest substep.
     fine, fine_dt
         Model (default: `model`) and longest substep of "fine".
     noise
@@ -166,7 +167,7 @@ class Twin:
     u_true: Formula | Mapping[str, Formula] | None = None
     u0: Any = None
     truth: Truth = "discrete"
-    scheme: Scheme = field(default_factory=ImplicitEuler)
+    scheme: Scheme = field(default_factory=Alexander2)
     dt_max: float = np.inf
     fine: Model | None = None
     fine_dt: float = np.inf
