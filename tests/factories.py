@@ -185,14 +185,12 @@ def readings(
     times: Iterable[float],
     noise: float,
     seed: int = 0,
+    scheme: lp.Scheme = lp.SensitivityLaw.scheme,
 ) -> list[tuple[float, np.ndarray]]:
-    """Return noisy samples of a process that starts at zero, with one unknown q(t).
-
-    The process steps as a sensitivity law does.
-    """
+    """Return noisy samples of a process that starts at zero, with one unknown q(t)."""
     rng, observed = np.random.default_rng(seed), observe(model, sensors)
     forward, u, found = ForwardStage(model), model.initial(0.0), []
     for t0, t1 in pairwise(float(t) for t in times):
-        u = advanced(forward, u, lambda t: np.array([q(t)]), t0, t1)
+        u = advanced(forward, u, lambda t: np.array([q(t)]), t0, t1, scheme)
         found.append((t1, observed.G @ u + noise * rng.standard_normal(observed.size)))
     return found

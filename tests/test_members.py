@@ -204,7 +204,8 @@ def test_members_without_a_reading_step_with_the_others(monkeypatch: pytest.Monk
 
     monkeypatch.setattr("livepde.laws.sensitivity.step_alone", counted)
     model = rod({"left": 1.0, "right": 0.0})
-    fleet = lp.Fleet(model, lp.Points([0.3, 0.6], noise=5.0), lp.SensitivityLaw(), 2)
+    law = lp.SensitivityLaw(start_window=0)  # its iterations are made by each member alone
+    fleet = lp.Fleet(model, lp.Points([0.3, 0.6], noise=5.0), law, 2)
     for k in range(5):
         fleet.step(0.1 * (k + 1), [[0.5, 0.3], [np.nan, np.nan]])
     assert not alone
