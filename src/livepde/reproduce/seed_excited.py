@@ -86,7 +86,12 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
             model, full, gain=1000.0, damping=ResidualDamping(1.0), D=D, u0=start
         ),
         "sensitivity": Identifier(
-            model, full, SensitivityLaw(modes=12, noise=NOISE_LEVEL), q0=0.0, u0=start
+            model,
+            full,
+            SensitivityLaw(modes=12, noise=NOISE_LEVEL),
+            q0=0.0,
+            u0=start,
+            scheme=twin.scheme,
         ),
     }
     tracks = {
