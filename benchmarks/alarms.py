@@ -32,7 +32,7 @@ from livepde.plots import NORMAL_95
 from livepde.progress import watched
 from livepde.reproduce import seed_excited
 from livepde.runs import Check, Outcome, Table, drive, unexplained
-from livepde.stepping import Advance, Alexander2, simulate
+from livepde.stepping import Advance, simulate
 
 __all__ = ["PROCESSES", "SUSPECTS", "Process", "Suspect", "Told", "alarms", "followed", "warned"]
 
@@ -137,8 +137,8 @@ def _times(count: int) -> Array:
 
 def _states(model: Model, q: Array, u0: Any, times: Array) -> list[Array]:
     """Return the states of the forward model by the estimator's own scheme."""
-    latent = model.latent.inverse(q)
-    return [u for _, u in simulate(model, latent, u0, times.tolist(), Advance(Alexander2()))]
+    latent, control = model.latent.inverse(q), Advance(SensitivityLaw.scheme)
+    return [u for _, u in simulate(model, latent, u0, times.tolist(), control)]
 
 
 def _driven(x: Any, t: float) -> Any:

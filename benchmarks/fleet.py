@@ -21,7 +21,7 @@ from livepde.model import Model
 from livepde.models import heat
 from livepde.observation import Points
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.stepping import Advance, ImplicitEuler, simulate
+from livepde.stepping import Advance, simulate
 
 __all__ = ["fleet"]
 
@@ -201,7 +201,7 @@ def _samples(model: Model, members: int, count: int) -> list[tuple[float, Array,
         return float(np.sin(t) + np.sin(3.1 * t))
 
     sensors = Points(SENSORS).matrix(model.state_space)
-    truths, control = [], Advance(ImplicitEuler())
+    truths, control = [], Advance(SensitivityLaw.scheme)
     for _ in range(TRUTHS):
         q = model.initial_parameter({"alpha": rng.uniform(0.3, 0.8), "loss": rng.uniform(0.2, 1.0)})
         states = simulate(model, q, 0.0, times, control, lambda t: _inputs(heated(t)))

@@ -29,7 +29,7 @@ from livepde.runs import Check, Journal, Outcome, Table, journal_of
 from livepde.runs.database import log_of
 from livepde.runs.feeds import Samples
 from livepde.runs.live import Live, Retention
-from livepde.stepping import Advance, ImplicitEuler, simulate
+from livepde.stepping import Advance, simulate
 
 __all__ = ["soak"]
 
@@ -226,7 +226,7 @@ def _samples(model: Model) -> Iterator[Sample]:
         return Inputs({"left": float(left[round(t / DT)])})
 
     q = np.array([K, LOSS])
-    states = simulate(model, q, 0.0, times.tolist(), Advance(ImplicitEuler()), inputs)
+    states = simulate(model, q, 0.0, times.tolist(), Advance(SensitivityLaw.scheme), inputs)
     G = Points(SENSORS).matrix(model.state_space)
     seen = [(G @ u).tolist() for _, u in states][-PERIOD:]
     rng = np.random.default_rng(0)

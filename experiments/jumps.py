@@ -53,7 +53,7 @@ def measured(law: lp.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: int) -
     noise = NOISE
     if isinstance(law, lp.GradientLaw):
         sensors, noise = lp.Full(), 0.0
-    identifier = lp.Identifier(model, sensors, law, u0=0.0)
+    identifier = lp.Identifier(model, sensors, law, u0=0.0, scheme=lp.ImplicitEuler())
     G, values = identifier.observed.G, []
     for t, u in exact:
         z = G @ u + noise * rng.standard_normal(G.shape[0])

@@ -128,6 +128,7 @@ def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
         inputs=pulses,
         noise=AbsoluteNoise(50.0),
         seed=2,
+        scheme=lp.SensitivityLaw.scheme,
     )
     law = lp.SensitivityLaw(replay=lp.Replay(first=16))
     identifier = lp.Identifier(model, sensor, law, u0=START)
@@ -162,8 +163,8 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
     for before, t in pairwise(times):
         q = {"D": 2 * D * np.exp(-t / end), "R_0": 0.05}
         latent, now = model.initial_parameter(q), pulses(t)
-        inputs = lambda t, now=now: now  # noqa: E731
-        steps = simulate(model, latent, c, [before, t], Advance(lp.ImplicitEuler()), inputs)
+        inputs, control = lambda t, now=now: now, Advance(lp.SensitivityLaw.scheme)
+        steps = simulate(model, latent, c, [before, t], control, inputs)
         *_, (_, c) = steps
         z = observed.predict(c, model.latent.value(latent), lp.Moment(t, now))
         estimate = identifier.step(t, {"V": z[0] + noise * rng.normal()}, now)

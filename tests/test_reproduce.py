@@ -146,7 +146,8 @@ def test_no_noise_level_told_to_the_filter_does_harm(level: float) -> None:
         times=seed_excited.TIMES,
     )
     law = lp.SensitivityLaw(modes=12, noise=level)
-    identifier = lp.Identifier(model, full, law, u0=lambda x: seed_excited.u_true(x, 0.0))
+    start = lambda x: seed_excited.u_true(x, 0.0)  # noqa: E731
+    identifier = lp.Identifier(model, full, law, u0=start, scheme=stream.scheme)
     found = track(identifier, stream, "")
     assert found.error(60.0) < 3.6e-4
 

@@ -161,6 +161,11 @@ def _turned(
 
 
 def _ended(state: SensitivityState, k: int, one: SensitivityState) -> SensitivityState:
-    """Return all members with one of them, whose replay is over."""
+    """Return all members with one of them, whose replay is over.
+
+    A filter to go back to that was set with this sample, before its replay, is that after it.
+    """
+    if one.since_newer[0] == one.log.shape[1] - 1:
+        one = changed(one, newer=one.now)
     replay = changed(ReplayState.none(one.start), distance=one.replay.distance)
     return put(state, k, changed(one, replay=replay, due=2 * one.replay.count))

@@ -93,7 +93,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
             SensitivityLaw(modes=12, noise=NOISE_LEVEL),
             q0=0.0,
             u0=start,
-            scheme=ImplicitEuler(),
+            scheme=twin.scheme,
         ),
     }
     tracks = {
