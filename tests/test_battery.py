@@ -154,7 +154,7 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
         noise=noise,
     )
     observed = voltage.bind(model.state_space, model.X, model.parameter_space)
-    identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(), u0=START)
+    identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(), u0=START, hold=True)
     rng = np.random.default_rng(0)
     c = model.initial(START)
     times = np.arange(0.0, end + 1.0, 40.0)
