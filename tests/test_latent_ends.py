@@ -75,9 +75,10 @@ def test_what_is_reached_is_told():
 def test_a_stated_number_counts_and_infinity_is_no_end():
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]
     narrow = {"prior": 0.5, "std": 0.01, "transform": "log"}
-    near = run(decay(lp.Scalar(**narrow, within=3.0)), stream(far)).to_xarray()
+    law = lp.SensitivityLaw(gate=np.inf)
+    near = run(decay(lp.Scalar(**narrow, within=3.0)), stream(far), law).to_xarray()
     assert near["k"].values[-1] == pytest.approx(0.5 * np.exp(3 * 0.02))
-    free = run(decay(lp.Scalar(**narrow, within=np.inf)), stream(far)).to_xarray()
+    free = run(decay(lp.Scalar(**narrow, within=np.inf)), stream(far), law).to_xarray()
     assert free["k"].values[-1] > 1.5
     assert "bounded" not in free
 
@@ -85,7 +86,7 @@ def test_a_stated_number_counts_and_infinity_is_no_end():
 def test_the_filter_stays_linear_so_that_nothing_is_lost():
     """While the estimate is held, the filter learns as ever: afterwards it is where it would be."""
     values = [5.0] * 3 + [0.0] * 60
-    law = lp.SensitivityLaw(guards=None)
+    law = lp.SensitivityLaw(guards=None, gate=np.inf)
     held, free = (
         run(source(lp.Scalar(0.0, 0.2, within=within)), stream(values), law, 0.0)
         for within in (2.0, np.inf)
@@ -114,12 +115,12 @@ def test_a_field_stays_within_its_ends(pointwise: bool):
         MESH, ElementLineP1(), inner=inner, prior=0.5, std=0.1, transform="log", within=3.0
     )
     model = decay(field)
-    identifier = lp.Identifier(model, lp.Points([0.3, 0.7], noise=NOISE), lp.SensitivityLaw())
+    law = lp.SensitivityLaw(gate=np.inf)
+    identifier = lp.Identifier(model, lp.Points([0.3, 0.7], noise=NOISE), law)
     lower, upper = identifier._work.filter.reduction.ends
     assert (upper > lower).all()
     far = [np.exp(-4.0 * (k + 1) * 0.1) for k in range(30)]
-    result = run(model, stream(far))
-    data = result.to_xarray()
+    data = run(model, stream(far), law).to_xarray()
     assert data["k"].values.max() <= np.exp(upper).max() * (1 + 1e-12)
     assert data["bounded"].values.max() >= 1.0
     if pointwise:

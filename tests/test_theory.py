@@ -276,6 +276,7 @@ def twin_of(module, samples, **options):
         "q_true": module.q_true,
         "u_true": module.u_true,
         "times": module.TIMES[:samples],
+        "scheme": lp.GradientLaw.scheme,
     }
     return Twin(**defaults | options)
 

@@ -49,6 +49,7 @@ def twin(**options: Any) -> Twin:
         "q_true": q_true,
         "u_true": u_true,
         "times": TIMES,
+        "scheme": lp.ImplicitEuler(),
     }
     return Twin(**{**given, **options})
 

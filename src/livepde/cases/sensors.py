@@ -40,6 +40,10 @@ __all__ = [
 ]
 
 
+# The first sample interpolated: with the noise of its readings, or as if they had none.
+INTERPOLATED = ("interpolate", "interpolate-exact")
+
+
 def columns_of(frame: Frame) -> dict[str, Column]:
     """Return channel -> where it comes from in the data."""
     found = {}
@@ -269,19 +273,22 @@ def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
     if isinstance(initial, dict):
         unit = frame.equation.state.unit
         return {name: frame.convert(v, unit, f"initial.{name}") for name, v in initial.items()}
-    if initial != "interpolate":
+    if initial not in INTERPOLATED:
         if isinstance(initial, str) and not any(letter.isdigit() for letter in initial):
-            text = f"got '{initial}'; {did_you_mean(initial, ['interpolate', 'a number'])}"
+            text = f"got '{initial}'; {did_you_mean(initial, [*INTERPOLATED, 'a number'])}"
             raise frame.error("initial", text)
         return frame.convert(initial, frame.equation.state.unit, "initial")
     if len(mesh.p) != 1:
-        raise frame.error("initial", "'interpolate' needs an interval; give a number.")
+        raise frame.error("initial", f"'{initial}' needs an interval; give a number.")
     at, level, _ = _initial_readings(frame, mesh, first)
     return lambda x: np.interp(x[0], at, level)
 
 
 def initial_weights(frame: Frame, mesh: Any, first: Sample) -> dict[str, Any]:
-    """Return channel -> how an interpolated initial state changes with its reading, as x -> u."""
+    """Return channel -> how an interpolated initial state changes with its reading, as x -> u.
+
+    None where readings are taken as exact (`initial = "interpolate-exact"`).
+    """
     if frame.spec.initial != "interpolate" or len(mesh.p) != 1:
         return {}
     at, _, names = _initial_readings(frame, mesh, first)
