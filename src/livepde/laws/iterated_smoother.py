@@ -9,7 +9,7 @@ probable, and serves unknowns that stay and unknowns that move.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,26 +66,36 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     opening = first_interval(log, problem.channels)
     samples = _Samples(work, state, opening, intervals_since(log, problem.channels))
     shape = (1 + len(samples.intervals), state.now.C.shape[2])
-    begun = [samples.about(np.zeros(shape))]
-    plain = samples.relinearised()
-    if not work.filter.moves:  # where the filter has come to, with its safeguards
-        begun.append(samples.about(np.broadcast_to(samples.reached, shape)))
-    if plain is not None:
-        begun.append(samples.about(plain.smoothed))
-    ends = [_descended(samples, one) for one in begun if one is not None]
+    ends = []
+    for trajectory in _beginnings(samples, shape):
+        one = samples.about(trajectory)
+        if one is not None:
+            ends.append(_descended(samples, one))
+        if ends and ends[-1] is one and one.misfit <= samples.usual_misfit:
+            break  # linear where the filter is, which explains the samples: no other basin is better
     if not ends:
         return None
     best = min(ends, key=lambda one: one.misfit)
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
 
 
+def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
+    """Return trajectories to begin at, the most promising one first."""
+    if not samples.work.filter.moves:  # where the filter has come to, with its safeguards
+        yield np.broadcast_to(samples.reached, shape)
+    plain = samples.relinearised()
+    if plain is not None:
+        yield plain.smoothed
+    yield np.zeros(shape)
+
+
 def _descended(samples: _Samples, best: _Pass) -> _Pass:
     """Return the pass about a most probable trajectory near that of another."""
     for _ in range(ITERATIONS):
         step = best.smoothed - best.trajectory
-        step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
         if _deviations(best.x, step[-1]) <= CONVERGED:
             break
+        step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
         better = _damped(samples, best, step)
         if better is None:
             break
@@ -134,6 +144,16 @@ class _Samples:
         self.state = state
         self.opening = opening
         self.intervals = intervals
+
+    @property
+    def usual_misfit(self) -> float:
+        """Return what minus twice the logarithm of the probability rarely exceeds.
+
+        Squared misfits of m readings, each in standard deviations of its noise, sum up to m, give
+        or take the square root of 2 m.
+        """
+        readings = sum(int(np.isfinite(one.z1).sum()) for one in self.intervals)
+        return float(readings + 3.0 * np.sqrt(2.0 * readings))
 
     @property
     def reached(self) -> Array:
