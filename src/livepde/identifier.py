@@ -24,7 +24,7 @@ from livepde.errors import (
 )
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
-from livepde.laws import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws import AnyLaw, Belief, Law, Problem, Report, Status, numerical
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
@@ -267,21 +267,61 @@ class Identifier:
                 "sort the stream, and drop repeated samples."
             )
         if self._state is None:
-            self._begin(values)
+            self._begun_by(values, t)
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
-        if t == self._t:
-            moment = Moment(t, values)
-            belief = self._belief()
-            report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
-            interval = Interval(t, t, values, values, used, used)
-            self._state = self.law.begin(self._work, self._state, interval)
-        else:
-            interval = Interval(self._t, t, self._inputs, values, self._z, used)
-            self._state, report = self.law.step(self._work, self._state, interval)
+        start = self._inputs if t > self._t else values
+        interval = Interval(self._t, t, start, values, self._z if t > self._t else used, used)
+        self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held)
+
+    def _begun_by(self, inputs: Inputs, t: float) -> None:
+        """Begin with the inputs of the first sample, unless no finite state comes of them."""
+        try:
+            with _quiet():
+                state = self._start(inputs)
+                finite = self.law.finite(self._work, state)
+        except Exception as error:
+            if numerical(error) is None:
+                raise
+            finite = False
+        if not finite:
+            raise SampleError(
+                f"the sample at t = {t:g} gives no finite initial state: check the values of its "
+                f"inputs {list(self.inputs)}; the run begins with the next one."
+            )
+        self._state, self._inputs = state, inputs
+
+    def _stepped(self, interval: Interval) -> tuple[Any, Report]:
+        """Return state and report after a sample; the state of before where numbers fail.
+
+        Numbers fail where an operation raises, and where what the law believes then is not finite,
+        be it only the squares of its numbers.
+        """
+        before, t0, t1 = self._state, interval.t0, interval.t1
+        try:
+            with _quiet():
+                if t1 > t0:
+                    state, report = self.law.step(self._work, before, interval)
+                else:
+                    state = self.law.begin(self._work, before, interval)
+                    report = Report(Status(), self._expected(interval))
+                if not report.status.taken or self.law.finite(self._work, state):
+                    return state, report
+                failure = Status("not_finite", "what the law believes after it is not finite")
+        except Exception as error:
+            found = numerical(error)
+            if found is None:
+                raise
+            failure = found
+        return before, Report(failure, np.full(self.observed.size, np.nan))
+
+    def _expected(self, interval: Interval) -> Array:
+        """Return what the sensors show of the estimate of now."""
+        belief = self._belief()
+        return self.observed.predict(belief.u, belief.q, interval.end)
 
     def latent_belief(self) -> Belief:
         """Return what the law itself believes: q and its factor in latent coefficients.
@@ -526,6 +566,11 @@ class Identifier:
         self._state = state
         if state is None and not self.inputs:
             self._begin(inputs)
+
+
+def _quiet() -> np.errstate:
+    """Return a context in which NumPy does not warn: what overflows is found in the result."""
+    return np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 def _watched(stream: Iterable[Any], progress: bool, total: int | None) -> Iterable[Any]:

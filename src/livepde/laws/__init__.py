@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
 from livepde.laws.auto import AutoLaw
-from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status, numerical
 from livepde.laws.bounds import (
     Constants,
     ExactBound,
@@ -50,5 +50,6 @@ __all__ = [
     "SmoothedBound",
     "Status",
     "diffusion_operator",
+    "numerical",
     "unobserved_damping",
 ]

@@ -379,6 +379,9 @@ class AutoLaw(Law[Bank, AutoState]):
         filters = work.filters(state.tick, np.ones_like(state.noise))
         return changed(state, members=self.member.suspended(filters, state.members))
 
+    def finite(self, work: Bank, state: AutoState) -> bool:
+        return self.member.finite(work.work, state.members)
+
     def belief(self, work: Bank, state: AutoState) -> Belief:
         return self.reader(work, state)()
 

@@ -10,14 +10,16 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
+from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 
-__all__ = ["Belief", "Law", "Notes", "Problem", "Report", "Status"]
+__all__ = ["Belief", "Law", "Notes", "Problem", "Report", "Status", "finite", "numerical"]
 
+LARGEST = 1e150  # of a sum of squares: the product of two of them is finite
 REMEDIES = {
     "ok": "",
     "not_converged": "Take a smaller dt_max, a smaller gain, or less damping.",
@@ -259,6 +261,29 @@ class Report:
     notes: Mapping[str, float] = field(default_factory=dict)
 
 
+def finite(*arrays: Array | None) -> bool:
+    """Return whether products of the squares of some arrays are finite; None counts as empty."""
+    return all(float(np.vdot(a, a)) <= LARGEST for a in arrays if a is not None)
+
+
+def numerical(error: Exception) -> Status | None:
+    """Return the status of a step that an operation on numbers has ended, None for other errors.
+
+    Such operations raise `ArithmeticError` (overflow, a singular matrix), NumPy's `LinAlgError`,
+    the `ValueError` of SciPy for arrays that are not finite, or the `RuntimeError` of SuperLU.
+    """
+    text = str(error).rstrip(".") or type(error).__name__
+    if isinstance(error, StepFailed):
+        return Status.of(error)
+    if isinstance(error, LinearAlgebraError | np.linalg.LinAlgError | ZeroDivisionError):
+        return Status("singular", text)
+    if isinstance(error, RuntimeError) and "singular" in text:
+        return Status("singular", text)
+    if isinstance(error, ArithmeticError) or isinstance(error, ValueError) and "infs" in text:
+        return Status("not_finite", text)
+    return None
+
+
 Work = TypeVar("Work")
 State = TypeVar("State")
 
@@ -324,6 +349,14 @@ class Law(ABC, Generic[Work, State]):
         A law that steps them as arrays has `begin_members`, `step_members` and `member_belief`.
         """
         return f"{type(self).__name__} steps one at a time"
+
+    def finite(self, work: Work, state: State) -> bool:
+        """Return whether what is believed is finite, with its squares; here it is computed for that.
+
+        A law whose belief is not cheap overrides this by the arrays that it is made of.
+        """
+        belief = self.belief(work, state)
+        return finite(belief.q, belief.u, belief.q_factor, belief.u_factor)
 
     @abstractmethod
     def belief(self, work: Work, state: State) -> Belief:

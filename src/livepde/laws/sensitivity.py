@@ -17,7 +17,7 @@ from livepde.laws.assimilation import (
     assimilate,
     assimilate_at_once,
 )
-from livepde.laws.base import Belief, Law, Problem, Report
+from livepde.laws.base import Belief, Law, Problem, Report, finite
 from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
@@ -404,6 +404,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             return state
         due = np.full_like(state.due, NEVER - 1)  # a replay is known as such, and none begins
         return changed(state, replay=ReplayState.none(state.start), due=due)
+
+    def finite(self, work: SensitivityWork, state: SensitivityState) -> bool:
+        x = state.now
+        return finite(x.u, x.q, x.du, x.da, x.U, x.C)
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)
