@@ -63,7 +63,7 @@ def test_a_value_that_overflows_is_a_status(law, place, value):
 def test_a_first_sample_without_a_finite_state_is_refused(law):
     who = rod(law)
     t, z, _ = sample(0)
-    with pytest.raises(SampleError, match="no finite initial state.*'left'"):
+    with pytest.raises(SampleError, match=r"no finite initial state.*'left'"):
         who.step(t, z, {"left": 1e200})
     for k in range(1, 4):
         assert who.step(*sample(k)).status.ok

@@ -323,6 +323,15 @@ class Identifier:
         belief = self._belief()
         return self.observed.predict(belief.u, belief.q, interval.end)
 
+    @property
+    def place(self) -> tuple[Any, ...]:
+        """Where it stands, for `return_to`; holds what a step does not change."""
+        return self._state, self._t, self._z, self._inputs, self._samples
+
+    def return_to(self, place: tuple[Any, ...]) -> None:
+        """Stand again where it stood, as if nothing had been taken since then."""
+        self._state, self._t, self._z, self._inputs, self._samples = place
+
     def latent_belief(self) -> Belief:
         """Return what the law itself believes: q and its factor in latent coefficients.
 

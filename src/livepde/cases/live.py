@@ -56,6 +56,9 @@ class Wiring:
         The case as its first sample found it; None before that.
     silent
         Nothing has come for too long while the first sample was waited for.
+    why
+        Why all is not well meanwhile, in one sentence: the source is silent, or what comes is
+        refused; empty if it is.
 
     Raises
     ------
@@ -75,6 +78,7 @@ class Wiring:
         self.case = case
         self.prepared: Prepared | None = None
         self.silent = False
+        self.why = ""
         # Before anything is connected: a case that is wrong says so at once.
         self._policy, self._limits = policy_of(case.frame), limits_of(case.frame)
         self._path = path
@@ -175,10 +179,11 @@ class Wiring:
         while not (stopping.is_set() or self._feed.done):
             found = list(self._feed.poll(LOOK))
             if self._feed.heard():
-                heard, self.silent = time.monotonic(), False
+                heard, self.silent, self.why = time.monotonic(), False, ""
             elif not self.silent and time.monotonic() - heard > silence:
                 self.silent = True
-                LOG.warning("silent: nothing from the source for %.0f s", silence)
+                self.why = f"nothing has come from the source for more than {silence:g} s"
+                LOG.warning("silent: %s", self.why)
             remarks = self._feed.remarks(found)
             new = [one for one in remarks if (one.kind, one.channel) not in irregular]
             for remark in remarks:
@@ -189,6 +194,7 @@ class Wiring:
                     return self.case.begin(Sample(found[0].t, values), self._start), found
                 except DataError as error:
                     why = str(error).removesuffix(".")
+                self.why = f"the run cannot begin yet: {why}"
                 if why != told:
                     told = why
                     LOG.warning("cannot begin yet: %s", why)

@@ -279,7 +279,7 @@ def numerical(error: Exception) -> Status | None:
         return Status("singular", text)
     if isinstance(error, RuntimeError) and "singular" in text:
         return Status("singular", text)
-    if isinstance(error, ArithmeticError) or isinstance(error, ValueError) and "infs" in text:
+    if isinstance(error, ArithmeticError) or (isinstance(error, ValueError) and "infs" in text):
         return Status("not_finite", text)
     return None
 
@@ -351,7 +351,7 @@ class Law(ABC, Generic[Work, State]):
         return f"{type(self).__name__} steps one at a time"
 
     def finite(self, work: Work, state: State) -> bool:
-        """Return whether what is believed is finite, with its squares; here it is computed for that.
+        """Return whether what is believed is finite, with its squares; here it is computed.
 
         A law whose belief is not cheap overrides this by the arrays that it is made of.
         """

@@ -29,6 +29,7 @@ from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, FigureFactory, Table
+from livepde.runs.salvage import Salvage
 from livepde.runs.summary import arrivals, tables
 
 if TYPE_CHECKING:
@@ -284,6 +285,13 @@ class Run:
             return xr.load_dataset(path, engine="scipy", mmap=False)
         except (OSError, ValueError, TypeError, LookupError, MemoryError) as error:
             raise RunError(f"{path} is damaged: {error}.") from error
+
+    def salvage(self) -> list[str]:
+        """Take as dataset what is whole in a damaged journal; return what is not, in words."""
+        kept = Salvage(self.path / JOURNAL)
+        with kept:
+            self.__dict__["dataset"] = kept.dataset()
+        return kept.sentences()
 
     def case_file(self) -> Path:
         """Return the case to take a run's samples again: where it was run, if it is unchanged.

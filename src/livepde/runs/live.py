@@ -14,8 +14,9 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from livepde.errors import DataError, LivepdeError
+from livepde.errors import DataError, LivepdeError, RunError
 from livepde.identifier import Identifier
+from livepde.laws import numerical
 from livepde.result import Estimate, Result
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
@@ -26,7 +27,10 @@ __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 CHECKPOINT = 256  # samples between two checkpoints
 LOOK = 0.5  # seconds between two looks at whether to stop
 LONGEST = 500  # characters of an event
-HARMLESS = frozenset({"heard", "missing", "disordered", "outside"})
+TRIES = 2  # times that a sample in whose step the process has ended is tried again
+REFUSED = 20  # rows and values refused in a row, after which a run is not well
+UNUSED = frozenset({"malformed", "late", "leap", "outside", "skipped"})  # rows of no use
+HARMLESS = frozenset({"heard", "well", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
 
 
@@ -127,6 +131,12 @@ class Live:
         Ends the run when it is set; it may be set already.
     clock
         Seconds that pass.
+
+    Attributes
+    ----------
+    ailments
+        Each returns why the run is not well, in one sentence, or nothing; the first that does is
+        what /health, the metrics, the log and the page say. A verdict on the estimate joins here.
     """
 
     def __init__(
@@ -148,6 +158,7 @@ class Live:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
+        self._begun = identifier.dump()
         self.feed = feed
         self.journal = journal
         self.sinks = list(sinks)
@@ -160,7 +171,16 @@ class Live:
         self.stopping = stopping or threading.Event()
         self.busy = False  # a step is taken
         self._clock = clock
-        self._heard = clock()
+        self._heard = self._taken = clock()
+        self._refused = self._failed = 0  # in a row
+        self._refusal = self._failure = ""
+        self._unwell, self._told = "", (-1, "well")
+        self.ailments: list[Callable[[], str]] = [
+            self._unlinked,
+            self._silence,
+            self._refusing,
+            self._failing,
+        ]
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._remarked = set(self._counts)
@@ -171,14 +191,23 @@ class Live:
         self._count(irregular)
 
     def resume(self) -> int:
-        """Take again what the journal holds after its last checkpoint; return how many samples."""
+        """Take again what the journal holds after its last checkpoint; return how many samples.
+
+        A sample with which the process has ended again and again is set aside.
+        """
+        reached = self.journal.estimated
         state = self.journal.rewind()
-        if state is not None:
-            self.identifier.restore(state, str(self.journal.path))
+        self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
         self.result = self._read()
         again = 0
         for taken in self.journal.samples():
+            new = taken.id > reached
+            if new and self.journal.mark() > TRIES:
+                self._set_aside(taken.t, f"the process has ended {TRIES + 1} times in its step")
+                continue
             self._step(taken, again=True)
+            if new:
+                self.journal.commit()  # its step did end
             again += 1
         if again and self.result.last is not None:
             self._put(self.result.last)
@@ -223,12 +252,13 @@ class Live:
                 self._settle()  # who reads the journal sees all before it is waited for more
             if self.backlog.has_room(self._waiting):
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
-                self._watch(self.feed.heard())
+                self._listen(self.feed.heard())
             self._relieve()
             if self._waiting:
                 self._take(self._waiting.popleft())
             elif self.feed.done:
                 break
+            self._look()
         self._settle()
 
     def _settle(self) -> None:
@@ -249,6 +279,9 @@ class Live:
     def _count(self, remarks: Iterable[Remark]) -> None:
         """Count remarks; the first of each kind and channel is an event, with its words."""
         for remark in remarks:
+            if remark.kind in UNUSED:
+                self._refused += remark.number
+                self._refusal = f"{remark.kind}: {remark.message}"
             self._counts[remark.kind, remark.channel] += remark.number
             self.journal.count(remark.kind, remark.channel, remark.number)
             if (remark.kind, remark.channel) not in self._remarked:
@@ -266,12 +299,13 @@ class Live:
 
     @property
     def health(self) -> dict[str, Any]:
-        """What a watchdog should know: ok, unless the source is silent or steps fail."""
+        """What a watchdog should know: ok, or why not, in one sentence."""
         last = self.result.last
         counts = self._counts.copy()  # who asks does so from another thread
-        failed = last is not None and not last.status.ok
+        why = self.why
         return {
-            "ok": not (self.silent or failed),
+            "ok": not why,
+            "why": why,
             "t": self.identifier.t,
             "samples": len(self.result),
             "waiting": len(self._waiting),
@@ -280,6 +314,61 @@ class Live:
             "seconds": self._seconds,
             "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
+
+    @property
+    def why(self) -> str:
+        """Why the run is not well, in one sentence; empty if it is.
+
+        As long as it ails of the same the sentence stays as it was when that began.
+        """
+        ailing, why = self._ailing()
+        return self._unwell if ailing == self._told[0] else why
+
+    def _ailing(self) -> tuple[int, str]:
+        """Return the number of the first ailment that there is, -1 for none, and what it says."""
+        found = ((k, why) for k, ailment in enumerate(self.ailments) if (why := ailment()))
+        return next(found, (-1, ""))
+
+    def _unlinked(self) -> str:
+        if self.journal.in_place:
+            return ""
+        return (
+            "the journal's file is no longer the one in the run directory, and what is written "
+            "ends with this process: stop it, and run the case into a new folder"
+        )
+
+    def _silence(self) -> str:
+        if not self.silent:
+            return ""
+        return f"nothing has come from the source for more than {self.silence:g} s"
+
+    def _refusing(self) -> str:
+        long = self._clock() - self._taken > self.silence
+        if not (long or self._refused >= REFUSED):
+            return ""
+        if not self._refused:
+            return f"no sample has been taken for more than {self.silence:g} s"
+        return f"rows come and none is taken; the last one: {self._refusal}"
+
+    def _failing(self) -> str:
+        last = self.result.last
+        if self._failed > 1:
+            return f"the last steps have failed; the last one: {self._failure}"
+        return "" if last is None or last.status.ok else f"the last step: {last.status}"
+
+    def _look(self) -> None:
+        """Say in the log, and to who reads the journal, what has changed of the run's health."""
+        ailing, why = self._ailing()
+        before, kind = self._told
+        if ailing == before:
+            return
+        self._unwell = why
+        self._told = ailing, "silent" if self.silent else "unwell" if why else "well"
+        self.journal.say_health(why)
+        if why:
+            self._tell(self._told[1], why)
+        elif kind == "unwell":  # of the end of a silence it has been said that it is heard
+            self._tell("well", "all is well again")
 
     def _take(self, ready: Ready) -> None:
         position = self.feed.position(self._waiting)
@@ -291,27 +380,62 @@ class Live:
     def _step(self, taken: Taken, *, again: bool = False) -> None:
         self.busy = True
         try:
-            self._estimate(taken, again)
-        except DataError as error:
-            if not self.strict:
-                self._tell("refused", str(error))
-            self.journal.withdraw()
-            # Those that wait are later: they are taken, or refused in their turn.
-            self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
-            if self.strict:
-                raise
+            estimate = self._estimate(taken)
+            if estimate is not None:
+                self._hand_on(estimate, again)
         finally:
             self.busy = False
 
-    def _estimate(self, taken: Taken, again: bool) -> None:
-        begun = time.monotonic()
-        estimate = self.identifier.step(taken.t, taken.values)
-        self._seconds += time.monotonic() - begun
-        self.result.add(estimate)
+    def _estimate(self, taken: Taken) -> Estimate | None:
+        """Take a step; return None where the sample was refused or set aside."""
+        before, begun = self.identifier.place, time.monotonic()
+        try:
+            estimate = self.identifier.step(taken.t, taken.values)
+            self._seconds += time.monotonic() - begun
+            self.result.add(estimate)
+        except DataError as error:
+            if not self.strict:
+                self._tell("refused", str(error))
+                self._refused += 1
+                self._refusal = str(error)
+            self._withdraw()
+            if self.strict:
+                raise
+        except RunError:  # of the journal
+            raise
+        except Exception as error:
+            if self.strict and numerical(error) is None:
+                raise
+            self.identifier.return_to(before)
+            self._set_aside(taken.t, f"{type(error).__name__}: {error}")
+        else:
+            return estimate
+        return None
+
+    def _withdraw(self) -> None:
+        """Forget the last sample; those that wait are later, and taken or refused in their turn."""
+        self.journal.withdraw()
+        self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
+
+    def _set_aside(self, t: float, why: str) -> None:
+        """Forget a sample with which a step cannot end; the stream goes on."""
+        self._failed += 1
+        self._failure = f"t = {t:g} was set aside: {why}"
+        self._tell("aside", self._failure)
+        self._counts["aside", ""] += 1
+        self.journal.count("aside")
+        self._withdraw()
+
+    def _hand_on(self, estimate: Estimate, again: bool) -> None:
+        """Tell of an estimate, and keep a checkpoint from time to time."""
         if not again:
             self._put(estimate)
+        if estimate.status.taken:
+            self._taken, self._refused = self._clock(), 0
+        self._failed = 0 if estimate.status.ok else self._failed + 1
         if not estimate.status.ok:
-            self._tell(estimate.status.code, str(estimate.status))
+            self._failure = str(estimate.status)
+            self._tell(estimate.status.code, self._failure)
         self._steps += 1
         if self._steps % CHECKPOINT == 0:
             self.journal.checkpoint(self.identifier.dump())
@@ -327,12 +451,11 @@ class Live:
                 self.sinks.remove(sink)
                 self._tell("sink", f"{type(sink).__name__} is given up: {error}")
 
-    def _watch(self, heard: bool) -> None:
+    def _listen(self, heard: bool) -> None:
         now = self._clock()
         if heard:
             if self.silent:
                 self._tell("heard", f"the source is heard again after {now - self._heard:.0f} s")
             self._heard, self.silent = now, False
-        elif not self.silent and now - self._heard > self.silence:
+        elif now - self._heard > self.silence:
             self.silent = True
-            self._tell("silent", f"nothing from the source for {now - self._heard:.0f} s")
