@@ -313,10 +313,10 @@ def test_a_folder_that_may_only_be_read(shared, killed):
 
 def test_a_journal_appears_whole_or_not_at_all(tmp_path):
     path = tmp_path / NAME
-    partial = tmp_path / f"{NAME}.partial"
+    partial = tmp_path / f"{NAME}.0.partial"
     partial.write_bytes(b"SQLite format 3\0 and then it was killed")
     kept = journal(path)
-    assert not partial.exists()
+    assert [*kept] == []
     kept.close()
     with pytest.raises(lp.RunError, match="already; go on with it"):
         journal(path)
@@ -805,12 +805,13 @@ def test_a_folder_whose_making_was_ended_is_made_again(tmp_path):
         shutil.rmtree(folder)
 
 
-def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path):
+def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
     options = {"version": "1", "case": "a = 1\n"}
     path = tmp_path / "run"
     RunWriter.create(path, command=["x"], title="A run", **options)
-    (path / "run.json.partial").mkdir()
-    with pytest.raises(lp.RunError, match="cannot be written: Is a directory; make room"):
+    monkeypatch.setattr("livepde.whole.secrets.token_hex", lambda size: "0")
+    (path / "run.json.0.partial").mkdir()
+    with pytest.raises(lp.RunError, match="cannot be written: File exists; make room"):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
 
 

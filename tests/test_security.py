@@ -12,7 +12,9 @@ import tomllib
 import urllib.error
 import urllib.request
 import zipfile
+from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,12 +25,14 @@ from typer.testing import CliRunner
 import livepde as lp
 from livepde import cases, checkpoint, runs
 from livepde.cli.program import app
+from livepde.runs import RunWriter
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import LONGEST_BODY, THREADS, Address, Server
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake
 from livepde.streams.sources import LONGEST, Follow, Lines, Rows, json_row
 from livepde.streams.table import Column
+from livepde.whole import replacing, write_bytes
 
 TOKEN = "long-enough-to-be-a-token"
 
@@ -408,3 +412,45 @@ def test_health_and_metrics_ask_for_the_token_too():
         assert ask(monitor, path, Authorization=f"Bearer {TOKEN}")[0] in (200, 404)
     assert TOKEN not in monitor.shown
     monitor.close()
+
+
+def test_nothing_is_written_through_links_of_a_strangers_directory(tmp_path):
+    """Links named as files in the making lead nowhere; a run with links is not gone on with."""
+    run, victim = tmp_path / "run", tmp_path / "victim"
+    victim.write_text("mine")
+    options = {"version": "1", "case": "a = 1\n"}
+    writer = RunWriter.create(run, command=["x"], title="A run", **options)
+    names = ("run.json.partial", "estimates.nc.partial", "checkpoint.npz.partial", "report.md")
+    for name in (*names, "estimates.nc", "checkpoint.npz", "overview.png", "case.toml"):
+        (run / name).unlink(missing_ok=True)
+        (run / name).symlink_to(victim)
+    who = identifier()
+    found = who.run([lp.Sample(row.pop("t"), row) for row in rows(3)]).to_xarray()
+    plain = SimpleNamespace(savefig=lambda file, **options: file.write(b"a figure"))
+    figures = {"overview": lambda: plain}
+    writer.finish(status="finished", dataset=found, identifier=who, figures=figures)
+    assert victim.read_text() == "mine"
+    for name in ("report.md", "estimates.nc", "checkpoint.npz", "overview.png", "run.json"):
+        assert not (run / name).is_symlink()
+    with pytest.raises(lp.RunError, match="is a link"):
+        RunWriter.reopen(run, command=["x"], settings=(), **options)
+
+
+def test_a_file_in_the_making_is_made_by_nobody_else(tmp_path, monkeypatch):
+    monkeypatch.setattr("livepde.whole.secrets.token_hex", lambda size: "0")
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (tmp_path / "a.txt.0.partial").symlink_to(victim)
+    with pytest.raises(FileExistsError):
+        write_bytes(tmp_path / "a.txt", b"new")
+    assert victim.read_text() == "mine"
+    (tmp_path / "a.txt.0.partial").unlink()
+    (tmp_path / "a.txt").symlink_to(victim)
+    write_bytes(tmp_path / "a.txt", b"new", sync=True)
+    assert (tmp_path / "a.txt").read_bytes() == b"new"
+    assert victim.read_text() == "mine"
+    with suppress(ZeroDivisionError), replacing(tmp_path / "a.txt") as partial:
+        partial.write_text("half")
+        _ = 1 // 0
+    assert (tmp_path / "a.txt").read_bytes() == b"new"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["a.txt", "victim"]

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -269,12 +269,21 @@ def concluded(
     """
     from livepde.linalg import in_use
     from livepde.runs import arrivals, checks_of, doubts, input_notes, tables
+    from livepde.runs.outcome import attempted
 
-    dataset = driven.result.to_xarray()
-    shown = [*tables(dataset), *arrivals(driven.journal)]
-    checks = checks_of(loaded.expected, dataset)
+    notes: list[str] = []
+    nothing: list[Any] = []
+    found = attempted("The estimate of the end", driven.result.to_xarray, None, notes)
+    dataset = driven.journal.dataset() if found is None else found
+    writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
+    shown = [
+        *attempted("The tables", lambda: tables(dataset), nothing, notes),
+        *attempted("The table of irregular rows", lambda: arrivals(driven.journal), nothing, notes),
+    ]
+    checks = attempted("The checks", lambda: checks_of(loaded.expected, dataset), nothing, notes)
     driving = loaded.frame.roles("boundary", "input")
-    notes = [*loaded.notes, *doubts(dataset), *input_notes(driven.journal, driving)]
+    notes[:0] = [*loaded.notes, *attempted("The doubts", lambda: doubts(dataset), nothing, notes)]
+    notes += input_notes(driven.journal, driving)
     if (engine := in_use()) is not None:
         notes.append(f"Large systems were solved by {engine.reason}.")
         if "resumed" in writer.record:
@@ -283,7 +292,7 @@ def concluded(
                 "these solvers, not to the last digit."
             )
     if len(driven.result):
-        notes += _traded(loaded, identifier)
+        notes += attempted("Identifiability", lambda: _traded(loaded, identifier), nothing, notes)
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:

@@ -52,6 +52,7 @@ from livepde.runs.database import (
     writer,
 )
 from livepde.runs.packing import layout_from, packed, unpacked
+from livepde.whole import replacing
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -175,12 +176,9 @@ class Journal:
                     f"{path}: there is a journal already; go on with it (--resume), or choose "
                     "another folder."
                 )
-            partial = path.with_name(path.name + ".partial")
-            partial.unlink(missing_ok=True)
-            with closing(sqlite3.connect(partial)) as new:
+            with replacing(path) as partial, closing(sqlite3.connect(partial)) as new:
                 new.execute("PRAGMA journal_mode = MEMORY")  # no second file beside it
                 _fill(new, meta)
-            partial.replace(path)
             return cls(path, writer(path), lock)
 
     @classmethod
@@ -252,7 +250,7 @@ class Journal:
 
     def _enter(self, t: float, channels: bytes, position: str) -> None:
         self._newest += 1
-        self._insert("samples", self._newest, t, channels, position)
+        self._insert("samples", self._newest, float(t), channels, position)
         self._current = self._newest
 
     def _insert(self, table: str, *values: Any, conflict: str = "") -> None:
@@ -308,7 +306,7 @@ class Journal:
         self._insert(
             "estimates",
             self._current,
-            record.t,
+            float(record.t),
             record.status,
             record.steps,
             b"".join(np.asarray(values, dtype=float).tobytes() for values in found),
@@ -367,7 +365,7 @@ class Journal:
     def note(self, event: Event) -> None:
         """Keep an event; one that was kept before a crash is not kept twice."""
         message = event.message[:LONGEST].encode(errors="replace").decode()
-        told = (event.t, event.kind, event.channel, message)
+        told = (float(event.t), event.kind, event.channel, message)
         self._execute(
             "INSERT INTO events (t, kind, channel, message, crc) VALUES (?, ?, ?, ?, ?) "
             "ON CONFLICT DO NOTHING",

@@ -20,6 +20,7 @@ from livepde.laws import numerical
 from livepde.result import Estimate, Result
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
+from livepde.runs.outcome import attempted
 from livepde.streams.intake import Ready, Remark
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
@@ -239,12 +240,19 @@ class Live:
     def _conclude(self) -> None:
         if self.journal.accepted > self.journal.estimated:
             return  # stopped within a step: from the checkpoint before, it is taken again
+        notes: list[str] = []
+        attempted("What is under way at the end", self._settled, None, notes)
+        for note in notes:
+            self._tell("unfinished", note)
+        self.journal.checkpoint(self.identifier.dump())
+
+    def _settled(self) -> None:
+        """Keep the estimate and the fields of the end."""
         last = self.result.last
         if last is not None:
             self.result.settle(last := self.identifier.settled(last))
         if self.journal.estimated:
             self.journal.keep(self.result.snapshot(last or self.identifier.estimate()))
-        self.journal.checkpoint(self.identifier.dump())
 
     def _run(self) -> None:
         while not self.stopping.is_set():

@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 MOST_ROWS = 40
+DIGITS = 15  # of a number
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
 ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, too
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
@@ -57,7 +58,9 @@ def digits(value: float, std: float) -> tuple[str, str]:
     if value and not 1e-3 <= abs(value) < 1e5:
         power = math.floor(math.log10(abs(value)))
     scale = 10.0**power
-    places = max(0, 1 - math.floor(math.log10(std / scale)))
+    places = max(0, 1 + power - math.floor(math.log10(std)))
+    if places > DIGITS or std / scale > 10.0**DIGITS:  # no digits of one in the other
+        return f"{value:.5g}", f"{std:.2g}"
     exponent = f"e{power:+03d}" if power else ""
     return f"{value / scale:.{places}f}{exponent}", f"{std / scale:.{places}f}{exponent}"
 
