@@ -16,7 +16,7 @@ from livepde.cases.data import read_data
 from livepde.cases.sources import Data, limits_of, policy_of, publishers_of, source_of
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
-from livepde.runs.feeds import Feed, Gathered, Paced, Samples
+from livepde.runs.feeds import Feed, Gathered, Paced, Samples, shifted
 from livepde.runs.journal import Journal
 from livepde.runs.live import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
@@ -142,6 +142,8 @@ class Wiring:
             self.prepared, waiting = found
         if self._journal is None:
             self._journal = self._stack.enter_context(self.prepared.journal(self._path))
+        if self._intake is not None:
+            self._intake.past = self._journal
         backlog, retention, silence = self._limits
         live = Live(
             self.prepared.identifier,
@@ -221,6 +223,7 @@ class Wiring:
             self._origin = table.origin
             return Samples(table, after=last)
         begun = None if journal is None else journal.layout.attrs.get("origin")
+        shift, position = shifted("" if journal is None else journal.position)
         self._intake = Intake(
             case.columns,
             case.clock,
@@ -229,9 +232,10 @@ class Wiring:
             origin=None if journal is None else _seconds(begun),
             dates=None if journal is None else begun is not None,
             last=last,
+            shift=shift,
             recent=[(one.t, one.values) for one in journal.recent(RECENT)] if journal else (),
         )
-        position = "" if journal is None else journal.position
+        self._intake.past = journal
         return Gathered(source_of(case.frame, data, position), self._intake)
 
 

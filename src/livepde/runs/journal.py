@@ -64,6 +64,7 @@ FORMAT = 2
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
+FEW = 64  # samples that are looked at to know a row again
 TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
 LONGEST = 2000  # characters of the message of an event
 
@@ -463,6 +464,39 @@ class Journal:
     def recent(self, count: int) -> list[Taken]:
         """Return the last accepted samples, oldest first."""
         return [*self._samples("ORDER BY id DESC LIMIT ?", count)][::-1]
+
+    def between(self, low: float, high: float) -> list[tuple[float, dict[str, float]]]:
+        """Return the first samples from one time to another, at most a few."""
+        start = self._number_at(low)
+        found = self._samples("WHERE id >= ? ORDER BY id LIMIT ?", start, FEW)
+        return [(one.t, one.values) for one in found if one.t <= high]
+
+    def _number_at(self, t: float) -> int:
+        """Return the number of the first sample that is not earlier than a time: by halving."""
+        low, high = 0, self._newest + 1
+        while low < high:
+            middle = (low + high) // 2
+            rows = self._read("SELECT id, t FROM samples WHERE id >= ? ORDER BY id LIMIT 1", middle)
+            if not rows or rows[0][1] >= t:
+                high = middle
+            else:
+                low = rows[0][0] + 1
+        return low
+
+    def returns_to(self, t: float) -> bool:
+        """Return whether all samples later than a time can be withdrawn."""
+        before = self._number_at(math.nextafter(t, math.inf)) - 1
+        numbers = [n for (n,) in self._read("SELECT id FROM checkpoints WHERE id <= ?", before)]
+        return before > 0 and bool(numbers or not self._thinning()[0])
+
+    def go_back(self, t: float) -> None:
+        """Withdraw all samples later than a time, with what came of them; for good."""
+        first = self._number_at(math.nextafter(t, math.inf))
+        later = self._read("SELECT id FROM samples WHERE id >= ? ORDER BY id DESC", first)
+        for (number,) in later:
+            self._forget(int(number))
+        self._write(self._db.commit)
+        self._last = self._current = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
 
     @property
     def position(self) -> str:

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -70,6 +70,8 @@ class Backlog:
         oldest = [waiting.popleft() for _ in range(excess)]
         if self.overflow == "merge":
             waiting.appendleft(_merged([*oldest, waiting.popleft()]))
+        elif waiting:
+            waiting[0] = replace(waiting[0], since=_since([*oldest, waiting[0]]))
         return oldest
 
     def has_room(self, waiting: deque[Ready]) -> bool:
@@ -100,7 +102,13 @@ def _merged(samples: Sequence[Ready]) -> Ready:
             if np.isfinite(value):
                 values.setdefault(channel, []).append(value)
     mean = {channel: float(np.mean(several)) for channel, several in values.items()}
-    return Ready(samples[-1].t, mean, tuple(t for sample in samples for t in sample.tokens))
+    tokens = tuple(t for sample in samples for t in sample.tokens)
+    return Ready(samples[-1].t, mean, tokens, _since(samples))
+
+
+def _since(samples: Iterable[Ready]) -> float | None:
+    """Return the earliest time after which samples are to be taken back, None for none."""
+    return min((s.since for s in samples if s.since is not None), default=None)
 
 
 class Live:
@@ -196,7 +204,13 @@ class Live:
 
         A sample with which the process has ended again and again is set aside.
         """
-        reached = self.journal.estimated
+        again = self._again(self.journal.estimated)
+        if again and self.result.last is not None:
+            self._put(self.result.last)
+        return again
+
+    def _again(self, reached: int) -> int:
+        """Go back to the last checkpoint and take again what came after it, `reached` at most."""
         state = self.journal.rewind()
         self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
         self.result = self._read()
@@ -210,8 +224,6 @@ class Live:
             if new:
                 self.journal.commit()  # its step did end
             again += 1
-        if again and self.result.last is not None:
-            self._put(self.result.last)
         return again
 
     def _read(self) -> Result:
@@ -292,7 +304,7 @@ class Live:
                 self._refusal = f"{remark.kind}: {remark.message}"
             self._counts[remark.kind, remark.channel] += remark.number
             self.journal.count(remark.kind, remark.channel, remark.number)
-            if (remark.kind, remark.channel) not in self._remarked:
+            if remark.kind == "clock" or (remark.kind, remark.channel) not in self._remarked:
                 self._remarked.add((remark.kind, remark.channel))
                 self._tell(remark.kind, remark.message, remark.channel)
 
@@ -379,11 +391,18 @@ class Live:
             self._tell("well", "all is well again")
 
     def _take(self, ready: Ready) -> None:
+        if ready.since is not None:
+            self._go_back(ready.since)
         position = self.feed.position(self._waiting)
         self._count(self.feed.remarks(self._waiting))
         taken = self.journal.accept(ready.t, ready.values, position)
         self.feed.acknowledge(ready)
         self._step(taken)
+
+    def _go_back(self, t: float) -> None:
+        """Take back the samples later than a time, and stand where they had not come yet."""
+        self.journal.go_back(t)
+        self._again(self.journal.estimated)
 
     def _step(self, taken: Taken, *, again: bool = False) -> None:
         self.busy = True
