@@ -118,3 +118,15 @@ def test_what_is_wrong_in_a_program_is_raised():
         who.step(*sample(5))
     assert numerical(ValueError("operands could not be broadcast")) is None
     assert numerical(RuntimeError("no thread")) is None
+
+
+@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+def test_a_step_of_no_length_to_speak_of_is_no_crash(law):
+    who = rod(law)
+    who.step(*sample(0))
+    _, z, inputs = sample(1)
+    estimate = who.step(5e-324, z, inputs)
+    assert np.isfinite(estimate.q).all()
+    for k in range(1, 4):
+        estimate = who.step(*sample(k))
+    assert estimate.status.ok

@@ -552,3 +552,26 @@ def test_health_and_metrics(tmp_path):
     with pytest.raises(lp.RunError, match="choose another port"):
         Monitor(Address(port=monitor.port), dict, metrics)
     monitor.close()
+
+
+def test_two_columns_of_one_name_are_told(tmp_path):
+    """And not only missing: nobody would know why."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,a,a,,\n0,1,2,,\n1,1,2,,\n")
+    source = Follow(path)
+    first, *rest = source.poll(0.0)
+    source.close()
+    assert first.broken == "two columns are called 'a', and none of them is taken: rename one"
+    assert [row.values["t"] for row in rest] == ["0", "1"]
+    assert all("a" not in row.values for row in rest)
+
+
+def test_a_followed_file_in_utf_16_is_named(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,a\n0,1\n1,2\n", encoding="utf-16")
+    source = Follow(path)
+    found = source.poll(0.0)
+    source.close()
+    assert found
+    assert all("UTF-16" in row.broken for row in found if row.broken)
+    assert found[0].broken == "the file is in UTF-16, not to be followed: write UTF-8"

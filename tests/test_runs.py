@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
 import warnings
 
@@ -408,3 +409,16 @@ def test_the_last_fields_that_cannot_be_computed_are_an_event(tmp_path, monkeypa
     (event,) = driven.journal.events
     assert event.kind == "unfinished"
     assert "SVD did not converge" in event.message
+
+
+def test_a_report_holds_no_html_of_titles_and_notes():
+    text = markdown(
+        "<script>alert(1)</script>",
+        [Table("<b>T</b>", ("a<br>",), [("<img src=x>", 1.0)])],
+        [Check("<i>", 1.0, 2.0, "<=")],
+        ["<!-- hidden", "a < b"],
+    )
+    assert not re.search("<[A-Za-z/!?]", text)
+    assert "&lt;script>" in text
+    assert "a < b" in text
+    assert "| <= |" in text

@@ -54,6 +54,7 @@ RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
 JOURNAL = "journal.sqlite"
 LONGEST = 10_000_000  # bytes of a record
+MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
 WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
 
 
@@ -450,7 +451,7 @@ def markdown(
         parts.append(_markdown_table(Table("Checks", ("number", "value", "", "bound", ""), rows)))
     parts += [f"> {note}" for note in notes]
     parts += [f"![{name.removesuffix('.png')}]({name})" for name in figures]
-    return "\n\n".join(parts) + "\n"
+    return MARKUP.sub("&lt;", "\n\n".join(parts)) + "\n"
 
 
 def bound_text(check: Check) -> str:

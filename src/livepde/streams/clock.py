@@ -165,8 +165,10 @@ def is_naive(cell: Any, clock: Clock) -> bool:
 def number_of(cell: Any, decimal: str = ".") -> float | None:
     """Return a number or a number as text, None if it is neither."""
     try:
-        if isinstance(cell, str) and decimal != ".":
-            cell = cell.translate(POINT)
+        if isinstance(cell, str):
+            if "_" in cell:  # which Python reads as 1000 in 1_000
+                return None
+            cell = cell if decimal == "." else cell.translate(POINT)
         return None if isinstance(cell, bool) else float(cell)
     except (TypeError, ValueError, OverflowError):
         return None
