@@ -491,6 +491,7 @@ def peers(
 
 
 KILLS, LENGTH, BROKEN = Count(200, 4), Count(2000, 400), Count(100_000, 2000)
+FLIPS = Count(200, 20)
 
 
 @app.command()
@@ -501,10 +502,14 @@ def faults(
         int, LENGTH.option("Samples of a run that is killed.", least=50)
     ] = LENGTH.usual,
     malformed: Annotated[int, BROKEN.option("Broken rows and messages.")] = BROKEN.usual,
+    flips: Annotated[int, FLIPS.option("Damaged journals.")] = FLIPS.usual,
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="One of file, mqtt, restart, malformed, messages. Repeat it."),
+        typer.Option(
+            help="One of file, mqtt, restart, malformed, messages, journals, clocks, visitors, "
+            "cases. Repeat it."
+        ),
     ] = None,
     quick: Annotated[
         bool,
@@ -514,7 +519,7 @@ def faults(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Kill runs, take their sources away, feed them broken rows, and count what is lost.
+    """Kill runs, take their sources away, feed them broken rows, damage their journals and clocks.
 
     Example:  python -m benchmarks faults --kills 20 --only file
     """
@@ -527,6 +532,7 @@ def faults(
         KILLS.of(context, "kills"),
         LENGTH.of(context, "samples"),
         BROKEN.of(context, "malformed"),
+        FLIPS.of(context, "flips"),
         seed,
         only or (),
         progress=True,

@@ -39,6 +39,7 @@ COUNTS = {  # keys that say how much is kept or tried -> the most
 }
 OTHER = 1_000_000_000  # of any other whole number
 FREE = ("data.missing",)  # keys whose numbers only stand for something
+NAMES = 10_000  # of a table
 UNIT = 100  # characters of a unit
 LONGEST = 200  # characters of a name
 POWER = r"(?:\^|\*\*)"
@@ -57,7 +58,7 @@ def check_text(text: str, where: str) -> None:
 
 def check_document(document: Mapping[str, Any], where: str) -> None:
     """Refuse numbers and depths that no case needs."""
-    for key, value, depth in _values(document, "", 0):
+    for key, value, depth in _values(document, where):
         if depth > DEPTH:
             text = f"more than {DEPTH} tables or lists within one another"
             raise CaseError(f"{where}: {key[:LONGEST]}: {text}.")
@@ -77,14 +78,19 @@ def _digits(value: int) -> str:
     return str(value) if abs(value) < 10**20 else f"a number of {value.bit_length()} bits"
 
 
-def _values(value: Any, key: str, depth: int) -> Iterator[tuple[str, Any, int]]:
+def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
     """Iterate over all values with their keys; what is too deep is not looked into."""
-    stack = [(key, value, depth)]
+    stack: list[tuple[str, Any, int]] = [("", value, 0)]
     while stack:
         key, value, depth = stack.pop()
         if depth > DEPTH or not isinstance(value, Mapping | list):
             yield key, value, depth
         elif isinstance(value, Mapping):
+            if len(value) > NAMES:
+                what = key or "the case"
+                raise CaseError(
+                    f"{where}: {what} has {len(value)} names; expected at most {NAMES}."
+                )
             stack += [(f"{key}.{n}" if key else n, v, depth + 1) for n, v in value.items()]
         else:
             stack += [(key, item, depth + 1) for item in value]
