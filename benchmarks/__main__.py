@@ -168,6 +168,25 @@ def fleet(
     _report(context, _both(separate, rods()), as_json)
 
 
+STORED = Count(8000, 2000)
+
+
+@app.command()
+def replay(
+    context: typer.Context,
+    samples: Annotated[int, STORED.option("Samples of the run.", least=100)] = STORED.usual,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer samples.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Time the longest call while stored samples are assimilated again.
+
+    Example:  python -m benchmarks replay --samples 2000
+    """
+    from benchmarks.replay import replay as benchmark
+
+    _report(context, benchmark(STORED.of(context, "samples")), as_json)
+
+
 LOOPS = Count(5, 1)
 
 

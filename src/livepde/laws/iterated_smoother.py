@@ -72,7 +72,7 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
         if one is not None:
             ends.append(_descended(samples, one))
         if ends and ends[-1] is one and one.misfit <= samples.usual_misfit:
-            break  # linear where the filter is, which explains the samples: no other basin is better
+            break  # linear where the filter is, and that explains the samples
     if not ends:
         return None
     best = min(ends, key=lambda one: one.misfit)
