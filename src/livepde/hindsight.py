@@ -10,14 +10,14 @@ import numpy as np
 
 from livepde.laws import Belief, FixedInterval, Problem, Status
 from livepde.linalg import Array
-from livepde.records import Record
+from livepde.records import SMOOTHED, Record, bare
 from livepde.result import Estimate, Result
 from livepde.stepping import Interval
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Hindsight"]
+__all__ = ["Hindsight", "with_smoothed"]
 
 
 class Hindsight:
@@ -93,3 +93,20 @@ class Hindsight:
         withheld = 0 if result.withheld is None else result.withheld.size
         unseen = np.full(result.observed.size, np.nan), np.full(withheld, np.nan)
         return Estimate(t, belief, *unseen, status, 0, nothing, (), result.model.parameter_space)
+
+
+def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:
+    """Return the dataset of a run with what is smoothed beside it: `k_smoothed`, `k_smoothed_std`.
+
+    Parameters
+    ----------
+    smoothed
+        Of the same samples, as `Identifier.smoothed` returns it.
+    """
+    attrs, found = data.attrs, {}
+    own = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}
+    for key, variable in smoothed.data_vars.items():
+        name = key if key in own else bare(str(key))
+        if name in own:
+            found[f"{name}{SMOOTHED}{str(key).removeprefix(str(name))}"] = variable.variable
+    return data.assign(found)

@@ -457,6 +457,11 @@ class Identifier:
             result.settle(self.settled(result.last))
         return result
 
+    @property
+    def unsmoothed(self) -> str:
+        """Why the law smooths nothing; empty if it does."""
+        return self.law.unsmoothed(self._work)
+
     def smoothed(self, stream: Iterable[Any], *, fields_every: int = 1) -> xr.Dataset:
         """Return what unknowns and state were at each sample of a run, given all of them.
 
@@ -486,7 +491,7 @@ class Identifier:
                 "smoothed takes a run from its first sample on: call it of an identifier that has "
                 "taken none."
             )
-        if why := self.law.unsmoothed(self._work):
+        if why := self.unsmoothed:
             raise LawError(f"smoothed: {why}; take SensitivityLaw or AutoLaw.")
         who, run, before = copy.copy(self), Hindsight(self._q0), self._state
         for item in stream:

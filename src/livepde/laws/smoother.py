@@ -14,7 +14,7 @@ mu = 0 and B = I at the end (Rauch, Tung and Striebel 1965):
     mu = g + T^T mu',    B = upper triangle of a QR factorisation of [B' T; R]
 
 All is linear about one trajectory of the unknowns. It begins at the estimates of the run, of what
-stays at the last one, and is moved to the smoothed one by damped Gauss-Newton steps that make
+stays at its last one, and is moved to the smoothed one by damped Gauss-Newton steps that make
 samples and prior together more probable (Bell 1994), until these change it by less than a tenth of
 a standard deviation.
 """
@@ -40,7 +40,7 @@ from livepde.stepping import KeptFactors
 __all__ = ["smoothed"]
 
 ITERATIONS = 6  # Gauss-Newton steps at most
-HALVINGS = 3  # of a step that makes samples and prior less probable
+HALVINGS = 2  # of a step that makes samples and prior less probable
 CONVERGED = 0.1  # standard deviations that a step moves the trajectory by, at the end of it
 STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 ROUNDING = 1e-12  # share of a variance
@@ -158,14 +158,15 @@ class _FixedInterval:
 
     @property
     def estimated(self) -> Array:
-        """Trajectory of the run's estimates, of unknowns that stay the last one."""
-        reduction = self.work.filter.reduction
+        """Trajectory of the run's estimates; what gains nothing is traced back from later ones."""
+        reduction, none = self.work.filter.reduction, np.zeros((1, self.work.filter.reduction.size))
         prior = self.work.filter.problem.model.latent.prior
-        found = reduction.reduced(np.array(self.data.q) - prior)
-        stays = np.full(reduction.size, not self.work.filter.drift.any()) & reduction.still
-        if self.jumps:
-            stays &= ~self.work.jumping
-        return np.where(stays, found[-1], found)
+        a = np.atleast_2d(reduction.reduced(np.array(self.data.q) - prior))
+        for number, interval in reversed(list(enumerate(self.data.intervals))):
+            h = interval.t1 - interval.t0
+            back = np.linalg.solve(reduction.transition(h), a[number + 1])
+            a[number] = np.where(self._gained(none, number, h) > 0.0, a[number], back)
+        return a
 
     def about(self, trajectory: Array) -> _Pass | None:
         """Filter the samples, linear about a trajectory; None if that fails."""
@@ -188,7 +189,7 @@ class _FixedInterval:
                 x = filter_.relinearised(x)
             elif self.moves:
                 x = expecting(filter_, x, trajectory[number], h)
-            gained = self._gained(x, number - 1, h)
+            gained = self._gained((x.C**2).sum(axis=1), number - 1, h)
             x, P = self._predicted(x, number - 1)
             if P is None:
                 return None
@@ -219,11 +220,11 @@ class _FixedInterval:
             x = assimilate_at_once(filter_, x, span, self.work.options)
         return x, misfit
 
-    def _gained(self, x: FilterState, number: int, h: float) -> Array:
+    def _gained(self, variance: Array, number: int, h: float) -> Array:
         """Return the variance that coordinates gain in an interval, with a jump, shape (k,)."""
         filter_, jumps = self.work.filter, self.work.jumps
-        variance = (x.C**2).sum(axis=1)
-        gained = filter_.reduction.gained(h, variance, filter_.drifts(x.member))[0]
+        drifts = filter_.drifts(self.window.now.member)
+        gained = filter_.reduction.gained(h, variance, drifts)[0]
         if jumps is not None and number in self.jumps:
             F = filter_.reduction.transition(h)
             gained = gained + jumps.size**2 * (F**2 @ self.work.jumping)
