@@ -43,6 +43,7 @@ from livepde.laws.sensitivity_state import (
     new_window,
     restarted,
 )
+from livepde.laws.smoother import evidence, smoothed
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Alexander2, Interval, Scheme
 
@@ -387,16 +388,23 @@ class AutoLaw(Law[Bank, AutoState]):
     def smoothed(
         self, work: Bank, before: AutoState, after: AutoState, data: FixedInterval
     ) -> Iterator[Belief]:
-        """Smooth by the member that leads at the end, as if it had led from the start."""
+        """Smooth by the one member that makes all samples most probable.
+
+        Who leads at the end need not have led before.
+        """
         if not after.known:
             return iter([self.belief(work, after)] * (1 + len(data.intervals)))
-        leader, after = after.leader, self.settled(work, after)
-        last = take(after.members, after.at(leader))
+        after = self.settled(work, after)
+        last = take(after.members.now, after.at(after.leader))
         begun = before if before.known else self._initial(work, before.start, after.noise)
-        first = take(begun.members, begun.at(leader))
-        filters = work.filters(after.tick, after.noise)
-        jumps = None if work.candidates[leader].drift else JUMPS  # what drifts follows by itself
-        return self.member.smoothed(replace(filters, jumps=jumps), first, last, data)
+        filters = replace(work.filters(after.tick, after.noise), jumps=JUMPS)
+        each, chances = [], []
+        for k, chance in enumerate(work.chances.tolist()):
+            first, now = take(begun.members, begun.at(k)), changed(last, member=np.array([k]))
+            each.append((filters, first, now, data))
+            chances.append(chance + evidence(*each[-1]))
+        best = each[int(np.argmax(chances))]
+        return (self.member.member_belief(filters, x, 0) for x in smoothed(*best))
 
     def suspended(self, work: Bank, state: AutoState) -> AutoState:
         filters = work.filters(state.tick, np.ones_like(state.noise))

@@ -37,7 +37,7 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array
 from livepde.stepping import KeptFactors
 
-__all__ = ["smoothed"]
+__all__ = ["evidence", "smoothed"]
 
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 2  # of a step that makes samples and prior less probable
@@ -82,6 +82,20 @@ def smoothed(
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # not finite: not used
         best = _descended(_FixedInterval(work, before, after, data))
     return _backward(best, after)
+
+
+def evidence(
+    work: SensitivityWork, before: SensitivityState, after: FilterState, data: FixedInterval
+) -> float:
+    """Return the logarithm of the likelihood of all samples, linear about the run's estimates.
+
+    Minus infinity where they cannot be followed. Parameters as for `smoothed`.
+    """
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        samples = _FixedInterval(work, before, after, data)
+        samples.work = replace(work, options=replace(work.options, adaptive=True))
+        found = samples.about(samples.estimated)
+    return float(found.points[-1].x.evidence[0]) if found is not None else -np.inf
 
 
 def _descended(samples: _FixedInterval) -> _Pass:
