@@ -7,8 +7,9 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,7 @@ from livepde import checkpoint
 from livepde.channels import Channels
 from livepde.errors import (
     ConfigurationError,
+    LawError,
     MissingInputError,
     RunError,
     SampleError,
@@ -24,6 +26,7 @@ from livepde.errors import (
 )
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
+from livepde.hindsight import Hindsight
 from livepde.laws import AnyLaw, Belief, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.model import Model
@@ -31,6 +34,9 @@ from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Sample, number, numbers, sample_of
 from livepde.stepping import Advance, Interval, Scheme
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["Identifier", "Sample"]
 
@@ -438,15 +444,68 @@ class Identifier:
             Keep the fields of every so many samples (scalars and innovations of all).
         """
         result = Result(self.model, self.observed, self.withheld, fields_every)
+        begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
+        result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
         for item in _watched(stream, progress, total):
             sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
             result.add(estimate)
+            taken.append(Sample(sample.t, copy.copy(sample.z), copy.copy(sample.inputs)))
             if on_estimate is not None:
                 on_estimate(estimate)
         if result.last is not None:
             result.settle(self.settled(result.last))
         return result
+
+    @property
+    def unsmoothed(self) -> str:
+        """Why the law smooths nothing; empty if it does."""
+        return self.law.unsmoothed(self._work)
+
+    def smoothed(self, stream: Iterable[Any], *, fields_every: int = 1) -> xr.Dataset:
+        """Return what unknowns and state were at each sample of a run, given all of them.
+
+        A fixed-interval smoother: see `livepde.laws.smoother`. All samples are taken by a copy of
+        this identifier, as in a run, and then at least once more; this one stays as it is.
+
+        Parameters
+        ----------
+        stream, fields_every
+            As for `run`.
+
+        Returns
+        -------
+        smoothed
+            As `Result.to_xarray` of the run, without innovations and notes. What is constant has
+            one value at all times: the last one.
+
+        Raises
+        ------
+        ConfigurationError
+            An identifier that has taken a sample.
+        LawError
+            A law without a covariance that a smoother could follow.
+        """
+        if self._samples:
+            raise ConfigurationError(
+                "smoothed takes a run from its first sample on: call it of an identifier that has "
+                "taken none."
+            )
+        if why := self.unsmoothed:
+            raise LawError(f"smoothed: {why}; take SensitivityLaw or AutoLaw.")
+        who, run, before = copy.copy(self), Hindsight(self._q0), self._state
+        for item in stream:
+            sample = sample_of(item)
+            t, z, inputs = who._t, who._z, who._inputs
+            estimate = who.step(sample.t, sample.z, sample.inputs)
+            if before is None:  # the law begins with the inputs of the first sample
+                before, inputs = self._start(who._inputs), who._inputs
+            interval = Interval(t, who._t, inputs, who._inputs, z, who._z)
+            run.add(estimate, interval, who.latent_belief().q)
+        result = Result(self.model, self.observed, self.withheld, fields_every)
+        data = run.fixed_interval(fields_every)
+        beliefs = data and self.law.smoothed(self._work, before, who._state, data)
+        return run.dataset(result, self.problem, beliefs or ())
 
     def _reachable(self, t: float) -> None:
         """Refuse a time that is too many substeps away."""

@@ -25,6 +25,7 @@ __all__ = [
     "FIELD_ENDS",
     "NOTE",
     "NUMBER_ENDS",
+    "SMOOTHED",
     "STATE_ENDS",
     "STATUS_CODES",
     "Layout",
@@ -39,6 +40,7 @@ __all__ = [
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 
 NOTE = "note_"  # what a note is called whose own name is taken
+SMOOTHED = "_smoothed"  # after the name of a variable that is given all samples of a run
 DATE = "date"  # column of an exported table, beside the variables of the dataset
 # What stands beside an unknown or a component of the state: end of the variable's name -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
@@ -482,6 +484,9 @@ def name_clashes(
                 uses[name].append("a note of the law")
             for end, meaning in ends.items():
                 uses.setdefault(f"{name}{end}", []).append(f"{meaning} of '{name}'")
+            for end in ("", *STATE_ENDS, *INTERVAL_ENDS):
+                smoothed = uses.setdefault(f"{name}{SMOOTHED}{end}", [])
+                smoothed.append(f"a smoothed variable of '{name}'")
     return [
         f"in tables and datasets of a run '{name}' would be {' and '.join(both)}: give the "
         f"{'unknown' if any('unknown' in use for use in both) else 'component'} another name."

@@ -407,12 +407,15 @@ class OutputSpec(Spec):
     fields_every: PositiveInt = 24
     retain: Quantity | None = None
     thin: PositiveInt = 1
+    smoothed: StrictBool = False
     mqtt: PublishSpec | None = None
 
     @model_validator(mode="after")
     def _thins_the_past(self) -> OutputSpec:
         if self.thin > 1 and self.retain is None:
             raise ValueError("thin belongs to retain = the time for which all is kept")
+        if self.smoothed and self.retain is not None:
+            raise ValueError("smoothed takes all samples again, which retain does not keep")
         return self
 
 

@@ -36,7 +36,7 @@ from livepde.cli.printing import (
     show,
     terminal,
 )
-from livepde.errors import ConfigurationError
+from livepde.errors import ConfigurationError, LivepdeError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -169,8 +169,7 @@ def run(
             writer.finish(status="interrupted", notes=["Ended before the first sample."])
             raise typer.Exit(INTERRUPTED)
         prepared, driven = taken
-        identifier = prepared.identifier
-        dataset, shown, checks, notes = concluded(loaded, identifier, driven, writer)
+        dataset, shown, checks, notes = concluded(prepared, prepared.identifier, driven, writer)
     if driven.error is not None:
         raise driven.error
     if as_json:
@@ -258,7 +257,12 @@ def batch(
 
 
 def concluded(
-    loaded: Case, identifier: Identifier, driven: Driven, writer: RunWriter, *, draw: bool = True
+    prepared: Prepared,
+    identifier: Identifier,
+    driven: Driven,
+    writer: RunWriter,
+    *,
+    draw: bool = True,
 ) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
     """Write what a run gave; return its dataset, tables, checks and notes.
 
@@ -270,7 +274,7 @@ def concluded(
     from livepde.linalg import in_use
     from livepde.runs import arrivals, checks_of, doubts, input_notes, tables
 
-    dataset = driven.result.to_xarray()
+    loaded, dataset = prepared.case, driven.result.to_xarray()
     shown = [*tables(dataset), *arrivals(driven.journal)]
     checks = checks_of(loaded.expected, dataset)
     driving = loaded.frame.roles("boundary", "input")
@@ -284,6 +288,9 @@ def concluded(
             )
     if len(driven.result):
         notes += _traded(loaded, identifier)
+    if loaded.smoothed:
+        dataset, told = _with_smoothed(prepared, driven, dataset)
+        notes += told
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
@@ -298,6 +305,23 @@ def concluded(
         figures=figures_of(dataset, loaded.title) if draw and can_draw(terminal(err=True)) else {},
     )
     return dataset, shown, checks, notes
+
+
+def _with_smoothed(
+    prepared: Prepared, driven: Driven, dataset: xr.Dataset
+) -> tuple[xr.Dataset, list[str]]:
+    """Return the dataset of a run with what is smoothed beside it, or a note why it is not."""
+    from livepde.hindsight import with_smoothed
+
+    if driven.status != "finished" or not len(driven.result):
+        return dataset, ["Nothing is smoothed: the run has not come to its end."]
+    samples = ((taken.t, taken.values) for taken in driven.journal.taken())
+    begun = prepared.identifier_with(prepared.case.law)
+    try:
+        smoothed = begun.smoothed(samples, fields_every=prepared.case.fields_every)
+    except LivepdeError as error:  # what the run has found is kept
+        return dataset, [f"Nothing is smoothed: {error}"]
+    return with_smoothed(dataset, smoothed), []
 
 
 def _traded(loaded: Case, identifier: Identifier) -> list[str]:

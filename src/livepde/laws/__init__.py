@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
 from livepde.laws.auto import AutoLaw
-from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws.base import AnyLaw, Belief, FixedInterval, Law, Problem, Report, Status
 from livepde.laws.bounds import (
     Constants,
     ExactBound,
@@ -33,6 +33,7 @@ __all__ = [
     "Damping",
     "ExactBound",
     "ExcitationGate",
+    "FixedInterval",
     "GradientLaw",
     "Guards",
     "Jumps",

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
+from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 
-__all__ = ["Belief", "Law", "Notes", "Problem", "Report", "Status"]
+__all__ = ["Belief", "FixedInterval", "Law", "Notes", "Problem", "Report", "Status"]
 
 REMEDIES = {
     "ok": "",
@@ -259,6 +260,31 @@ class Report:
     notes: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class FixedInterval:
+    """The samples of a run and its estimates, for a smoother.
+
+    Attributes
+    ----------
+    opening
+        The sample at the initial time as an interval without length, NaN where there is none.
+    intervals
+        From the initial time to the first sample that was taken later, and so on to the last.
+    q
+        Latent parameters estimated at the initial time and after each interval.
+    jumps
+        Numbers of the intervals in which unknowns may have jumped.
+    fields
+        Where the state is asked for: 0 at the initial time, k after the k-th interval.
+    """
+
+    opening: Interval
+    intervals: Sequence[Interval]
+    q: Sequence[Array]
+    jumps: Collection[int]
+    fields: Collection[int]
+
+
 Work = TypeVar("Work")
 State = TypeVar("State")
 
@@ -317,6 +343,24 @@ class Law(ABC, Generic[Work, State]):
         For a forecast: it goes on from the estimate of now, as the next step does.
         """
         return state
+
+    def unsmoothed(self, work: Work) -> str:
+        """Return why the law smooths nothing, empty if it has `smoothed`."""
+        return f"{type(self).__name__} has no covariance that a smoother could follow"
+
+    def smoothed(
+        self, work: Work, before: State, after: State, data: FixedInterval
+    ) -> Iterator[Belief]:
+        """Iterate over beliefs given all samples of a run, from the last one to the initial time.
+
+        Where the state is not asked for the belief has no coefficients of it.
+
+        Parameters
+        ----------
+        before, after
+            State before the first and after the last sample.
+        """
+        raise LawError(f"smoothed: {self.unsmoothed(work)}.")
 
     def stepped_alone(self, work: Work) -> str:
         """Return why the members of a fleet are stepped one by one; empty if as arrays.

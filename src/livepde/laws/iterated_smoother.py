@@ -25,7 +25,7 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
-__all__ = ["apart", "iterated_smoother", "learns"]
+__all__ = ["apart", "expecting", "iterated_smoother", "learns", "missed", "moved"]
 
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
@@ -179,23 +179,27 @@ class _Samples:
         q = known if trajectory is None else prior + beyond + reduction.Phi @ trajectory[0]
         x, misfit = self._placed(q), 0.0
         if self.state.opening[0]:
-            misfit += self._missed(x, self.opening)
+            misfit += missed(filter_, x, self.opening)
             x = assimilate_at_once(filter_, x, filter_.span(self.opening), self.work.options)
         x = self._remembered(x)
         followed = [reduction.reduced(x.q[0] - prior)]
+        nothing = np.zeros((1, reduction.size))
         misfit += float(followed[0] @ followed[0])
         for number, interval in enumerate(self.intervals, start=1):
             h = interval.t1 - interval.t0
             if trajectory is None:
                 x = filter_.relinearised(x)
             elif filter_.moves:
-                x = _about(filter_, x, trajectory[number], h)
+                x = expecting(filter_, x, trajectory[number], h)
             x, told = assimilate(filter_, x, filter_.span(interval), self.work.options)
             if not (told.status.ok and told.finite[0]):
                 return None
             x = self._remembered(x)
             followed.append(reduction.reduced(x.q[0] - prior))
-            misfit += self._missed(x, interval) + self._moved(followed[-2], followed[-1], h)
+            misfit += missed(filter_, x, interval)
+            if filter_.moves:
+                gained = reduction.gained(h, nothing, filter_.drifts(x.member))[0]
+                misfit += moved(filter_, followed[-2], followed[-1], h, gained)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
         smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
         return _Pass(np.array(followed), smoothed, x, misfit)
@@ -210,28 +214,30 @@ class _Samples:
         window = Window(state.start, now, state.start.q[0], initial, opening.end, length)
         return placed(self.work.filter, window, self.work.filter.reduction.bounded(q))
 
-    def _missed(self, x: FilterState, interval: Interval) -> float:
-        """Return the squared misfit of the linearisation point at the end of an interval."""
-        filter_ = self.work.filter
-        alone = changed(x, du=np.zeros_like(x.du), da=np.zeros_like(x.da))
-        predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
-        noise = np.sqrt(x.level[0]) * filter_.noise
-        e = np.abs((interval.z1 - predicted[0]) / noise)
-        beyond = 2.0 * OUTLIER**2 * np.log(np.maximum(e / OUTLIER, 1.0))
-        return float(np.nansum(np.minimum(e, OUTLIER) ** 2 + beyond))
 
-    def _moved(self, before: Array, after: Array, h: float) -> float:
-        """Return the squared increment of a trajectory in a time h, in units of what it gains."""
-        filter_, reduction = self.work.filter, self.work.filter.reduction
-        if not filter_.moves:
-            return 0.0
-        nothing = np.zeros((1, len(before)))
-        gained = reduction.gained(h, nothing, filter_.drifts(self.state.now.member))[0]
-        increment = after - reduction.transition(h) @ before
-        return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())
+def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
+    """Return the squared misfit of the linearisation point at the end of an interval."""
+    alone = changed(x, du=np.zeros_like(x.du), da=np.zeros_like(x.da))
+    predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
+    noise = np.sqrt(x.level[0]) * filter_.noise
+    e = np.abs((interval.z1 - predicted[0]) / noise)
+    beyond = 2.0 * OUTLIER**2 * np.log(np.maximum(e / OUTLIER, 1.0))
+    return float(np.nansum(np.minimum(e, OUTLIER) ** 2 + beyond))
 
 
-def _about(filter_: Filter, x: FilterState, a: Array, h: float) -> FilterState:
+def moved(filter_: Filter, before: Array, after: Array, h: float, gained: Array) -> float:
+    """Return the squared increment of a trajectory in a time h, in units of what it gains.
+
+    Parameters
+    ----------
+    gained
+        Variance that each coordinate gains in that time, shape (k,).
+    """
+    increment = after - filter_.reduction.transition(h) @ before
+    return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())
+
+
+def expecting(filter_: Filter, x: FilterState, a: Array, h: float) -> FilterState:
     """Return a filter whose linearisation point is expected to have the unknowns a in a time h."""
     reduction = filter_.reduction
     now = np.linalg.solve(reduction.transition(h), a)

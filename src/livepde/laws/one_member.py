@@ -260,4 +260,5 @@ def _watched(
         else:
             now = work.filter.relinearised(new.now)
             new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)
+        report = replace(report, notes={**report.notes, "jump_samples": float(len(known) - before)})
     return new, replace(report, notes={**report.notes, "jump": float(alarm)})

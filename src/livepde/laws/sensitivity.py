@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -17,7 +17,7 @@ from livepde.laws.assimilation import (
     assimilate,
     assimilate_at_once,
 )
-from livepde.laws.base import Belief, Law, Problem, Report
+from livepde.laws.base import Belief, FixedInterval, Law, Problem, Report
 from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
@@ -41,6 +41,7 @@ from livepde.laws.sensitivity_state import (
     stored,
 )
 from livepde.laws.sensors import MemberSensors
+from livepde.laws.smoother import smoothed
 from livepde.linalg import Array, Mask
 from livepde.stepping import (
     Alexander2,
@@ -160,6 +161,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             raise LawError(f"SensitivityLaw: start_window must be >= 0; got {self.start_window}.")
         if self.gate_patience < 1:
             raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
+
+    @property
+    def fades(self) -> bool:
+        """True if what the state knows of the unknowns fades."""
+        return bool(np.isfinite(self.memory))
 
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
@@ -404,6 +410,21 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             return state
         due = np.full_like(state.due, NEVER - 1)  # a replay is known as such, and none begins
         return changed(state, replay=ReplayState.none(state.start), due=due)
+
+    def unsmoothed(self, work: SensitivityWork) -> str:
+        return "memory= lets the past fade, which no smoother can follow" if self.fades else ""
+
+    def smoothed(
+        self,
+        work: SensitivityWork,
+        before: SensitivityState,
+        after: SensitivityState,
+        data: FixedInterval,
+    ) -> Iterator[Belief]:
+        if self.fades:
+            return super().smoothed(work, before, after, data)
+        now = self.settled(work, after).now
+        return (self.member_belief(work, x, 0) for x in smoothed(work, before, now, data))
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)

@@ -393,6 +393,20 @@ class Journal:
             self._current = int(rows[0][0])
             yield self._taken(*rows[0])
 
+    def taken(self) -> Iterator[Taken]:
+        """Iterate over all accepted samples that are kept."""
+        number = 0
+        while True:
+            rows = self._read(
+                "SELECT id, t, channels FROM samples WHERE id > ? ORDER BY id LIMIT ?",
+                number,
+                TOGETHER,
+            )
+            if not rows:
+                return
+            yield from (self._taken(*row) for row in rows)
+            number = int(rows[-1][0])
+
     def _taken(self, number: int, t: float, channels: bytes) -> Taken:
         with sound(self.path):
             if len(channels) != 8 * len(self.channels):
