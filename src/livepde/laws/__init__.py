@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
 from livepde.laws.auto import AutoLaw
-from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws.base import AnyLaw, Belief, InitialReading, Law, Problem, Report, Status
 from livepde.laws.bounds import (
     Constants,
     ExactBound,
@@ -35,6 +35,7 @@ __all__ = [
     "ExcitationGate",
     "GradientLaw",
     "Guards",
+    "InitialReading",
     "Jumps",
     "KueglerLaw",
     "Law",

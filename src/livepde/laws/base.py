@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 
-__all__ = ["Belief", "Law", "Notes", "Problem", "Report", "Status"]
+__all__ = ["Belief", "InitialReading", "Law", "Notes", "Problem", "Report", "Status"]
 
 REMEDIES = {
     "ok": "",
@@ -67,6 +67,21 @@ class Status:
         return self.code if self.ok else f"{self.code}: {self.detail}. {self.remedy}"
 
 
+class InitialReading(NamedTuple):
+    """A reading that the initial state was made of.
+
+    Attributes
+    ----------
+    weight
+        How the initial state changes with it, shape (n,).
+    noise
+        Its standard deviation; NaN: that of the sensor or channel.
+    """
+
+    weight: Array
+    noise: float = np.nan
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A model and what is observed of it: where the two meet.
@@ -77,15 +92,15 @@ class Problem:
         The process, its sensors, and how steps are taken.
     input_noise
         Channel of the model -> standard deviation of its noise.
-    initial_weights
-        Channel -> how the initial state changes with its reading at the initial time, shape (n,).
+    initial_readings
+        Channel -> its reading at the initial time, if the initial state was made of it.
     """
 
     model: Model
     observed: Observed
     control: Advance
     input_noise: Mapping[str, float] = field(default_factory=dict)
-    initial_weights: Mapping[str, Array] = field(default_factory=dict)
+    initial_readings: Mapping[str, InitialReading] = field(default_factory=dict)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
@@ -94,7 +109,7 @@ class Problem:
 
     def unread(self, interval: Interval) -> Interval:
         """Return an interval without the readings that the initial state was made of."""
-        used = [name in self.initial_weights for name in self.observed.names]
+        used = [name in self.initial_readings for name in self.observed.names]
         return replace(interval, z1=np.where(used, np.nan, interval.z1)) if any(used) else interval
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
@@ -310,6 +325,10 @@ class Law(ABC, Generic[Work, State]):
         For the estimate at the end of a run: the run goes on from the state that it had.
         """
         return state
+
+    def weighs_readings(self) -> bool:
+        """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
+        return False
 
     def suspended(self, work: Work, state: State) -> State:
         """Return the state without what `step` does in parts and has not ended; here the same.

@@ -161,6 +161,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if self.gate_patience < 1:
             raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
 
+    def weighs_readings(self) -> bool:
+        return True
+
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
         noise = observed.noise
@@ -379,7 +382,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             d = span.z1 - told.predicted
             scale = scale.add(span.z1, d)
             if told.largest.max() > guards.runaway:
-                noise = np.sqrt(before.level)[:, None] * filter_.noise
+                noise = np.sqrt(before.level)[:, None] * filter_.noise_of(span)
                 usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
         if (jumps := self.jumps) is not None and present.any():
             e = x.innovations.newest
