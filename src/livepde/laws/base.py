@@ -187,6 +187,18 @@ class Belief:
         std = _deviation(rows @ self.q_factor[part])
         return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
 
+    def left_out(self, rows: Any, part: slice) -> float:
+        """Return the share of the modes that the law leaves out in the variance of rows @ q[part].
+
+        Of the mean over the rows; 0 without a law that leaves out modes, or without variance.
+        """
+        std = self.deviation(rows, part)
+        if std is None or self.rest is None:
+            return 0.0
+        variance = float(std @ std)
+        rest = abs(rows) @ self.rest[part]
+        return float(rest @ rest) / variance if variance > 0.0 else 0.0
+
     def left(self, rows: Any) -> Array:
         """Return the share of the prior deviation that is left of each of some coefficients of q.
 
