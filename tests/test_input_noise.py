@@ -255,7 +255,7 @@ def test_a_case_states_the_noise_of_its_channels(tmp_path):
     prepared = cases.load(tmp_path / "case.toml").prepare()
     problem = prepared.identifier.problem
     assert problem.input_noise == {"left": 0.2}
-    assert list(problem.initial_weights) == ["left", "T"]
+    assert list(problem.initial_readings) == ["left", "T"]
     result = prepared.identifier.run(prepared.stream)
     assert result.last.belief.u_factor[3].any()
 

@@ -27,12 +27,12 @@ from livepde.errors import (
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
 from livepde.hindsight import Hindsight
-from livepde.laws import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws import AnyLaw, Belief, InitialReading, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
-from livepde.samples import Sample, number, numbers, sample_of
+from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
 from livepde.stepping import Advance, Interval, Scheme
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 4  # of the checkpoint
+FORMAT = 5  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -80,7 +80,7 @@ class Identifier:
     u0_from
         Channel -> how u0 changes with its reading at t0, as u0 is given (a function of x, say): for
         a u0 that was made of readings. Their noise is that of the start then, and they are not
-        assimilated once more.
+        assimilated once more. A pair (how, standard deviation): the noise of this reading.
 
     Raises
     ------
@@ -132,7 +132,7 @@ class Identifier:
         )
         if u0_from and u0 is None:
             raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
-        self.problem = replace(self.problem, initial_weights=self.weights(u0_from or {}))
+        self.problem = replace(self.problem, initial_readings=self.initial_readings(u0_from or {}))
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
@@ -182,8 +182,8 @@ class Identifier:
                 )
         return dict(given)
 
-    def weights(self, u0_from: Mapping[str, Any]) -> dict[str, Array]:
-        """Return how u0 changes with the readings that it was made of, as coefficients."""
+    def initial_readings(self, u0_from: Mapping[str, Any]) -> dict[str, InitialReading]:
+        """Return the readings that u0 was made of; the way u0 changes with them as coefficients."""
         known = {*self.observed.names, *self.model.channels}
         for name in u0_from:
             if name not in known:
@@ -192,7 +192,11 @@ class Identifier:
                     f"those are {sorted(known)}."
                 )
         space = self.model.state_space
-        return {name: space.interpolate(weight) for name, weight in u0_from.items()}
+        found = {}
+        for name, given in u0_from.items():
+            weight, noise = given if isinstance(given, tuple) else (given, math.nan)
+            found[name] = InitialReading(space.interpolate(weight), check_noise(name, noise))
+        return found
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
         """Return an identifier that goes on by itself; model, law and matrices are shared."""
@@ -241,10 +245,10 @@ class Identifier:
     def step(
         self,
         t: float,
-        z: ArrayLike | Mapping[str, float],
+        z: Readings,
         inputs: Mapping[str, float] | None = None,
     ) -> Estimate:
-        """Take one sample and return the estimate at its time.
+        """Take one sample and return the estimate at its time; parameters as of a `Sample`.
 
         A step that fails numerically changes nothing and says so in `status`; the next sample
         tries again from the last good state. One with the status "departed" takes the sample and
@@ -253,7 +257,8 @@ class Identifier:
         Raises
         ------
         SampleError
-            Wrong shape, text, infinity, or an unknown channel.
+            Wrong shape, text, infinity, or an unknown channel; a noise that is not positive, or one
+            for a law that does not weigh readings.
         TimeOrderError
             t is not later than the sample before.
         MissingInputError
@@ -263,7 +268,8 @@ class Identifier:
         t = number(t, "time t")
         if math.isnan(t):
             raise SampleError("time t is NaN; give the time of the sample.")
-        measured, withheld, named = self._channels.parse(z, inputs or {})
+        measured, noise, withheld, named = self._channels.parse(z, inputs or {})
+        self.check_weighs(noise)
         values, held = self._channels.filled(named, self._inputs)
         first = self._samples == 0
         self._reachable(t)
@@ -279,15 +285,23 @@ class Identifier:
             moment = Moment(t, values)
             belief = self._belief()
             report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
-            interval = Interval(t, t, values, values, used, used)
+            interval = Interval(t, t, values, values, used, used, noise)
             self._state = self.law.begin(self._work, self._state, interval)
         else:
-            interval = Interval(self._t, t, self._inputs, values, self._z, used)
+            interval = Interval(self._t, t, self._inputs, values, self._z, used, noise)
             self._state, report = self.law.step(self._work, self._state, interval)
         self._samples += 1
         if report.status.taken:
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held)
+
+    def check_weighs(self, noise: Array | None) -> None:
+        """Refuse the noise of readings where the law does not weigh them; None: there is none."""
+        if noise is not None and not self.law.weighs_readings():
+            raise SampleError(
+                f"{type(self.law).__name__} does not weigh readings by their noise: leave it out "
+                "of the samples."
+            )
 
     def latent_belief(self) -> Belief:
         """Return what the law itself believes: q and its factor in latent coefficients.

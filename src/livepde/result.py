@@ -267,15 +267,16 @@ class Result:
 
     def snapshot(self, estimate: Estimate) -> Snapshot:
         """Return the fields at the vertices."""
-        space, told = self.model.parameter_space, {}
-        for name in space.fields:
+        space, told, left_out = self.model.parameter_space, {}, {}
+        for name, field in space.fields.items():
             left = estimate.belief.modes_left(space.part(name))
             if len(left):
                 told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
+                left_out[name] = estimate.belief.left_out(field.at_vertices, space.part(name))
         profiles = self._profiles(estimate).items()
         order = vertex_order(self.model)
         ordered = {name: values[order] for name, values in profiles}
-        return Snapshot(ordered, told, _correlation(estimate))
+        return Snapshot(ordered, told, _correlation(estimate), left_out)
 
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
         """Return values and deviations of all fields at the vertices."""
@@ -305,8 +306,9 @@ class Result:
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
         with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
         law with covariance also `_left`, the share of the prior deviation of a number that is left;
-        `_modes`, of how many modes of a field the data have told, over `snapshot`; and
-        `correlation` of the last numbers, over (`unknown`, `other`).
+        `_modes`, of how many modes of a field the data have told, and `_left_out`, the share of the
+        modes that the law leaves out in its mean variance, over `snapshot`; and `correlation` of
+        the last numbers, over (`unknown`, `other`).
         """
         records, last = RecordArrays.of(self.records), None
         if self.last is not None and self._settled is not None:

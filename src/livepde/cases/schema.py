@@ -245,6 +245,7 @@ class ChannelSpec(Spec):
     quantity: str | None = None
     of: Name | None = None
     noise: Quantity | None = None
+    noise_column: Name | None = None
     unit: str | None = None
     offset: Quantity | None = None
     gain: PositiveFloat | None = None
@@ -299,6 +300,8 @@ class ChannelSpec(Spec):
                 'missing = "interpolate" and spikes belong to boundary and input channels; '
                 "values of sensors that are far off are refused by law.gate"
             )
+        if self.noise_column is not None and self.role not in ("sensor", "withheld"):
+            raise ValueError("noise_column belongs to sensors: leave it out")
         if self.role == "position" and self.noise is not None:
             raise ValueError("noise of a channel of role position is not possible: leave it out")
         return self

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.errors import MissingInputError
 from livepde.identifier import Sample
+from livepde.linalg import Array
 from livepde.observation import (
     Averages,
     Combined,
@@ -27,6 +29,7 @@ from livepde.observation import (
     Reconstruction,
     Tikhonov,
 )
+from livepde.samples import by_name, noise_channel
 from livepde.streams import Column
 
 __all__ = [
@@ -62,7 +65,20 @@ def columns_of(frame: Frame) -> dict[str, Column]:
             needed,
             decimal=frame.spec.data.decimal,
         )
+        if channel.noise_column is not None:
+            found[noise_channel(name)] = _noise_column(frame, name, channel, rule.factor)
     return found
+
+
+def _noise_column(frame: Frame, name: str, channel: ChannelSpec, factor: float) -> Column:
+    """Return where the noise of the readings of a channel comes from, in its unit."""
+    key = f"channels.{name}.noise_column"
+    if isinstance(frame.spec.law, GradientSpec):
+        raise frame.error(key, "the gradient law does not weigh readings: leave it out.")
+    if noise_channel(name) in frame.spec.channels:
+        raise frame.error(key, f"another channel is called '{noise_channel(name)}': rename it.")
+    decimal = frame.spec.data.decimal
+    return Column((str(channel.noise_column),), factor, decimal=decimal, noise_of=name)
 
 
 def observation_of(
@@ -285,19 +301,26 @@ def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
 
 
 def initial_weights(frame: Frame, mesh: Any, first: Sample) -> dict[str, Any]:
-    """Return channel -> how an interpolated initial state changes with its reading, as x -> u.
+    """Return channel -> how an interpolated initial state changes with its reading, and its noise.
 
-    None where readings are taken as exact (`initial = "interpolate-exact"`).
+    As x -> u, and NaN for that of the sensor. None where readings are taken as exact (`initial =
+    "interpolate-exact"`).
     """
     if frame.spec.initial != "interpolate" or len(mesh.p) != 1:
         return {}
     at, _, names = _initial_readings(frame, mesh, first)
     if len(set(at)) < len(at):  # np.interp takes one of two readings at one place
         return {}
-    unit = np.eye(len(at))
-    return {
-        name: lambda x, weight=unit[k]: np.interp(x[0], at, weight) for k, name in enumerate(names)
-    }
+    given = by_name(first.z, ())
+    found = {}
+    for name, unit in zip(names, np.eye(len(at)), strict=True):
+        weight = partial(_interpolated, at, unit)
+        found[name] = (weight, given.get(noise_channel(name), np.nan))
+    return found
+
+
+def _interpolated(at: Sequence[float], values: Array, x: Any) -> Any:
+    return np.interp(x[0], at, values)
 
 
 def _initial_readings(

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
 from livepde.laws.auto import AutoLaw
-from livepde.laws.base import AnyLaw, Belief, FixedInterval, Law, Problem, Report, Status
+from livepde.laws.base import (
+    AnyLaw,
+    Belief,
+    FixedInterval,
+    InitialReading,
+    Law,
+    Problem,
+    Report,
+    Status,
+)
 from livepde.laws.bounds import (
     Constants,
     ExactBound,
@@ -36,6 +45,7 @@ __all__ = [
     "FixedInterval",
     "GradientLaw",
     "Guards",
+    "InitialReading",
     "Jumps",
     "KueglerLaw",
     "Law",

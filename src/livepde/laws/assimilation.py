@@ -148,7 +148,7 @@ def _absorbed(
         zero = np.zeros(len(x))
         finite: Mask = np.isfinite((x.u + x.du).sum(axis=1) + x.U.sum(axis=(1, 2)))
         return x, Assimilation(predicted, steps, OK, finite, zero, zero)
-    noise = filter_.noise[None]
+    noise = filter_.noise_of(span)
     if options.adaptive or x.level[0] != 1.0:
         noise = np.sqrt(x.level)[:, None] * noise
     Y, d = Y / noise[:, None], d / noise

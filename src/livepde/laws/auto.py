@@ -128,12 +128,15 @@ class AutoLaw(Law[Bank, AutoState]):
             gate_patience=self.gate_patience,
         )
 
+    def weighs_readings(self) -> bool:
+        return True
+
     def prepare(self, problem: Problem) -> Bank:
         stated = self.noise is not None or problem.observed.noise is not None
         law = self.member
         if not stated:  # until it is guessed; nor is that of an initial state known
             law = replace(self.member, noise=1.0)
-            problem = replace(problem, initial_weights={})
+            problem = replace(problem, initial_readings={})
         work = law.prepare(problem)
         reduction = work.filter.reduction
         # A factor costs in proportion to its columns, and a field that drifts is the exception.

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,7 +17,16 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 
-__all__ = ["Belief", "FixedInterval", "Law", "Notes", "Problem", "Report", "Status"]
+__all__ = [
+    "Belief",
+    "FixedInterval",
+    "InitialReading",
+    "Law",
+    "Notes",
+    "Problem",
+    "Report",
+    "Status",
+]
 
 REMEDIES = {
     "ok": "",
@@ -68,6 +77,21 @@ class Status:
         return self.code if self.ok else f"{self.code}: {self.detail}. {self.remedy}"
 
 
+class InitialReading(NamedTuple):
+    """A reading that the initial state was made of.
+
+    Attributes
+    ----------
+    weight
+        How the initial state changes with it, shape (n,).
+    noise
+        Its standard deviation; NaN: that of the sensor or channel.
+    """
+
+    weight: Array
+    noise: float = np.nan
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A model and what is observed of it: where the two meet.
@@ -78,15 +102,15 @@ class Problem:
         The process, its sensors, and how steps are taken.
     input_noise
         Channel of the model -> standard deviation of its noise.
-    initial_weights
-        Channel -> how the initial state changes with its reading at the initial time, shape (n,).
+    initial_readings
+        Channel -> its reading at the initial time, if the initial state was made of it.
     """
 
     model: Model
     observed: Observed
     control: Advance
     input_noise: Mapping[str, float] = field(default_factory=dict)
-    initial_weights: Mapping[str, Array] = field(default_factory=dict)
+    initial_readings: Mapping[str, InitialReading] = field(default_factory=dict)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
@@ -95,7 +119,7 @@ class Problem:
 
     def unread(self, interval: Interval) -> Interval:
         """Return an interval without the readings that the initial state was made of."""
-        used = [name in self.initial_weights for name in self.observed.names]
+        used = [name in self.initial_readings for name in self.observed.names]
         return replace(interval, z1=np.where(used, np.nan, interval.z1)) if any(used) else interval
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
@@ -172,6 +196,18 @@ class Belief:
             return None
         std = _deviation(rows @ self.q_factor[part])
         return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
+
+    def left_out(self, rows: Any, part: slice) -> float:
+        """Return the share of the modes that the law leaves out in the variance of rows @ q[part].
+
+        Of the mean over the rows; 0 without a law that leaves out modes, or without variance.
+        """
+        std = self.deviation(rows, part)
+        if std is None or self.rest is None:
+            return 0.0
+        variance = float(std @ std)
+        rest = abs(rows) @ self.rest[part]
+        return float(rest @ rest) / variance if variance > 0.0 else 0.0
 
     def left(self, rows: Any) -> Array:
         """Return the share of the prior deviation that is left of each of some coefficients of q.
@@ -336,6 +372,10 @@ class Law(ABC, Generic[Work, State]):
         For the estimate at the end of a run: the run goes on from the state that it had.
         """
         return state
+
+    def weighs_readings(self) -> bool:
+        """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
+        return False
 
     def suspended(self, work: Work, state: State) -> State:
         """Return the state without what `step` does in parts and has not ended; here the same.

@@ -119,6 +119,16 @@ class Filter:
         """Return the interval of one process as that of its one member."""
         return Span.of(self.problem.control.over(interval), self.problem.channels)
 
+    def noise_of(self, z: Span | Interval) -> Array:
+        """Return the standard deviation of each reading at the end, shape (members or 1, sensors).
+
+        That of the reading where it has one, else that of the sensor.
+        """
+        if z.noise is None:
+            return self.noise[None]
+        noise: Array = np.where(np.isnan(z.noise), self.noise, z.noise)
+        return np.atleast_2d(noise)
+
     def estimate(self, x: FilterState) -> Array:
         """Return the estimated latent parameters, not yet bounded, shape (members, m)."""
         q: Array = x.q + x.da @ self.reduction.Phi.T

@@ -177,7 +177,7 @@ def _rescued(
 
     Whatever led there is not used again: the state is only carried on from the past.
     """
-    noise = np.sqrt(state.now.level)[:, None] * work.filter.noise
+    noise = np.sqrt(state.now.level)[:, None] * work.filter.noise_of(interval)
     z = interval.z1[None]
     scale = state.scale.add(z, z - report.predicted)
 

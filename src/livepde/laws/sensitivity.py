@@ -167,6 +167,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         """True if what the state knows of the unknowns fades."""
         return bool(np.isfinite(self.memory))
 
+    def weighs_readings(self) -> bool:
+        return True
+
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
         noise = observed.noise
@@ -385,7 +388,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             d = span.z1 - told.predicted
             scale = scale.add(span.z1, d)
             if told.largest.max() > guards.runaway:
-                noise = np.sqrt(before.level)[:, None] * filter_.noise
+                noise = np.sqrt(before.level)[:, None] * filter_.noise_of(span)
                 usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
         if (jumps := self.jumps) is not None and present.any():
             e = x.innovations.newest

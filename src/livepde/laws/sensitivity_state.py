@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
-from livepde.laws.base import Notes
+from livepde.laws.base import InitialReading, Notes
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards, Scale
@@ -55,9 +55,9 @@ class SensitivityWork:
     jumps: Jumps | None
     start_window: int
 
-    def made_of(self, weights: Mapping[str, Array]) -> SensitivityWork:
+    def made_of(self, readings: Mapping[str, InitialReading]) -> SensitivityWork:
         """Return the same for a member whose initial state was made of some readings."""
-        problem = replace(self.filter.problem, initial_weights=weights)
+        problem = replace(self.filter.problem, initial_readings=readings)
         return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property
