@@ -79,6 +79,8 @@ class Problem:
         Channel of the model -> standard deviation of its noise.
     initial_weights
         Channel -> how the initial state changes with its reading at the initial time, shape (n,).
+    initial
+        The initial state as it was given: a number, a function of x, coefficients, or a mapping.
     """
 
     model: Model
@@ -86,6 +88,7 @@ class Problem:
     control: Advance
     input_noise: Mapping[str, float] = field(default_factory=dict)
     initial_weights: Mapping[str, Array] = field(default_factory=dict)
+    initial: Any = None
 
     @cached_property
     def channels(self) -> tuple[str, ...]:

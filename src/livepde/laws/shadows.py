@@ -1,0 +1,485 @@
+"""The discretisation error of a filter: what step, mesh and input lines have shifted it by.
+
+The filter and one without discretisation error would take the same samples with the same gain. What
+the former is off by, e of the state and s of the unknowns, follows
+
+    predict   [e; s]+ = T [e; s] + d,      T the linearised step, d the error that this step adds
+    update    [e; s] <- [e; s] - K H [e; s]
+
+with the filter's own T, H and gain K, for unknowns that stay and for unknowns that move. Each
+shadow says what d is, by Richardson's extrapolation: the step from two halved steps, the input
+lines from the curvature of the readings. The mesh has a trajectory of its own on the halved mesh,
+with the unknowns of the filter: what it differs by is no d, but is seen by the sensors.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from livepde.errors import LawError, LivepdeError
+from livepde.fem import Moment
+from livepde.laws.halved_mesh import HalvedMesh, refusal
+from livepde.laws.members import changed, put, take
+from livepde.laws.shadow_state import ShadowState
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import KeptFactors, Moments, Span
+
+if TYPE_CHECKING:
+    from livepde.laws.filter import Filter, Update
+    from livepde.laws.filter_state import FilterState
+
+__all__ = ["KINDS", "ShadowSet", "Shadows"]
+
+FIRST = 32  # steps that are all shadowed: where a run begins the error changes from step to step
+# Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
+# phase alone; on average 8, of which each stands for those before it.
+LATER = np.array([5, 11, 7, 9])
+MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
+KINDS = ("step", "mesh", "input")
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """Which discretisation errors the sensitivity law follows beside its estimates.
+
+    Their signed shifts are summed, and widen what is reported: variance plus square of the sum. The
+    estimate itself, and the filter, stay as they are.
+
+    The first 32 steps are shadowed, later one of eight, which stands for those before it: an error
+    that changes much faster is found on average only.
+
+    Parameters
+    ----------
+    step
+        The time step, by halved steps.
+    mesh
+        The mesh, by the halved mesh: for states and unknown fields of first order and sensors that
+        mean the same on every mesh.
+    inputs
+        The straight line between readings of a channel, by the curvature of three readings; not
+        where inputs are held.
+    largest
+        Coefficients of the state beyond which the mesh is not halved, because that would cost more
+        than the filter.
+    """
+
+    step: bool = True
+    mesh: bool = True
+    inputs: bool = True
+    largest: int = 2000
+
+    def __post_init__(self) -> None:
+        if not (self.step or self.mesh or self.inputs):
+            raise LawError("Shadows: none is left; write shadows=None to follow no error.")
+        if self.largest < 1:
+            raise LawError(f"Shadows: largest must be at least 1; got {self.largest}.")
+
+
+class Steps(NamedTuple):
+    """The steps of some members that a shadow stands for.
+
+    Attributes
+    ----------
+    x, end
+        The filter before and after the last of them.
+    span, block
+        The last of them, and all of them.
+    waited
+        Their number, shape (members,).
+    """
+
+    x: FilterState
+    end: FilterState
+    span: Span
+    block: Span
+    waited: IntArray
+
+
+class Found(NamedTuple):
+    """What a shadow has found.
+
+    Attributes
+    ----------
+    error
+        What the state is off by more, shape (members, n).
+    parts
+        Fields of `ShadowState` to exchange.
+    failed
+        Members whose shadow could not be stepped, shape (members,); nothing is added for them.
+    """
+
+    error: Array
+    parts: dict[str, Any]
+    failed: Mask
+
+
+class Shadow(ABC):
+    """Abstract source of a discretisation error."""
+
+    kind: ClassVar[str]
+
+    @abstractmethod
+    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
+        """Return what is known before the first step, of one member."""
+
+    @abstractmethod
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        """Return what the shadow has found about some steps."""
+
+    def seen(self, x: FilterState, at: Moments) -> Array | None:
+        """Return what sensors see of an error beside that in `ShadowState.u`; None if nothing."""
+        return None
+
+    def beside(self, s: ShadowState) -> Array | None:
+        """Return the error of the state beside that in `ShadowState.u`, shape (members, n)."""
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class StepShadow(Shadow):
+    """The error of the time step: one step less two halved ones, from the same state.
+
+    Attributes
+    ----------
+    halves
+        The filter without covariance, by halved steps.
+    factor
+        2^p/(2^p - 1) for a scheme of order p.
+    """
+
+    halves: Filter
+    factor: float
+
+    kind = "step"
+
+    @classmethod
+    def of(cls, mean: Filter) -> StepShadow:
+        """Return the shadow of a filter without covariance."""
+        control = mean.problem.control
+        finer = replace(mean.problem, control=replace(control, parts=2 * control.parts))
+        ratio = 2.0**control.scheme.order
+        return cls(replace(mean, problem=finer, stage=mean.stage.twin()), ratio / (ratio - 1.0))
+
+    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
+        return changed(s, halves=self.halves.stage.kept(1))
+
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        u, kept, failed = _followed(self.halves, steps.x, steps.x.u, s.halves, steps.span)
+        error = self.factor * (steps.end.u - u)
+        return Found(steps.waited[:, None] * error, {"halves": kept}, failed)
+
+
+@dataclass(frozen=True, eq=False)
+class InputShadow(Shadow):
+    """The error of the straight line between two readings of a channel.
+
+    The mean of a line misses that of a curve by h^2/12 times its second derivative, which the last
+    three readings tell. Second differences of noise add up to nothing.
+
+    Attributes
+    ----------
+    mean
+        The filter without covariance.
+    """
+
+    mean: Filter
+
+    kind = "input"
+
+    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
+        nothing = np.zeros((1, len(self.mean.problem.channels)))
+        return changed(s, slope=nothing, missed=nothing)
+
+    @staticmethod
+    def read(s: ShadowState, span: Span) -> ShadowState:
+        """Return what straight lines have missed after one more interval."""
+        h = span.t1 - span.t0
+        slope = np.nan_to_num(span.inputs1 - span.inputs0) / h[:, None]
+        known = (s.length > 0.0)[:, None]
+        bend = 2.0 * (slope - s.slope) / (h + s.length)[:, None]
+        missed = s.missed + np.where(known, bend * (h**3 / 12.0)[:, None], 0.0)
+        return changed(s, slope=slope, length=np.broadcast_to(h, s.length.shape), missed=missed)
+
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        missed, span, end = s.missed, steps.span, steps.end
+        left = {"missed": np.zeros_like(missed)}
+        if not missed.any():
+            return Found(np.zeros_like(end.u), left, np.zeros(len(end), dtype=bool))
+        off = missed / (span.t1 - span.t0)[:, None]
+        moved = replace(span, inputs0=span.inputs0 + off, inputs1=span.inputs1 + off, interval=None)
+        u, _, failed = _followed(self.mean, steps.x, steps.x.u, steps.x.kept, moved)
+        return Found(u - end.u, left, failed)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshShadow(Shadow):
+    """The error of the mesh: a trajectory on the halved mesh beside one on the mesh.
+
+    It has the unknowns of the filter, and follows where samples move the state: only its difference
+    to the state of the filter is kept. Several steps are taken at once on both meshes.
+
+    Attributes
+    ----------
+    mean
+        The filter without covariance.
+    fine
+        The same on the halved mesh.
+    mesh
+        That mesh.
+    """
+
+    mean: Filter
+    fine: Filter
+    mesh: HalvedMesh
+
+    kind = "mesh"
+
+    @classmethod
+    def of(cls, mean: Filter) -> MeshShadow:
+        """Return the shadow of a filter without covariance; raises `LivepdeError`."""
+        mesh = HalvedMesh.of(mean.problem)
+        finer = replace(mean.problem, model=mesh.model)
+        fine = replace(mean, problem=finer, stage=mesh.stage)
+        return cls(replace(mean, stage=mean.stage.twin()), fine, mesh)
+
+    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
+        given = self.mean.problem.initial
+        return changed(
+            s,
+            u0=x.u,
+            blocks=self.mean.stage.kept(1),
+            fine=self.mesh.begun(given, x.q[0], x.u[0], moment)[None],
+            fine_stage=self.fine.stage.kept(1),
+        )
+
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        x, end, mesh = steps.x, steps.end, self.mesh
+        coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
+        if (steps.waited > 1).any():
+            coarse, blocks, failed = _followed(self.mean, x, s.u0, blocks, steps.block)
+        start = mesh.prolonged(s.u0) + s.fine
+        u, kept, wrong = _followed(self.fine, x, start, s.fine_stage, steps.block)
+        difference, failed = u - mesh.prolonged(coarse), failed | wrong
+        parts = {
+            "blocks": blocks,
+            "fine": np.where(failed[:, None], s.fine, difference),
+            "fine_stage": kept,
+        }
+        return Found(np.zeros_like(end.u), parts, failed)
+
+    def seen(self, x: FilterState, at: Moments) -> Array | None:
+        fine, mesh = x.shadows.fine, self.mesh
+        if mesh.G is not None:
+            return np.asarray(-MESH * (mesh.G @ fine.T).T)
+        each = zip(x.u, x.q, fine, strict=True)
+        seen = [mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in enumerate(each)]
+        return -MESH * np.array(seen)
+
+    def beside(self, s: ShadowState) -> Array | None:
+        return -MESH * s.fine[:, self.mesh.at]
+
+
+def _followed(
+    mean: Filter, x: FilterState, u: Array, kept: KeptFactors, span: Span
+) -> tuple[Array, KeptFactors, Mask]:
+    """Return the states of members after a span, what the last stage left, and who failed.
+
+    Parameters
+    ----------
+    mean
+        A filter without covariance.
+    x, u
+        The filter at the start, and the states that are followed in the place of its own.
+    """
+    members, n = u.shape
+    k = x.C.shape[2]
+    bare = changed(
+        x,
+        u=u,
+        du=np.zeros_like(u),
+        da=np.zeros((members, k)),
+        U=np.zeros((members, 0, n)),
+        C=np.zeros((members, 0, k)),
+        past=x.past[:, :0],
+        kept=kept,
+        shadows=ShadowState.none(members, n, k),
+    )
+    end, _, failure = mean.carried(bare, span)
+    failed = ~np.isfinite(end.u).all(axis=1)
+    if failure is not None:
+        failed[:] = True
+    return end.u, end.kept if failure is None else kept, failed
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowSet:
+    """The shadows of a filter.
+
+    Attributes
+    ----------
+    filter
+        The filter itself, without shadows.
+    shadows
+        One for each row of `ShadowState.u`.
+    refused
+        Why the mesh has none; empty if it has, or none was asked for.
+    """
+
+    filter: Filter
+    shadows: tuple[Shadow, ...]
+    refused: str = ""
+
+    @classmethod
+    def of(cls, filter_: Filter, mean: Filter, options: Shadows) -> ShadowSet:
+        """Return the shadows of a filter, from the same without covariance."""
+        problem, found, refused = filter_.problem, [], ""
+        if options.step:
+            found.append(StepShadow.of(mean))
+        if options.mesh and not (refused := refusal(problem, options.largest)):
+            try:
+                found.append(MeshShadow.of(mean))
+            except LivepdeError as error:
+                refused = f"on the halved mesh: {error}"
+        if options.inputs and problem.model.channels and not problem.control.hold:
+            found.append(InputShadow(mean))
+        return cls(filter_, tuple(found), refused)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of each shadow."""
+        return tuple(shadow.kind for shadow in self.shadows)
+
+    @cached_property
+    def _inputs(self) -> bool:
+        return "input" in self.kinds
+
+    @cached_property
+    def _mesh(self) -> bool:
+        return "mesh" in self.kinds
+
+    def begun(self, x: FilterState, moment: Moment | None) -> ShadowState:
+        """Return the shadows of one member at the start; None stands for no moment yet."""
+        n, k = x.u.shape[1], x.C.shape[2]
+        rows = len(self.shadows)
+        nothing = np.zeros((1, len(self.filter.problem.channels)))
+        s = changed(
+            ShadowState.none(1, n, k),
+            u=np.zeros((1, rows, n)),
+            a=np.zeros((1, rows, k)),
+            inputs0=nothing,
+        )
+        for shadow in self.shadows:
+            s = shadow.begun(s, x, moment)
+        return s
+
+    def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
+        """Return the state after a span with the errors that have come about in it.
+
+        Parameters
+        ----------
+        x, end
+            Before and after the span; `end` with the errors of before, propagated.
+        """
+        s = _opened(end.shadows, x, span, self._mesh)
+        if self._inputs:
+            s = InputShadow.read(s, span)
+        taken = s.count - s.waited
+        wait = np.where(s.count < FIRST, 1, LATER[taken % len(LATER)])
+        s = changed(s, count=s.count + 1, waited=s.waited + 1)
+        due = s.waited >= wait
+        for t in np.unique(s.begun[due]) if due.any() else ():
+            group = np.flatnonzero(due & (s.begun == t))
+            if len(group) == len(s):
+                s = self._taken(s, x, end, span)
+            else:
+                parts = (take(s, group), take(x, group), take(end, group), _part(span, group))
+                s = put(s, group, self._taken(*parts))
+        return changed(end, shadows=s)
+
+    def _taken(self, s: ShadowState, x: FilterState, end: FilterState, span: Span) -> ShadowState:
+        """Return members that began together after their shadows were taken."""
+        block = span
+        if (s.waited > 1).any():
+            block = replace(span, t0=s.begun, inputs0=s.inputs0, interval=None)
+        steps, u = Steps(x, end, span, block, s.waited), s.u.copy()
+        for row, shadow in enumerate(self.shadows):
+            found = shadow.found(s, steps)
+            if found.failed.any():
+                u[~found.failed, row] += found.error[~found.failed]
+            else:
+                u[:, row] += found.error
+            s = changed(s, **found.parts, failed=s.failed + found.failed)
+        return changed(s, u=u, waited=np.zeros_like(s.waited))
+
+    def updated(
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
+    ) -> ShadowState:
+        """Return the shadows after a sample.
+
+        Parameters
+        ----------
+        x, new
+            The filter before and after it.
+        weights
+            One over the noise of each value that was used, zero for others, (members, sensors).
+        """
+        s = x.shadows
+        seen = self.filter.sensors.rows(x, s.u, s.a, at)
+        for row, shadow in enumerate(self.shadows):
+            more = shadow.seen(x, at)
+            if more is not None:
+                seen[:, row] += more
+        used = (weights > 0.0)[:, None]
+        half = (np.where(used, seen, 0.0) * weights[:, None]) @ made.left.transpose(0, 2, 1)
+        return changed(s, u=s.u - half @ new.U, a=s.a - half @ new.C)
+
+    def shifts(self, x: FilterState) -> tuple[Array, Array]:
+        """Return what the state and the reduced unknowns are off by, (members, rows, n or k)."""
+        s, u = x.shadows, x.shadows.u.copy()
+        for row, shadow in enumerate(self.shadows):
+            more = shadow.beside(s)
+            if more is not None:
+                u[:, row] += more
+        return u, s.a
+
+    def widening(self, x: FilterState) -> tuple[Array, Array]:
+        """Return the row of the square root [U C] that is reported for all shifts together.
+
+        Shapes (members, 1, n) and (members, 1, k). It is no longer than one prior standard
+        deviation: what the data tell wrongly is known as well as before, and the linear filter is
+        nothing to count more.
+        """
+        u, a = (rows.sum(axis=1, keepdims=True) for rows in self.shifts(x))
+        size = np.linalg.norm(self.filter.reduction.in_prior_units(a, x.age), axis=2)
+        good = np.isfinite(size) & np.isfinite(u).all(axis=2)
+        factor = np.where(good, 1.0 / np.maximum(size, 1.0), 0.0)[:, :, None]
+        return np.where(good[..., None], u, 0.0) * factor, np.where(
+            good[..., None], a, 0.0
+        ) * factor
+
+
+def _opened(s: ShadowState, x: FilterState, span: Span, mesh: bool) -> ShadowState:
+    """Return members of which those without steps since the last shadow begin at a span."""
+    fresh = s.waited == 0
+    if not fresh.any():
+        return s
+    begun = np.where(fresh, span.t0, s.begun)
+    inputs0 = np.where(fresh[:, None], span.inputs0, s.inputs0)
+    u0 = np.where(fresh[:, None], x.u, s.u0) if mesh else s.u0
+    return changed(s, begun=begun, inputs0=inputs0, u0=u0)
+
+
+def _part(span: Span, group: IntArray) -> Span:
+    """Return the span of some members."""
+
+    def some(values: Array) -> Array:
+        return values[group] if len(values) > 1 else values
+
+    parts = {item.name: getattr(span, item.name) for item in fields(span)}
+    arrays = {name: some(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+    return Span(**(parts | arrays))
