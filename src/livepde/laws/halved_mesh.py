@@ -110,6 +110,8 @@ class HalvedMesh:
         u, q
             State and latent parameter of the mesh, about which sensors are linear.
         """
+        if self.G is not None:
+            return np.asarray(self.G @ difference)
         physical = self.model.latent.value(self.unknowns @ q)
         H_u, _ = self.observed.jacobian(self.prolonged(u[None])[0], physical, moment)
         return np.asarray(H_u @ difference)

@@ -21,22 +21,24 @@ class ShadowState:
     u, a
         By how much the discretisation has shifted state and reduced unknowns, a row for each
         shadow, shapes (members, shadows, n) and (members, shadows, k).
-    count, waited
-        Steps so far, and since the shadows were taken last, shape (members,).
+    count, last, due
+        Steps so far, and at which the shadows were taken last and are taken next, (members,).
     begun, u0, inputs0
         Time, state and inputs where the shadows were taken last; the state without columns if no
         shadow needs it. Shapes (members,), (members, n) and (members, channels).
     length, slope
-        Of the last interval, and how inputs changed in it per unit of time, (members,) and
-        (members, channels).
-    missed
-        Integral of what straight lines have missed of the inputs since the shadows were taken
-        last, shape (members, channels).
+        Of the last interval, infinite before the first, and how inputs changed in it per unit of
+        time; shapes (members,) and (members, channels).
+    bend, missed
+        Integral of what straight lines have missed of the inputs in the last interval, and of all that
+        no shadow has stepped with yet, shapes (members, channels).
     halves, blocks
         What the last stages of halved steps, and of a block of steps, have left.
     fine, fine_stage
         The state on the halved mesh minus that of the filter, shape (members, N), and what the last
         stage there has left.
+    seen
+        What the sensors see of that until the next shadow, shape (members, sensors).
     failed
         How many shadow steps had no solution, shape (members,).
     """
@@ -44,17 +46,20 @@ class ShadowState:
     u: Array
     a: Array
     count: IntArray
-    waited: IntArray
+    last: IntArray
+    due: IntArray
     begun: Array
     u0: Array
     inputs0: Array
     length: Array
     slope: Array
+    bend: Array
     missed: Array
     halves: KeptFactors
     blocks: KeptFactors
     fine: Array
     fine_stage: KeptFactors
+    seen: Array
     failed: IntArray
 
     def __len__(self) -> int:
@@ -70,16 +75,19 @@ class ShadowState:
             u,
             a,
             count=zero,
-            waited=zero,
+            last=zero,
+            due=zero,
             begun=time,
             u0=nothing,
             inputs0=nothing,
-            length=time,
+            length=time + np.inf,
             slope=nothing,
+            bend=nothing,
             missed=nothing,
             halves=kept,
             blocks=kept,
             fine=nothing,
             fine_stage=kept,
+            seen=nothing,
             failed=zero,
         )

@@ -88,9 +88,9 @@ class Steps(NamedTuple):
     x, end
         The filter before and after the last of them.
     span, block
-        The last of them, and all of them.
-    waited
-        Their number, shape (members,).
+        The last of them, and all since the shadow was taken before.
+    waited, next
+        The number of the latter, and of those that follow until the next is taken, (members,).
     """
 
     x: FilterState
@@ -98,6 +98,7 @@ class Steps(NamedTuple):
     span: Span
     block: Span
     waited: IntArray
+    next: IntArray
 
 
 class Found(NamedTuple):
@@ -106,14 +107,14 @@ class Found(NamedTuple):
     Attributes
     ----------
     error
-        What the state is off by more, shape (members, n).
+        What the state is off by more, shape (members, n); None for nothing.
     parts
         Fields of `ShadowState` to exchange.
     failed
         Members whose shadow could not be stepped, shape (members,); nothing is added for them.
     """
 
-    error: Array
+    error: Array | None
     parts: dict[str, Any]
     failed: Mask
 
@@ -131,7 +132,7 @@ class Shadow(ABC):
     def found(self, s: ShadowState, steps: Steps) -> Found:
         """Return what the shadow has found about some steps."""
 
-    def seen(self, x: FilterState, at: Moments) -> Array | None:
+    def seen(self, s: ShadowState) -> Array | None:
         """Return what sensors see of an error beside that in `ShadowState.u`; None if nothing."""
         return None
 
@@ -143,6 +144,8 @@ class Shadow(ABC):
 @dataclass(frozen=True, eq=False)
 class StepShadow(Shadow):
     """The error of the time step: one step less two halved ones, from the same state.
+
+    One step stands for half of those since the shadow before and half of those until the next.
 
     Attributes
     ----------
@@ -170,8 +173,8 @@ class StepShadow(Shadow):
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
         u, kept, failed = _followed(self.halves, steps.x, steps.x.u, s.halves, steps.span)
-        error = self.factor * (steps.end.u - u)
-        return Found(steps.waited[:, None] * error, {"halves": kept}, failed)
+        weight = 0.5 * self.factor * (steps.waited + steps.next)
+        return Found(weight[:, None] * (steps.end.u - u), {"halves": kept}, failed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,27 +196,30 @@ class InputShadow(Shadow):
 
     def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
         nothing = np.zeros((1, len(self.mean.problem.channels)))
-        return changed(s, slope=nothing, missed=nothing)
+        return changed(s, slope=nothing, bend=nothing, missed=nothing)
 
     @staticmethod
     def read(s: ShadowState, span: Span) -> ShadowState:
         """Return what straight lines have missed after one more interval."""
-        h = span.t1 - span.t0
-        slope = np.nan_to_num(span.inputs1 - span.inputs0) / h[:, None]
-        known = (s.length > 0.0)[:, None]
-        bend = 2.0 * (slope - s.slope) / (h + s.length)[:, None]
-        missed = s.missed + np.where(known, bend * (h**3 / 12.0)[:, None], 0.0)
-        return changed(s, slope=slope, length=np.broadcast_to(h, s.length.shape), missed=missed)
+        length = span.t1 - span.t0
+        h = length[:, None]
+        slope = (span.inputs1 - span.inputs0) / h
+        bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
+        return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
-        missed, span, end = s.missed, steps.span, steps.end
-        left = {"missed": np.zeros_like(missed)}
+        ahead = (0.5 * (steps.next - 1))[:, None] * s.bend  # of half of the steps until the next
+        missed = s.missed + ahead
+        missed = np.where(np.isfinite(missed), missed, 0.0)  # not so for positions of sensors
+        left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
         if not missed.any():
-            return Found(np.zeros_like(end.u), left, np.zeros(len(end), dtype=bool))
+            return Found(None, left, np.zeros(len(missed), dtype=bool))
+        span = steps.span
         off = missed / (span.t1 - span.t0)[:, None]
-        moved = replace(span, inputs0=span.inputs0 + off, inputs1=span.inputs1 + off, interval=None)
+        ends = {"inputs0": span.inputs0 + off, "inputs1": span.inputs1 + off}
+        moved = replace(span, **ends, interval=None)
         u, _, failed = _followed(self.mean, steps.x, steps.x.u, steps.x.kept, moved)
-        return Found(u - end.u, left, failed)
+        return Found(u - steps.end.u, left, failed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +227,8 @@ class MeshShadow(Shadow):
     """The error of the mesh: a trajectory on the halved mesh beside one on the mesh.
 
     It has the unknowns of the filter, and follows where samples move the state: only its difference
-    to the state of the filter is kept. Several steps are taken at once on both meshes.
+    to the state of the filter is kept. Several steps are taken at once on both meshes. Until the
+    next the sensors see the difference as it is expected to be halfway.
 
     Attributes
     ----------
@@ -248,14 +255,15 @@ class MeshShadow(Shadow):
         return cls(replace(mean, stage=mean.stage.twin()), fine, mesh)
 
     def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
-        given = self.mean.problem.initial
-        return changed(
-            s,
-            u0=x.u,
-            blocks=self.mean.stage.kept(1),
-            fine=self.mesh.begun(given, x.q[0], x.u[0], moment)[None],
-            fine_stage=self.fine.stage.kept(1),
-        )
+        if moment is None:
+            difference = np.zeros((1, self.mesh.model.X.dim))
+            seen = np.zeros((1, self.mesh.observed.size))
+        else:
+            given = self.mean.problem.initial
+            difference = self.mesh.begun(given, x.q[0], x.u[0], moment)[None]
+            seen = self.mesh.seen(x.u[0], x.q[0], difference[0], moment)[None]
+        kept = {"blocks": self.mean.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
+        return changed(s, u0=x.u, fine=difference, seen=seen, **kept)
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
         x, end, mesh = steps.x, steps.end, self.mesh
@@ -264,21 +272,17 @@ class MeshShadow(Shadow):
             coarse, blocks, failed = _followed(self.mean, x, s.u0, blocks, steps.block)
         start = mesh.prolonged(s.u0) + s.fine
         u, kept, wrong = _followed(self.fine, x, start, s.fine_stage, steps.block)
-        difference, failed = u - mesh.prolonged(coarse), failed | wrong
-        parts = {
-            "blocks": blocks,
-            "fine": np.where(failed[:, None], s.fine, difference),
-            "fine_stage": kept,
-        }
-        return Found(np.zeros_like(end.u), parts, failed)
+        failed = (failed | wrong)[:, None]
+        fine = np.where(failed, s.fine, u - mesh.prolonged(coarse))
+        halfway = fine + (0.5 * (steps.next - 1) / steps.waited)[:, None] * (fine - s.fine)
+        at = steps.block.end
+        each = enumerate(zip(end.u, end.q, halfway, strict=True))
+        seen = np.array([mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in each])
+        parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
+        return Found(None, parts, failed[:, 0])
 
-    def seen(self, x: FilterState, at: Moments) -> Array | None:
-        fine, mesh = x.shadows.fine, self.mesh
-        if mesh.G is not None:
-            return np.asarray(-MESH * (mesh.G @ fine.T).T)
-        each = zip(x.u, x.q, fine, strict=True)
-        seen = [mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in enumerate(each)]
-        return -MESH * np.array(seen)
+    def seen(self, s: ShadowState) -> Array | None:
+        return -MESH * s.seen
 
     def beside(self, s: ShadowState) -> Array | None:
         return -MESH * s.fine[:, self.mesh.at]
@@ -349,18 +353,10 @@ class ShadowSet:
             found.append(InputShadow(mean))
         return cls(filter_, tuple(found), refused)
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[str, ...]:
         """Kind of each shadow."""
         return tuple(shadow.kind for shadow in self.shadows)
-
-    @cached_property
-    def _inputs(self) -> bool:
-        return "input" in self.kinds
-
-    @cached_property
-    def _mesh(self) -> bool:
-        return "mesh" in self.kinds
 
     def begun(self, x: FilterState, moment: Moment | None) -> ShadowState:
         """Return the shadows of one member at the start; None stands for no moment yet."""
@@ -385,13 +381,14 @@ class ShadowSet:
         x, end
             Before and after the span; `end` with the errors of before, propagated.
         """
-        s = _opened(end.shadows, x, span, self._mesh)
-        if self._inputs:
+        s = end.shadows
+        fresh = s.count == s.last
+        if fresh.any():
+            s = _opened(s, fresh, x, span, "mesh" in self.kinds)
+        if "input" in self.kinds:
             s = InputShadow.read(s, span)
-        taken = s.count - s.waited
-        wait = np.where(s.count < FIRST, 1, LATER[taken % len(LATER)])
-        s = changed(s, count=s.count + 1, waited=s.waited + 1)
-        due = s.waited >= wait
+        s = changed(s, count=s.count + 1)
+        due = s.count >= s.due
         for t in np.unique(s.begun[due]) if due.any() else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):
@@ -403,18 +400,17 @@ class ShadowSet:
 
     def _taken(self, s: ShadowState, x: FilterState, end: FilterState, span: Span) -> ShadowState:
         """Return members that began together after their shadows were taken."""
-        block = span
-        if (s.waited > 1).any():
+        waited, block = s.count - s.last, span
+        if (waited > 1).any():
             block = replace(span, t0=s.begun, inputs0=s.inputs0, interval=None)
-        steps, u = Steps(x, end, span, block, s.waited), s.u.copy()
+        wait = np.where(s.count < FIRST, 1, LATER[s.count // 8 % len(LATER)])
+        steps, u = Steps(x, end, span, block, waited, wait), s.u.copy()
         for row, shadow in enumerate(self.shadows):
             found = shadow.found(s, steps)
-            if found.failed.any():
-                u[~found.failed, row] += found.error[~found.failed]
-            else:
-                u[:, row] += found.error
+            if found.error is not None:
+                u[:, row] += np.where(found.failed[:, None], 0.0, found.error)
             s = changed(s, **found.parts, failed=s.failed + found.failed)
-        return changed(s, u=u, waited=np.zeros_like(s.waited))
+        return changed(s, u=u, last=s.count, due=s.count + wait)
 
     def updated(
         self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
@@ -431,7 +427,7 @@ class ShadowSet:
         s = x.shadows
         seen = self.filter.sensors.rows(x, s.u, s.a, at)
         for row, shadow in enumerate(self.shadows):
-            more = shadow.seen(x, at)
+            more = shadow.seen(s)
             if more is not None:
                 seen[:, row] += more
         used = (weights > 0.0)[:, None]
@@ -463,15 +459,11 @@ class ShadowSet:
         ) * factor
 
 
-def _opened(s: ShadowState, x: FilterState, span: Span, mesh: bool) -> ShadowState:
-    """Return members of which those without steps since the last shadow begin at a span."""
-    fresh = s.waited == 0
-    if not fresh.any():
-        return s
-    begun = np.where(fresh, span.t0, s.begun)
-    inputs0 = np.where(fresh[:, None], span.inputs0, s.inputs0)
-    u0 = np.where(fresh[:, None], x.u, s.u0) if mesh else s.u0
-    return changed(s, begun=begun, inputs0=inputs0, u0=u0)
+def _opened(s: ShadowState, fresh: Mask, x: FilterState, span: Span, mesh: bool) -> ShadowState:
+    """Return members of which some begin a block of steps with a span."""
+    rows = fresh[:, None]
+    begun, u0 = np.where(fresh, span.t0, s.begun), np.where(rows, x.u, s.u0) if mesh else s.u0
+    return changed(s, begun=begun, u0=u0, inputs0=np.where(rows, span.inputs0, s.inputs0))
 
 
 def _part(span: Span, group: IntArray) -> Span:

@@ -308,6 +308,7 @@ class BandedStage(MemberStage):
             new[0] += self._boundary(at)
         if not len(apart):
             return new, stage.kept
+        # Products of other shapes may round in another way: none is shared with the rest.
         known = np.array((self._mass @ apart.reshape(-1, n).T).T, order="C").reshape(apart.shape)
         known -= ((h * stage.directions[:, together - 1 :]) @ driven).transpose(1, 0, 2)
         return np.concatenate([new, factor.solve(known)]), stage.kept

@@ -293,7 +293,7 @@ class ForwardStage:
             Bound on the error of the tangents, relative to the norm of all of them; it is a
             hundredth of their change, too.
         apart
-            How many of the last tangents are solved apart from all others, and leave nothing.
+            How many of the last tangents are solved apart from all others, by one correction.
 
         Raises
         ------
@@ -329,13 +329,13 @@ class ForwardStage:
             kept.spent,
         )
         new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
-        left: Kept | None = None
         for part in groups:
+            start, known = c[:, part], driven(u, part)
             if part.stop is None:
-                left = Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
-            start = c[:, part]
-            new[:, part] = corrected.solve(start, start, driven(u, part), tolerance, PASSES - 1)
-        return new, left or Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
+                new[:, part] = corrected.once(start, known)
+            else:
+                new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
+        return new, Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
 
     def _driven(
         self, u: Array, c: Array, q: Array, directions: Array, h: float, moment: Moment
