@@ -34,7 +34,7 @@ from livepde.stepping import Advance, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 4  # of the checkpoint
+FORMAT = 5  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 

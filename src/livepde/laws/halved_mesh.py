@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from livepde.fem import FieldBlock, Moment
 from livepde.laws.base import Problem
-from livepde.linalg import Array, compact
+from livepde.linalg import Array, IntArray, compact
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import KeptFactors, MemberStage, StageOfMembers, member_stage
@@ -39,7 +39,7 @@ class HalvedMesh:
     stage: MemberStage
     P: sp.csr_array | Array
     unknowns: sp.csr_array
-    at: Array
+    at: IntArray
 
     @classmethod
     def of(cls, problem: Problem) -> HalvedMesh:
@@ -97,10 +97,10 @@ class HalvedMesh:
         if moment is None:
             return np.zeros_like(coarse)
         if self.model.form_initial is not None:
-            return self.model.initial_state(self.unknowns @ q, moment) - coarse
+            return np.asarray(self.model.initial_state(self.unknowns @ q, moment) - coarse)
         if given is None or not _pointwise(given):
             return np.zeros_like(coarse)
-        return self.model.initial(given, moment) - coarse
+        return np.asarray(self.model.initial(given, moment) - coarse)
 
     def seen(self, u: Array, q: Array, difference: Array, moment: Moment) -> Array:
         """Return what sensors see of a difference of the state there, shape (sensors,).

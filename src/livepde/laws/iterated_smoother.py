@@ -21,8 +21,8 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.members import changed
-from livepde.laws.shadow_state import ShadowState
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import Interval
 

@@ -30,8 +30,8 @@ class ShadowState:
         Of the last interval, infinite before the first, and how inputs changed in it per unit of
         time; shapes (members,) and (members, channels).
     bend, missed
-        Integral of what straight lines have missed of the inputs in the last interval, and of all that
-        no shadow has stepped with yet, shapes (members, channels).
+        Integral of what straight lines have missed of the inputs in the last interval, and of all
+        that no shadow has stepped with yet, shapes (members, channels).
     halves, blocks
         What the last stages of halved steps, and of a block of steps, have left.
     fine, fine_stage

@@ -23,6 +23,7 @@ import numpy as np
 
 from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
+from livepde.laws.covariance import robust_factors
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.members import changed, put, take
 from livepde.laws.shadow_state import ShadowState
@@ -216,8 +217,8 @@ class InputShadow(Shadow):
             return Found(None, left, np.zeros(len(missed), dtype=bool))
         span = steps.span
         off = missed / (span.t1 - span.t0)[:, None]
-        ends = {"inputs0": span.inputs0 + off, "inputs1": span.inputs1 + off}
-        moved = replace(span, **ends, interval=None)
+        first, last = span.inputs0 + off, span.inputs1 + off
+        moved = replace(span, inputs0=first, inputs1=last, interval=None)
         u, _, failed = _followed(self.mean, steps.x, steps.x.u, steps.x.kept, moved)
         return Found(u - steps.end.u, left, failed)
 
@@ -314,7 +315,7 @@ def _followed(
         shadows=ShadowState.none(members, n, k),
     )
     end, _, failure = mean.carried(bare, span)
-    failed = ~np.isfinite(end.u).all(axis=1)
+    failed: Mask = np.asarray(~np.isfinite(end.u).all(axis=1))
     if failure is not None:
         failed[:] = True
     return end.u, end.kept if failure is None else kept, failed
@@ -341,7 +342,8 @@ class ShadowSet:
     @classmethod
     def of(cls, filter_: Filter, mean: Filter, options: Shadows) -> ShadowSet:
         """Return the shadows of a filter, from the same without covariance."""
-        problem, found, refused = filter_.problem, [], ""
+        problem, refused = filter_.problem, ""
+        found: list[Shadow] = []
         if options.step:
             found.append(StepShadow.of(mean))
         if options.mesh and not (refused := refusal(problem, options.largest)):
@@ -442,6 +444,37 @@ class ShadowSet:
             if more is not None:
                 u[:, row] += more
         return u, s.a
+
+    def notes(self, x: FilterState) -> dict[str, Array]:
+        """Return notes on the shifts of the unknowns, each of shape (members,).
+
+        Of each number by kind in its unit (`k_step_shift`), and in standard deviations of what is
+        reported without them: of all kinds together where that is largest
+        (`discretisation_shift`), and of each kind there (`step_shift`).
+        """
+        reduction, latent = self.filter.reduction, self.filter.problem.model.latent
+        C = robust_factors(self.filter, x)[1]
+        found: dict[str, list[float]] = {}
+        for k, a in enumerate(x.shadows.a):
+            q = reduction.bounded(x.q[k] + reduction.Phi @ x.da[k])
+            each = latent.tangent(q, reduction.Phi @ a.T)  # (m, shadows)
+            std = np.linalg.norm(latent.tangent(q, reduction.Phi @ C[k].T), axis=1)
+            shift = each / np.where(std > 0.0, std, np.inf)[:, None]
+            total = np.abs(shift.sum(axis=1))
+            worst = int(np.argmax(np.where(np.isfinite(total), total, -1.0)))
+            numbers = {"discretisation_shift": float(total[worst])}
+            for row, kind in enumerate(self.kinds):
+                numbers[f"{kind}_shift"] = float(shift[worst, row])
+                for label, at in latent.space.labels.items():
+                    numbers[f"{label}_{kind}_shift"] = float(each[at, row])
+            for name, value in numbers.items():
+                found.setdefault(name, []).append(value)
+        told = {name: np.array(values) for name, values in found.items()}
+        if x.shadows.failed.any():
+            told["shadow_failed"] = x.shadows.failed.astype(float)
+        if self.refused:
+            told["mesh_unfollowed"] = np.ones(len(x))
+        return told
 
     def widening(self, x: FilterState) -> tuple[Array, Array]:
         """Return the row of the square root [U C] that is reported for all shifts together.

@@ -120,7 +120,7 @@ class MemberStage(ABC):
 
     @abstractmethod
     def twin(self) -> MemberStage:
-        """Return a stage of the same model whose factors are its own: for steps of other lengths."""
+        """Return a stage of the same model with factors of its own: for other steps."""
 
     @abstractmethod
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
