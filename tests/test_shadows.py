@@ -222,7 +222,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     )
     given = lp.Identifier(model, SENSORS, lp.SensitivityLaw(), u0=0.0)
     assert ran(given, samples()[:10]).notes["mesh_unfollowed"] == 1.0
-    few = lp.SensitivityLaw(shadows=lp.Shadows(largest=5))
+    few = lp.SensitivityLaw(shadows=lp.Shadows(largest=10))
     assert ran(identifier(8, few), samples()[:10]).notes["mesh_unfollowed"] == 1.0
 
 

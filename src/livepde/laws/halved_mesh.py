@@ -120,8 +120,9 @@ class HalvedMesh:
 def refusal(problem: Problem, largest: int) -> str:
     """Return why a process is not followed on the halved mesh; empty if it is."""
     model = problem.model
-    if model.X.dim > largest:
-        return f"the state has {model.X.dim} coefficients, more than Shadows.largest = {largest}"
+    size = model.X.dim * 2 ** model.mesh.dim()
+    if size > largest:
+        return f"the state has about {size} coefficients there, more than {largest}"
     if not problem.observed.observation.portable:
         return "the readings of its sensors are coefficients of the given mesh"
     return ""

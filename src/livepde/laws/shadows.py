@@ -65,14 +65,14 @@ class Shadows:
         The straight line between readings of a channel, by the curvature of three readings; not
         where inputs are held.
     largest
-        Coefficients of the state beyond which the mesh is not halved, because that would cost more
-        than the filter.
+        Coefficients of the state on the halved mesh beyond which it is not followed, because that
+        would cost more than the filter.
     """
 
     step: bool = True
     mesh: bool = True
     inputs: bool = True
-    largest: int = 2000
+    largest: int = 4000
 
     def __post_init__(self) -> None:
         if not (self.step or self.mesh or self.inputs):
@@ -202,9 +202,13 @@ class InputShadow(Shadow):
     @staticmethod
     def read(s: ShadowState, span: Span) -> ShadowState:
         """Return what straight lines have missed after one more interval."""
-        length = span.t1 - span.t0
+        length, slope = span.t1 - span.t0, span.inputs1 - span.inputs0
+        if len(length) < len(s):  # the members of a bank have their samples in common
+            length = np.repeat(length, len(s))
+        if len(slope) < len(s):
+            slope = np.repeat(slope, len(s), axis=0)
         h = length[:, None]
-        slope = (span.inputs1 - span.inputs0) / h
+        slope = slope / h
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
         return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
 
