@@ -22,15 +22,20 @@ __all__ = ["Together"]
 class Together:
     """Steps all members of one model by `SensitivityLaw.step_members`.
 
-    `weights` say of each member which readings its initial state was made of.
+    `weights` say of each member which readings its initial state was made of, `initial` how it was
+    given.
     """
 
     def __init__(
-        self, law: Any, work: SensitivityWork, weights: Sequence[Mapping[str, Array]]
+        self,
+        law: Any,
+        work: SensitivityWork,
+        weights: Sequence[Mapping[str, Array]],
+        initial: Sequence[Any],
     ) -> None:
         self.law = law
         self.work = work
-        self._begins = [work.made_of(one) for one in weights]
+        self._begins = [work.made_of(*one) for one in zip(weights, initial, strict=True)]
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]

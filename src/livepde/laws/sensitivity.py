@@ -238,7 +238,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             shadows=ShadowState.none(1, n, k),
         )
         if filter_.shadows is not None:
-            x = changed(x, shadows=filter_.shadows.begun(x, moment))
+            given = problem.initial
+            x = changed(x, shadows=filter_.shadows.begun(x, moment, given))
         no = np.zeros(1, dtype=bool)
         return SensitivityState(
             now=x,
@@ -432,7 +433,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""
-        return robust_factors(work.filter, x)
+        U, C = robust_factors(work.filter, x)
+        if work.filter.shadows is None:
+            return U, C
+        u, a = work.filter.shadows.widening(x)
+        return np.concatenate([U, u], axis=1), np.concatenate([C, a], axis=1)
 
     def member_belief(self, work: SensitivityWork, now: FilterState, k: int) -> Belief:
         """Return what is believed of one member, in latent coefficients."""
@@ -440,9 +445,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         reduction, one = filter_.reduction, take(now, k)
         drift = float(filter_.drifts(one.member)[0])
         U, C = self.factors(work, one)
-        if filter_.shadows is not None:
-            u, a = filter_.shadows.widening(one)
-            U, C = np.concatenate([U, u], axis=1), np.concatenate([C, a], axis=1)
         return Belief(
             reduction.bounded(now.q[k] + reduction.Phi @ now.da[k]),
             now.u[k] + now.du[k],

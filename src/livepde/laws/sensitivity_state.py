@@ -55,9 +55,9 @@ class SensitivityWork:
     jumps: Jumps | None
     start_window: int
 
-    def made_of(self, weights: Mapping[str, Array]) -> SensitivityWork:
-        """Return the same for a member whose initial state was made of some readings."""
-        problem = replace(self.filter.problem, initial_weights=weights)
+    def made_of(self, weights: Mapping[str, Array], initial: Any) -> SensitivityWork:
+        """Return the same for a member whose initial state was given so, and made of readings."""
+        problem = replace(self.filter.problem, initial_weights=weights, initial=initial)
         return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property

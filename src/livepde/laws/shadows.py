@@ -126,8 +126,16 @@ class Shadow(ABC):
     kind: ClassVar[str]
 
     @abstractmethod
-    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
-        """Return what is known before the first step, of one member."""
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
+        """Return what is known before the first step, of one member.
+
+        Parameters
+        ----------
+        moment, given
+            Time and inputs, None before any; and the initial state as it was given.
+        """
 
     @abstractmethod
     def found(self, s: ShadowState, steps: Steps) -> Found:
@@ -169,7 +177,9 @@ class StepShadow(Shadow):
         ratio = 2.0**control.scheme.order
         return cls(replace(mean, problem=finer, stage=mean.stage.twin()), ratio / (ratio - 1.0))
 
-    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
         return changed(s, halves=self.halves.stage.kept(1))
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
@@ -195,7 +205,9 @@ class InputShadow(Shadow):
 
     kind = "input"
 
-    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
         nothing = np.zeros((1, len(self.mean.problem.channels)))
         return changed(s, slope=nothing, bend=nothing, missed=nothing)
 
@@ -259,12 +271,13 @@ class MeshShadow(Shadow):
         fine = replace(mean, problem=finer, stage=mesh.stage)
         return cls(replace(mean, stage=mean.stage.twin()), fine, mesh)
 
-    def begun(self, s: ShadowState, x: FilterState, moment: Moment | None) -> ShadowState:
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
         if moment is None:
             difference = np.zeros((1, self.mesh.model.X.dim))
             seen = np.zeros((1, self.mesh.observed.size))
         else:
-            given = self.mean.problem.initial
             difference = self.mesh.begun(given, x.q[0], x.u[0], moment)[None]
             seen = self.mesh.seen(x.u[0], x.q[0], difference[0], moment)[None]
         kept = {"blocks": self.mean.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
@@ -364,7 +377,7 @@ class ShadowSet:
         """Kind of each shadow."""
         return tuple(shadow.kind for shadow in self.shadows)
 
-    def begun(self, x: FilterState, moment: Moment | None) -> ShadowState:
+    def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
         """Return the shadows of one member at the start; None stands for no moment yet."""
         n, k = x.u.shape[1], x.C.shape[2]
         rows = len(self.shadows)
@@ -376,7 +389,7 @@ class ShadowSet:
             inputs0=nothing,
         )
         for shadow in self.shadows:
-            s = shadow.begun(s, x, moment)
+            s = shadow.begun(s, x, moment, given)
         return s
 
     def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
