@@ -128,7 +128,7 @@ class Identifier:
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
         control = Advance(scheme or law.scheme, dt_max, halvings, hold)
         self.problem = Problem(
-            model, self.observed, control, self._input_noise(input_noise or {}), {}
+            model, self.observed, control, self._input_noise(input_noise or {}), {}, u0
         )
         if u0_from and u0 is None:
             raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")

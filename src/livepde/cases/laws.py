@@ -23,6 +23,7 @@ from livepde.laws import (
     Replay,
     ResidualDamping,
     SensitivityLaw,
+    Shadows,
 )
 
 __all__ = ["law_of"]
@@ -60,6 +61,7 @@ def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
         "gate": spec.gate,
         "jumps": _jumps(frame, spec),
         "guards": _chosen(Guards, spec.guards),
+        "shadows": _chosen(Shadows, spec.shadows),
     }
     replay = _chosen(Replay, spec.replay)
     return SensitivityLaw(spec.modes, _noise(frame, spec), drift, memory, replay, **more)

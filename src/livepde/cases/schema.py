@@ -28,7 +28,7 @@ from livepde.cases.values import (
     TimeFormat,
 )
 from livepde.fem import Scalar
-from livepde.laws import Guards, Jumps, Replay, SensitivityLaw
+from livepde.laws import Guards, Jumps, Replay, SensitivityLaw, Shadows
 from livepde.streams.csvfile import UTF_8
 
 __all__ = [
@@ -340,6 +340,15 @@ class GuardsSpec(Spec):
     past: PositiveInt = Guards.past
 
 
+class ShadowsSpec(Spec):
+    """Which discretisation errors are followed and widen what is reported."""
+
+    step: StrictBool = Shadows.step
+    mesh: StrictBool = Shadows.mesh
+    inputs: StrictBool = Shadows.inputs
+    largest: PositiveInt = Shadows.largest
+
+
 class SensitivitySpec(Spec):
     """The law for sparse, noisy sensors."""
 
@@ -352,6 +361,7 @@ class SensitivitySpec(Spec):
     gate: PositiveFloat = SensitivityLaw.gate
     jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | JumpsSpec = False
     guards: StrictBool | GuardsSpec = True
+    shadows: StrictBool | ShadowsSpec = True
 
 
 class AutoSpec(Spec):

@@ -116,15 +116,16 @@ class Fleet:
         self.model = model = self._one.model
         self.law = law
         self.problem = self._one.problem
+        if any(u0 is not u0s[0] for u0 in u0s):
+            self.problem = replace(self.problem, initial=None)
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
         self._engine: Engine = Separately(law, self._work, self.problem)
         self.note = law.stepped_alone(self._work)
         if not self.note:
-            self._engine = Together(
-                law, self._work, [self._one.initial_readings(one) for one in made_of]
-            )
+            readings = [self._one.initial_readings(one) for one in made_of]
+            self._engine = Together(law, self._work, readings, u0s)
         elif any(one.keys() != made_of[0].keys() for one in made_of):
             raise ConfigurationError(
                 "u0_from differs between members, which are stepped separately, as "

@@ -22,15 +22,20 @@ __all__ = ["Together"]
 class Together:
     """Steps all members of one model by `SensitivityLaw.step_members`.
 
-    `readings` are those that the initial state of each member was made of.
+    `readings` are those that the initial state of each member was made of, `initial` how it was
+    given.
     """
 
     def __init__(
-        self, law: Any, work: SensitivityWork, readings: Sequence[Mapping[str, InitialReading]]
+        self,
+        law: Any,
+        work: SensitivityWork,
+        readings: Sequence[Mapping[str, InitialReading]],
+        initial: Sequence[Any],
     ) -> None:
         self.law = law
         self.work = work
-        self._begins = [work.made_of(one) for one in readings]
+        self._begins = [work.made_of(*one) for one in zip(readings, initial, strict=True)]
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]

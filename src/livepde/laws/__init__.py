@@ -31,6 +31,7 @@ from livepde.laws.operators import diffusion_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
+from livepde.laws.shadows import Shadows
 
 __all__ = [
     "AnyLaw",
@@ -58,6 +59,7 @@ __all__ = [
     "Residual",
     "ResidualDamping",
     "SensitivityLaw",
+    "Shadows",
     "SmoothedBound",
     "Status",
     "diffusion_operator",

@@ -104,6 +104,8 @@ class Problem:
         Channel of the model -> standard deviation of its noise.
     initial_readings
         Channel -> its reading at the initial time, if the initial state was made of it.
+    initial
+        The initial state as it was given: a number, a function of x, coefficients, or a mapping.
     """
 
     model: Model
@@ -111,6 +113,7 @@ class Problem:
     control: Advance
     input_noise: Mapping[str, float] = field(default_factory=dict)
     initial_readings: Mapping[str, InitialReading] = field(default_factory=dict)
+    initial: Any = None
 
     @cached_property
     def channels(self) -> tuple[str, ...]:

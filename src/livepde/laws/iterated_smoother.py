@@ -10,7 +10,7 @@ probable, and serves unknowns that stay and unknowns that move.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -22,6 +22,7 @@ from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
@@ -41,6 +42,8 @@ class _Pass:
 
     Attributes
     ----------
+    about
+        What was asked for, None for each estimate.
     trajectory, smoothed
         Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
         which the filter was linear, and those that it then estimates from all samples.
@@ -50,6 +53,7 @@ class _Pass:
         Minus twice the logarithm of the probability of the trajectory, up to a constant.
     """
 
+    about: Array | None
     trajectory: Array
     smoothed: Array
     x: FilterState
@@ -64,7 +68,8 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     problem = work.filter.problem
     log = state.log[:, int(state.window[0]) :]
     opening = first_interval(log, problem.channels)
-    samples = _Samples(work, state, opening, intervals_since(log, problem.channels))
+    intervals = intervals_since(log, problem.channels)
+    samples = _Samples(*_without_shadows(work, state), opening, intervals)
     shape = (1 + len(samples.intervals), state.now.C.shape[2])
     ends = []
     for trajectory in _beginnings(samples, shape):
@@ -75,7 +80,12 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
             break  # linear where the filter is, and that explains the samples
     if not ends:
         return None
-    best = min(ends, key=lambda one: one.misfit)
+    best: _Pass | None = min(ends, key=lambda one: one.misfit)
+    if best is not None and work.filter.shadows is not None:
+        # Shadows change no other number: they follow the last pass only.
+        best = _Samples(work, state, opening, samples.intervals).about(best.about)
+    if best is None:
+        return None
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
 
 
@@ -87,6 +97,20 @@ def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
     if plain is not None:
         yield plain.smoothed
     yield np.zeros(shape)
+
+
+def _without_shadows(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityWork, SensitivityState]:
+    """Return a filter that follows no discretisation error, and one member of it."""
+    if work.filter.shadows is None:
+        return work, state
+    start, now = (
+        changed(x, shadows=ShadowState.none(len(x), x.u.shape[1], x.C.shape[2]))
+        for x in (state.start, state.now)
+    )
+    plain = replace(work, filter=replace(work.filter, shadows=None))
+    return plain, changed(state, start=start, now=now)
 
 
 def _descended(samples: _Samples, best: _Pass) -> _Pass:
@@ -163,7 +187,7 @@ class _Samples:
         reached: Array = filter_.reduction.reduced(estimate)[0]
         return reached
 
-    def about(self, trajectory: Array) -> _Pass | None:
+    def about(self, trajectory: Array | None) -> _Pass | None:
         """Assimilate the samples, linear about a trajectory; None if that fails."""
         return self._run(trajectory)
 
@@ -202,7 +226,7 @@ class _Samples:
                 misfit += moved(filter_, followed[-2], followed[-1], h, gained)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
         smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
-        return _Pass(np.array(followed), smoothed, x, misfit)
+        return _Pass(trajectory, np.array(followed), smoothed, x, misfit)
 
     def _remembered(self, x: FilterState) -> FilterState:
         return self.work.filter.remembered(x) if self.work.filter.moves else x

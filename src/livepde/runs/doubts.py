@@ -31,6 +31,15 @@ TELLING = "longer data, with larger changes nearer to the sensors, would tell mo
 LEAVES = 1.0  # squared distance from the prior over what model and prior allow
 REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
+SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+REMEDIES = {
+    "step": ("the time step", "take a smaller dt_max (steps.dt_max), or a scheme of second order"),
+    "mesh": ("the mesh", "take more elements, where the state bends most"),
+    "input": (
+        "the straight lines between readings of the input channels",
+        "read these channels more often",
+    ),
+}
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 
 
@@ -47,7 +56,8 @@ def doubts(data: xr.Dataset) -> list[str]:
     half of a run, by more than 0.3 of what it has learned. In more than 0.03 of the samples a bank
     believes that unknowns drift. Latent values were held where they would have left their
     prior. Of the mean variance of a field more than a quarter is that of modes that the law leaves
-    out. Something jumped.
+    out. Something jumped. Time step, mesh and straight lines between readings of inputs have
+    together shifted an unknown by more than two standard deviations.
     """
     if not data.sizes["time"]:
         return []
@@ -63,6 +73,7 @@ def doubts(data: xr.Dataset) -> list[str]:
         *_departure(data),
         *_gain(data),
         *_jumps(data),
+        *_discretised(data),
     ]
 
 
@@ -312,6 +323,27 @@ def _departure(data: xr.Dataset) -> list[str]:
         "disagree with the model by more than their noise, and the unknowns take it up; or the "
         "prior is too narrow. Take kind = 'sensitivity', refine the mesh and the steps, state a "
         "larger noise, or a larger std of the unknowns."
+    ]
+
+
+def _discretised(data: xr.Dataset) -> list[str]:
+    """Return whether the discretisation has shifted the unknowns at the end, and by what."""
+    total = note(data, "discretisation_shift")
+    if total is None or not total[-1] > SHIFTED:
+        return []
+    notes = {kind: note(data, f"{kind}_shift") for kind in REMEDIES}
+    sizes = {kind: abs(float(values[-1])) for kind, values in notes.items() if values is not None}
+    kind = max(sizes, key=lambda kind: sizes[kind])
+    what, remedy = REMEDIES[kind]
+    parts = []
+    for label in scalars(data):
+        shift = note(data, f"{label}_{kind}_shift")
+        if shift is not None and np.isfinite(shift[-1]):
+            parts.append(f"{label} by {shift[-1]:+.2g}")
+    moved = f" ({', '.join(parts[:MOST_SENSORS])})" if parts else ""
+    return [
+        f"The discretisation has shifted the unknowns by {total[-1]:.1f} standard deviations, and "
+        f"most of it is {what}{moved}. The intervals were widened by that: {remedy}."
     ]
 
 

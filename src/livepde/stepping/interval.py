@@ -125,12 +125,15 @@ class Advance:
     hold
         Whether inputs are held between samples at what the later one brings, as an actuator that
         is set anew at each sample leaves them; else they change linearly.
+    parts
+        Every substep is divided into so many: for the same interval with shorter steps.
     """
 
     scheme: Scheme
     dt_max: float = np.inf
     halvings: int = 8
     hold: bool = False
+    parts: int = 1
 
     def __post_init__(self) -> None:
         given: Any = self.halvings
@@ -149,7 +152,7 @@ class Advance:
     def count(self, length: float) -> int:
         """Return the number of even substeps of an interval of that length."""
         ratio = length / self.dt_max
-        return max(1, math.ceil(ratio * (1 - 1e-12)))
+        return self.parts * max(1, math.ceil(ratio * (1 - 1e-12)))
 
 
 def _width(t: float, stop: float) -> float:
