@@ -4,12 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from typer import Typer
-from typer.testing import CliRunner
+from commands import bench
 
 import livepde as lp
 from benchmarks.honest import KINDS, PROBLEMS, honest
-from benchmarks.honest.__main__ import main
 from benchmarks.honest.batch import Batch
 from benchmarks.honest.linear import Chebyshev, Linear, fine_times
 from benchmarks.honest.noise import disturbed
@@ -18,6 +16,7 @@ from benchmarks.honest.problems.flux import NonlinearFlux, RodFlux
 from benchmarks.honest.problems.warm import WarmRod
 from benchmarks.honest.report import outcome
 from benchmarks.honest.twin import SHARES, Run
+from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 
 SMALL = 0.15  # of the noise, root mean square: that much truth and refined livepde may differ
@@ -287,15 +286,12 @@ def test_twins_are_scored_in_every_kind():
 
 
 def test_command():
-    app = Typer()
-    app.command()(main)
-    run = CliRunner().invoke(
-        app,
-        ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1", "--json"],
-    )
-    shown = json.loads(run.stdout)
-    assert run.exit_code == (0 if all(check["ok"] for check in shown["checks"]) else 1)
+    given = ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1"]
+    code, output = bench("honest", *given, "--json")
+    shown = json.loads(output)
+    assert code == (0 if all(check["ok"] for check in shown["checks"]) else 1)
     assert {row[0] for row in shown["tables"][0]["rows"]} == {"rod"}
     assert set(shown["checks"][0]) == {"name", "value", "bound", "sense", "ok"}
-    wrong = CliRunner().invoke(app, ["--only", "rood"])
-    assert wrong.exit_code == 2
+    for option, wrong, what in (("--only", "rood", "problem"), ("--kind", "whit", "kind of data")):
+        with pytest.raises(ConfigurationError, match=f"there is no {what} '{wrong}'; did you mean"):
+            bench("honest", option, wrong)

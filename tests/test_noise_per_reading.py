@@ -134,6 +134,8 @@ def test_all_forms_say_the_same():
         ({"a": (1.0, np.inf)}, "send NaN"),
         ({"a": (1.0, "x")}, "noise of a: got 'x'"),
         ({"a": (1.0, 0.1, 0.2)}, "expected a number, or of a sensor a pair"),
+        ([(1.0, 0.1), ("1.0", 0.1)], "not an array of numbers"),
+        ([(1.0, 0.1), 1.0], "not a number"),
         ({"noise of c": 0.1}, "unknown channel 'noise of c'"),
     ],
 )

@@ -158,6 +158,14 @@ def plan(name: str, values: Any, count: int) -> Array:
     return np.broadcast_to(found, (count,))
 
 
+def _are_pairs(z: Any, size: int) -> bool:
+    """Return whether z holds a pair for each of so many sensors."""
+    try:
+        return bool(np.shape(z) == (size, 2))
+    except ValueError:  # rows of several lengths
+        return False
+
+
 def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     """Return the measurements of all sensors, shape (sensors,), as an array of their own.
 
@@ -166,10 +174,10 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
     if usual and np.isfinite(z).all():
         return np.array(z), None
-    if np.shape(z) == (observed.size, 2):
-        pairs = zip(observed.names, numbers(z, "z"), strict=True)
-        noise = own_noise([check_noise(name, std) for name, (_, std) in pairs])
-        return readings(np.array([value for value, _ in z]), observed)[0], noise
+    if _are_pairs(z, observed.size):
+        named = list(zip(observed.names, z, strict=True))
+        noise = own_noise([check_noise(name, std) for name, (_, std) in named])
+        return readings([value for _, (value, _) in named], observed)[0], noise
     if (
         np.asarray(z).dtype.kind in "USb"
         if not isinstance(z, list | tuple)
