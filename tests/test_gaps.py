@@ -329,7 +329,7 @@ def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
 
     with ExitStack() as stack:
         writer, (_, driven) = batch(prepared, folder, write, stack, quiet=True)
-        _, _, _, notes = concluded(case, prepared.identifier, driven, writer, draw=False)
+        _, _, _, notes = concluded(prepared, prepared.identifier, driven, writer, draw=False)
     assert (
         "Channel left: 1 values far off those before and after were refused as spikes; 3 gaps were "
         "interpolated between the values before and after; 1 missing values were not between known "

@@ -86,7 +86,7 @@ def test_a_stated_number_counts_and_infinity_is_no_end():
 def test_the_filter_stays_linear_so_that_nothing_is_lost():
     """While the estimate is held, the filter learns as ever: afterwards it is where it would be."""
     values = [5.0] * 3 + [0.0] * 60
-    law = lp.SensitivityLaw(guards=None, gate=np.inf)
+    law = lp.SensitivityLaw(guards=None, gate=np.inf, shadows=None)
     held, free = (
         run(source(lp.Scalar(0.0, 0.2, within=within)), stream(values), law, 0.0)
         for within in (2.0, np.inf)

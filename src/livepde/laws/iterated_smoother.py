@@ -26,7 +26,7 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
-__all__ = ["apart", "expecting", "iterated_smoother", "learns", "missed", "moved"]
+__all__ = ["apart", "expecting", "iterated_smoother", "learns", "missed", "moved", "without_shadows"]
 
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
@@ -69,7 +69,7 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     log = state.log[:, int(state.window[0]) :]
     opening = first_interval(log, problem.channels)
     intervals = intervals_since(log, problem.channels)
-    samples = _Samples(*_without_shadows(work, state), opening, intervals)
+    samples = _Samples(*without_shadows(work, state), opening, intervals)
     shape = (1 + len(samples.intervals), state.now.C.shape[2])
     ends = []
     for trajectory in _beginnings(samples, shape):
@@ -99,7 +99,7 @@ def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
     yield np.zeros(shape)
 
 
-def _without_shadows(
+def without_shadows(
     work: SensitivityWork, state: SensitivityState
 ) -> tuple[SensitivityWork, SensitivityState]:
     """Return a filter that follows no discretisation error, and one member of it."""

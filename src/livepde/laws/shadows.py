@@ -458,7 +458,7 @@ class ShadowSet:
         s, u = x.shadows, x.shadows.u.copy()
         for row, shadow in enumerate(self.shadows):
             more = shadow.beside(s)
-            if more is not None:
+            if more is not None and u.size:  # of a state that is asked for
                 u[:, row] += more
         return u, s.a
 

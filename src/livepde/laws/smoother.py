@@ -31,7 +31,7 @@ from livepde.laws.assimilation import assimilate_at_once
 from livepde.laws.base import FixedInterval
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
-from livepde.laws.iterated_smoother import expecting, missed, moved
+from livepde.laws.iterated_smoother import expecting, missed, moved, without_shadows
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array
@@ -79,6 +79,7 @@ def smoothed(
         The member before the first sample, and its filter after the last one in the run: its noise
         level and the statistics of its innovations are those of all samples.
     """
+    work, before = without_shadows(work, before)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # not finite: not used
         best = _descended(_FixedInterval(work, before, after, data))
     return _backward(best, after)
@@ -91,6 +92,7 @@ def evidence(
 
     Minus infinity where they cannot be followed. Parameters as for `smoothed`.
     """
+    work, before = without_shadows(work, before)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         samples = _FixedInterval(work, before, after, data)
         samples.work = replace(work, options=replace(work.options, adaptive=True))
@@ -125,9 +127,14 @@ def _descended(samples: _FixedInterval) -> _Pass:
 
 
 def _backward(best: _Pass, after: FilterState) -> Iterator[FilterState]:
-    """Iterate backward over the filters given all samples, with the innovations of the run."""
+    """Iterate backward over the filters given all samples.
+
+    Innovations are those of the run, and so is by how much discretisation has shifted the unknowns
+    in the end; of the state the shift is known at the end only.
+    """
     rows = best.points[-1].x.C.shape[1]
     mu, B = np.zeros(rows), np.eye(rows)
+    shadows = after.shadows
     for point in reversed(best.points):
         x = point.x
         yield changed(
@@ -137,7 +144,9 @@ def _backward(best: _Pass, after: FilterState) -> Iterator[FilterState]:
             U=B @ x.U,
             C=B @ x.C,
             innovations=after.innovations,
+            shadows=changed(shadows, u=shadows.u[:, :, : x.u.shape[1]]),
         )
+        shadows = changed(shadows, u=0.0 * shadows.u, fine=0.0 * shadows.fine)
         T = x.past[0]
         mu = x.dpast[0] + mu @ T
         B = np.asarray(np.linalg.qr(np.vstack([B @ T, point.R]), mode="r"))
