@@ -63,7 +63,7 @@ def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tole
     one = lp.Identifier(
         model,
         lp.Points(SENSORS, noise=1.0),
-        lp.SensitivityLaw(),
+        lp.SensitivityLaw(shadows=None),
         u0=0.0,
         scheme=scheme,
         input_noise={name: noise},
@@ -90,7 +90,7 @@ def test_a_model_that_is_not_linear_has_it_too():
     one = lp.Identifier(
         model,
         lp.Points(SENSORS, noise=1.0),
-        lp.SensitivityLaw(),
+        lp.SensitivityLaw(shadows=None),
         u0=0.0,
         scheme=ImplicitEuler(),
         input_noise={"left": noise},

@@ -52,8 +52,8 @@ def ends(model, law, samples, u0=0.0):
 def test_nothing_changes_where_all_is_linear(evolution):
     model = sourced(evolution)
     samples = list(readings(model, [1.5]))
-    plain = ends(model, lp.SensitivityLaw(start_window=0), samples)
-    iterated = ends(model, lp.SensitivityLaw(), samples)
+    plain = ends(model, lp.SensitivityLaw(start_window=0, shadows=None), samples)
+    iterated = ends(model, lp.SensitivityLaw(shadows=None), samples)
     assert any("smoother_moved" in estimate.notes for estimate in iterated)
     for one, other in zip(plain, iterated, strict=True):
         np.testing.assert_allclose(other.q, one.q, rtol=1e-8, atol=1e-10)
