@@ -40,6 +40,7 @@ FIRST = 32  # steps that are all shadowed: where a run begins the error changes 
 # Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
 # phase alone; on average 8, of which each stands for those before it.
 LATER = np.array([5, 11, 7, 9])
+LONG = 256  # steps from which on they are twice as many: one of 256 tells little
 MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
 KINDS = ("step", "mesh", "input")
 
@@ -51,8 +52,8 @@ class Shadows:
     Their signed shifts are summed, and widen what is reported: variance plus square of the sum. The
     estimate itself, and the filter, stay as they are.
 
-    The first 32 steps are shadowed, later one of eight, which stands for those before it: an error
-    that changes much faster is found on average only.
+    The first 32 steps are shadowed, later one of eight, from 256 on one of sixteen, which stands
+    for those around it: an error that changes much faster is found on average only.
 
     Parameters
     ----------
@@ -422,7 +423,7 @@ class ShadowSet:
         waited, block = s.count - s.last, span
         if (waited > 1).any():
             block = replace(span, t0=s.begun, inputs0=s.inputs0, interval=None)
-        wait = np.where(s.count < FIRST, 1, LATER[s.count // 8 % len(LATER)])
+        wait = _wait(s.count)
         steps, u = Steps(x, end, span, block, waited, wait), s.u.copy()
         for row, shadow in enumerate(self.shadows):
             found = shadow.found(s, steps)
@@ -507,6 +508,12 @@ class ShadowSet:
         return np.where(good[..., None], u, 0.0) * factor, np.where(
             good[..., None], a, 0.0
         ) * factor
+
+
+def _wait(count: IntArray) -> IntArray:
+    """Return after how many more steps shadows are taken that were taken after so many."""
+    later = LATER[count // 8 % len(LATER)] * np.where(count < LONG, 1, 2)
+    return np.where(count < FIRST, 1, later)
 
 
 def _opened(s: ShadowState, fresh: Mask, x: FilterState, span: Span, mesh: bool) -> ShadowState:
