@@ -268,6 +268,7 @@ def test_checks_find_what_is_wrong():
     assert outcome(good).notes[-1] == "rod, spike, seed 0: StepFailed: at t = 1"
 
 
+@pytest.mark.study
 def test_twins_are_scored_in_every_kind():
     found = honest(["borehole"], seeds=1, workers=1)
     overview, details = found.tables

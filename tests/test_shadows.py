@@ -139,6 +139,7 @@ def test_no_number_of_the_filter_moves(evolution: Any) -> None:
     assert (one.q_std >= other.q_std).all()
 
 
+@pytest.mark.study
 def test_intervals_hold_on_a_coarse_mesh() -> None:
     """The plain 95 % intervals miss a constant in most runs on five cells; these hold it."""
     held, plain = [], []

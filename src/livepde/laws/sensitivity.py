@@ -485,7 +485,5 @@ def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
 
 
 def without_factors(x: FilterState) -> FilterState:
-    """Return a filter without what its last stage has left: what estimates hold."""
-    if not x.kept.trend.size:
-        return x
-    return changed(x, kept=KeptFactors.none(len(x)))
+    """Return a filter without what its last stages have left: what estimates hold."""
+    return changed(x, kept=KeptFactors.none(len(x)), shadows=x.shadows.without_stages())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,4 +90,11 @@ class ShadowState:
             fine_stage=kept,
             seen=nothing,
             failed=zero,
+        )
+
+    def without_stages(self) -> ShadowState:
+        """Return the shifts alone, without what the next steps need."""
+        kept, nothing = KeptFactors.none(len(self)), np.zeros((len(self), 0))
+        return replace(
+            self, halves=kept, blocks=kept, fine_stage=kept, u0=nothing, inputs0=nothing
         )
