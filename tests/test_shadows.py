@@ -108,7 +108,7 @@ def test_predicts_the_shift_by_steps_across_jumps() -> None:
     truth = Twin(
         model=model,
         observation=sensors,
-        q_true=9.7e-5,
+        q_true={"alpha": 9.7e-5},
         u0=20.0,
         times=times,
         dt_max=2.0,

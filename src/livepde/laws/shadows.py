@@ -429,8 +429,9 @@ class ShadowSet:
             if len(group) == len(s):
                 s = self._taken(s, x, end, span, jumps)
             else:
-                members = (take(part, group) for part in (s, x, end))
-                s = put(s, group, self._taken(*members, _part(span, group), jumps[group]))
+                some, one, after = take(s, group), take(x, group), take(end, group)
+                taken = self._taken(some, one, after, _part(span, group), jumps[group])
+                s = put(s, group, taken)
         return changed(end, shadows=s)
 
     def _taken(
