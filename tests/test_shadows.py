@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import livepde as lp
+from livepde.models import heat
 from livepde.runs.doubts import doubts
 from livepde.stepping import Alexander2, ImplicitEuler
-from livepde.streams import Twin
+from livepde.streams import AbsoluteNoise, Twin
 
 NOISE, WIDTH, COUNT = 0.003, 0.1, 150
 TRUE = {"k": 1.3, "h": 0.8}
@@ -92,6 +93,36 @@ def test_predicts_the_shift_by_the_step() -> None:
     actual = estimate.q - reference().q
     assert np.abs(actual / reference().q_std).max() > 8.0
     assert_predicts(shifts(estimate, "step"), actual, reference().q_std, 0.2)
+
+
+def test_predicts_the_shift_by_steps_across_jumps() -> None:
+    """A heater that goes on and off: the jumps are shadowed, and each counts once."""
+    mesh = lp.interval(0.0, 0.4, 20)
+    model = heat(
+        mesh,
+        alpha=lp.Scalar(5e-5, 3e-5, transform="log"),
+        dirichlet={"left": lambda x, t: 20.0 + 30.0 * (t % 3600.0 < 600.0)},
+    )
+    sensors = lp.Points([0.1, 0.2], noise=0.05)
+    times = np.arange(0.0, 7200.0, 60.0)
+    truth = Twin(
+        model=model,
+        observation=sensors,
+        q_true={"alpha": 9.7e-5},
+        u0=20.0,
+        times=times,
+        dt_max=2.0,
+        noise=AbsoluteNoise(0.05),
+    )
+    rows, ends = list(truth), []
+    for width in (30.0, 2.0):
+        given = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=20.0, dt_max=width)
+        ends.append([given.step(sample.t, sample.z) for sample in rows][-1])
+    coarse, fine = ends
+    (label,) = coarse.parameters
+    predicted, actual = coarse.notes[f"{label}_step_shift"], (coarse.q - fine.q)[0]
+    assert abs(actual) > 2.0 * fine.q_std[0]
+    assert predicted == pytest.approx(actual, rel=0.4)
 
 
 def test_the_second_order_scheme_is_shifted_little() -> None:

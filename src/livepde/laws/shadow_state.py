@@ -23,6 +23,12 @@ class ShadowState:
         shadow, shapes (members, shadows, n) and (members, shadows, k).
     count, last, due
         Steps so far, and at which the shadows were taken last and are taken next, (members,).
+    rate, usual, jumped
+        Change of the state per unit of time in the last step, how much that usually differs from
+        one step to the next, and the count of steps at which it last differed by much more; shapes
+        (members, n), (members,) and (members,).
+    size
+        Norm of what the step shadow found last, (members,); infinite before.
     begun, u0, inputs0
         Time, state and inputs where the shadows were taken last; the state without columns if no
         shadow needs it. Shapes (members,), (members, n) and (members, channels).
@@ -48,6 +54,10 @@ class ShadowState:
     count: IntArray
     last: IntArray
     due: IntArray
+    rate: Array
+    usual: Array
+    jumped: IntArray
+    size: Array
     begun: Array
     u0: Array
     inputs0: Array
@@ -77,6 +87,10 @@ class ShadowState:
             count=zero,
             last=zero,
             due=zero,
+            rate=np.zeros((members, n)),
+            usual=time,
+            jumped=zero,
+            size=time + np.inf,
             begun=time,
             u0=nothing,
             inputs0=nothing,

@@ -28,7 +28,7 @@ from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.members import changed, put, take
 from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import KeptFactors, Moments, Span
+from livepde.stepping import TINY, KeptFactors, Moments, Span
 
 if TYPE_CHECKING:
     from livepde.laws.filter import Filter, Update
@@ -37,6 +37,11 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "ShadowSet", "Shadows"]
 
 FIRST = 32  # steps that are all shadowed: where a run begins the error changes from step to step
+CALM = 4  # steps after a jump that are all shadowed
+JUMP = 4.0  # times the usual difference of two changes of the state: something has jumped
+USUAL = 16.0  # steps over which that is averaged
+ALIKE = 3.0  # ratio of the errors of two steps that others between them have, too
+AHEAD = 0.5  # share of the last change of the mesh error that is expected to follow
 # Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
 # phase alone; on average 8, of which each stands for those before it.
 LATER = np.array([5, 11, 7, 9])
@@ -93,6 +98,8 @@ class Steps(NamedTuple):
         The last of them, and all since the shadow was taken before.
     waited, next
         The number of the latter, and of those that follow until the next is taken, (members,).
+    jumps
+        Members of which something jumped in the last step, shape (members,).
     """
 
     x: FilterState
@@ -101,6 +108,7 @@ class Steps(NamedTuple):
     block: Span
     waited: IntArray
     next: IntArray
+    jumps: Mask
 
 
 class Found(NamedTuple):
@@ -155,7 +163,8 @@ class Shadow(ABC):
 class StepShadow(Shadow):
     """The error of the time step: one step less two halved ones, from the same state.
 
-    One step stands for half of those since the shadow before and half of those until the next.
+    One step stands for half of those since the shadow before and half of those until the next,
+    unless its error is much larger than that of the shadow before.
 
     Attributes
     ----------
@@ -185,8 +194,13 @@ class StepShadow(Shadow):
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
         u, kept, failed = _followed(self.halves, steps.x, steps.x.u, s.halves, steps.span)
-        weight = 0.5 * self.factor * (steps.waited + steps.next)
-        return Found(weight[:, None] * (steps.end.u - u), {"halves": kept}, failed)
+        error = self.factor * (steps.end.u - u)
+        size = np.linalg.norm(error, axis=1)
+        # An error much larger than the one before is that of this step alone.
+        alike = np.where(size <= ALIKE * s.size, 1.0, s.size / np.maximum(size, TINY))
+        weight = 1.0 + (0.5 * (steps.waited + steps.next) - 1.0) * alike
+        parts = {"halves": kept, "size": np.where(steps.jumps | failed, s.size, size)}
+        return Found(weight[:, None] * error, parts, failed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,7 +307,8 @@ class MeshShadow(Shadow):
         u, kept, wrong = _followed(self.fine, x, start, s.fine_stage, steps.block)
         failed = (failed | wrong)[:, None]
         fine = np.where(failed, s.fine, u - mesh.prolonged(coarse))
-        halfway = fine + (0.5 * (steps.next - 1) / steps.waited)[:, None] * (fine - s.fine)
+        ahead = np.minimum(0.5 * (steps.next - 1) / steps.waited, AHEAD)
+        halfway = fine + ahead[:, None] * (fine - s.fine)
         at = steps.block.end
         each = enumerate(zip(end.u, end.q, halfway, strict=True))
         seen = np.array([mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in each])
@@ -407,24 +422,27 @@ class ShadowSet:
             s = _opened(s, fresh, x, span, "mesh" in self.kinds)
         if "input" in self.kinds:
             s = InputShadow.read(s, span)
-        s = changed(s, count=s.count + 1)
-        due = s.count >= s.due
+        s, jumps = _watched(s, x, end, span)
+        due = (s.count >= s.due) | jumps
         for t in np.unique(s.begun[due]) if due.any() else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):
-                s = self._taken(s, x, end, span)
+                s = self._taken(s, x, end, span, jumps)
             else:
-                parts = (take(s, group), take(x, group), take(end, group), _part(span, group))
-                s = put(s, group, self._taken(*parts))
+                some, one, after = take(s, group), take(x, group), take(end, group)
+                taken = self._taken(some, one, after, _part(span, group), jumps[group])
+                s = put(s, group, taken)
         return changed(end, shadows=s)
 
-    def _taken(self, s: ShadowState, x: FilterState, end: FilterState, span: Span) -> ShadowState:
+    def _taken(
+        self, s: ShadowState, x: FilterState, end: FilterState, span: Span, jumps: Mask
+    ) -> ShadowState:
         """Return members that began together after their shadows were taken."""
         waited, block = s.count - s.last, span
         if (waited > 1).any():
             block = replace(span, t0=s.begun, inputs0=s.inputs0, interval=None)
-        wait = _wait(s.count)
-        steps, u = Steps(x, end, span, block, waited, wait), s.u.copy()
+        wait = np.where(s.count - s.jumped < CALM, 1, _wait(s.count))
+        steps, u = Steps(x, end, span, block, waited, wait, jumps), s.u.copy()
         for row, shadow in enumerate(self.shadows):
             found = shadow.found(s, steps)
             if found.error is not None:
@@ -508,6 +526,23 @@ class ShadowSet:
         return np.where(good[..., None], u, 0.0) * factor, np.where(
             good[..., None], a, 0.0
         ) * factor
+
+
+def _watched(
+    s: ShadowState, x: FilterState, end: FilterState, span: Span
+) -> tuple[ShadowState, Mask]:
+    """Return members after one more step, and of whom something jumped in it."""
+    rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
+    differs = np.linalg.norm(rate - s.rate, axis=1)
+    jumps = (differs > JUMP * s.usual) & (s.count > CALM)
+    # Before the second step nothing is known; a jump does not count as usual.
+    told = np.where(s.count > CALM, np.minimum(differs, JUMP * s.usual), differs)
+    usual = np.where(
+        s.count > 1, s.usual + (told - s.usual) / np.minimum(s.count + 1.0, USUAL), differs
+    )
+    count = s.count + 1
+    jumped = np.where(jumps, count, s.jumped)
+    return changed(s, rate=rate, usual=usual, count=count, jumped=jumped), jumps
 
 
 def _wait(count: IntArray) -> IntArray:
