@@ -49,7 +49,8 @@ def _gradient(spec: GradientSpec) -> GradientLaw:
 
 def _auto(frame: Frame, spec: AutoSpec) -> AutoLaw:
     noise = None if spec.noise is None else _level(frame, spec.noise)
-    return AutoLaw(spec.modes, noise, gate=spec.gate)
+    shadows = _chosen(Shadows, spec.shadows)
+    return AutoLaw(spec.modes, noise, gate=spec.gate, shadows=shadows)
 
 
 def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:

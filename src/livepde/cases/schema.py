@@ -371,6 +371,7 @@ class AutoSpec(Spec):
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
     gate: PositiveFloat = SensitivityLaw.gate
+    shadows: StrictBool | ShadowsSpec = True
 
 
 class TikhonovSpec(Spec):

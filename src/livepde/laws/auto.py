@@ -43,6 +43,7 @@ from livepde.laws.sensitivity_state import (
     new_window,
     restarted,
 )
+from livepde.laws.shadows import Shadows
 from livepde.laws.smoother import evidence, smoothed
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Alexander2, Interval, Scheme
@@ -94,7 +95,7 @@ class AutoLaw(Law[Bank, AutoState]):
         samples, which are assimilated then.
     replay
         Of the members whose unknowns stay; see `Replay`.
-    gate, gate_patience
+    gate, gate_patience, shadows
         As for `SensitivityLaw`.
     """
 
@@ -103,6 +104,7 @@ class AutoLaw(Law[Bank, AutoState]):
     replay: Replay = field(default_factory=Replay)
     gate: float = SensitivityLaw.gate
     gate_patience: int = 10
+    shadows: Shadows | None = field(default_factory=Shadows)
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
 
@@ -126,6 +128,7 @@ class AutoLaw(Law[Bank, AutoState]):
             replay=self.replay,
             gate=self.gate,
             gate_patience=self.gate_patience,
+            shadows=self.shadows,
         )
 
     def weighs_readings(self) -> bool:
