@@ -95,6 +95,7 @@ def samples(sensors: lp.Observation, noise: float) -> list[tuple[float, Any]]:
 
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay())])
 @pytest.mark.parametrize("of", ["phi", "c and phi"])
+@pytest.mark.slow
 def test_both_unknowns_are_identified_from_the_potential(law: Any, of: str):
     noise = 0.01
     potential = lp.Points({"phi_2": 0.2, "phi_6": 0.6}, of="phi", noise=noise)

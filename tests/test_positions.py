@@ -46,9 +46,10 @@ def estimated(found, std):
     return one, one.run(found).last.belief
 
 
+@pytest.mark.study
 def test_shifts_are_found_and_what_they_cost_is_in_the_interval():
-    inside, without, shifts_inside = 0, 0, 0
-    for seed in range(20):
+    inside, shifts_inside = 0, 0
+    for seed in range(10):
         rng = np.random.default_rng(100 + seed)
         k = 0.1 + 0.03 * float(np.clip(rng.standard_normal(), -2.0, 2.0))
         shifts = 0.02 * rng.standard_normal(3)
@@ -57,15 +58,12 @@ def test_shifts_are_found_and_what_they_cost_is_in_the_interval():
         std = belief.q_std
         inside += abs(belief.q[0] - k) < 1.96 * std[0]
         shifts_inside += int((np.abs(belief.q[1:] - shifts) < 1.96 * std[1:]).sum())
-        _, exact = estimated(found, None)
-        without += abs(exact.q[0] - k) < 1.96 * exact.q_factor[0, 0]
     assert one.model.parameter_space.labels.keys() == {
         "k",
         *(f"position[{name}]" for name in AT),
     }
-    assert inside >= 17
-    assert shifts_inside >= 51
-    assert without < 17
+    assert inside >= 9
+    assert shifts_inside >= 26
 
 
 def test_it_is_a_quadratic_in_the_shift():

@@ -31,6 +31,7 @@ HALF = 0.5  # share of a variance that is left, below which a linearisation may 
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 4  # of a step that makes samples and prior less probable
 CONVERGED = 0.3  # standard deviations that a step moves the trajectory by, at the end of it
+HOLDS = 0.1  # the same, of the first step, for a linearisation that holds
 STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
 
@@ -71,7 +72,7 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
         one = samples.about(trajectory)
         if one is not None:
             ends.append(_descended(samples, one))
-        if ends and ends[-1] is one and one.misfit <= samples.usual_misfit:
+        if one is not None and _holds(one) and one.misfit <= samples.usual_misfit:
             break  # linear where the filter is, and that explains the samples
     if not ends:
         return None
@@ -87,6 +88,11 @@ def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
     if plain is not None:
         yield plain.smoothed
     yield np.zeros(shape)
+
+
+def _holds(one: _Pass) -> bool:
+    """True if samples and prior together are most probable where the pass is linear."""
+    return _deviations(one.x, (one.smoothed - one.trajectory)[-1]) <= HOLDS
 
 
 def _descended(samples: _Samples, best: _Pass) -> _Pass:

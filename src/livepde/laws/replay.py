@@ -48,7 +48,7 @@ class Replay:
     window: int = 4096
     first: int = 8
     iterations: int = 4
-    slice: int = 12
+    slice: int = 16
 
     def __post_init__(self) -> None:
         if not 1 <= self.first <= self.window:
