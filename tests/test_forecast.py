@@ -63,6 +63,7 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("law", ["sensitivity", "replay"])
+@pytest.mark.slow
 def test_a_forecast_is_what_the_next_step_expects(law):
     identifier = rod(LAWS[law])
     for k, (t, z) in enumerate(samples(30)):

@@ -317,6 +317,7 @@ def plant(folder: Path, left: str = "", sensor: str = "", wait: float = 0.0, bro
 BROKEN = {30: "", 31: "", 60: "9999", 119: ""}
 
 
+@pytest.mark.slow
 def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
     whole = cases.load(plant(tmp_path)).prepare()
     whole_k = float(whole.identifier.run(whole.stream).to_xarray()["alpha"][-1])
@@ -355,6 +356,7 @@ def test_sensors_are_neither_interpolated_nor_screened(tmp_path, key):
 
 
 @pytest.mark.parametrize(("wait", "known"), [(0.0, False), (3 * SECONDS, True)])
+@pytest.mark.slow
 def test_beside_a_process_the_wait_decides(tmp_path, wait, known):
     path = plant(tmp_path, wait=wait)
     u = 20.0 + 10.0 * np.sin(2.0 * np.pi * np.arange(COUNT) / COUNT)

@@ -102,6 +102,7 @@ def simulated(problem, theta, refine, substeps):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.slow
 def test_truths_agree_with_livepde_refined(name):
     problem = PROBLEMS[name]
     theta = 0.7 * np.random.default_rng(5).standard_normal(problem.coordinates)
@@ -215,6 +216,7 @@ def test_kinds_of_data():
 # --- batch and scores ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_batch_posterior_holds_its_truths():
     """Errors of the batch fit in its own standard deviations are standard normal."""
     problem, errors = PROBLEMS["column"], []
@@ -286,6 +288,7 @@ def test_twins_are_scored_in_every_kind():
     assert [row[:10] for row in again.tables[0].rows] == [row[:10] for row in white]
 
 
+@pytest.mark.slow
 def test_command():
     given = ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1"]
     code, output = bench("honest", *given, "--json")

@@ -49,6 +49,7 @@ def states(model, inputs, scheme) -> np.ndarray:
 
 @pytest.mark.parametrize("flux", [False, True])
 @pytest.mark.parametrize(("scheme", "tolerance"), [(ImplicitEuler(), 0.01), (Alexander2(), 0.05)])
+@pytest.mark.slow
 def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tolerance):
     """Each reading one standard deviation off moves the state; squares add up."""
     model, noise = rod(std=1e-9, flux=flux), 0.2
@@ -181,6 +182,7 @@ def test_an_offset_is_not_learned_from_the_state_that_was_made_with_it():
 
 
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay())])
+@pytest.mark.slow
 def test_a_wrong_start_does_not_end_in_the_unknowns(law):
     """Means of squared errors over expected variances: of order one with the noise of the start."""
     scores = []

@@ -389,6 +389,7 @@ def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
     assert all(thread.daemon for thread in begun)
 
 
+@pytest.mark.slow
 def test_slow_visitors_do_not_keep_others_out(serving):
     server = serving()
     slow = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(THREADS - 1)]
