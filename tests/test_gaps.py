@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from factories import ROD_CASE
 from live_rod import CLOCK
 
 import livepde as lp
@@ -271,30 +272,13 @@ def test_a_spike_is_refused_within_the_wait_and_the_same_after_a_restart():
 
 # --- cases -------------------------------------------------------------------------------------
 
-CASE = """
-equation = "heat"
-initial = "20 degC"
-[mesh]
-from = 0
-to = "1 m"
-cells = 10
-[data]
-file = "rows.csv"
-time = "t"
-time_unit = "s"
-[intake]
-wait = "{wait} s"
-[boundary]
-right = "20 degC"
-[unknowns.alpha]
-prior = "2e-5 m^2/s"
-std = "1e-5 m^2/s"
-[channels]
-left = {{ role = "boundary", column = "left", at = "left", unit = "degC"{left} }}
-T = {{ role = "sensor", column = "T", at = "0.3 m", unit = "degC"{sensor} }}
-[law]
-kind = "sensitivity"
+CASE = f"""{ROD_CASE}
 noise = "0.1 K"
+[intake]
+wait = "{{wait}} s"
+[channels]
+left = {{{{ role = "boundary", column = "left", at = "left", unit = "degC"{{left}} }}}}
+T = {{{{ role = "sensor", column = "T", at = "0.3 m", unit = "degC"{{sensor}} }}}}
 """
 SECONDS = 300.0
 COUNT = 120

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from factories import INTERPOLATED_ROD_CASE
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -227,27 +228,10 @@ def test_the_gradient_law_has_no_covariance():
 
 # --- cases and fleets --------------------------------------------------------------------------
 
-CASE = """
-equation = "heat"
-initial = "interpolate"
-[mesh]
-from = 0
-to = "1 m"
-cells = 10
-[data]
-file = "rows.csv"
-time = "t"
-time_unit = "s"
-[boundary]
-right = "20 degC"
-[unknowns.alpha]
-prior = "2e-5 m^2/s"
-std = "1e-5 m^2/s"
+CASE = f"""{INTERPOLATED_ROD_CASE}
 [channels]
-left = { role = "boundary", column = "left", at = "left", unit = "degC", noise = "0.2 K" }
-T = { role = "sensor", column = "T", at = "0.3 m", unit = "degC", noise = "0.1 K" }
-[law]
-kind = "sensitivity"
+left = {{ role = "boundary", column = "left", at = "left", unit = "degC", noise = "0.2 K" }}
+T = {{ role = "sensor", column = "T", at = "0.3 m", unit = "degC", noise = "0.1 K" }}
 """
 
 
@@ -261,6 +245,40 @@ def test_a_case_states_the_noise_of_its_channels(tmp_path):
     assert list(problem.initial_readings) == ["left", "T"]
     result = prepared.identifier.run(prepared.stream)
     assert result.last.belief.u_factor[3].any()
+
+
+def of_two_sensors_at_one_place(tmp_path, initial: str) -> lp.Identifier:
+    rows = ["t,left,T,S", *(f"{300 * k},20,{20.5 + 0.1 * k},21.5" for k in range(5)), ""]
+    (tmp_path / "rows.csv").write_text("\n".join(rows))
+    other = 'S = { role = "sensor", column = "S", at = "0.3 m", unit = "degC", noise = "0.1 K" }\n'
+    text = (CASE + other).replace('"interpolate"', f'"{initial}"')
+    (tmp_path / "case.toml").write_text(text)
+    return cases.load(tmp_path / "case.toml").prepare().identifier
+
+
+@pytest.mark.parametrize("initial", ["interpolate", "interpolate-exact"])
+def test_the_start_is_interpolated_from_the_mean_of_readings_at_one_place(tmp_path, initial):
+    identifier = of_two_sensors_at_one_place(tmp_path, initial)
+    x = identifier.model.state.mesh.p[0]
+    assert identifier.u0 == pytest.approx(np.interp(x, [0.0, 0.3], [20.0, 21.0]))
+
+
+def test_readings_at_one_place_share_the_noise_of_the_start(tmp_path):
+    identifier = of_two_sensors_at_one_place(tmp_path, "interpolate")
+    readings = identifier.problem.initial_readings
+    x = identifier.model.state.mesh.p[0]
+    assert readings["S"].weight == pytest.approx(np.interp(x, [0.0, 0.3], [0.0, 0.5]))
+    identifier.step(0.0, {"left": 20.0, "T": 20.5, "S": 21.5})
+    there = identifier.observed.G[0] @ identifier.latent_belief().u_factor
+    assert np.linalg.norm(there) == pytest.approx(0.1 / np.sqrt(2.0))
+
+
+def test_an_exact_start_has_no_noise(tmp_path):
+    identifier = of_two_sensors_at_one_place(tmp_path, "interpolate-exact")
+    assert not identifier.problem.initial_readings
+    identifier.step(0.0, {"left": 20.0})
+    there = identifier.observed.G[0] @ identifier.latent_belief().u_factor
+    assert np.linalg.norm(there) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_members_of_a_fleet_start_from_readings_of_their_own():

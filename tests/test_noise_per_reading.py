@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 from commands import call
+from factories import INTERPOLATED_ROD_CASE
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -239,24 +240,9 @@ def test_a_reading_that_the_start_is_made_of_brings_its_noise():
 
 # --- cases -------------------------------------------------------------------------------------
 
-CASE = """
-equation = "heat"
-initial = "interpolate"
-[mesh]
-from = 0
-to = "1 m"
-cells = 10
-[data]
-file = "rows.csv"
-time = "t"
-time_unit = "s"
-[boundary]
-right = "20 degC"
-[unknowns.alpha]
-prior = "2e-5 m^2/s"
-std = "1e-5 m^2/s"
+CASE = f"""{INTERPOLATED_ROD_CASE}
 [channels]
-left = { role = "boundary", column = "left", at = "left", unit = "degC" }
+left = {{ role = "boundary", column = "left", at = "left", unit = "degC" }}
 [channels.T]
 role = "sensor"
 column = "T"
@@ -264,8 +250,6 @@ at = "0.3 m"
 unit = "degF"
 noise = "0.1 K"
 noise_column = "s"
-[law]
-kind = "sensitivity"
 """
 STD = ["0.9", "1.8", "", "0", "-1", "0.9", "0.9"]  # degF of a difference
 

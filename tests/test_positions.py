@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from factories import ROD_CASE
 from skfem import ElementLineP1, ElementQuad1
 
 import livepde as lp
@@ -152,28 +153,11 @@ def test_what_does_not_go_together_is_refused():
         base.bind(model.state_space, model.X, model.parameter_space)
 
 
-CASE = """
-equation = "heat"
-initial = "20 degC"
-[mesh]
-from = 0
-to = "1 m"
-cells = 10
-[data]
-file = "rows.csv"
-time = "t"
-time_unit = "s"
-[boundary]
-left = "30 degC"
-right = "20 degC"
-[unknowns.alpha]
-prior = "2e-5 m^2/s"
-std = "1e-5 m^2/s"
-[channels]
-T = {{ role = "sensor", column = "T", {place}, unit = "degC", noise = "0.1 K" }}
-[law]
-kind = "sensitivity"
+LEFT = '[boundary]\nleft = "30 degC"'
+CASE = f"""{ROD_CASE.replace("[boundary]", LEFT)}
 shadows = false
+[channels]
+T = {{{{ role = "sensor", column = "T", {{place}}, unit = "degC", noise = "0.1 K" }}}}
 """
 
 

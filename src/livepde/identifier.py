@@ -127,12 +127,10 @@ class Identifier:
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
         control = Advance(scheme or law.scheme, dt_max, halvings, hold)
-        self.problem = Problem(
-            model, self.observed, control, self._input_noise(input_noise or {}), {}, u0
-        )
         if u0_from and u0 is None:
             raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
-        self.problem = replace(self.problem, initial_readings=self.initial_readings(u0_from or {}))
+        noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
+        self.problem = Problem(model, self.observed, control, noise, readings, u0)
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)

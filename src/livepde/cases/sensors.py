@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from statistics import fmean
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.errors import MissingInputError
 from livepde.identifier import Sample
-from livepde.linalg import Array
 from livepde.observation import (
     Averages,
     Combined,
@@ -296,50 +296,61 @@ def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
         return frame.convert(initial, frame.equation.state.unit, "initial")
     if len(mesh.p) != 1:
         raise frame.error("initial", f"'{initial}' needs an interval; give a number.")
-    at, level, _ = _initial_readings(frame, mesh, first)
-    return lambda x: np.interp(x[0], at, level)
+    at, level = _level(_initial_readings(frame, mesh, first))
+    return partial(_interpolated, at, level)
 
 
 def initial_weights(frame: Frame, mesh: Any, first: Sample) -> dict[str, Any]:
     """Return channel -> how an interpolated initial state changes with its reading, and its noise.
 
-    As x -> u, and NaN for that of the sensor. None where readings are taken as exact (`initial =
+    As x -> u, and NaN for that of the sensor. Empty where readings are taken as exact (`initial =
     "interpolate-exact"`).
     """
     if frame.spec.initial != "interpolate" or len(mesh.p) != 1:
         return {}
-    at, _, names = _initial_readings(frame, mesh, first)
-    if len(set(at)) < len(at):  # np.interp takes one of two readings at one place
-        return {}
+    readings = _initial_readings(frame, mesh, first)
     given = by_name(first.z, ())
     found = {}
-    for name, unit in zip(names, np.eye(len(at)), strict=True):
-        weight = partial(_interpolated, at, unit)
-        found[name] = (weight, given.get(noise_channel(name), np.nan))
+    for number, one in enumerate(readings):
+        unit = [other._replace(value=float(n == number)) for n, other in enumerate(readings)]
+        weight = partial(_interpolated, *_level(unit))
+        found[one.channel] = (weight, given.get(noise_channel(one.channel), np.nan))
     return found
 
 
-def _interpolated(at: Sequence[float], values: Array, x: Any) -> Any:
+def _interpolated(at: Sequence[float], values: Sequence[float], x: Any) -> Any:
     return np.interp(x[0], at, values)
 
 
-def _initial_readings(
-    frame: Frame, mesh: Any, first: Sample
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
-    """Return positions, values and channels that the initial state is interpolated from."""
+class _Reading(NamedTuple):
+    """A reading that the initial state is interpolated from."""
+
+    at: float
+    value: float
+    channel: str
+
+
+def _level(readings: Sequence[_Reading]) -> tuple[list[float], list[float]]:
+    """Return the places of readings, in order, and the mean of those at each place."""
+    places = sorted({one.at for one in readings})
+    return places, [fmean(one.value for one in readings if one.at == place) for place in places]
+
+
+def _initial_readings(frame: Frame, mesh: Any, first: Sample) -> list[_Reading]:
+    """Return the readings that the initial state is interpolated from."""
     ends = {"left": float(mesh.p.min()), "right": float(mesh.p.max())}
     values = dict(first.z) if isinstance(first.z, Mapping) else {}
     found = []
     for name, channel in frame.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:
-            found.append((ends[str(channel.at)], values[name], name))
+            found.append(_Reading(ends[str(channel.at)], values[name], name))
         elif channel.role == "sensor" and channel.at is not None:
-            found.append((_position(frame, mesh, name, channel), values[name], name))
-    present = sorted(item for item in found if np.isfinite(item[1]))
+            place = _position(frame, mesh, name, channel)
+            found.append(_Reading(place, values[name], name))
+    present = [one for one in found if np.isfinite(one.value)]
     if not present:
         raise MissingInputError(
             f"{frame.where('initial')}: 'interpolate' found no sensor or boundary with a value in "
             "the first sample; start later, or give a number."
         )
-    at, level, names = zip(*present, strict=True)
-    return at, level, names
+    return present
