@@ -43,5 +43,8 @@ def replay(samples: int = SAMPLES) -> Outcome:
         Check("longest call / median call", float(calls.max()), LONGEST, "<="),
         Check("longest call of the second half / median call", late, LONGEST, "<="),
     ]
-    note = f"Processor times of a rod of 31 nodes with 2 unknowns; {beyond} calls took longer."
+    note = (
+        f"Processor times of a rod of 31 nodes with 2 unknowns; {beyond} calls took more than "
+        f"{LONGEST:g} medians."
+    )
     return Outcome(tables=[table], checks=checks, notes=[note])

@@ -18,6 +18,7 @@ from benchmarks.honest.problem import Latent, Problem
 from benchmarks.honest.problems import PROBLEMS
 from livepde.plots import NORMAL_95, interval_95
 from livepde.stepping import StepFailed
+from livepde.streams import FillGaps
 
 __all__ = ["SHARES", "Run", "Smoothed", "twins"]
 
@@ -160,9 +161,10 @@ def _identified(problem: Problem, data: Data, freed: bool, smooths: bool = False
     names = tuple(problem.channels)
     rows = zip(times.tolist(), data.z, data.inputs.tolist(), strict=True)
     stream = ((t, z, dict(zip(names, values, strict=True))) for t, z, values in rows)
+    filled = FillGaps(names)(stream) if names else stream
     identifier = problem.identifier(data.biased if freed else None)
     try:
-        result = identifier.run(stream, on_estimate=look, fields_every=problem.intervals)
+        result = identifier.run(filled, on_estimate=look, fields_every=problem.intervals)
         if smooths:
             hindsight = result.smoothed()
             for label, latent in problem.latents.items():
