@@ -136,6 +136,7 @@ def test_damage_is_seen(other, lost, doubled, different):
     assert all(check.ok for check in seen.checks("x")) == (lost + doubled + different == 0)
 
 
+@pytest.mark.slow
 def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
     (tmp_path / "case.toml").write_text(rod.case_text())
     monkeypatch.setattr(broken, "JSON", {"right": lambda row, write, rng: write(dict(row))})

@@ -364,6 +364,7 @@ def test_a_full_disk_is_one_sentence_where_a_run_goes_on_or_is_shown(rod, here, 
     assert call("run", rod, "--out", "full", "--resume")[0] == 0
 
 
+@pytest.mark.slow
 def test_no_figures_without_matplotlib(rod, here, monkeypatch):
     import importlib.util
 

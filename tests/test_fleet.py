@@ -177,6 +177,7 @@ def test_equals_separate_identifiers_with_another_scheme_and_substeps(build):
     assert estimate.steps.tolist() == [3, 3, 3, 3]
 
 
+@pytest.mark.slow
 def test_members_start_where_they_are_told_to():
     starts = [{"alpha": 0.3 + 0.1 * k, "loss": 0.2} for k in range(4)]
     states = [0.0, 0.2, lambda x: x[0], 1.0]
@@ -184,6 +185,7 @@ def test_members_start_where_they_are_told_to():
     assert len(np.unique(estimate.q[:, 0])) == 4
 
 
+@pytest.mark.slow
 def test_an_unknown_initial_state_learns_from_a_first_sample():
     model = lp.Model(
         lp.Field(line(16), ElementLineP1(), dirichlet={"right": 0.0}),
@@ -201,6 +203,7 @@ def test_an_unknown_initial_state_learns_from_a_first_sample():
     assert np.ptp(estimate.q[:, 1]) > 0.5
 
 
+@pytest.mark.slow
 def test_a_bound_is_kept_and_left_again():
     model = rod(bounds=(0.45, 0.55))
     fleet, estimate = compare(model, LAWS["plain"], members=6)
@@ -292,6 +295,7 @@ def test_other_models_step_one_by_one_and_say_so(build, why):
     assert why in fleet.note
 
 
+@pytest.mark.slow
 def test_sensors_that_see_an_unknown_step_one_by_one():
     model = rod().with_unknowns({"offset": lp.Scalar(0.0, std=0.1)})
     sensors = lp.Points(
@@ -483,6 +487,7 @@ def test_members_that_step_separately_are_not_kept_as_arrays():
 
 
 @pytest.mark.parametrize("law", ["plain", "drift", "gate, noise"])
+@pytest.mark.slow
 def test_an_identifier_goes_on_from_where_a_member_is(law):
     fleet = lp.Fleet(rod(), SENSORS, LAWS[law], ["a", "b"])
     stream = samples(fleet, 24)

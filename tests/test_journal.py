@@ -809,7 +809,7 @@ def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
     options = {"version": "1", "case": "a = 1\n"}
     path = tmp_path / "run"
     RunWriter.create(path, command=["x"], title="A run", **options)
-    monkeypatch.setattr("livepde.whole.secrets.token_hex", lambda size: "0")
+    monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
     (path / "run.json.0.partial").mkdir()
     with pytest.raises(lp.RunError, match="cannot be written: File exists; make room"):
         RunWriter.reopen(path, command=["x"], settings=(), **options)

@@ -40,6 +40,7 @@ def closed():
         OPENED.pop().close()
 
 
+@pytest.mark.slow
 def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     write(tmp_path, 50)
     run = live(tmp_path)
@@ -56,6 +57,7 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
         xr.testing.assert_identical(reader.layout.dataset(list(reader)), found)
 
 
+@pytest.mark.slow
 def test_samples_in_order_go_on_after_the_last_one(tmp_path):
     def samples():
         return (lp.Sample(row.pop("t"), row) for row in rows(20))

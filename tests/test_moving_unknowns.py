@@ -360,7 +360,7 @@ def test_replays_find_the_most_probable_parameter():
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
         initial=lambda q, v, x: q.w * np.sin(np.pi * x[0]) * v,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
     identifier = lp.Identifier(model, sensors(), law)
     latent, forward, times = model.latent, ForwardStage(model), 0.02 * np.arange(64)
 

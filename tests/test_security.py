@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases, checkpoint, runs
+from livepde.atomic_write import replacing, write_bytes
 from livepde.cli.program import app
 from livepde.runs import RunWriter, lobby
 from livepde.runs.lobby import LONGEST_BODY
@@ -33,7 +34,6 @@ from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake
 from livepde.streams.sources import LONGEST, Follow, Lines, Rows, json_row
 from livepde.streams.table import Column
-from livepde.whole import replacing, write_bytes
 
 TOKEN = "long-enough-to-be-a-token"
 
@@ -512,7 +512,7 @@ def test_nothing_is_written_through_links_of_a_strangers_directory(tmp_path):
 
 
 def test_a_file_in_the_making_is_made_by_nobody_else(tmp_path, monkeypatch):
-    monkeypatch.setattr("livepde.whole.secrets.token_hex", lambda size: "0")
+    monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
     victim = tmp_path / "victim"
     victim.write_text("mine")
     (tmp_path / "a.txt.0.partial").symlink_to(victim)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from livepde.atomic_write import write_bytes
 from livepde.errors import RunError
 from livepde.linalg import Array
-from livepde.whole import write_bytes
 
 __all__ = ["flatten", "packed", "read", "rebuild", "unpacked", "write"]
 

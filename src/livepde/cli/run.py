@@ -36,7 +36,7 @@ from livepde.cli.printing import (
     show,
     terminal,
 )
-from livepde.errors import ConfigurationError
+from livepde.errors import ConfigurationError, LivepdeError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -169,8 +169,7 @@ def run(
             writer.finish(status="interrupted", notes=["Ended before the first sample."])
             raise typer.Exit(INTERRUPTED)
         prepared, driven = taken
-        identifier = prepared.identifier
-        dataset, shown, checks, notes = concluded(loaded, identifier, driven, writer)
+        dataset, shown, checks, notes = concluded(prepared, prepared.identifier, driven, writer)
     if driven.error is not None:
         raise driven.error
     if as_json:
@@ -258,7 +257,12 @@ def batch(
 
 
 def concluded(
-    loaded: Case, identifier: Identifier, driven: Driven, writer: RunWriter, *, draw: bool = True
+    prepared: Prepared,
+    identifier: Identifier,
+    driven: Driven,
+    writer: RunWriter,
+    *,
+    draw: bool = True,
 ) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
     """Write what a run gave; return its dataset, tables, checks and notes.
 
@@ -271,6 +275,7 @@ def concluded(
     from livepde.runs import arrivals, checks_of, doubts, input_notes, tables
     from livepde.runs.outcome import attempted
 
+    loaded = prepared.case
     notes: list[str] = []
     nothing: list[Any] = []
     found = attempted("The estimate of the end", driven.result.to_xarray, None, notes)
@@ -293,6 +298,10 @@ def concluded(
             )
     if len(driven.result):
         notes += attempted("Identifiability", lambda: _traded(loaded, identifier), nothing, notes)
+        if loaded.smoothed:
+            smooth = partial(_with_smoothed, prepared, driven, dataset)
+            dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
+            notes += told
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
@@ -307,6 +316,23 @@ def concluded(
         figures=figures_of(dataset, loaded.title) if draw and can_draw(terminal(err=True)) else {},
     )
     return dataset, shown, checks, notes
+
+
+def _with_smoothed(
+    prepared: Prepared, driven: Driven, dataset: xr.Dataset
+) -> tuple[xr.Dataset, list[str]]:
+    """Return the dataset of a run with what is smoothed beside it, or a note why it is not."""
+    from livepde.hindsight import with_smoothed
+
+    if driven.status != "finished" or not len(driven.result):
+        return dataset, ["Nothing is smoothed: the run has not come to its end."]
+    samples = ((taken.t, taken.values) for taken in driven.journal.taken())
+    begun = prepared.identifier_with(prepared.case.law)
+    try:
+        smoothed = begun.smoothed(samples, fields_every=prepared.case.fields_every)
+    except LivepdeError as error:  # what the run has found is kept
+        return dataset, [f"Nothing is smoothed: {error}"]
+    return with_smoothed(dataset, smoothed), []
 
 
 def _traded(loaded: Case, identifier: Identifier) -> list[str]:

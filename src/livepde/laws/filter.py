@@ -15,10 +15,10 @@ For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -39,7 +39,10 @@ from livepde.stepping import (
     advance,
 )
 
-__all__ = ["Filter", "Update"]
+if TYPE_CHECKING:
+    from livepde.laws.shadows import ShadowSet
+
+__all__ = ["Filter", "MeanFilter", "Update"]
 
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once
@@ -94,6 +97,8 @@ class Filter:
         number, shape (numbers,), or (1,) for all.
     fading
         Time after which what the state knows of the unknowns has faded to 1/e.
+    shadows
+        What follows the discretisation error; None: nothing does.
     """
 
     problem: Problem
@@ -105,6 +110,7 @@ class Filter:
     scale: Array
     drift: Array
     fading: float = np.inf
+    shadows: ShadowSet | None = None
 
     def drifts(self, member: IntArray) -> Array:
         """Return the drift of some members."""
@@ -118,6 +124,16 @@ class Filter:
     def span(self, interval: Interval) -> Span:
         """Return the interval of one process as that of its one member."""
         return Span.of(self.problem.control.over(interval), self.problem.channels)
+
+    def noise_of(self, z: Span | Interval) -> Array:
+        """Return the standard deviation of each reading at the end, shape (members or 1, sensors).
+
+        That of the reading where it has one, else that of the sensor.
+        """
+        if z.noise is None:
+            return self.noise[None]
+        noise: Array = np.where(np.isnan(z.noise), self.noise, z.noise)
+        return np.atleast_2d(noise)
 
     def estimate(self, x: FilterState) -> Array:
         """Return the estimated latent parameters, not yet bounded, shape (members, m)."""
@@ -149,6 +165,7 @@ class Filter:
             C=np.concatenate([x.C @ F.T, new], axis=1),
             past=_extended(x.past, len(grows)),
             age=x.age + h,
+            shadows=changed(x.shadows, a=x.shadows.a @ F.T),
         )
 
     def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
@@ -156,14 +173,16 @@ class Filter:
 
         What unknowns gain in one substep is independent of what they gain in the next.
         """
-        end, taken, failure = self._propagated(x, span)
+        end, taken, failure = self.carried(x, span)
         if failure is None and self.problem.input_noise:
-            end, failure = with_input_noise(self._propagated, self.problem, x, end, span)
+            end, failure = with_input_noise(self.carried, self.problem, x, end, span)
         if failure is not None:
             return x, taken, failure
+        if self.shadows is not None:
+            end = self.shadows.predicted(x, end, span)
         return self._faded(end, span), taken, None
 
-    def _propagated(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+    def carried(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a span whose inputs are known exactly."""
         length = span.t1 - span.start
         count = self.problem.control.count(length) if self.moves else 1
@@ -188,10 +207,15 @@ class Filter:
         """Return the state at the end of a part of a span."""
         end, kept, deviates = self.predict_unknowns(x, stop - start), x.kept, not x.centred
         off = x.off_centre if deviates else np.zeros(len(x), dtype=bool)
+        shadows = x.shadows.u.shape[1]
 
         def directions(at: FilterState) -> Array:
             C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C
-            return self.reduction.directions(at.q, C)
+            found = self.reduction.directions(at.q, C)
+            if not shadows:  # which change no number of the others
+                return found
+            apart = self.reduction.directions(at.q, at.shadows.a)
+            return np.concatenate([found, apart], axis=1)
 
         at_end = directions(end)
         factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
@@ -203,18 +227,23 @@ class Filter:
                 now = self.predict_unknowns(x, t - start)
                 q, along = now.q, directions(now)
             same = factors if q is end.q else {}
-            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same)
+            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same, shadows)
             y, kept = self.stage.advance(columns, work)
             return y
 
         last = [end.du[None]] if deviates else []
+        if shadows:
+            last.append(end.shadows.u.transpose(1, 0, 2))
         columns = np.concatenate([end.u[None], end.U.transpose(1, 0, 2), *last])
         columns, steps, failure = advance(self.problem.control, stage, columns, start, stop)
         if failure is not None:
             return x, steps, failure
         rows = end.U.shape[1]
-        U, du = columns[1 : 1 + rows].transpose(1, 0, 2), columns[-1] if deviates else end.du
+        U, du = columns[1 : 1 + rows].transpose(1, 0, 2), columns[1 + rows] if deviates else end.du
         new = changed(end, u=columns[0], U=U, du=du, kept=kept)
+        if shadows:
+            u = columns[-shadows:].transpose(1, 0, 2)
+            new = changed(new, shadows=changed(end.shadows, u=u))
         return self._compressed(new) if rows > self.rank else new, steps, None
 
     @staticmethod
@@ -287,7 +316,9 @@ class Filter:
         C = np.broadcast_to(np.eye(k), (members, k, k))
         U, du, da = np.zeros((members, k, x.u.shape[1])), np.zeros_like(x.du), np.zeros_like(x.da)
         past = np.zeros((members, k, x.past.shape[2]))
-        return changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past)
+        shadows = changed(x.shadows, a=np.zeros_like(x.shadows.a))
+        new = changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past)
+        return changed(new, shadows=shadows)
 
     def _compressed(self, x: FilterState) -> FilterState:
         """Return the state with a square root of `rank` rows.
@@ -310,6 +341,23 @@ class Filter:
         past = rotation.transpose(0, 2, 1) @ x.past
         past = np.concatenate([past[:, :k], leading @ past[:, k:]], axis=1)
         return changed(x, U=U, C=C, past=past)
+
+
+class MeanFilter(Filter):
+    """The filter without covariance: what it expects, and nothing of how uncertain that is."""
+
+    @classmethod
+    def of(cls, filter_: Filter) -> MeanFilter:
+        """Return the same filter without covariance, noise of inputs and shadows."""
+        parts = {item.name: getattr(filter_, item.name) for item in fields(filter_)}
+        return cls(**(parts | {"shadows": None}))
+
+    def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
+        """Return the state whose unknowns have moved for a time h as they are expected to."""
+        if not self.moves or h == 0.0:
+            return x
+        F = self.reduction.transition(h)
+        return changed(x, q=self.reduction.predict(x.q, h), da=x.da @ F.T, age=x.age + h)
 
 
 def _extended(rows: Array, count: int) -> Array:

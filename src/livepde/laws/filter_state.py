@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.laws.innovations import Innovations
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import KeptFactors
 
@@ -44,6 +45,8 @@ class FilterState:
         Logarithm of the likelihood of all samples so far, each given those before, (members,).
     kept
         What the last stage has left to the next.
+    shadows
+        What is known of the discretisation error.
     """
 
     member: IntArray
@@ -62,6 +65,7 @@ class FilterState:
     samples: Array
     evidence: Array
     kept: KeptFactors
+    shadows: ShadowState
 
     def __len__(self) -> int:
         return len(self.member)

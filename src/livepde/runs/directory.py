@@ -26,13 +26,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, FigureFactory, Table, attempted
 from livepde.runs.salvage import Salvage
 from livepde.runs.summary import arrivals, tables
-from livepde.whole import PARTIAL, replacing, write_bytes
 
 if TYPE_CHECKING:
     import xarray as xr

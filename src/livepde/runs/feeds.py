@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from livepde.identifier import Sample
+from livepde.samples import by_name
 from livepde.streams.intake import Intake, Outcome, Ready, Remark, gather
 from livepde.streams.sources import Row, Source
 
@@ -198,10 +199,7 @@ class Samples:
         return []
 
     def _values(self, sample: Sample) -> dict[str, float]:
-        values = sample.z
-        if not isinstance(values, Mapping):
-            values = dict(zip(self._names, np.atleast_1d(values).tolist(), strict=True))
-        return {**values, **(sample.inputs or {})}
+        return {**by_name(sample.z, self._names), **(sample.inputs or {})}
 
     def heard(self) -> bool:
         """Samples that are there are never silent."""

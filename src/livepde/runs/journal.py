@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock
 
+from livepde.atomic_write import replacing
 from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
@@ -52,7 +53,7 @@ from livepde.runs.database import (
     writer,
 )
 from livepde.runs.packing import layout_from, packed, unpacked
-from livepde.whole import replacing
+from livepde.samples import noise_channel
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -94,7 +95,10 @@ ESTIMATES = (
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """An accepted sample: its number, time, the values of all channels (NaN: missing)."""
+    """An accepted sample: its number, time, the values of all channels (NaN: missing).
+
+    And the noise of its readings, by the names that `noise_channel` gives, if it has any.
+    """
 
     id: int
     t: float
@@ -120,6 +124,8 @@ class Journal:
         The SQLite file.
     channels
         Names of all channels of a sample, in the order in which they are kept.
+    noise
+        Names of the noise of their readings, which a sample that has any keeps after them.
     layout
         What the numbers of the records mean.
 
@@ -138,6 +144,7 @@ class Journal:
         with sound(path):
             self.channels = tuple(map(str, json.loads(meta["channels"])))
             self.layout = layout_from(meta["layout"])
+        self.noise = tuple(map(noise_channel, self.channels))
         self._vertices = max(map(len, self.layout.coordinates.values()), default=0)
         self._thinned = 0
         self._file = None if path is MEMORY else _identity(path)
@@ -244,10 +251,13 @@ class Journal:
         position
             Where its source stands after it, to go on from there.
         """
-        row = array("d", [values.get(name, math.nan) for name in self.channels])
+        names = self.channels
+        if not values.keys().isdisjoint(self.noise):
+            names += self.noise
+        row = array("d", [values.get(name, math.nan) for name in names])
         self._enter(t, row.tobytes(), position)
         self._write(self._db.commit)
-        return Taken(self._current, t, dict(zip(self.channels, row, strict=True)))
+        return Taken(self._current, t, self._named(row.tolist()))
 
     def _enter(self, t: float, channels: bytes, position: str) -> None:
         self._newest += 1
@@ -266,7 +276,8 @@ class Journal:
         Parameters
         ----------
         rows
-            Values of the channels of each sample, and its estimate.
+            Values of the channels of each sample, with or without their noise after them, and its
+            estimate.
         state
             The identifier's.
         """
@@ -549,16 +560,30 @@ class Journal:
             self._current = found.id
             yield found
 
+    def taken(self) -> Iterator[Taken]:
+        """Iterate over all accepted samples that are kept."""
+        number, found = 0, True
+        while found:
+            found = False
+            for taken in self._samples("WHERE id > ? ORDER BY id LIMIT ?", number, TOGETHER):
+                number, found = taken.id, True
+                yield taken
+
     def _samples(self, which: str, *values: Any) -> Iterator[Taken]:
         """Iterate over samples."""
         rows = self._read(f"SELECT * FROM samples {which}", *values)
         for number, t, channels, _ in self._sound("samples", rows):
             with sound(self.path):
-                if len(channels) != 8 * len(self.channels):
+                if len(channels) not in (8 * len(self.channels), 16 * len(self.channels)):
                     raise ValueError(f"sample {number} has not the size of the others")
-                found = np.frombuffer(channels).tolist()
-                taken = Taken(number, float(t), dict(zip(self.channels, found, strict=True)))
-            yield taken
+                named = self._named(np.frombuffer(channels).tolist())
+            yield Taken(number, float(t), named)
+
+    def _named(self, row: Sequence[float]) -> dict[str, float]:
+        """Return what is kept of a sample by name: all channels, and the noise that is there."""
+        values = dict(zip(self.channels, row, strict=False))
+        noise = zip(self.noise, row[len(self.channels) :], strict=False)
+        return values | {name: std for name, std in noise if not math.isnan(std)}
 
     def __len__(self) -> int:
         return int(self._one("SELECT COUNT(*) FROM estimates"))

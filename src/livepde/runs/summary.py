@@ -244,8 +244,8 @@ def tables(data: xr.Dataset) -> list[Table]:
             deviation = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
             numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
             unit = data[name].attrs.get("units", "")
-            rows.append((name, *numbers, shown(deviation, ".2g"), unit))
-        columns = ("field", "least", "mean", "largest", "mean deviation", "unit")
+            rows.append((name, *numbers, shown(deviation, ".2g"), _left_out(data, name), unit))
+        columns = ("field", "least", "mean", "largest", "mean deviation", "left-out modes", "unit")
         result.append(Table("Estimated fields", columns, rows))
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
@@ -262,6 +262,12 @@ def tables(data: xr.Dataset) -> list[Table]:
     columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))
     return result + [table for table in (_told(data, labels), _jumped(data)) if table.rows]
+
+
+def _left_out(data: xr.Dataset, name: str) -> str:
+    """Return the share of the mean variance of a field that is of modes that the law leaves out."""
+    share = float(data[f"{name}_left_out"][-1]) if f"{name}_left_out" in data else math.nan
+    return shown(100 * share, ".2g", " %")
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:

@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol
 from livepde.errors import DataError, SampleError
 from livepde.streams.clock import Clock, is_naive, origin_at, since_1970
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
-from livepde.streams.table import Column, channel_value, row_time
+from livepde.streams.table import Column, channel_value, row_time, without_noise
 
 __all__ = ["Habit", "Intake", "Outcome", "Past", "Policy", "Ready", "Remark", "gather"]
 
@@ -528,9 +528,14 @@ class Intake:
             sample = self._open.pop(t)
             self._last = t
             self._bridge(t, sample, found)
-            lacking = [c for c in self.columns if math.isnan(sample.values.get(c, math.nan))]
+            for channel in without_noise(self.columns, sample.values):
+                text = f"t = {t:g}: the noise of the reading is not positive"
+                found.remark("invalid", channel, text, sample.tokens[-1])
+            lacking = [c for c in self.columns if self._lacks(c, sample.values)]
             for channel in lacking:
-                found.remark("missing", channel, f"no value for t = {t:g}", sample.tokens[-1])
+                text = f"no value for t = {t:g}"
+                text += "; that of the sensor is taken" if self.columns[channel].noise_of else ""
+                found.remark("missing", channel, text, sample.tokens[-1])
             needed = [channel for channel in lacking if self.columns[channel].needed]
             if needed:
                 found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
@@ -540,6 +545,12 @@ class Intake:
                 self._released.append(t)
                 since, self._since = self._since, None
                 found.ready.append(Ready(t, sample.values, tuple(sample.tokens), since))
+
+    def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
+        """Return whether a sample has no value of a channel; noise belongs to a reading."""
+        of = self.columns[channel].noise_of
+        absent = math.isnan(values.get(channel, NAN))
+        return absent and not (of and math.isnan(values.get(of, NAN)))
 
     def _bridge(self, t: float, sample: _Open, found: Outcome) -> None:
         """Interpolate gaps of a sample, and refuse its spikes, where later values are known."""
