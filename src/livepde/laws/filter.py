@@ -18,31 +18,31 @@ import math
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import lapack
 
+from livepde.fem import Moment
 from livepde.laws.base import Problem
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.members import changed
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensors import MemberSensors
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, BlockFactor, IntArray, Mask
 from livepde.stepping import (
     Interval,
     MemberStage,
+    Moments,
     Span,
     StageOfMembers,
     StepFailed,
     advance,
 )
 
-if TYPE_CHECKING:
-    from livepde.laws.shadows import ShadowSet
-
-__all__ = ["Filter", "MeanFilter", "Update"]
+__all__ = ["Filter", "FollowedErrors", "MeanFilter", "Update"]
 
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once
@@ -75,6 +75,32 @@ class Update(NamedTuple):
         """Return log det (I + Y^T Y)/2, shape (members,)."""
         spread: Array = -np.log(np.abs(np.diagonal(self.W, axis1=1, axis2=2))).sum(axis=1)
         return spread
+
+
+class FollowedErrors(Protocol):
+    """Errors of the discretisation, followed beside a filter: `livepde.laws.shadows`."""
+
+    def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
+        """Return what is known of one member at the start; None stands for no moment yet."""
+        ...
+
+    def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
+        """Return the state after a span, from those before and after, with the errors in it."""
+        ...
+
+    def updated(
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
+    ) -> ShadowState:
+        """Return what is known after a sample; weights: one over noise, (members, sensors)."""
+        ...
+
+    def notes(self, x: FilterState) -> dict[str, Array]:
+        """Return notes on the errors, each of shape (members,)."""
+        ...
+
+    def widening(self, x: FilterState) -> tuple[Array, Array]:
+        """Return the row of [U C] that is reported for all of them, (members, 1, n or k)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +136,7 @@ class Filter:
     scale: Array
     drift: Array
     fading: float = np.inf
-    shadows: ShadowSet | None = None
+    shadows: FollowedErrors | None = None
 
     def drifts(self, member: IntArray) -> Array:
         """Return the drift of some members."""

@@ -17,22 +17,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
 from livepde.laws.covariance import robust_factors
+from livepde.laws.filter import Filter, Update
+from livepde.laws.filter_state import FilterState
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.members import changed, put, take
 from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import TINY, KeptFactors, Moments, Span
-
-if TYPE_CHECKING:
-    from livepde.laws.filter import Filter, Update
-    from livepde.laws.filter_state import FilterState
 
 __all__ = ["KINDS", "ShadowSet", "Shadows"]
 
