@@ -156,7 +156,7 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, subste
 def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
     model = linear_model(EVOLUTIONS[name])
     law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0)
-    stream = samples(12, missing=False)
+    stream = samples(10, missing=False)
     check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
 
 
