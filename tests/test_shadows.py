@@ -153,11 +153,10 @@ def test_follows_a_drive_that_turns_between_two_shadows_of_the_mesh() -> None:
         return float(np.sin(3.0 * t))
 
     points, times = lp.Points([0.25, 0.5, 0.75], noise=0.01), 0.05 * np.arange(401)
-    ends = {}
-    for cells in (16, 64):
-        unknown = {"a": lp.Scalar(0.2, std=0.2)}
-        model = driven_rod(unknown, left, lp.interval(0.0, 1.0, cells))
-        rows = readings(model, points, lambda t: 0.3, times, 0.01, 0) if cells == 16 else rows
+    unknown, ends = {"a": lp.Scalar(0.2, std=0.2)}, {}
+    models = {n: driven_rod(unknown, left, lp.interval(0.0, 1.0, n)) for n in (16, 64)}
+    rows = readings(models[16], points, lambda t: 0.3, times, 0.01, 0)
+    for cells, model in models.items():
         given = lp.Identifier(model, points, lp.SensitivityLaw(), u0=0.0)
         ends[cells] = [given.step(t, z) for t, z in rows][-1]
     coarse, fine = ends[16], ends[64]
