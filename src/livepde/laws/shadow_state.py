@@ -114,5 +114,12 @@ class ShadowState:
     def without_stages(self) -> ShadowState:
         """Return the shifts alone, without what the next steps need."""
         kept, nothing = KeptFactors.none(len(self)), np.zeros((len(self), 0))
-        bare = {"u0": nothing, "inputs0": nothing, "gains": self.gains[:, :0]}
-        return replace(self, halves=kept, blocks=kept, fine_stage=kept, **bare)
+        return replace(
+            self,
+            halves=kept,
+            blocks=kept,
+            fine_stage=kept,
+            u0=nothing,
+            inputs0=nothing,
+            gains=self.gains[:, :0],
+        )
