@@ -34,7 +34,7 @@ from livepde.stepping import Advance, Interval, Scheme
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 4  # of the checkpoint
+FORMAT = 5  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -324,6 +324,7 @@ class Identifier:
             notes=report.notes,
             held=held,
             space=self.model.parameter_space,
+            judge=self.law.judge(self._work, self._state),
         )
 
     def estimate(self) -> Estimate:
@@ -354,7 +355,8 @@ class Identifier:
         state = self.law.settled(self._work, self._state)
         if state is self._state:
             return estimate
-        return replace(estimate, belief=self.problem.physical(self.law.belief(self._work, state)))
+        belief = self.problem.physical(self.law.belief(self._work, state))
+        return replace(estimate, belief=belief, judge=self.law.judge(self._work, state))
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return what the sensors will show if nothing more is measured; nothing is learned.

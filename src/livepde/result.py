@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
+from livepde.verdict import FLAT, TELLING, Finding, Verdict
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,6 +58,8 @@ class Estimate:
         Input channels whose last value was held because the sample had none.
     space
         The unknowns.
+    judge
+        Gives what the law says of the run so far; see `verdict`.
     """
 
     t: float
@@ -67,6 +71,7 @@ class Estimate:
     notes: Mapping[str, float]
     held: tuple[str, ...]
     space: FunctionSpace
+    judge: Callable[[], Verdict] = Verdict.unjudged
 
     @classmethod
     def deferred(
@@ -81,6 +86,7 @@ class Estimate:
         notes: Mapping[str, float],
         held: tuple[str, ...],
         space: FunctionSpace,
+        judge: Callable[[], Verdict],
     ) -> Estimate:
         """Return an estimate whose belief is computed when it is first read, and kept then.
 
@@ -100,6 +106,7 @@ class Estimate:
             notes=notes,
             held=held,
             space=space,
+            judge=judge,
         )
         return estimate
 
@@ -117,7 +124,16 @@ class Estimate:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: the belief itself."""
-        return {"belief": self.belief} | {k: v for k, v in vars(self).items() if k != "_read"}
+        own = {"belief": self.belief, "verdict": self.verdict}
+        return own | {k: v for k, v in vars(self).items() if k not in ("_read", "judge")}
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the estimates are to be believed, by all samples so far.
+
+        It is found when it is first read, and takes about a millisecond.
+        """
+        return self.judge().with_findings(known_badly(self.belief, self.space))
 
     @property
     def q(self) -> Array:
@@ -151,8 +167,8 @@ class Estimate:
     def to_dict(self) -> dict[str, Any]:
         """Return time, status, unknown numbers and innovations as JSON can hold them.
 
-        {"t", "status", "unknowns": {label: {"value", "std"}}, "innovation": [...]}; None stands
-        where there is no number.
+        {"t", "status", "unknowns": {label: {"value", "std"}}, "innovation": [...], "verdict"}; None
+        stands where there is no number.
         """
         unknowns = {
             label: {"value": _number(value), "std": _number(std)}
@@ -163,6 +179,7 @@ class Estimate:
             "status": self.status.code,
             "unknowns": unknowns,
             "innovation": [_number(value) for value in self.innovation.tolist()],
+            "verdict": self.verdict.level,
         }
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Any, Any]:
@@ -196,6 +213,23 @@ class Estimate:
         part = space.part(name)
         ends: tuple[Array, Array] = unknown_of(space, name).interval(self.q[part], std[part], level)
         return ends
+
+
+def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
+    """Return which scalar unknowns the data have hardly told of, or end at a bound."""
+    for label, row in space.labels.items():
+        unknown, value = unknown_of(space, label), float(belief.q[row])
+        lower, upper = map(float, unknown.bounds)
+        if value in (lower, upper):
+            text = f"{label} ends at its bound {value:g}: the bound decides, not the data."
+            yield Finding("bound", "caution", text, label, value)
+        left = float(belief.left([row])[0])
+        if left > FLAT and not unknown.evolution.moves:
+            text = (
+                f"{label}: the data have told hardly anything, {left:.0%} of its prior standard "
+                "deviation is left."
+            )
+            yield Finding("flat", "caution", text, label, left, remedy=TELLING)
 
 
 class Result:
@@ -237,6 +271,11 @@ class Result:
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the run so far: that of the last estimate."""
+        return Verdict.unjudged() if self.last is None else self.last.verdict
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""

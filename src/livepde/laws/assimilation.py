@@ -14,6 +14,7 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.members import changed
 from livepde.linalg import Array, Mask
 from livepde.stepping import Span
+from livepde.verdict import Judge, Seen
 
 __all__ = ["OK", "Assimilation", "MemberReports", "assimilate", "assimilate_at_once"]
 
@@ -166,6 +167,8 @@ def _absorbed(
         e = np.where(used, e, np.nan)
     if not whole:  # zeros tell nothing: what is missing takes part as such
         Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
+    if filter_.judge is not None:
+        x = _judged(filter_.judge, filter_, x, Y, d, used, noise, predicted, span)
     new, made = filter_.update(x, Y, d)
     parts = {"innovations": x.innovations.add(e, measured, newest), "refused": refused}
     if options.adaptive:
@@ -175,6 +178,26 @@ def _absorbed(
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
     finite = np.isfinite(sums + largest * largest)
     return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
+
+
+def _judged(
+    judge: Judge,
+    filter_: Filter,
+    x: FilterState,
+    Y: Array,
+    d: Array,
+    used: Mask,
+    noise: Array,
+    predicted: Array,
+    span: Span,
+) -> FilterState:
+    """Return the state before an update with what the verdict keeps of the sample."""
+    q, reduction = filter_.estimate(x), filter_.reduction
+    a = reduction.reduced(q - filter_.problem.model.latent.prior)
+    u = x.u + x.du
+    seen = Seen(x.C, x.causes, a, q, u, Y, d, used, span.z1, predicted, noise, span.end)
+    causes, ledger = judge.heard(x.ledger, seen)
+    return changed(x, causes=causes, ledger=ledger)
 
 
 def _far(x: FilterState, e: Array, used: Mask, gate: float) -> Mask | None:

@@ -43,8 +43,10 @@ from livepde.laws.sensitivity_state import (
     new_window,
     restarted,
 )
+from livepde.laws.verdict import judged
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Alexander2, Interval, Scheme
+from livepde.verdict import Verdict
 
 __all__ = ["AutoLaw"]
 
@@ -387,6 +389,12 @@ class AutoLaw(Law[Bank, AutoState]):
         tick, now = state.tick, without_factors(state.members.now)
         weights = np.exp(state.weights[now.member])
         return lambda: self._mixture(work.filters(tick, noise), now, weights)
+
+    def judge(self, work: Bank, state: AutoState) -> Callable[[], Verdict]:
+        if not state.known:
+            return super().judge(work, state)
+        filters = work.filters(state.tick, state.noise)
+        return judged(filters.filter, state.members.now, state.at(state.leader))
 
     def _mixture(self, filters: SensitivityWork, now: FilterState, weights: Array) -> Belief:
         """Return the mean and covariance of all members."""

@@ -38,6 +38,7 @@ from livepde.stepping import (
     StepFailed,
     advance,
 )
+from livepde.verdict import Judge
 
 __all__ = ["Filter", "Update"]
 
@@ -94,6 +95,8 @@ class Filter:
         number, shape (numbers,), or (1,) for all.
     fading
         Time after which what the state knows of the unknowns has faded to 1/e.
+    judge
+        Keeps the sums that a verdict is drawn from; None: there is none.
     """
 
     problem: Problem
@@ -105,6 +108,7 @@ class Filter:
     scale: Array
     drift: Array
     fading: float = np.inf
+    judge: Judge | None = None
 
     def drifts(self, member: IntArray) -> Array:
         """Return the drift of some members."""
@@ -148,6 +152,7 @@ class Filter:
             U=_extended(x.U, len(grows)),
             C=np.concatenate([x.C @ F.T, new], axis=1),
             past=_extended(x.past, len(grows)),
+            causes=_extended(x.causes, len(grows)),
             age=x.age + h,
         )
 
@@ -234,6 +239,8 @@ class Filter:
         if x.past.shape[2]:
             past = Wt @ x.past
             new = changed(new, past=past, dpast=x.dpast + (row @ past)[:, 0])
+        if x.causes.shape[2]:
+            new = changed(new, causes=Wt @ x.causes)
         return new, Update(W, Y, half, misfit)
 
     def remembered(self, x: FilterState) -> FilterState:
@@ -277,7 +284,8 @@ class Filter:
         members, _, k = x.C.shape
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
         C = np.concatenate([x.C, np.broadcast_to(rows, (members, *rows.shape))], axis=1)
-        new = changed(x, U=_extended(x.U, len(rows)), C=C, past=_extended(x.past, len(rows)))
+        U, past, causes = (_extended(part, len(rows)) for part in (x.U, x.past, x.causes))
+        new = changed(x, U=U, C=C, past=past, causes=causes)
         return self._compressed(new) if C.shape[1] > self.rank else new
 
     def with_prior(self, x: FilterState) -> FilterState:
@@ -287,7 +295,9 @@ class Filter:
         C = np.broadcast_to(np.eye(k), (members, k, k))
         U, du, da = np.zeros((members, k, x.u.shape[1])), np.zeros_like(x.du), np.zeros_like(x.da)
         past = np.zeros((members, k, x.past.shape[2]))
-        return changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past)
+        causes = np.zeros((members, k, x.causes.shape[2]))
+        u = x.u + x.du
+        return changed(x, u=u, q=prior, du=du, da=da, U=U, C=C, past=past, causes=causes)
 
     def _compressed(self, x: FilterState) -> FilterState:
         """Return the state with a square root of `rank` rows.
@@ -309,7 +319,9 @@ class Filter:
         U = np.concatenate([rotated[:, :k], leading @ alone], axis=1)
         past = rotation.transpose(0, 2, 1) @ x.past
         past = np.concatenate([past[:, :k], leading @ past[:, k:]], axis=1)
-        return changed(x, U=U, C=C, past=past)
+        causes = rotation.transpose(0, 2, 1) @ x.causes
+        causes = np.concatenate([causes[:, :k], leading @ causes[:, k:]], axis=1)
+        return changed(x, U=U, C=C, past=past, causes=causes)
 
 
 def _extended(rows: Array, count: int) -> Array:

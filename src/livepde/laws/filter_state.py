@@ -9,6 +9,7 @@ import numpy as np
 from livepde.laws.innovations import Innovations
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import KeptFactors
+from livepde.verdict import Ledger
 
 __all__ = ["FilterState", "along"]
 
@@ -44,6 +45,10 @@ class FilterState:
         Logarithm of the likelihood of all samples so far, each given those before, (members,).
     kept
         What the last stage has left to the next.
+    causes, ledger
+        What the verdict is drawn from: by how much possible causes of misfit have moved the
+        estimate, as coordinates on the rows of the square root, (members, r, columns), and running
+        sums; see `livepde.verdict`. The filter itself never reads them.
     """
 
     member: IntArray
@@ -62,6 +67,8 @@ class FilterState:
     samples: Array
     evidence: Array
     kept: KeptFactors
+    causes: Array = field(metadata={"grows": 1})
+    ledger: Ledger
 
     def __len__(self) -> int:
         return len(self.member)

@@ -41,6 +41,7 @@ from livepde.laws.sensitivity_state import (
     stored,
 )
 from livepde.laws.sensors import MemberSensors
+from livepde.laws.verdict import judge_of, judged
 from livepde.linalg import Array, Mask
 from livepde.stepping import (
     Alexander2,
@@ -51,6 +52,7 @@ from livepde.stepping import (
     Span,
     member_stage,
 )
+from livepde.verdict import Ledger, Verdict
 
 __all__ = ["SensitivityLaw", "without_factors"]
 
@@ -114,6 +116,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         `livepde.laws.iterated_smoother`. 0: never. Not where a `Replay` does the like.
     guards
         What to do when a linearisation is overconfident or the estimate runs away; None: nothing.
+    verdict
+        Judge the run as it goes on (`Estimate.verdict`): True; "cheap", without the directions that
+        cost solves, those of terms that the process may lack; False: not at all.
     """
 
     modes: int | str | dict[str, int] = "auto"
@@ -127,6 +132,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     jumps: Jumps | None = None
     start_window: int = 64
     guards: Guards | None = field(default_factory=Guards)
+    verdict: bool | str = True
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
 
@@ -145,6 +151,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
             )
         self._check_parts()
+        if self.verdict not in (True, False, "cheap"):
+            raise LawError(
+                f"SensitivityLaw: verdict must be True, 'cheap' or False; got {self.verdict!r}."
+            )
 
     def _check_parts(self) -> None:
         """Refuse parts that are of another kind, and gates that let nothing through."""
@@ -160,6 +170,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             raise LawError(f"SensitivityLaw: start_window must be >= 0; got {self.start_window}.")
         if self.gate_patience < 1:
             raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
+
+    @property
+    def _keeps_all(self) -> bool:
+        """True if nothing that was learned of unknowns that stay is forgotten."""
+        return not self.drift and bool(np.isinf(self.memory))
 
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
@@ -194,6 +209,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             np.sqrt(mass / mass.sum()),
             np.array([self.drift]),
             self.memory,
+            judge_of(
+                problem,
+                reduction,
+                noise,
+                self.verdict,
+                kept=not (self.drift or self.memory < np.inf),
+            ),
         )
         options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
         iterated = 0 if self.replay else self.start_window
@@ -220,6 +242,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             samples=GUESS * one,
             evidence=0.0 * one,
             kept=filter_.stage.kept(1),
+            causes=np.zeros((1, k, filter_.judge.columns if filter_.judge else 0)),
+            ledger=filter_.judge.start() if filter_.judge else Ledger.start(0, 0, 0, 0, 0, 0),
         )
         no = np.zeros(1, dtype=bool)
         return SensitivityState(
@@ -411,6 +435,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def reader(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Belief]:
         now = without_factors(state.now)
         return lambda: self.member_belief(work, now, 0)
+
+    def judge(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Verdict]:
+        return judged(work.filter, state.now, 0)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

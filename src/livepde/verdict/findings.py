@@ -1,0 +1,181 @@
+"""What a verdict says: its level, and findings with evidence, causes, remedy and consequence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+__all__ = ["FLAT", "LEVELS", "TELLING", "Cause", "Finding", "Level", "Severity", "Verdict"]
+
+Level: TypeAlias = Literal["trusted", "caution", "do not trust"]
+Severity: TypeAlias = Literal["note", "caution", "do not trust"]
+Measure: TypeAlias = Literal["e-value", "p-value", "number"]
+
+LEVELS: tuple[Level, ...] = ("trusted", "caution", "do not trust")
+RANK = {"note": 0, "trusted": 0, "caution": 1, "do not trust": 2}
+FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly anything
+TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
+MOST = 5  # findings that are said unasked
+LARGEST = 1e99  # evidence beyond is written as that
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause that would explain a finding.
+
+    Attributes
+    ----------
+    kind, subject
+        What is wrong ("offset", "lag", "position", "gain", "drift", "jump", "boundary", "source",
+        "loss", "flux", "initial"), and of which sensor, channel, boundary or unknown.
+    text
+        The same in words, with its size.
+    share
+        Part of the misfit beyond the noise that it explains, 0 to 1; NaN if not known.
+    remedy
+        What to do, with the line of the case that would test it.
+    """
+
+    kind: str
+    subject: str
+    text: str
+    share: float = math.nan
+    remedy: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cause as JSON can hold it."""
+        share = None if math.isnan(self.share) else self.share
+        return {
+            "kind": self.kind,
+            "subject": self.subject,
+            "text": self.text,
+            "share": share,
+            "remedy": self.remedy,
+        }
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that speaks against the estimates.
+
+    Attributes
+    ----------
+    what
+        Name of the test, such as "misfit", "constancy", "withheld", "prior" or "stuck".
+    severity
+        "note" (worth knowing), "caution" or "do not trust".
+    text
+        What was found, as a sentence.
+    subject
+        The unknown or sensor concerned; empty for the whole run.
+    evidence, measure
+        A number, and whether it is an e-value, a p-value or the number itself.
+    causes
+        Likely causes, the likeliest first.
+    remedy
+        What to do.
+    shift
+        Unknown -> by how many of its standard deviations the estimate would move if the first
+        cause were taken into account.
+    """
+
+    what: str
+    severity: Severity
+    text: str
+    subject: str = ""
+    evidence: float = math.nan
+    measure: Measure = "number"
+    causes: tuple[Cause, ...] = ()
+    remedy: str = ""
+    shift: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def sentence(self) -> str:
+        """The finding with its causes, consequence and remedy, in plain English."""
+        parts = [self.text]
+        if self.causes:
+            first, *others = self.causes
+            share = "" if math.isnan(first.share) else f" (explains {first.share:.0%} of it)"
+            parts.append(f"Most likely {first.text}{share}.")
+            if others:
+                share = "" if math.isnan(others[0].share) else f" ({others[0].share:.0%})"
+                parts.append(f"Else {others[0].text}{share}.")
+        moved = [(name, size) for name, size in self.shift.items() if abs(size) >= 0.5]
+        if moved:
+            each = [f"{name} by {size:+.1f}" for name, size in moved[:3]]
+            parts.append(f"That would move {', '.join(each)} standard deviations.")
+        remedy = self.remedy or (self.causes[0].remedy if self.causes else "")
+        if remedy:
+            parts.append(remedy)
+        return " ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as JSON can hold it."""
+        evidence = None if math.isnan(self.evidence) else min(self.evidence, LARGEST)
+        return {
+            "what": self.what,
+            "severity": self.severity,
+            "subject": self.subject,
+            "text": self.text,
+            "evidence": evidence,
+            "measure": self.measure,
+            "causes": [cause.to_dict() for cause in self.causes],
+            "remedy": self.remedy,
+            "shift": {name: float(size) for name, size in self.shift.items()},
+            "sentence": self.sentence,
+        }
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the estimates of a run are to be believed.
+
+    Attributes
+    ----------
+    level
+        "trusted", "caution" or "do not trust".
+    findings
+        What speaks against them, the worst first, and notes.
+    untested
+        What was not tested, and why.
+    """
+
+    level: Level
+    findings: tuple[Finding, ...] = ()
+    untested: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, findings: Iterable[Finding], untested: Iterable[str] = ()) -> Verdict:
+        """Return the verdict of some findings: the worst of them counts."""
+        ordered = sorted(findings, key=lambda finding: -RANK[finding.severity])
+        worst = max((RANK[finding.severity] for finding in ordered), default=0)
+        return cls(LEVELS[worst], tuple(ordered), tuple(dict.fromkeys(untested)))
+
+    @classmethod
+    def unjudged(cls) -> Verdict:
+        """Return the verdict where nothing was looked at."""
+        return cls.of((), ("everything: no law has judged the run",))
+
+    def with_findings(self, more: Iterable[Finding]) -> Verdict:
+        """Return the verdict with more findings; one that says the same is not said twice."""
+        said = {finding.text for finding in self.findings}
+        new = [finding for finding in more if finding.text not in said]
+        return Verdict.of([*self.findings, *new], self.untested)
+
+    @property
+    def sentences(self) -> list[str]:
+        """At most five sentences, the worst first, each once."""
+        return list(dict.fromkeys(finding.sentence for finding in self.findings))[:MOST]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as JSON can hold it."""
+        return {
+            "level": self.level,
+            "findings": [finding.to_dict() for finding in self.findings],
+            "untested": list(self.untested),
+        }
+
+    def __str__(self) -> str:
+        return "\n".join([self.level, *(f"- {text}" for text in self.sentences)])
