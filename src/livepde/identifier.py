@@ -31,6 +31,7 @@ from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Sample, number, numbers, sample_of
 from livepde.stepping import Advance, Interval, Scheme
+from livepde.verdict import Verdict, WithheldLedger
 
 __all__ = ["Identifier", "Sample"]
 
@@ -141,6 +142,7 @@ class Identifier:
         self._z = np.full(self.observed.size, np.nan)
         self._inputs: Inputs = Inputs({})
         self._samples = 0
+        self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
         if not self.inputs:
             self._begin(self._inputs)
 
@@ -281,7 +283,7 @@ class Identifier:
         self._samples += 1
         if report.status.taken:
             self._t, self._z, self._inputs = t, used, values
-        return self._estimate(t, measured, withheld, values, report, held)
+        return self._estimate(t, measured, withheld, values, report, held, scored=True)
 
     def latent_belief(self) -> Belief:
         """Return what the law itself believes: q and its factor in latent coefficients.
@@ -308,12 +310,18 @@ class Identifier:
         inputs: Inputs,
         report: Report,
         held: tuple[str, ...],
+        *,
+        scored: bool = False,
     ) -> Estimate:
         read, error = self._reader(), withheld
         if self.withheld is not None:
             belief = read()
             read = lambda: belief  # noqa: E731
-            error = withheld - self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
+            predicted = self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
+            error = withheld - predicted
+            if scored and t >= self.assimilate_from:
+                variance = self._predicted_variance(belief, Moment(t, inputs))
+                self._withheld = self._withheld.add(withheld, predicted, variance)
         return Estimate.deferred(
             read,
             t=t,
@@ -324,8 +332,27 @@ class Identifier:
             notes=report.notes,
             held=held,
             space=self.model.parameter_space,
-            judge=self.law.judge(self._work, self._state),
+            judge=self._judge(self._state),
         )
+
+    def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
+        """Return the variance of what withheld sensors are predicted to show, without noise."""
+        if self.withheld is None or belief.u_factor is None or belief.q_factor is None:
+            return np.zeros(self._withheld.last.shape)
+        H_u, H_q = self.withheld.jacobian(belief.u, belief.q, moment)
+        rows = np.asarray(H_u @ belief.u_factor)
+        if H_q is not None:
+            rows = rows + H_q @ belief.q_factor
+        found: Array = (rows * rows).sum(axis=1)
+        return found
+
+    def _judge(self, state: Any) -> Callable[[], Verdict]:
+        """Return a function that gives the verdict on the run so far."""
+        judge, ledger = self.law.judge(self._work, state), self._withheld
+        if self.withheld is None:
+            return judge
+        names = self.withheld.names
+        return lambda: judge().with_findings(ledger.findings(names))
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last accepted sample.
@@ -356,7 +383,7 @@ class Identifier:
         if state is self._state:
             return estimate
         belief = self.problem.physical(self.law.belief(self._work, state))
-        return replace(estimate, belief=belief, judge=self.law.judge(self._work, state))
+        return replace(estimate, belief=belief, judge=self._judge(state))
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return what the sensors will show if nothing more is measured; nothing is learned.
@@ -481,6 +508,8 @@ class Identifier:
             "z": self._z,
             "samples": self._samples,
             "inputs": np.array([self._inputs[c] for c in self._inputs]),
+            "withheld": self._withheld.sums,
+            "withheld_last": self._withheld.last,
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
@@ -514,6 +543,7 @@ class Identifier:
         state = None
         try:
             t, samples, z = float(leaves["t"]), int(leaves["samples"]), leaves["z"]
+            withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
             names = self.inputs if len(leaves["inputs"]) else ()
             inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
             if header["begun"]:
@@ -525,7 +555,7 @@ class Identifier:
                 "as they were when it was saved."
             ) from error
         self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
-        self._state = state
+        self._state, self._withheld = state, withheld
         if state is None and not self.inputs:
             self._begin(inputs)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
-from livepde.verdict import FLAT, TELLING, Finding, Verdict
+from livepde.verdict import FLAT, Finding, Verdict, at_bound, flat
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -221,15 +222,10 @@ def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
         unknown, value = unknown_of(space, label), float(belief.q[row])
         lower, upper = map(float, unknown.bounds)
         if value in (lower, upper):
-            text = f"{label} ends at its bound {value:g}: the bound decides, not the data."
-            yield Finding("bound", "caution", text, label, value)
+            yield at_bound(label, value)
         left = float(belief.left([row])[0])
         if left > FLAT and not unknown.evolution.moves:
-            text = (
-                f"{label}: the data have told hardly anything, {left:.0%} of its prior standard "
-                "deviation is left."
-            )
-            yield Finding("flat", "caution", text, label, left, remedy=TELLING)
+            yield flat(label, left)
 
 
 class Result:
@@ -343,7 +339,8 @@ class Result:
         with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
         law with covariance also `_left`, the share of the prior deviation of a number that is left;
         `_modes`, of how many modes of a field the data have told, over `snapshot`; and
-        `correlation` of the last numbers, over (`unknown`, `other`).
+        `correlation` of the last numbers, over (`unknown`, `other`). The attribute `verdict` is
+        what `Verdict.to_dict` gives, as JSON.
         """
         records, last = RecordArrays.of(self.records), None
         if self.last is not None and self._settled is not None:
@@ -353,7 +350,10 @@ class Result:
             records = records.with_last(np.array(self._readout(self._settled)), snapshot)
         if self.last is not None and records.last_snapshot < len(records) - 1:
             last = self.snapshot(self.last)
-        return self.layout.dataset(records, last)
+        data = self.layout.dataset(records, last)
+        if self.last is not None:
+            data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
+        return data
 
     def table(self) -> dict[str, dict[str, float]]:
         """Return the last estimates and the root mean square errors of all sensors.

@@ -268,10 +268,20 @@ def concluded(
         With figures.
     """
     from livepde.linalg import in_use
-    from livepde.runs import arrivals, checks_of, doubts, input_notes, tables
+    from livepde.runs import (
+        arrivals,
+        checks_of,
+        doubts,
+        input_notes,
+        tables,
+        verdict,
+        verdict_table,
+    )
 
     dataset = driven.result.to_xarray()
-    shown = [*tables(dataset), *arrivals(driven.journal)]
+    found = verdict(dataset)
+    judged = [verdict_table(found)] if len(driven.result) else []
+    shown = [*judged, *tables(dataset), *arrivals(driven.journal)]
     checks = checks_of(loaded.expected, dataset)
     driving = loaded.frame.roles("boundary", "input")
     notes = [*loaded.notes, *doubts(dataset), *input_notes(driven.journal, driving)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.runs.directory import JOURNAL, RECORD, Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
-from livepde.runs.doubts import doubts, unexplained
+from livepde.runs.doubts import doubts, severities, unexplained, verdict, verdict_table
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
 from livepde.runs.live import Backlog, Live, Retention, Sink
@@ -38,7 +38,10 @@ __all__ = [
     "measures",
     "open",
     "refuse_taken",
+    "severities",
     "stopped_by_signals",
     "tables",
     "unexplained",
+    "verdict",
+    "verdict_table",
 ]

@@ -298,6 +298,15 @@ class Journal:
             self._execute("INSERT OR REPLACE INTO meta VALUES ('position', ?)", stands)
         self._write(self._db.commit)
 
+    def judge(self, verdict: Mapping[str, Any]) -> None:
+        """Keep the verdict on the run so far, as `Verdict.to_dict` gives it."""
+        self._execute("INSERT OR REPLACE INTO meta VALUES ('verdict', ?)", json.dumps(verdict))
+
+    @property
+    def verdict(self) -> str:
+        """The verdict that was kept last, as JSON; empty before any."""
+        return self._meta().get("verdict", "")
+
     def note(self, event: Event) -> None:
         """Keep an event; one that was kept before a crash is not kept twice."""
         self._execute(
@@ -441,7 +450,10 @@ class Journal:
         """Return the estimates as a dataset; see `Result.to_xarray`."""
         records = RecordArrays.of(self)
         with sound(self.path):
-            return self.layout.dataset(records)
+            data = self.layout.dataset(records)
+        if verdict := self.verdict:
+            data.attrs["verdict"] = verdict
+        return data
 
     @property
     def events(self) -> list[Event]:

@@ -20,10 +20,12 @@ from livepde.result import Estimate, Result
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.streams.intake import Ready, Remark
+from livepde.verdict import LEVELS
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
 CHECKPOINT = 256  # samples between two checkpoints
+JUDGED = 50  # samples between two looks at the verdict, of which a change is an event
 LOOK = 0.5  # seconds between two looks at whether to stop
 LONGEST = 500  # characters of an event
 HARMLESS = frozenset({"heard", "missing", "disordered", "outside"})
@@ -165,6 +167,8 @@ class Live:
         self._counts = Counter(journal.counts)
         self._remarked = set(self._counts)
         self._steps = 0
+        told = [event for event in journal.events if event.kind == "verdict"]
+        self._level = told[-1].message.partition(":")[0] if told else LEVELS[0]
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
@@ -213,6 +217,7 @@ class Live:
         last = self.result.last
         if last is not None:
             self.result.settle(last := self.identifier.settled(last))
+            self.journal.judge(last.verdict.to_dict())
         if self.journal.estimated:
             self.journal.keep(self.result.snapshot(last or self.identifier.estimate()))
         self.journal.checkpoint(self.identifier.dump())
@@ -278,6 +283,8 @@ class Live:
             "silent": self.silent,
             "status": "" if last is None else last.status.code,
             "seconds": self._seconds,
+            "verdict": "" if last is None else last.verdict.level,
+            "findings": [] if last is None else last.verdict.sentences,
             "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
 
@@ -313,10 +320,21 @@ class Live:
         if not estimate.status.ok:
             self._tell(estimate.status.code, str(estimate.status))
         self._steps += 1
+        if len(self.result) % JUDGED == 0:
+            self._judge(estimate)
         if self._steps % CHECKPOINT == 0:
             self.journal.checkpoint(self.identifier.dump())
             if math.isfinite(self.retention.span):
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
+
+    def _judge(self, estimate: Estimate) -> None:
+        """Tell of a verdict that is another one than before."""
+        verdict = estimate.verdict
+        self.journal.judge(verdict.to_dict())
+        if verdict.level != self._level:
+            self._level = verdict.level
+            said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
+            self._tell("verdict", f"{verdict.level}: {said}")
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; one that fails is given up, the run goes on."""

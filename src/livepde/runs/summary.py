@@ -210,7 +210,8 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run.
 
-    Estimates with references, errors of each channel, what the data have told, and jumps.
+    Estimates with references, errors of each channel, what the data have told, jumps, and the
+    verdict.
     """
     result: list[Table] = []
     labels = scalars(data) if data.sizes["time"] else []

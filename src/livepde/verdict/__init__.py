@@ -2,13 +2,26 @@
 
 from livepde.verdict.assess import Position, assess
 from livepde.verdict.directions import Dictionary, Direction
-from livepde.verdict.findings import FLAT, LEVELS, TELLING, Cause, Finding, Verdict
+from livepde.verdict.findings import (
+    FLAT,
+    LEVELS,
+    MOST,
+    TELLING,
+    Cause,
+    Finding,
+    Severity,
+    Verdict,
+    at_bound,
+    flat,
+)
 from livepde.verdict.judge import Judge, Seen
 from livepde.verdict.ledger import WINDOWS, Ledger
+from livepde.verdict.withheld import WithheldLedger
 
 __all__ = [
     "FLAT",
     "LEVELS",
+    "MOST",
     "TELLING",
     "WINDOWS",
     "Cause",
@@ -19,6 +32,10 @@ __all__ = [
     "Ledger",
     "Position",
     "Seen",
+    "Severity",
     "Verdict",
+    "WithheldLedger",
     "assess",
+    "at_bound",
+    "flat",
 ]

@@ -35,6 +35,9 @@ FAR = 3.0  # standard deviations between a sensor that stands still and its pred
 STANDS = 10  # equal readings in a row
 MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
 EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
+SEEN = 4.0  # standard errors of an amplitude from which it shows
+BEYOND = 2.0  # standard deviations of a shift beyond an interval
+UNSEEN = 3  # sentences on what is not seen
 NAMED = 4  # causes that are kept
 
 
@@ -83,7 +86,33 @@ def assess(dictionary: Dictionary, at: Position) -> Verdict:
     if not findings:
         findings += _records(at, evidence)
     findings += [*_noise(at), *_stuck(at), *_prior(at)]
-    return Verdict.of(findings, dictionary.left_out)
+    return Verdict.of(findings, dictionary.left_out, _unseen(dictionary, at))
+
+
+def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
+    """Return which errors of sensors would not show, and move an estimate beyond its interval.
+
+    One of less than `SEEN` standard errors is not seen, and none is larger than the amplitude of
+    its direction: what is usual.
+    """
+    den = at.ledger.sums[at.member, 1, 0].sum(axis=1)
+    hidden = np.minimum(SEEN / np.sqrt(np.maximum(den, 1e-300)), 1.0)
+    found = []
+    for d, direction in enumerate(dictionary.directions):
+        if direction.kind not in ("offset", "gain", "lag", "position"):
+            continue
+        for name, moved in at.moved.items():
+            shift = float(hidden[d] * abs(moved[0, d]))
+            if shift > BEYOND:
+                found.append((shift, d, name))
+    said = []
+    for shift, d, name in sorted(found, reverse=True)[:UNSEEN]:
+        text, remedy = _words(dictionary.directions[d], float(hidden[d]), at)
+        said.append(
+            f"If {text}, that is not seen, and moves {name} by {shift:.1f} standard "
+            f"deviations. {remedy}"
+        )
+    return said
 
 
 def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
@@ -162,6 +191,7 @@ def _words(direction: Direction, size: float, at: Position) -> tuple[str, str]:
     unit = f" {direction.unit}" if direction.unit else ""
     interval = float(at.ledger.times[at.member, 1])
     time = f" {at.time_unit}" if at.time_unit else ""
+    typical, of = float(np.median(at.noise)), f" {at.unit}" if at.unit else ""
     side = "above" if size > 0 else "below"
     low = "high" if size < 0 else "low"
     words = {
@@ -193,8 +223,7 @@ def _words(direction: Direction, size: float, at: Position) -> tuple[str, str]:
             "Let it: law.jumps = true, or an evolution of the unknown.",
         ),
         "boundary": (
-            f"boundary value {name} is {low} by {abs(size):.2g} times three standard deviations "
-            "of the sensors",
+            f"boundary value {name} is {low} by {abs(size) * OFFSET * typical:.2g}{of}",
             f"Check {name}: its unit, its place, its offset, and gaps in it.",
         ),
         "source": (

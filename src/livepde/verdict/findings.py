@@ -7,7 +7,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
-__all__ = ["FLAT", "LEVELS", "TELLING", "Cause", "Finding", "Level", "Severity", "Verdict"]
+__all__ = [
+    "FLAT",
+    "LEVELS",
+    "MOST",
+    "TELLING",
+    "Cause",
+    "Finding",
+    "Level",
+    "Severity",
+    "Verdict",
+    "at_bound",
+    "flat",
+]
 
 Level: TypeAlias = Literal["trusted", "caution", "do not trust"]
 Severity: TypeAlias = Literal["note", "caution", "do not trust"]
@@ -111,6 +123,13 @@ class Finding:
             parts.append(remedy)
         return " ".join(parts)
 
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
+        """Return the finding that `to_dict` has written."""
+        own = {name: value for name, value in stored.items() if name != "sentence"}
+        causes = tuple(Cause(**{**item, "share": _number(item["share"])}) for item in own["causes"])
+        return cls(**{**own, "causes": causes, "evidence": _number(own["evidence"])})
+
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as JSON can hold it."""
         evidence = None if math.isnan(self.evidence) else min(self.evidence, LARGEST)
@@ -128,6 +147,25 @@ class Finding:
         }
 
 
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def at_bound(label: str, value: float) -> Finding:
+    """Return the finding of an unknown that ends at a bound."""
+    text = f"{label} ends at its bound {value:g}: the bound decides, not the data."
+    return Finding("bound", "caution", text, label, value)
+
+
+def flat(label: str, left: float) -> Finding:
+    """Return the finding of an unknown of which the data have told hardly anything."""
+    text = (
+        f"{label}: the data have told hardly anything, {left:.0%} of its prior standard deviation "
+        "is left."
+    )
+    return Finding("flat", "caution", text, label, left, remedy=TELLING)
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether the estimates of a run are to be believed.
@@ -140,18 +178,34 @@ class Verdict:
         What speaks against them, the worst first, and notes.
     untested
         What was not tested, and why.
+    unseen
+        Errors that the data would not show and that would yet move an estimate by more than its
+        interval, as sentences, the worst first.
     """
 
     level: Level
     findings: tuple[Finding, ...] = ()
     untested: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, findings: Iterable[Finding], untested: Iterable[str] = ()) -> Verdict:
+    def of(
+        cls,
+        findings: Iterable[Finding],
+        untested: Iterable[str] = (),
+        unseen: Iterable[str] = (),
+    ) -> Verdict:
         """Return the verdict of some findings: the worst of them counts."""
         ordered = sorted(findings, key=lambda finding: -RANK[finding.severity])
         worst = max((RANK[finding.severity] for finding in ordered), default=0)
-        return cls(LEVELS[worst], tuple(ordered), tuple(dict.fromkeys(untested)))
+        untested = tuple(dict.fromkeys(untested))
+        return cls(LEVELS[worst], tuple(ordered), untested, tuple(unseen))
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Verdict:
+        """Return the verdict that `to_dict` has written."""
+        findings = [Finding.from_dict(item) for item in stored["findings"]]
+        return cls.of(findings, stored["untested"], stored["unseen"])
 
     @classmethod
     def unjudged(cls) -> Verdict:
@@ -162,7 +216,7 @@ class Verdict:
         """Return the verdict with more findings; one that says the same is not said twice."""
         said = {finding.text for finding in self.findings}
         new = [finding for finding in more if finding.text not in said]
-        return Verdict.of([*self.findings, *new], self.untested)
+        return Verdict.of([*self.findings, *new], self.untested, self.unseen)
 
     @property
     def sentences(self) -> list[str]:
@@ -175,6 +229,7 @@ class Verdict:
             "level": self.level,
             "findings": [finding.to_dict() for finding in self.findings],
             "untested": list(self.untested),
+            "unseen": list(self.unseen),
         }
 
     def __str__(self) -> str:
