@@ -144,9 +144,12 @@ class AutoLaw(Law[Bank, AutoState]):
         # What moves far has no use for a reference that stays.
         walks = reduction.moving(0.0) > 0
         replays = np.array([not (walks or c.drift) for c in candidates])
+        judge = work.filter.judge
+        wider = None if judge is None else judge.widened(rank - work.filter.rank)
+        drift = np.zeros(len(candidates))
         work = replace(
             work,
-            filter=replace(work.filter, rank=rank, drift=np.zeros(len(candidates))),
+            filter=replace(work.filter, rank=rank, drift=drift, judge=wider),
             options=replace(work.options, adaptive=True),
             start_window=self.member.start_window if walks else 0,
         )

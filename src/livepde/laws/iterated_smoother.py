@@ -10,7 +10,7 @@ probable, and serves unknowns that stay and unknowns that move.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
@@ -63,13 +63,8 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     """
     problem = work.filter.problem
     log = state.log[:, int(state.window[0]) :]
-    opening, intervals = (
-        first_interval(log, problem.channels),
-        intervals_since(log, problem.channels),
-    )
-    # What a verdict needs is kept in the last pass only.
-    bare = replace(work, filter=replace(work.filter, judge=None))
-    samples = _Samples(bare, state, opening, intervals)
+    opening = first_interval(log, problem.channels)
+    samples = _Samples(work, state, opening, intervals_since(log, problem.channels))
     shape = (1 + len(samples.intervals), state.now.C.shape[2])
     begun = [samples.about(np.zeros(shape))]
     plain = samples.relinearised()
@@ -81,8 +76,6 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     if not ends:
         return None
     best = min(ends, key=lambda one: one.misfit)
-    if work.filter.judge is not None:
-        best = _Samples(work, state, opening, intervals).about(best.trajectory) or best
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
 
 

@@ -214,6 +214,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 reduction,
                 noise,
                 self.verdict,
+                rank,
                 kept=not (self.drift or self.memory < np.inf),
             ),
         )
@@ -243,7 +244,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             evidence=0.0 * one,
             kept=filter_.stage.kept(1),
             causes=np.zeros((1, k, filter_.judge.columns if filter_.judge else 0)),
-            ledger=filter_.judge.start() if filter_.judge else Ledger.start(0, 0, 0, 0, 0, 0),
+            ledger=filter_.judge.start() if filter_.judge else Ledger.start(0, 0, 0, 0, 0, 0, 0, 0),
         )
         no = np.zeros(1, dtype=bool)
         return SensitivityState(

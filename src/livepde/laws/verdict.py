@@ -11,6 +11,7 @@ from livepde.laws.base import Problem
 from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
+from livepde.laws.input_noise import input_rank
 from livepde.laws.members import take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
@@ -20,7 +21,13 @@ __all__ = ["judge_of", "judged"]
 
 
 def judge_of(
-    problem: Problem, reduction: Reduction, noise: Array, verdict: bool | str, *, kept: bool
+    problem: Problem,
+    reduction: Reduction,
+    noise: Array,
+    verdict: bool | str,
+    rank: int,
+    *,
+    kept: bool,
 ) -> Judge | None:
     """Return the judge of a filter; None if there is to be none.
 
@@ -28,6 +35,8 @@ def judge_of(
     ----------
     verdict
         As for `SensitivityLaw`.
+    rank
+        Rows of the square root at most.
     kept
         Whether the filter forgets nothing, so that a record of unknowns that stay makes sense.
     """
@@ -43,7 +52,10 @@ def judge_of(
         dearer=verdict is True,
         windows=len(WINDOWS),
     )
-    return Judge(dictionary, problem.observed.size, reduction.size, model.X.dim, still=still)
+    sizes = problem.observed.size, reduction.size, model.X.dim
+    # Noise of inputs, and of the readings of the start, adds rows before they are compressed.
+    rows = rank + input_rank(problem) + len(problem.initial_weights)
+    return Judge(dictionary, *sizes, rows, still=still)
 
 
 def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict]:
@@ -55,7 +67,12 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
         return lambda: Verdict.of([_unseen()])
     one = take(x, member)
     ledger = replace(one.ledger, process=one.ledger.process[:, :0])
-    return lambda: assess(judge.dictionary, _position(filter_, replace(one, ledger=ledger)))
+
+    def found() -> Verdict:
+        w, settled = judge.settled(ledger, one.causes)
+        return assess(judge.dictionary, _position(filter_, replace(one, causes=w, ledger=settled)))
+
+    return found
 
 
 def _unseen() -> Finding:

@@ -129,40 +129,45 @@ class Dictionary:
     def __len__(self) -> int:
         return len(self.directions)
 
+    def moved(self, u: Array) -> Array:
+        """Return how readings change with shifts of their sensors, (members, axes * sensors)."""
+        if self.shifts is None:
+            return np.zeros((len(u), 0))
+        return np.concatenate([(shift @ u.T).T for shift in self.shifts], axis=1)
+
     def signals(
-        self, noise: Array, h: Array, first: Array, last: Array, share: Array, u: Array
+        self, noise: Array, h: Array, first: Array, last: Array, share: Array, moved: Array
     ) -> Array:
-        """Return what each direction does to its own sensor, (members, directions, sensors).
+        """Return what each direction does to its own sensor, (samples, directions, sensors).
 
         In units of the noise; of the process and of jumps zero. That of a drift is its slope.
 
         Parameters
         ----------
         noise
-            Shape (1 or members, sensors).
+            Shape (samples, sensors).
         h, first, last
-            Predictions now, at the start and of the last sample, (members, sensors).
+            Predictions now, at the start and of the sample before, (samples, sensors).
         share
-            Usual interval between samples over this one, (members,).
-        u
-            The state, shape (members, n).
+            Usual interval between samples over this one, (samples,).
+        moved
+            Shape (samples, axes * sensors).
         """
-        members, sensors = h.shape
+        samples, sensors = h.shape
         parts: dict[str, Any] = {}
         for kind in self.kinds:
             if kind == "offset":
-                parts[kind] = np.full((members, sensors), OFFSET)
+                parts[kind] = np.full((samples, sensors), OFFSET)
             elif kind == "drift":
-                parts[kind] = np.full((members, sensors), OFFSET / DRIFT)
+                parts[kind] = np.full((samples, sensors), OFFSET / DRIFT)
             elif kind == "gain":
                 parts[kind] = GAIN * (h - first) / noise
             elif kind == "lag":
                 rate = (last - h) * share[:, None]
                 parts[kind] = LAG * np.where(np.isfinite(rate), rate, 0.0) / noise
-            elif self.shifts is not None:
-                each = [(shift @ u.T).T / noise for shift in self.shifts]
-                parts[kind] = np.concatenate(each, axis=1)
-        f = np.zeros((members, len(self), sensors))
+            else:
+                parts[kind] = moved / np.tile(noise, moved.shape[1] // sensors)
+        f = np.zeros((samples, len(self.directions), sensors))
         if parts:
             own = np.concatenate([parts[kind] for kind in self.kinds], axis=1)
             f[:, np.arange(len(self._own)), self._own] = own

@@ -13,13 +13,19 @@ of the noise, an update is
 
     w <- W^T (w - Y f),    since  [U C] <- W^T [U C]  and  K = [U C]^T W W^T Y N^-1.
 
+Several samples are summed together. Until then `FilterState.causes` holds [T Z_1 Z_2 ...]: the
+identity and Y of each sample that waits, moved on as rows of w are. Then w = T w_0 - sum_j Z_j f_j,
+and with A_k = Y_k^T [T Z_1 ...] at the time of sample k
+
+    g_k = f_k + A_k [w_0; -f_1; -f_2; ...].
+
 So w costs no solve: it is exact for a linear filter, whatever moves, and C^T w says by how much the
 estimate of the unknowns is off for each unit of the cause.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -27,8 +33,8 @@ import numpy as np
 from livepde.linalg import Array, Mask
 from livepde.stepping import Moments
 from livepde.verdict.directions import JUMP, Dictionary
-from livepde.verdict.ledger import WINDOWS, Ledger, blocked, summed
-from livepde.verdict.process import Now, Process, stride
+from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, summed
+from livepde.verdict.process import Now, stride
 
 __all__ = ["Judge", "Seen"]
 
@@ -45,8 +51,8 @@ class Seen:
     Attributes
     ----------
     C, causes
-        Square root of the covariance of the unknowns, (members, r, k), and w of all directions in
-        all windows, (members, r, windows times directions).
+        Square root of the covariance of the unknowns, (members, r, k), and [T Z_1 ...], (members,
+        r, columns).
     a, q, u
         Reduced and latent unknowns and the state, as they are estimated.
     Y, d, used
@@ -80,119 +86,226 @@ class Judge:
         The directions.
     sensors, unknowns, n
         Number of sensors, of reduced unknowns and of coefficients of the state.
+    rank
+        Rows of the square root at most when samples come.
     still
         Whether all unknowns stay as they are, so that their record can be kept.
     """
 
     def __init__(
-        self, dictionary: Dictionary, sensors: int, unknowns: int, n: int, *, still: bool
+        self, dictionary: Dictionary, sensors: int, unknowns: int, n: int, rank: int, *, still: bool
     ) -> None:
         self.dictionary = dictionary
-        self.sensors, self.unknowns, self.n = sensors, unknowns, n
+        self.sensors, self.unknowns, self.n, self.rank = sensors, unknowns, n, rank
         self.recorded = still and 0 < sensors * unknowns**2 <= MOST_RECORDED
-        self.windows = len(WINDOWS)
+        self.windows, self.batch = len(WINDOWS), batch_of(sensors)
+        self.terms = len(dictionary.process.terms) if dictionary.process else 0
         self._drift = dictionary.parts.get("drift", slice(0, 0))
         self._jump, self._process = dictionary.parts["jump"], dictionary.parts["process"]
+        # What stands in a row that waits.
+        axes = len(dictionary.shifts) if dictionary.shifts is not None else 0
+        sizes = {
+            "t": 1,
+            "used": sensors,
+            "d": sensors,
+            "noise": sensors,
+            "predicted": sensors,
+            "moved": axes * sensors,
+            "answers": self.terms * sensors,
+            "told": sensors if self.recorded else 0,
+            "Y": unknowns * sensors if self.recorded else 0,
+            "whitening": sensors * (sensors if sensors <= MOST_WHITENED else 1),
+            "A": sensors * self.columns,
+        }
+        ends = np.cumsum(list(sizes.values())).tolist()
+        self._at = {
+            name: slice(end - size, end)
+            for (name, size), end in zip(sizes.items(), ends, strict=True)
+        }
+        self.numbers = int(ends[-1])
+
+    def widened(self, more: int) -> Judge:
+        """Return the judge of a filter whose square root has more rows."""
+        sizes = self.sensors, self.unknowns, self.n, self.rank + more
+        return Judge(self.dictionary, *sizes, still=self.recorded)
 
     def start(self) -> Ledger:
         """Return the ledger of one member before any sample."""
-        terms = len(self.dictionary.process.terms) if self.dictionary.process else 0
         followed = self.unknowns if self.recorded else 0
-        counts = len(self.dictionary), followed, terms, self.n if terms else 0
-        return Ledger.start(self.sensors, *counts, self.windows)
+        n = self.n if self.terms else 0
+        counts = len(self.dictionary), followed, self.terms, n, self.windows, self.rank
+        return Ledger.start(self.sensors, *counts, self.numbers)
 
     @property
     def columns(self) -> int:
-        """Number of columns of w."""
-        return self.windows * len(self.dictionary)
+        """Number of columns of [T Z_1 ...]."""
+        return self.rank + self.batch * self.sensors
 
     def heard(self, ledger: Ledger, seen: Seen) -> tuple[Array, Ledger]:
-        """Return w, before the update takes its share of it, and the ledger after a sample."""
+        """Return [T Z_1 ...] with what a sample brings, before its update, and the ledger."""
         members, sensors = seen.d.shape
-        used, due = seen.used.astype(float), ledger.due
-        whole = bool(seen.used.all())
-        causes = self._opened(ledger, seen, due)
-        parts: dict[str, Any] = self._timed(ledger, seen)
-        process = self.dictionary.process
-        if process is not None and process.terms and members <= MOST_MEMBERS:
-            parts |= self._answered(process, ledger, seen, parts["times"][:, 1])
-        f = self._effects(ledger, seen, due, parts)
-        if not whole:
-            f = f * used[:, None]
-        g = f + causes.transpose(0, 2, 1) @ seen.Y
-        rows = self._whitened(np.concatenate([seen.d[:, None], g], axis=1), seen.Y)
-        r = ledger.clipped(rows[:, 0])
-        g = rows[:, 1:].reshape(members, self.windows, -1, sensors)
-        names = ("sums", "noise", "before", "present")
-        parts |= dict(zip(names, summed(ledger, due, r, g, used), strict=True))
+        causes, full = seen.causes, ledger.waiting == self.batch
+        if full.any() or not ledger.seen.all():
+            causes, ledger = self._begun(ledger, seen, full)
+        used = seen.used.astype(float)
+        parts: dict[str, Any] = {}
+        last, unit = ledger.times[:, 1], ledger.times[:, 2]
+        unit = np.where(np.isfinite(unit), unit, seen.at.t - last)
+        if self.terms and members <= MOST_MEMBERS:
+            parts = self._answered(ledger, seen, unit)
+        row = np.zeros((members, self.numbers))
+        row[:, self._at["t"]] = seen.at.t
+        row[:, self._at["used"]] = used
+        row[:, self._at["d"]] = seen.d
+        row[:, self._at["noise"]] = seen.noise
+        row[:, self._at["predicted"]] = seen.predicted
+        row[:, self._at["moved"]] = self.dictionary.moved(seen.u)
+        if parts:
+            row[:, self._at["answers"]] = _between(parts, seen.at.t).reshape(members, -1)
         if self.recorded and seen.C.shape[1] == self.unknowns:
             Y = _sensitivity(seen.C, seen.Y)
             if Y is not None:
-                told = seen.d + (seen.a[:, None] @ Y)[:, 0]
-                new = blocked(ledger, Y, told if whole else told * used)
-                parts |= dict(zip(("score", "information", "length"), new, strict=True))
+                row[:, self._at["told"]] = (seen.d + (seen.a[:, None] @ Y)[:, 0]) * used
+                row[:, self._at["Y"]] = Y.reshape(members, -1)
+        row[:, self._at["whitening"]] = _whitening(seen.Y)
+        A = seen.Y.transpose(0, 2, 1) @ causes
+        row[:, self._at["A"]] = A.reshape(members, -1)
+        rows, causes = ledger.rows.copy(), causes.copy()
+        for k, filled in enumerate(ledger.waiting.tolist()):
+            rows[k, filled] = row[k]
+            begin = self.rank + filled * sensors
+            causes[k, :, begin : begin + sensors] = seen.Y[k]
         same = np.abs(seen.z - ledger.value) <= SAME * np.abs(seen.z)
         parts |= {
             "seen": ledger.seen + 1,
-            "age": np.where(due, 1, ledger.age + 1),
-            "epoch": ledger.epoch + (due & (ledger.age > 0)),
+            "waiting": ledger.waiting + 1,
+            "rows": rows,
+            "times": np.stack([ledger.times[:, 0], np.full(members, seen.at.t), unit], axis=1),
             "first": np.where(np.isfinite(ledger.first), ledger.first, seen.predicted),
-            "last": seen.predicted,
             "stuck": np.where(same, ledger.stuck + 1, np.where(seen.used, 0, ledger.stuck)),
             "value": np.where(np.isfinite(seen.z), seen.z, ledger.value),
         }
-        return causes - seen.Y @ f.transpose(0, 2, 1), replace(ledger, **parts)
+        return causes, replace(ledger, **parts)
 
-    def _opened(self, ledger: Ledger, seen: Seen, due: Mask) -> Array:
+    def settled(self, ledger: Ledger, causes: Array) -> tuple[Array, Ledger]:
+        """Return w and the ledger after all samples that wait are summed.
+
+        Parameters
+        ----------
+        causes
+            [T Z_1 ...] now, (members, r, columns).
+
+        Returns
+        -------
+        w
+            Shape (members, r, windows times directions).
+        """
+        members, sensors, batch = len(ledger.seen), self.sensors, self.batch
+        rows, at = ledger.rows, self._at
+        there = np.arange(batch) < ledger.waiting[:, None]  # (members, batch)
+        used = rows[:, :, at["used"]] * there[:, :, None]
+        due = ledger.due
+        f = self._effects(ledger, due) * used[:, :, None]
+        count = f.shape[2]
+        known = f.transpose(0, 1, 3, 2).reshape(members, batch * sensors, count)
+        whole = np.concatenate([ledger.w, -known], axis=1)
+        A = rows[:, :, at["A"]].reshape(members, batch * sensors, self.columns)
+        g = (known + A @ whole).reshape(members, batch, sensors, count).transpose(0, 1, 3, 2)
+        r = rows[:, :, at["d"]]
+        whitening = rows[:, :, at["whitening"]]
+        if sensors <= MOST_WHITENED:
+            T = whitening.reshape(members, batch, sensors, sensors)
+            r, g = (r[:, :, None] @ T)[:, :, 0], g @ T
+        else:
+            r, g = r * whitening, g * whitening[:, :, None]
+        r = ledger.clipped(r) * there[:, :, None]
+        g = g.reshape(members, batch, self.windows, -1, sensors) * there[:, :, None, None, None]
+        names = ("sums", "noise", "before", "present")
+        parts: dict[str, Any] = dict(zip(names, summed(ledger, due, r, g, used), strict=True))
+        if self.recorded:
+            Y = rows[:, :, at["Y"]].reshape(members, batch, self.unknowns, sensors)
+            Y, told = Y * used[:, :, None], rows[:, :, at["told"]] * there[:, :, None]
+            new = blocked(ledger, ledger.seen - ledger.waiting, Y, told)
+            parts |= dict(zip(("score", "information", "length"), new, strict=True))
+        waited = ledger.waiting[:, None]
+        last = rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
+        parts |= {
+            "waiting": np.zeros_like(ledger.waiting),
+            "age": np.where(due, 0, ledger.age) + waited,
+            "epoch": ledger.epoch + (due & (ledger.age > 0)),
+            "last": np.where(waited > 0, last[:, at["predicted"]], ledger.last),
+            "times": np.concatenate([ledger.times[:, 1:2], ledger.times[:, 1:]], axis=1),
+        }
+        return causes @ whole, replace(ledger, **parts)
+
+    def _begun(self, ledger: Ledger, seen: Seen, full: Mask) -> tuple[Array, Ledger]:
+        """Return [T Z_1 ...] and the ledger of members whose batch is full, or the first one."""
+        begins = full | (ledger.seen == 0)
+        members, r, _ = seen.causes.shape
+        w = np.zeros((members, r, ledger.w.shape[2]))
+        if full.any():
+            found, settled = self.settled(ledger, seen.causes)
+            w[full] = found[full]
+            ledger = settled if full.all() else _where(full, settled, ledger)
+        w = self._opened(ledger, seen, ledger.due & begins[:, None], w)
+        kept = np.zeros_like(ledger.w)
+        kept[:, :r] = w[:, : self.rank]
+        chosen = begins[:, None, None]
+        fresh = np.zeros_like(seen.causes)
+        fresh[:, np.arange(r), np.arange(r)] = 1.0
+        causes = np.where(chosen, fresh, seen.causes)
+        return causes, replace(ledger, w=np.where(chosen, kept, ledger.w))
+
+    def _opened(self, ledger: Ledger, seen: Seen, due: Mask, w: Array) -> Array:
         """Return w with that of windows that begin: nothing but jumps of the unknowns."""
-        causes, count = seen.causes, len(self.dictionary)
+        count = len(self.dictionary)
         if not due.any() or not count:
-            return causes
-        members, r, _ = causes.shape
-        causes = causes.reshape(members, r, self.windows, count).copy()
-        causes.transpose(0, 2, 1, 3)[due] = 0.0
+            return w
+        members, r, _ = w.shape
+        w = w.reshape(members, r, self.windows, count)
+        w.transpose(0, 2, 1, 3)[due] = 0.0
         jumps = self.dictionary.jumps
         if jumps and ledger.seen.any():
             units = JUMP * np.eye(seen.C.shape[2])[:, jumps]
             for k in np.flatnonzero(due[:, 1:].any(axis=1)).tolist():
-                w = np.linalg.lstsq(seen.C[k].T, units, rcond=None)[0]
+                moved = np.linalg.lstsq(seen.C[k].T, units, rcond=None)[0]
                 for window in (1 + np.flatnonzero(due[k, 1:])).tolist():
-                    causes[k, :, window, self._jump] = w
-        return causes.reshape(members, r, -1)
+                    w[k, :, window, self._jump] = moved
+        return w.reshape(members, r, -1)
 
-    @staticmethod
-    def _timed(ledger: Ledger, seen: Seen) -> dict[str, Any]:
-        """Return time and usual interval after this sample."""
-        last, unit = ledger.times[:, 0], ledger.times[:, 1]
-        unit = np.where(np.isfinite(unit), unit, seen.at.t - last)
-        return {"times": np.stack([np.full(len(last), seen.at.t), unit], axis=1)}
-
-    def _effects(self, ledger: Ledger, seen: Seen, due: Mask, parts: dict[str, Any]) -> Array:
-        """Return f of all windows, (members, windows times directions, sensors)."""
-        members, sensors = seen.d.shape
+    def _effects(self, ledger: Ledger, due: Mask) -> Array:
+        """Return f of the samples that wait, (members, batch, windows * directions, sensors)."""
+        rows, at = ledger.rows, self._at
+        members, batch, _ = rows.shape
+        sensors = self.sensors
+        t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
+        before = np.concatenate([ledger.times[:, :1], t[:, :-1]], axis=1)
+        last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            share = parts["times"][:, 1] / (seen.at.t - ledger.times[:, 0])
-        first = np.where(np.isfinite(ledger.first), ledger.first, seen.predicted)
-        h = seen.predicted
-        f = self.dictionary.signals(seen.noise, h, first, ledger.last, share, seen.u)
-        if "readings" in parts:
-            (begin, end), (low, high) = parts["reached"].T, parts["readings"].transpose(1, 0, 2, 3)
-            width = np.where(end > begin, end - begin, 1.0)
-            along = np.clip((seen.at.t - begin) / width, 0.0, 1.0)[:, None, None]
-            f[:, self._process] = ((1.0 - along) * low + along * high) / seen.noise[:, None]
-        f = np.repeat(f[:, None], self.windows, axis=1)
+            share = ledger.times[:, 2:] / (t - before)
+        first = np.broadcast_to(ledger.first[:, None], h.shape)
+        noise = rows[:, :, at["noise"]]
+        noise = np.where(noise > 0.0, noise, 1.0)  # rows that are not filled yet
+        noise, h, first, last, moved = (
+            part.reshape(members * batch, -1)
+            for part in (noise, h, first, last, rows[:, :, at["moved"]])
+        )
+        f = self.dictionary.signals(noise, h, first, last, share.ravel(), moved)
+        if self.terms:
+            answers = rows[:, :, at["answers"]].reshape(members * batch, self.terms, sensors)
+            f[:, self._process] = answers / noise[:, None]
+        f = f.reshape(members, batch, 1, -1, sensors)
+        f = np.repeat(f, self.windows, axis=2)
         if self._drift.stop > self._drift.start:
-            age = np.where(due, 0, ledger.age)
-            f[:, :, self._drift] *= age[:, :, None, None]
-        return f.reshape(members, -1, sensors)
+            age = np.where(due, 0, ledger.age)[:, None] + np.arange(batch)[:, None]
+            f[:, :, :, self._drift] *= age[:, :, :, None, None]
+        return np.where(np.isfinite(f), f, 0.0).reshape(members, batch, -1, sensors)
 
-    def _answered(
-        self, process: Process, ledger: Ledger, seen: Seen, unit: Array
-    ) -> dict[str, Any]:
+    def _answered(self, ledger: Ledger, seen: Seen, unit: Array) -> dict[str, Any]:
         """Return responses of the process that reach this sample at least."""
-        t = seen.at.t
+        process, t = self.dictionary.process, seen.at.t
         behind = ~(ledger.reached[:, 1] >= t)
-        if not behind.any():
+        if process is None or not behind.any():
             return {"readings": ledger.readings, "reached": ledger.reached}
         p, readings = ledger.process.copy(), ledger.readings.copy()
         reached = ledger.reached.copy()
@@ -212,18 +325,37 @@ class Judge:
             reached[k] = begin, begin + h
         return {"process": p, "readings": readings, "reached": reached}
 
-    @staticmethod
-    def _whitened(rows: Array, Y: Array) -> Array:
-        """Return rows of readings in units of what is expected of the innovations."""
-        sensors = Y.shape[2]
-        if sensors > MOST_WHITENED:
-            size = np.sqrt(1.0 + (Y * Y).sum(axis=1))
-            return np.asarray(rows / size[:, None])
-        stacked = np.concatenate([np.eye(sensors) + np.zeros_like(Y[:, :1, :1]), Y], axis=1)
-        if not np.isfinite(stacked).all():  # such a sample is not used
-            return rows
-        R = np.linalg.qr(stacked, mode="r")  # nothing is squared before
-        return np.asarray(rows @ np.linalg.inv(R))
+
+def _between(parts: dict[str, Any], t: float) -> Array:
+    """Return the answers of the process at a time, (members, terms, sensors)."""
+    (begin, end), (low, high) = parts["reached"].T, parts["readings"].transpose(1, 0, 2, 3)
+    width = np.where(end > begin, end - begin, 1.0)
+    along = np.clip((t - begin) / width, 0.0, 1.0)[:, None, None]
+    found: Array = (1.0 - along) * low + along * high
+    return found
+
+
+def _whitening(Y: Array) -> Array:
+    """Return what makes innovations white, from the right, flat: (members, numbers)."""
+    members, _, sensors = Y.shape
+    if sensors > MOST_WHITENED:
+        return np.asarray(1.0 / np.sqrt(1.0 + (Y * Y).sum(axis=1)))
+    eye = np.eye(sensors)
+    stacked = np.concatenate([np.broadcast_to(eye, (members, sensors, sensors)), Y], axis=1)
+    if not np.isfinite(stacked).all():  # such a sample is not used
+        return np.broadcast_to(eye.ravel(), (members, sensors * sensors))
+    R = np.linalg.qr(stacked, mode="r")  # nothing is squared before
+    return np.asarray(np.linalg.inv(R).reshape(members, -1))
+
+
+def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:
+    """Return a ledger whose chosen members are of one, the rest of another."""
+
+    def either(name: str) -> Any:
+        first, second = getattr(one, name), getattr(other, name)
+        return np.where(chosen.reshape(-1, *(1,) * (first.ndim - 1)), first, second)
+
+    return Ledger(**{item.name: either(item.name) for item in fields(Ledger)})
 
 
 def _sensitivity(C: Array, Y: Array) -> Array | None:

@@ -14,12 +14,14 @@ import numpy as np
 
 from livepde.linalg import Array, IntArray, Mask
 
-__all__ = ["BLOCKS", "WINDOWS", "Ledger"]
+__all__ = ["BLOCKS", "WINDOWS", "Ledger", "batch_of", "blocked", "summed"]
 
 WINDOWS = (0, 64, 512)
 """Samples after which a window begins anew; 0: the window of all samples. The faults of a window
 begin with it, so that an old, sound record does not hide a fault that is new."""
 
+BATCH = 16  # samples at most that wait until they are summed together
+ROOM = 64  # columns at most that they take while they wait
 BLOCKS = 16  # of the record of an unknown that stays; they double in length, and pairs merge
 CLIP = 4.0  # times the usual size: no whitened innovation counts for more (Huber)
 
@@ -30,12 +32,19 @@ class Ledger:
 
     Attributes
     ----------
-    seen
-        Number of samples, shape (members,).
+    seen, waiting
+        Number of samples, and of those that wait to be summed, shape (members,).
+    rows
+        Samples that wait, (members, batch, numbers); see `livepde.verdict.judge`.
+    w
+        Coordinates of all directions in all windows on the rows of the square root as they were
+        when the first of these came, (members, columns, windows times directions).
     times
-        Time of the last sample and of the interval before the first one but one, (members, 2).
+        Time of the last sample that was summed, of the last one, and the usual interval,
+        (members, 3).
     first, last
-        First and last prediction of each sensor, (members, sensors); NaN before.
+        First prediction of each sensor, and the last that was summed, (members, sensors); NaN
+        before.
     age, epoch
         Samples in each window, and how often it has begun anew, (members, windows).
     sums
@@ -65,6 +74,9 @@ class Ledger:
     """
 
     seen: IntArray
+    waiting: IntArray
+    rows: Array
+    w: Array
     times: Array
     first: Array
     last: Array
@@ -85,7 +97,15 @@ class Ledger:
 
     @classmethod
     def start(
-        cls, sensors: int, directions: int, followed: int, terms: int, n: int, windows: int
+        cls,
+        sensors: int,
+        directions: int,
+        followed: int,
+        terms: int,
+        n: int,
+        windows: int,
+        columns: int,
+        numbers: int,
     ) -> Ledger:
         """Return the value of one member before any sample.
 
@@ -95,11 +115,16 @@ class Ledger:
             Number k of unknown coordinates of which the record is kept.
         terms, n
             Number of missing terms, and of coefficients of the state.
+        columns, numbers
+            Of `w` and of a row that waits.
         """
         never, zero = np.full((1, sensors), np.nan), np.zeros(1, dtype=np.int64)
         return cls(
             seen=zero,
-            times=np.full((1, 2), np.nan),
+            waiting=zero,
+            rows=np.zeros((1, batch_of(sensors), numbers)),
+            w=np.zeros((1, columns, windows * directions)),
+            times=np.full((1, 3), np.nan),
             first=never,
             last=never,
             age=np.zeros((1, windows), dtype=np.int64),
@@ -110,7 +135,7 @@ class Ledger:
             present=np.zeros((1, sensors)),
             score=np.zeros((1, BLOCKS, sensors, followed)),
             information=np.zeros((1, BLOCKS, sensors, followed, followed)),
-            length=zero + 1,
+            length=zero + batch_of(sensors),
             process=np.zeros((1, terms, n)),
             readings=np.zeros((1, 2, terms, sensors)),
             reached=np.full((1, 2), np.nan),
@@ -133,65 +158,75 @@ class Ledger:
         return np.minimum(np.maximum(r, -limit), limit)
 
 
+def batch_of(sensors: int) -> int:
+    """Return how many samples wait until they are summed together: a power of two."""
+    batch = BATCH
+    while batch > 1 and batch * sensors > ROOM:
+        batch //= 2
+    return batch
+
+
 def summed(
     old: Ledger, due: Mask, r: Array, g: Array, used: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return `sums`, `noise`, `before` and `present` after a sample.
+    """Return `sums`, `noise`, `before` and `present` after a batch of samples.
 
     Parameters
     ----------
     due
-        Windows that begin with this sample, (members, windows).
+        Windows that begin with this batch, (members, windows).
     r, g
-        Whitened innovations, (members, sensors), and responses, (members, windows, directions,
-        sensors).
+        Whitened innovations, (members, batch, sensors), and responses, (members, batch, windows,
+        directions, sensors).
     used
-        1 where there is a value, (members, sensors).
+        1 where there is a value, (members, batch, sensors).
     """
-    members, windows, directions, sensors = g.shape
-    r1, g1 = old.before[:, 0], old.before[:, 1:].reshape(g.shape)
-    sums, noise = old.sums, old.noise
+    members, _, windows, directions, sensors = g.shape
     anew = due & (old.age > 0)
-    if anew.any():
-        kept = ~anew
-        sums = sums * kept[:, None, :, None, None]
-        noise = noise * kept[:, None, :, None]
-    pair = used * old.present
-    if not pair.all():
-        r1, g1 = r1 * pair, g1 * pair[:, None, None]
-    if anew.any():
-        g1 = g1 * ~anew[:, :, None, None]
-    wide, wide1 = r[:, None, None], r1[:, None, None]
-    parts = np.empty_like(sums)
-    parts[:, 0] = g * wide
-    parts[:, 1] = g * g
-    parts[:, 2] = g * wide1
-    parts[:, 2] += g1 * wide
-    parts[:, 3] = g * g1
-    told = np.stack([used, r, r * r, r * r1, pair], axis=1)[:, :, None]
-    flat = g.reshape(members, windows * directions, sensors)
-    return sums + parts, noise + told, np.concatenate([r[:, None], flat], axis=1), used
+    kept = ~anew
+    before = old.before[:, 1:].reshape(members, 1, windows, directions, sensors)
+    before = before * kept[:, None, :, None, None]
+    rs = np.concatenate([old.before[:, :1], r], axis=1)
+    gs = np.concatenate([before, g], axis=1)
+    present = np.concatenate([old.present[:, None], used], axis=1)
+    pair = present[:, 1:] * present[:, :-1]
+    r1, g1 = rs[:, :-1] * pair, gs[:, :-1] * pair[:, :, None, None]
+    parts = np.stack(
+        [
+            np.einsum("mbwds,mbs->mwds", g, r),
+            np.einsum("mbwds,mbwds->mwds", g, g),
+            np.einsum("mbwds,mbs->mwds", g, r1) + np.einsum("mbwds,mbs->mwds", g1, r),
+            np.einsum("mbwds,mbwds->mwds", g, g1),
+        ],
+        axis=1,
+    )
+    told = np.stack([used, r, r * r, r * r1, pair], axis=1).sum(axis=2)[:, :, None]
+    sums = old.sums * kept[:, None, :, None, None] + parts
+    noise = old.noise * kept[:, None, :, None] + told
+    last = np.concatenate([r[:, -1:], g[:, -1].reshape(members, -1, sensors)], axis=1)
+    return sums, noise, last, used[:, -1]
 
 
-def blocked(old: Ledger, Y: Array, r: Array) -> tuple[Array, Array, IntArray]:
-    """Return `score`, `information` and `length` after a sample.
+def blocked(old: Ledger, before: IntArray, Y: Array, r: Array) -> tuple[Array, Array, IntArray]:
+    """Return `score`, `information` and `length` after a batch of samples.
 
     Parameters
     ----------
+    before
+        Number of samples before the batch, (members,).
     Y, r
-        Sensitivities to the followed unknowns, (members, k, sensors), and residuals at the prior
-        mean, (members, sensors), in units of the noise; zero where no value is.
+        Sensitivities to the followed unknowns, (members, batch, k, sensors), and residuals at the
+        prior mean, (members, batch, sensors), in units of the noise; zero where no value is.
     """
     score, information, length = old.score, old.information, old.length
-    full = old.seen // length >= BLOCKS
+    full = before // length >= BLOCKS
     if full.any():
         score, information = _merged(score, full), _merged(information, full)
         length = np.where(full, 2 * length, length)
-    at = np.arange(len(length)), old.seen // length
-    Yt = Y.transpose(0, 2, 1)
+    at = np.arange(len(length)), before // length
     score, information = score.copy(), information.copy()
-    score[at] += Yt * r[:, :, None]
-    information[at] += Yt[:, :, :, None] * Yt[:, :, None, :]
+    score[at] += np.einsum("mbks,mbs->msk", Y, r)
+    information[at] += np.einsum("mbks,mbls->mskl", Y, Y)
     return score, information, length
 
 
