@@ -189,7 +189,7 @@ def _words(direction: Direction, size: float, at: Position) -> tuple[str, str]:
     if direction.kind in ("offset", "drift"):  # by the noise that was found, where that is so
         amount = size * OFFSET * float(at.noise[list(at.sensors).index(name)])
     unit = f" {direction.unit}" if direction.unit else ""
-    interval = float(at.ledger.times[at.member, 2])
+    interval = float(at.ledger.times[at.member, 1])
     time = f" {at.time_unit}" if at.time_unit else ""
     typical, of = float(np.median(at.noise)), f" {at.unit}" if at.unit else ""
     side = "above" if size > 0 else "below"

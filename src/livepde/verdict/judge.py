@@ -102,20 +102,21 @@ class Judge:
         self.terms = len(dictionary.process.terms) if dictionary.process else 0
         self._drift = dictionary.parts.get("drift", slice(0, 0))
         self._jump, self._process = dictionary.parts["jump"], dictionary.parts["process"]
-        # What stands in a row that waits.
-        axes = len(dictionary.shifts) if dictionary.shifts is not None else 0
+        # What stands in a row that waits, in this order.
+        wide = sensors > MOST_WHITENED
         sizes = {
             "t": 1,
             "used": sensors,
             "d": sensors,
             "noise": sensors,
+            "z": sensors,
             "predicted": sensors,
-            "moved": axes * sensors,
+            "spread": sensors if wide else sensors**2,
+            "A": sensors * self.columns,
+            "moved": sensors * len(dictionary.shifts or ()),
             "answers": self.terms * sensors,
             "told": sensors if self.recorded else 0,
             "Y": unknowns * sensors if self.recorded else 0,
-            "whitening": sensors * (sensors if sensors <= MOST_WHITENED else 1),
-            "A": sensors * self.columns,
         }
         ends = np.cumsum(list(sizes.values())).tolist()
         self._at = {
@@ -147,45 +148,40 @@ class Judge:
         causes, full = seen.causes, ledger.waiting == self.batch
         if full.any() or not ledger.seen.all():
             causes, ledger = self._begun(ledger, seen, full)
-        used = seen.used.astype(float)
+        used, Yt = seen.used.astype(float), seen.Y.transpose(0, 2, 1)
+        A = Yt @ causes
+        wide = sensors > MOST_WHITENED
+        spread = (seen.Y * seen.Y).sum(axis=1) if wide else Yt @ seen.Y
+        noise, z = (np.broadcast_to(part, seen.d.shape) for part in (seen.noise, seen.z))
+        each = [used, seen.d, noise, z, seen.predicted]
+        each += [spread, A]
         parts: dict[str, Any] = {}
-        last, unit = ledger.times[:, 1], ledger.times[:, 2]
-        unit = np.where(np.isfinite(unit), unit, seen.at.t - last)
-        if self.terms and members <= MOST_MEMBERS:
-            parts = self._answered(ledger, seen, unit)
-        row = np.zeros((members, self.numbers))
-        row[:, self._at["t"]] = seen.at.t
-        row[:, self._at["used"]] = used
-        row[:, self._at["d"]] = seen.d
-        row[:, self._at["noise"]] = seen.noise
-        row[:, self._at["predicted"]] = seen.predicted
-        row[:, self._at["moved"]] = self.dictionary.moved(seen.u)
-        if parts:
-            row[:, self._at["answers"]] = _between(parts, seen.at.t).reshape(members, -1)
-        if self.recorded and seen.C.shape[1] == self.unknowns:
-            Y = _sensitivity(seen.C, seen.Y)
-            if Y is not None:
-                row[:, self._at["told"]] = (seen.d + (seen.a[:, None] @ Y)[:, 0]) * used
-                row[:, self._at["Y"]] = Y.reshape(members, -1)
-        row[:, self._at["whitening"]] = _whitening(seen.Y)
-        A = seen.Y.transpose(0, 2, 1) @ causes
-        row[:, self._at["A"]] = A.reshape(members, -1)
+        if self.dictionary.shifts is not None:
+            each.append(self.dictionary.moved(seen.u))
+        if self.terms:
+            parts = self._answered(ledger, seen) if members <= MOST_MEMBERS else {}
+            nothing = np.zeros((members, self.terms * sensors))
+            each.append(_between(parts, seen.at.t) if parts else nothing)
+        if self.recorded:
+            each += self._record(seen, used)
         rows, causes = ledger.rows.copy(), causes.copy()
         for k, filled in enumerate(ledger.waiting.tolist()):
-            rows[k, filled] = row[k]
+            rows[k, filled, 0] = seen.at.t
+            rows[k, filled, 1:] = np.concatenate([part[k].ravel() for part in each])
             begin = self.rank + filled * sensors
             causes[k, :, begin : begin + sensors] = seen.Y[k]
-        same = np.abs(seen.z - ledger.value) <= SAME * np.abs(seen.z)
-        parts |= {
-            "seen": ledger.seen + 1,
-            "waiting": ledger.waiting + 1,
-            "rows": rows,
-            "times": np.stack([ledger.times[:, 0], np.full(members, seen.at.t), unit], axis=1),
-            "first": np.where(np.isfinite(ledger.first), ledger.first, seen.predicted),
-            "stuck": np.where(same, ledger.stuck + 1, np.where(seen.used, 0, ledger.stuck)),
-            "value": np.where(np.isfinite(seen.z), seen.z, ledger.value),
-        }
-        return causes, replace(ledger, **parts)
+        more = {"seen": ledger.seen + 1, "waiting": ledger.waiting + 1, "rows": rows}
+        return causes, _changed(ledger, more | parts)
+
+    def _record(self, seen: Seen, used: Array) -> list[Array]:
+        """Return residuals at the prior mean and sensitivities to the unknowns, of the record."""
+        members, sensors = seen.d.shape
+        Y = None
+        if seen.C.shape[1] == self.unknowns:
+            Y = _sensitivity(seen.C, seen.Y)
+        if Y is None:
+            return [np.zeros_like(seen.d), np.zeros((members, self.unknowns, sensors))]
+        return [(seen.d + (seen.a[:, None] @ Y)[:, 0]) * used, Y]
 
     def settled(self, ledger: Ledger, causes: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
@@ -204,7 +200,7 @@ class Judge:
         rows, at = ledger.rows, self._at
         there = np.arange(batch) < ledger.waiting[:, None]  # (members, batch)
         used = rows[:, :, at["used"]] * there[:, :, None]
-        due = ledger.due
+        due, ledger = ledger.due, self._timed(ledger, there)
         f = self._effects(ledger, due) * used[:, :, None]
         count = f.shape[2]
         known = f.transpose(0, 1, 3, 2).reshape(members, batch * sensors, count)
@@ -212,12 +208,13 @@ class Judge:
         A = rows[:, :, at["A"]].reshape(members, batch * sensors, self.columns)
         g = (known + A @ whole).reshape(members, batch, sensors, count).transpose(0, 1, 3, 2)
         r = rows[:, :, at["d"]]
-        whitening = rows[:, :, at["whitening"]]
+        spread = rows[:, :, at["spread"]]
         if sensors <= MOST_WHITENED:
-            T = whitening.reshape(members, batch, sensors, sensors)
+            T = _whitening(spread.reshape(members, batch, sensors, sensors))
             r, g = (r[:, :, None] @ T)[:, :, 0], g @ T
         else:
-            r, g = r * whitening, g * whitening[:, :, None]
+            T = 1.0 / np.sqrt(1.0 + spread)
+            r, g = r * T, g * T[:, :, None]
         r = ledger.clipped(r) * there[:, :, None]
         g = g.reshape(members, batch, self.windows, -1, sensors) * there[:, :, None, None, None]
         names = ("sums", "noise", "before", "present")
@@ -228,15 +225,46 @@ class Judge:
             new = blocked(ledger, ledger.seen - ledger.waiting, Y, told)
             parts |= dict(zip(("score", "information", "length"), new, strict=True))
         waited = ledger.waiting[:, None]
+        parts |= self._stuck(ledger, there)
         last = rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
         parts |= {
             "waiting": np.zeros_like(ledger.waiting),
             "age": np.where(due, 0, ledger.age) + waited,
             "epoch": ledger.epoch + (due & (ledger.age > 0)),
             "last": np.where(waited > 0, last[:, at["predicted"]], ledger.last),
-            "times": np.concatenate([ledger.times[:, 1:2], ledger.times[:, 1:]], axis=1),
+            "times": np.where(waited > 0, _replaced(ledger.times, last[:, at["t"]]), ledger.times),
         }
         return causes @ whole, replace(ledger, **parts)
+
+    @staticmethod
+    def _unit(ledger: Ledger, k: int, t: float) -> float:
+        """Return the usual interval of a member, or the time since its first sample."""
+        known = float(ledger.times[k, 1])
+        since = t - float(ledger.rows[k, 0, 0])
+        return known if np.isfinite(known) else since if since > 0.0 else 1.0
+
+    def _timed(self, ledger: Ledger, there: Mask) -> Ledger:
+        """Return the ledger with the usual interval, and the first predictions."""
+        times = np.concatenate([ledger.times[:, :1], ledger.rows[:, :, 0]], axis=1)
+        steps = np.where(there, np.diff(times, axis=1), np.nan)
+        unit = ledger.times[:, 1]
+        for step in steps.T:
+            unit = np.where(np.isfinite(unit), unit, step)
+        predicted = ledger.rows[:, 0, self._at["predicted"]]
+        first = np.where(np.isfinite(ledger.first), ledger.first, predicted)
+        times = np.stack([ledger.times[:, 0], unit], axis=1)
+        return replace(ledger, times=times, first=first)
+
+    def _stuck(self, ledger: Ledger, there: Mask) -> dict[str, Any]:
+        """Return how often in a row sensors have shown the same value, and that value."""
+        stuck, value = ledger.stuck, ledger.value
+        values = ledger.rows[:, :, self._at["z"]]
+        for k in range(self.batch):
+            z = np.where(there[:, k : k + 1], values[:, k], np.nan)
+            seen, same = np.isfinite(z), np.abs(z - value) <= SAME * np.abs(z)
+            stuck = np.where(same, stuck + 1, np.where(seen, 0, stuck))
+            value = np.where(seen, z, value)
+        return {"stuck": stuck, "value": value}
 
     def _begun(self, ledger: Ledger, seen: Seen, full: Mask) -> tuple[Array, Ledger]:
         """Return [T Z_1 ...] and the ledger of members whose batch is full, or the first one."""
@@ -282,7 +310,7 @@ class Judge:
         before = np.concatenate([ledger.times[:, :1], t[:, :-1]], axis=1)
         last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            share = ledger.times[:, 2:] / (t - before)
+            share = ledger.times[:, 1:] / (t - before)
         first = np.broadcast_to(ledger.first[:, None], h.shape)
         noise = rows[:, :, at["noise"]]
         noise = np.where(noise > 0.0, noise, 1.0)  # rows that are not filled yet
@@ -301,7 +329,7 @@ class Judge:
             f[:, :, :, self._drift] *= age[:, :, :, None, None]
         return np.where(np.isfinite(f), f, 0.0).reshape(members, batch, -1, sensors)
 
-    def _answered(self, ledger: Ledger, seen: Seen, unit: Array) -> dict[str, Any]:
+    def _answered(self, ledger: Ledger, seen: Seen) -> dict[str, Any]:
         """Return responses of the process that reach this sample at least."""
         process, t = self.dictionary.process, seen.at.t
         behind = ~(ledger.reached[:, 1] >= t)
@@ -311,14 +339,15 @@ class Judge:
         reached = ledger.reached.copy()
         for k in np.flatnonzero(behind).tolist():
             rest = float(np.nanmean(ledger.first[k])) if np.isfinite(ledger.first[k]).any() else 0.0
-            now = Now(seen.u[k], seen.q[k], seen.at.member(k), float(unit[k]), rest)
+            now = Now(seen.u[k], seen.q[k], seen.at.member(k), self._unit(ledger, k, t), rest)
             if not np.isfinite(reached[k, 1]):
                 p[k] = process.begun()
                 readings[k] = process.shown(p[k], now)
                 reached[k] = t
                 continue
             begin, steps = float(reached[k, 1]), stride(int(ledger.seen[k]))
-            h = max(steps * float(unit[k]), t - begin)
+            unit = self._unit(ledger, k, t)
+            h = max(steps * unit, t - begin)
             p[k] = process.advance(p[k], now, h)
             readings[k, 0] = readings[k, 1]
             readings[k, 1] = process.shown(p[k], now)
@@ -335,17 +364,26 @@ def _between(parts: dict[str, Any], t: float) -> Array:
     return found
 
 
-def _whitening(Y: Array) -> Array:
-    """Return what makes innovations white, from the right, flat: (members, numbers)."""
-    members, _, sensors = Y.shape
-    if sensors > MOST_WHITENED:
-        return np.asarray(1.0 / np.sqrt(1.0 + (Y * Y).sum(axis=1)))
-    eye = np.eye(sensors)
-    stacked = np.concatenate([np.broadcast_to(eye, (members, sensors, sensors)), Y], axis=1)
-    if not np.isfinite(stacked).all():  # such a sample is not used
-        return np.broadcast_to(eye.ravel(), (members, sensors * sensors))
-    R = np.linalg.qr(stacked, mode="r")  # nothing is squared before
-    return np.asarray(np.linalg.inv(R).reshape(members, -1))
+def _whitening(spread: Array) -> Array:
+    """Return (1 + Y^T Y)^(-1/2) of matrices Y^T Y, (..., sensors, sensors)."""
+    finite = np.isfinite(spread).all(axis=(-2, -1), keepdims=True)
+    values, axes = np.linalg.eigh(np.where(finite, spread, 0.0))
+    scale = 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0))
+    found: Array = (axes * scale[..., None, :]) @ axes.swapaxes(-1, -2)
+    return found
+
+
+def _replaced(times: Array, last: Array) -> Array:
+    """Return the time of the last sample and the usual interval."""
+    return np.concatenate([last, times[:, 1:]], axis=1)
+
+
+def _changed(ledger: Ledger, parts: dict[str, Any]) -> Ledger:
+    """Return a ledger with some fields exchanged: `replace` in a tenth of its time."""
+    new: Ledger = object.__new__(Ledger)
+    new.__dict__.update(ledger.__dict__)
+    new.__dict__.update(parts)
+    return new
 
 
 def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:

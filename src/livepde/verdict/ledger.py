@@ -40,8 +40,7 @@ class Ledger:
         Coordinates of all directions in all windows on the rows of the square root as they were
         when the first of these came, (members, columns, windows times directions).
     times
-        Time of the last sample that was summed, of the last one, and the usual interval,
-        (members, 3).
+        Time of the last sample that was summed, and the usual interval, (members, 2).
     first, last
         First prediction of each sensor, and the last that was summed, (members, sensors); NaN
         before.
@@ -124,7 +123,7 @@ class Ledger:
             waiting=zero,
             rows=np.zeros((1, batch_of(sensors), numbers)),
             w=np.zeros((1, columns, windows * directions)),
-            times=np.full((1, 3), np.nan),
+            times=np.full((1, 2), np.nan),
             first=never,
             last=never,
             age=np.zeros((1, windows), dtype=np.int64),
@@ -151,10 +150,10 @@ class Ledger:
         return due
 
     def clipped(self, r: Array) -> Array:
-        """Return whitened innovations, (members, sensors), none far beyond their usual size."""
+        """Return whitened innovations, (members, batch, sensors), none far beyond the usual size."""
         count, squares = self.noise[:, 0, 0], self.noise[:, 2, 0]
         usual = np.sqrt(np.maximum((squares + 10.0) / (count + 10.0), 1.0))
-        limit = CLIP * usual
+        limit = CLIP * usual[:, None]
         return np.minimum(np.maximum(r, -limit), limit)
 
 
