@@ -52,7 +52,8 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     assert found.sizes["snapshot"] == 6
     run.journal.close()
     with Journal.open(tmp_path / "journal.sqlite") as reader:
-        xr.testing.assert_identical(reader.layout.dataset(list(reader)), found)
+        kept = reader.layout.dataset(list(reader))
+    xr.testing.assert_identical(kept.assign_attrs(verdict=found.attrs["verdict"]), found)
 
 
 def test_samples_in_order_go_on_after_the_last_one(tmp_path):
@@ -235,7 +236,8 @@ def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
     run.run()
     assert len(run.journal) == 200
     assert run.journal.counts == {("malformed", ""): 150, ("malformed", "a"): 50}
-    assert [event.kind for event in run.journal.events] == ["malformed", "malformed"]
+    kinds = [event.kind for event in run.journal.events]
+    assert [kind for kind in kinds if kind != "verdict"] == ["malformed", "malformed"]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "nan", "1" * 2_000_000, "[" * 100_000])
@@ -409,12 +411,15 @@ def test_health_and_metrics(tmp_path):
         "silent": False,
         "status": "ok",
         "counts": [["late", "a", 1], ["late", "b", 1], ["late", "left", 1]],
+        "verdict": "caution",
+        "findings": ["There are 4 samples: too few to judge by."],
     }
     value = run.result.last.parameters["k"][0]
     assert f'livepde_estimate{{unknown="k"}} {value!r}' in ask("/metrics")
     told = ask("/metrics")
     assert 'livepde_remarks_total{channel="a",kind="late"} 1.0' in told
     assert "livepde_waiting_samples 0.0" in told
+    assert "livepde_verdict 1.0" in told
     assert "livepde_silent 0.0" in told
     assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
     run.silent = True

@@ -70,7 +70,9 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
 
     def found() -> Verdict:
         w, settled = judge.settled(ledger, one.causes)
-        return assess(judge.dictionary, _position(filter_, replace(one, causes=w, ledger=settled)))
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            at = _position(filter_, replace(one, causes=w, ledger=settled))
+            return assess(judge.dictionary, at)
 
     return found
 

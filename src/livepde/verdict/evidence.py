@@ -98,6 +98,7 @@ def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array
     k = 1.0 / (1.0 + den)
     gained = np.minimum(num**2 * k / (NU + rss), 1.0 - 1e-12)
     log_e = 0.5 * np.log(k) - 0.5 * (NU + total) * np.log1p(-gained)
+    log_e = np.where(np.isfinite(log_e), log_e, 0.0)
     size = num / np.where(den > 0.0, den, np.inf)
     excess = np.maximum(rss - total, num * size)
     share = num * size / np.where(excess > 0.0, excess, np.inf)

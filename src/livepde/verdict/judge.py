@@ -183,6 +183,7 @@ class Judge:
             return [np.zeros_like(seen.d), np.zeros((members, self.unknowns, sensors))]
         return [(seen.d + (seen.a[:, None] @ Y)[:, 0]) * used, Y]
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # counted as nothing
     def settled(self, ledger: Ledger, causes: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
 
