@@ -212,7 +212,7 @@ def _off(problem: Problem, scene: Scene, estimate: lp.Estimate) -> float:
         with np.errstate(invalid="ignore", divide="ignore"):
             score = (centre - latent.value(scene.theta, last)) / half
         found.append(float(np.sqrt(np.mean(score**2))))
-    return max(found)
+    return max(np.inf if np.isnan(score) else score for score in found)
 
 
 def _names(verdict: Verdict, kinds: Sequence[str], subject: str) -> bool:
