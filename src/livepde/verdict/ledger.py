@@ -150,7 +150,7 @@ class Ledger:
         return due
 
     def clipped(self, r: Array) -> Array:
-        """Return whitened innovations, (members, batch, sensors), none far beyond the usual size."""
+        """Return whitened innovations, (members, batch, sensors), none far beyond usual."""
         count, squares = self.noise[:, 0, 0], self.noise[:, 2, 0]
         usual = np.sqrt(np.maximum((squares + 10.0) / (count + 10.0), 1.0))
         limit = CLIP * usual[:, None]
