@@ -168,6 +168,25 @@ def fleet(
     _report(context, _both(separate, rods()), as_json)
 
 
+STORED = Count(8000, 2000)
+
+
+@app.command()
+def replay(
+    context: typer.Context,
+    samples: Annotated[int, STORED.option("Samples of the run.", least=100)] = STORED.usual,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer samples.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Time the longest call while stored samples are assimilated again.
+
+    Example:  python -m benchmarks replay --samples 2000
+    """
+    from benchmarks.replay import replay as benchmark
+
+    _report(context, benchmark(STORED.of(context, "samples")), as_json)
+
+
 LOOPS = Count(5, 1)
 
 
@@ -389,6 +408,49 @@ def coverage(
     _report(context, benchmark(TWINS.of(context, "twins"), progress=True), as_json)
 
 
+HONEST = Count(40, 4)
+WorkersOption = Annotated[
+    int | None, typer.Option(min=1, help="Processes, default one for each processor.")
+]
+
+
+@app.command()
+def honest(
+    context: typer.Context,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", help="Only this problem. Repeat it for more.")
+    ] = None,
+    kind: Annotated[
+        list[str] | None, typer.Option("--kind", help="Only this kind of data. Repeat for more.")
+    ] = None,
+    seeds: Annotated[int, HONEST.option("Twins of each problem.")] = HONEST.usual,
+    workers: WorkersOption = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="Few twins of the problems that cost least: bounds of coverage are those that "
+            "chance keeps, so that they see gross errors alone.",
+        ),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Count how often intervals hold when the truth comes from another code on another mesh.
+
+    Example:  python -m benchmarks honest --only rod --kind white --seeds 10
+    """
+    from benchmarks.honest import KINDS, PROBLEMS, QUICK
+    from benchmarks.honest import honest as benchmark
+
+    for given, known, what in ((only, PROBLEMS, "problem"), (kind, KINDS, "kind of data")):
+        for name in given or ():
+            named(name, known, what)
+    chosen = only or (QUICK if quick else ())
+    count = HONEST.of(context, "seeds")
+    found = benchmark(chosen, kind or (), seeds=count, workers=workers, progress=True)
+    _report(context, found, as_json)
+
+
 JUMPS = Count(5, 1)
 
 
@@ -491,6 +553,7 @@ def peers(
 
 
 KILLS, LENGTH, BROKEN = Count(200, 4), Count(2000, 400), Count(100_000, 2000)
+FLIPS = Count(200, 20)
 
 
 @app.command()
@@ -501,10 +564,14 @@ def faults(
         int, LENGTH.option("Samples of a run that is killed.", least=50)
     ] = LENGTH.usual,
     malformed: Annotated[int, BROKEN.option("Broken rows and messages.")] = BROKEN.usual,
+    flips: Annotated[int, FLIPS.option("Damaged journals.")] = FLIPS.usual,
     seed: Annotated[int, typer.Option(help="Of what is drawn at random.")] = 0,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="One of file, mqtt, restart, malformed, messages. Repeat it."),
+        typer.Option(
+            help="One of file, mqtt, restart, malformed, messages, journals, clocks, visitors, "
+            "cases. Repeat it."
+        ),
     ] = None,
     quick: Annotated[
         bool,
@@ -514,7 +581,7 @@ def faults(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Kill runs, take their sources away, feed them broken rows, and count what is lost.
+    """Kill runs, take their sources away, feed them broken rows, damage their journals and clocks.
 
     Example:  python -m benchmarks faults --kills 20 --only file
     """
@@ -527,6 +594,7 @@ def faults(
         KILLS.of(context, "kills"),
         LENGTH.of(context, "samples"),
         BROKEN.of(context, "malformed"),
+        FLIPS.of(context, "flips"),
         seed,
         only or (),
         progress=True,

@@ -194,3 +194,26 @@ def readings(
         u = advanced(forward, u, lambda t: np.array([q(t)]), t0, t1, scheme)
         found.append((t1, observed.G @ u + noise * rng.standard_normal(observed.size)))
     return found
+
+
+# A rod in a case file, ready for its [channels].
+ROD_CASE = """
+equation = "heat"
+initial = "20 degC"
+[mesh]
+from = 0
+to = "1 m"
+cells = 10
+[data]
+file = "rows.csv"
+time = "t"
+time_unit = "s"
+[boundary]
+right = "20 degC"
+[unknowns.alpha]
+prior = "2e-5 m^2/s"
+std = "1e-5 m^2/s"
+[law]
+kind = "sensitivity"
+"""
+INTERPOLATED_ROD_CASE = ROD_CASE.replace('"20 degC"', '"interpolate"', 1)

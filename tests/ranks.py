@@ -101,7 +101,7 @@ far = { role = "sensor", column = "far", at = [0.6, 0.5] }
 
 def case_data() -> str:
     rows = [
-        f"{t},{0.6 * (1 - 0.8**k):.6f},{0.2 * (1 - 0.9**k):.6f}" for k, t in enumerate(range(4))
+        f"{t},{0.8 * (1 - 0.25**k):.6f},{0.4 * (1 - 0.5**k):.6f}" for k, t in enumerate(range(4))
     ]
     return "\n".join(["t,near,far", *rows]) + "\n"
 

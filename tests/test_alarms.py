@@ -185,6 +185,7 @@ def learned(unknowns: dict[str, Any], rate: Any) -> tuple[Any, Any]:
     return result.to_xarray(), identifiability(model, identifier.latent_belief())
 
 
+@pytest.mark.slow
 def test_shares_over_time_end_where_identifiability_says():
     unknowns = {
         "a": lp.Scalar(1.0, 0.5, transform="log"),
@@ -206,6 +207,7 @@ def test_shares_over_time_end_where_identifiability_says():
     assert float(modes[0]) < float(modes[-1])
 
 
+@pytest.mark.slow
 def test_the_table_says_pinned_flat_traded_off_and_at_a_bound():
     def states(unknowns: dict[str, Any], rate: Any) -> dict[str, str]:
         data, _ = learned(unknowns, rate)

@@ -14,7 +14,7 @@ from commands import bench
 
 import livepde as lp
 from benchmarks import faults, soak
-from benchmarks.faults import breaks, broken, damage, plants, rod
+from benchmarks.faults import breaks, broken, damage, hostile, plants, rod
 from benchmarks.journal import journal
 from benchmarks.overhead import overhead
 from livepde import cases
@@ -63,6 +63,43 @@ def test_broken_rows_have_a_reason_and_right_ones_arrive():
     assert sent >= 1200
 
 
+@pytest.mark.process
+def test_damaged_journals_are_told_and_salvaged():
+    outcome = faults.faults(samples=100, flips=10, only=["journals"], seed=1)
+    assert not failed(outcome)
+    ((flips, told, plain, different, whole, salvaged),) = outcome.tables[0].rows
+    assert (flips, different) == (10, 0)
+    assert 0 < told <= flips
+    assert plain == flips - told
+    assert 0 < salvaged <= whole
+
+
+@pytest.mark.slow
+def test_clocks_go_wrong_and_are_told():
+    outcome = faults.faults(only=["clocks"])
+    assert not failed(outcome)
+    assert outcome.tables[0].rows[0] == ("none", 500, 0, "–")
+
+
+def test_slow_visitors_keep_nobody_out(monkeypatch):
+    monkeypatch.setattr("benchmarks.faults.visitors.PAUSE", 0.0)
+    monkeypatch.setattr("benchmarks.faults.visitors.SOON", 60.0)  # no timed test
+    assert not failed(faults.faults(only=["visitors"]))
+
+
+@pytest.mark.process
+def test_hostile_cases_are_answered(monkeypatch):
+    few = ("unit, powers of powers", "1e12 cells")
+    monkeypatch.setattr(hostile, "HOSTILE", {name: hostile.HOSTILE[name] for name in few})
+    monkeypatch.setattr(hostile, "SOONEST", 60.0)  # no timed test
+    outcome = faults.faults(only=["cases"])
+    assert not failed(outcome)
+    assert [row[0] for row in outcome.tables[0].rows] == [*few]
+    crash = "Traceback (most recent call last):\nRecursionError"
+    monkeypatch.setattr(hostile, "_checked", lambda path: (1, crash, 0.1, 1.0))
+    assert failed(faults.faults(only=["cases"])) == ["hostile cases without one sentence"]
+
+
 @pytest.mark.parametrize("kind", [*(breaks.JSON | breaks.BYTES)])
 def test_every_kind_of_broken_line_is_no_right_one(kind):
     row = rod.rod_rows(1)[0]
@@ -99,6 +136,7 @@ def test_damage_is_seen(other, lost, doubled, different):
     assert all(check.ok for check in seen.checks("x")) == (lost + doubled + different == 0)
 
 
+@pytest.mark.slow
 def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
     (tmp_path / "case.toml").write_text(rod.case_text())
     monkeypatch.setattr(broken, "JSON", {"right": lambda row, write, rng: write(dict(row))})
@@ -115,15 +153,15 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_soak_in_small(monkeypatch):
-    monkeypatch.setattr(soak, "WARM", 500)
+    monkeypatch.setattr(soak, "WARM", 300)
     monkeypatch.setattr(soak, "BLOCK", 100)
-    outcome = soak.soak(2000)
+    outcome = soak.soak(1000)
     checks = {check.name.split(":")[0]: check for check in outcome.checks}
     assert checks["memory"].ok
     assert checks["steps that failed"].ok
     assert checks["estimates that a reader does not find"].ok
     assert checks["relative error of k at the end"].ok
-    with pytest.raises(lp.RunError, match="at least 1000"):
+    with pytest.raises(lp.RunError, match="at least 600"):
         soak.soak(100)
 
 
@@ -173,7 +211,7 @@ def test_the_commands_print_json(monkeypatch):
     code, out = bench("faults", "--kills", "7", "--only", "file", "--json")
     assert code == 0
     assert json.loads(out)["command"].endswith(
-        "--kills 7 --samples 2000 --malformed 100000 --seed 0 --only file"
+        "--kills 7 --samples 2000 --malformed 100000 --flips 200 --seed 0 --only file"
     )
     with pytest.raises(lp.ConfigurationError, match="there is no part 'nothing'"):
         bench("faults", "--only", "nothing")

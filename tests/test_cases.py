@@ -65,6 +65,7 @@ def result_of(path, **options):
         ("0.01 1/day", "1/s", 0.01 / 86400),
     ],
 )
+@pytest.mark.slow
 def test_quantities(value, unit, expected):
     assert convert(value, unit, "key") == pytest.approx(expected, rel=1e-9)
 
@@ -288,6 +289,7 @@ def test_guards(rod):
     assert some.law.guards == lp.Guards(reach=2.0)
 
 
+@pytest.mark.slow
 def test_the_level_of_the_noise_is_found(rod):
     path = rod(
         ("replay = true", 'noise = "auto"'),
@@ -304,6 +306,7 @@ def test_the_level_of_the_noise_is_found(rod):
         cases.load(path)
 
 
+@pytest.mark.slow
 def test_constant_boundary_and_initial_value(rod):
     path = rod(
         ('T_right = { role = "boundary", column = "T_right", at = "right" }', ""),
@@ -315,6 +318,7 @@ def test_constant_boundary_and_initial_value(rod):
     assert float(data.u[-1, -1]) == pytest.approx(20.0)
 
 
+@pytest.mark.slow
 def test_every_and_assimilate_from(rod):
     path = rod(("time_unit = ", 'every = 2\nassimilate_from = "10 min"\ntime_unit = '))
     prepared, data = result_of(path)
@@ -363,6 +367,7 @@ def test_own_equation_needs_permission(rod):
         cases.load(path)
 
 
+@pytest.mark.slow
 def test_own_function_runs(rod):
     body = "from livepde.models import heat\n\ndef build(mesh, unknowns, dirichlet):\n"
     body += "    return heat(mesh, unknowns['alpha'], dirichlet)\n"
@@ -375,6 +380,7 @@ def test_own_function_runs(rod):
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
 
 
+@pytest.mark.slow
 def test_own_equation_object_keeps_units(rod):
     body = "from livepde.models import EQUATIONS\nbuild = EQUATIONS['heat']\n"
     _, data = result_of(own_code(rod, body), allow_code=True)
@@ -711,6 +717,7 @@ def test_unknowns_that_move(rod, evolution, expected):
     assert 0 < preview(prepared, prepared.stream).unknowns[0].left < 1
 
 
+@pytest.mark.slow
 def test_positive_unknowns(rod):
     path = rod(('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "log"'))
     prepared, data = result_of(path)
@@ -840,6 +847,7 @@ def test_unknowns_of_sensors_share_a_prior(rod):
     assert path.exists()
 
 
+@pytest.mark.slow
 def test_an_unknown_offset_is_found(rod):
     import pandas as pd
 
@@ -853,6 +861,7 @@ def test_an_unknown_offset_is_found(rod):
     assert found["alpha"] == pytest.approx(9.7e-5, rel=0.05)
 
 
+@pytest.mark.slow
 def test_points_and_averages_together(rod):
     path = rod(('at = "30 cm", noise = "0.05 K"', 'over = ["28 cm", "32 cm"], noise = "0.07 K"'))
     prepared, data = result_of(path)
@@ -861,6 +870,7 @@ def test_points_and_averages_together(rod):
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
 
 
+@pytest.mark.slow
 def test_means_along_a_line(rod):
     path = rod(('at = "30 cm", noise = "0.05 K"', 'along = ["28 cm", 0.32], noise = "0.07 K"'))
     prepared, data = result_of(path)
@@ -1094,6 +1104,7 @@ def described(path):
     return prepared.case, data
 
 
+@pytest.mark.slow
 def test_references(rod):
     path = rod(REFERENCE, ("alpha = [9e-5, 1.05e-4]", 'alpha.error = "<= 0.03"'))
     case, data = described(path)

@@ -358,12 +358,13 @@ def test_a_full_disk_is_one_sentence_where_a_run_goes_on_or_is_shown(rod, here, 
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_text", full)
+        patch.setattr(Path, "replace", full)
         assert "No space left" in bad("run", rod, "--out", "full", "--resume")
         assert "No space left" in bad("report", "full")
     assert call("run", rod, "--out", "full", "--resume")[0] == 0
 
 
+@pytest.mark.slow
 def test_no_figures_without_matplotlib(rod, here, monkeypatch):
     import importlib.util
 

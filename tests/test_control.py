@@ -599,6 +599,7 @@ def test_levels_of_trust_that_make_no_sense_are_told(levels):
         ct.Trust(**levels)
 
 
+@pytest.mark.slow
 def test_without_trust_the_loop_acts_as_the_nominal_model_would():
     model = reduced()
     controller = ct.LQ(model, GOAL, PERIOD)

@@ -66,6 +66,7 @@ def test_what_no_sensor_sees_keeps_its_prior():
         assert np.linalg.eigvalsh(V).max() <= 1.0 + 1e-10
 
 
+@pytest.mark.slow
 def test_a_walk_is_no_wider_than_its_prior_of_now():
     work, x = learned(lp.RandomWalk(2.0))
     age = float(x.age[0])

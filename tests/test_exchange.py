@@ -690,6 +690,7 @@ def measured(count=40):
         yield x, {name: float(truth.forecast(truth.t)[name][0]) for name in "ab"}
 
 
+@pytest.mark.slow
 def test_a_regressor_predicts_before_it_learns():
     model = OnlineRegressor(slab({"a": 0.3, "b": 0.6}))
     before, errors = model.identifier.dump(), []
@@ -769,6 +770,7 @@ def test_rivers_checks_that_fit():
     assert model.clone().estimate is None
 
 
+@pytest.mark.slow
 def test_the_page_shows_a_controller_in_three_lines():
     """All blocks run in test_pages.py; here it must act, too."""
     page = (Path(__file__).parents[1] / "docs" / "exchange.md").read_text()

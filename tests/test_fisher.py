@@ -60,6 +60,7 @@ def test_the_sharp_wave_of_porous_fisher():
     m=st.floats(1.0, 3.0),
     porous=st.booleans(),
 )
+@pytest.mark.slow
 def test_checks_pass_for_random_parameters(D, r, K, m, porous):
     unknowns = (lp.Scalar(value, value, transform="log") for value in (D, r))
     options = {"m": m} if porous else {}

@@ -211,6 +211,7 @@ def test_an_equation_belongs_to_a_table(here):
     assert not Path("mine").exists()
 
 
+@pytest.mark.slow
 def test_from_a_table_to_estimates(here):
     rod, _ = write_template(Path("rod"))
     runner = CliRunner()

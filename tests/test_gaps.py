@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from factories import ROD_CASE
 from live_rod import CLOCK
 
 import livepde as lp
@@ -271,30 +272,13 @@ def test_a_spike_is_refused_within_the_wait_and_the_same_after_a_restart():
 
 # --- cases -------------------------------------------------------------------------------------
 
-CASE = """
-equation = "heat"
-initial = "20 degC"
-[mesh]
-from = 0
-to = "1 m"
-cells = 10
-[data]
-file = "rows.csv"
-time = "t"
-time_unit = "s"
-[intake]
-wait = "{wait} s"
-[boundary]
-right = "20 degC"
-[unknowns.alpha]
-prior = "2e-5 m^2/s"
-std = "1e-5 m^2/s"
-[channels]
-left = {{ role = "boundary", column = "left", at = "left", unit = "degC"{left} }}
-T = {{ role = "sensor", column = "T", at = "0.3 m", unit = "degC"{sensor} }}
-[law]
-kind = "sensitivity"
+CASE = f"""{ROD_CASE}
 noise = "0.1 K"
+[intake]
+wait = "{{wait}} s"
+[channels]
+left = {{{{ role = "boundary", column = "left", at = "left", unit = "degC"{{left}} }}}}
+T = {{{{ role = "sensor", column = "T", at = "0.3 m", unit = "degC"{{sensor}} }}}}
 """
 SECONDS = 300.0
 COUNT = 120
@@ -317,6 +301,7 @@ def plant(folder: Path, left: str = "", sensor: str = "", wait: float = 0.0, bro
 BROKEN = {30: "", 31: "", 60: "9999", 119: ""}
 
 
+@pytest.mark.slow
 def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
     whole = cases.load(plant(tmp_path)).prepare()
     whole_k = float(whole.identifier.run(whole.stream).to_xarray()["alpha"][-1])
@@ -329,7 +314,7 @@ def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
 
     with ExitStack() as stack:
         writer, (_, driven) = batch(prepared, folder, write, stack, quiet=True)
-        _, _, _, notes = concluded(case, prepared.identifier, driven, writer, draw=False)
+        _, _, _, notes = concluded(prepared, prepared.identifier, driven, writer, draw=False)
     assert (
         "Channel left: 1 values far off those before and after were refused as spikes; 3 gaps were "
         "interpolated between the values before and after; 1 missing values were not between known "
@@ -355,6 +340,7 @@ def test_sensors_are_neither_interpolated_nor_screened(tmp_path, key):
 
 
 @pytest.mark.parametrize(("wait", "known"), [(0.0, False), (3 * SECONDS, True)])
+@pytest.mark.slow
 def test_beside_a_process_the_wait_decides(tmp_path, wait, known):
     path = plant(tmp_path, wait=wait)
     u = 20.0 + 10.0 * np.sin(2.0 * np.pi * np.arange(COUNT) / COUNT)

@@ -63,6 +63,7 @@ def off(estimate: lp.Estimate, name: str, true: float) -> float:
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-5])
+@pytest.mark.slow
 def test_an_overconfident_linearisation_is_iterated(noise: float):
     """DESIGN.md, fact 5: partial exact data with a small stated noise."""
     model, _ = seed_excited.build()
@@ -95,6 +96,7 @@ def test_an_overconfident_linearisation_is_iterated(noise: float):
 
 
 @pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.slow
 def test_guards_do_nothing_where_all_is_well(replay: Any):
     model = rod()
     stream = samples(model, 0.25, 100)
@@ -186,6 +188,7 @@ def test_nothing_winds_up_while_nothing_is_excited():
     assert stds[-1] == pytest.approx(0.2, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_log_reaches_back_far_enough_and_stays_short():
     law = lp.SensitivityLaw(guards=lp.Guards(past=8))
     identifier = lp.Identifier(rod(), POINTS, law, u0=0.0)

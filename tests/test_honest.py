@@ -4,12 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from typer import Typer
-from typer.testing import CliRunner
+from commands import bench
 
 import livepde as lp
 from benchmarks.honest import KINDS, PROBLEMS, honest
-from benchmarks.honest.__main__ import main
 from benchmarks.honest.batch import Batch
 from benchmarks.honest.linear import Chebyshev, Linear, fine_times
 from benchmarks.honest.noise import disturbed
@@ -18,6 +16,7 @@ from benchmarks.honest.problems.flux import NonlinearFlux, RodFlux
 from benchmarks.honest.problems.warm import WarmRod
 from benchmarks.honest.report import outcome
 from benchmarks.honest.twin import SHARES, Run
+from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 
 SMALL = 0.15  # of the noise, root mean square: that much truth and refined livepde may differ
@@ -103,6 +102,7 @@ def simulated(problem, theta, refine, substeps):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.slow
 def test_truths_agree_with_livepde_refined(name):
     problem = PROBLEMS[name]
     theta = 0.7 * np.random.default_rng(5).standard_normal(problem.coordinates)
@@ -216,6 +216,7 @@ def test_kinds_of_data():
 # --- batch and scores ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_batch_posterior_holds_its_truths():
     """Errors of the batch fit in its own standard deviations are standard normal."""
     problem, errors = PROBLEMS["column"], []
@@ -269,6 +270,7 @@ def test_checks_find_what_is_wrong():
     assert outcome(good).notes[-1] == "rod, spike, seed 0: StepFailed: at t = 1"
 
 
+@pytest.mark.study
 def test_twins_are_scored_in_every_kind():
     found = honest(["borehole"], seeds=1, workers=1)
     overview, details = found.tables
@@ -286,16 +288,14 @@ def test_twins_are_scored_in_every_kind():
     assert [row[:10] for row in again.tables[0].rows] == [row[:10] for row in white]
 
 
+@pytest.mark.slow
 def test_command():
-    app = Typer()
-    app.command()(main)
-    run = CliRunner().invoke(
-        app,
-        ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1", "--json"],
-    )
-    shown = json.loads(run.stdout)
-    assert run.exit_code == (0 if all(check["ok"] for check in shown["checks"]) else 1)
+    given = ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1"]
+    code, output = bench("honest", *given, "--json")
+    shown = json.loads(output)
+    assert code == (0 if all(check["ok"] for check in shown["checks"]) else 1)
     assert {row[0] for row in shown["tables"][0]["rows"]} == {"rod"}
     assert set(shown["checks"][0]) == {"name", "value", "bound", "sense", "ok"}
-    wrong = CliRunner().invoke(app, ["--only", "rood"])
-    assert wrong.exit_code == 2
+    for option, wrong, what in (("--only", "rood", "problem"), ("--kind", "whit", "kind of data")):
+        with pytest.raises(ConfigurationError, match=f"there is no {what} '{wrong}'; did you mean"):
+            bench("honest", option, wrong)

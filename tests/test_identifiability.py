@@ -65,6 +65,7 @@ def test_three_of_which_only_a_sum_shows():
     assert "Of a, b, c the data pin the combination" in found.sentences[0]
 
 
+@pytest.mark.slow
 def test_modes_of_a_field_and_a_number_that_stands_for_its_mean():
     field = lp.Field(MESH, ElementLineP1(), inner="H1", std=1.0)
     alone = report({"q": field}, lambda q: q.q)

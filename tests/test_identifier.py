@@ -104,6 +104,7 @@ def test_nan_and_absent_are_missing_samples():
     assert np.isfinite(first.innovation[1])
 
 
+@pytest.mark.slow
 def test_withheld_channels_are_scored_and_never_used():
     one, two = identifier(), identifier()
     for k in range(1, 5):
@@ -275,6 +276,7 @@ def stream(n=20):
     return [lp.Sample(*sample(0.1 * k, a=0.1 + 0.01 * k)) for k in range(n)]
 
 
+@pytest.mark.slow
 def test_a_result_has_named_axes_and_units(tmp_path):
     result = identifier().run(stream(), fields_every=7)
     assert len(result) == 20
@@ -298,6 +300,7 @@ def test_a_result_has_named_axes_and_units(tmp_path):
         np.testing.assert_array_equal(again["u"].values, data["u"].values)
 
 
+@pytest.mark.slow
 def test_a_table_of_a_result():
     result = identifier().run(stream())
     table = result.table()
@@ -307,6 +310,7 @@ def test_a_table_of_a_result():
     assert table["withheld_error:c"]["count"] == 20
 
 
+@pytest.mark.slow
 def test_a_result_can_be_drawn():
     figure = identifier().run(stream()).plot()
     assert figure.axes
@@ -329,6 +333,7 @@ def test_a_field_in_the_plane():
     assert "withheld_error" not in data
 
 
+@pytest.mark.slow
 def test_progress_is_silent_where_nobody_watches(capsys):
     identifier().run(stream(), progress=True)
     assert capsys.readouterr() == ("", "")

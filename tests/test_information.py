@@ -319,6 +319,7 @@ def test_a_run_can_be_saved_and_continued(tmp_path) -> None:
     assert np.array_equal(one.q, two.q)
 
 
+@pytest.mark.slow
 def test_divided_steps_learn_the_same() -> None:
     errors = []
     for dt_max in (np.inf, 0.05):

@@ -52,8 +52,8 @@ def ends(model, law, samples, u0=0.0):
 def test_nothing_changes_where_all_is_linear(evolution):
     model = sourced(evolution)
     samples = list(readings(model, [1.5]))
-    plain = ends(model, lp.SensitivityLaw(start_window=0), samples)
-    iterated = ends(model, lp.SensitivityLaw(), samples)
+    plain = ends(model, lp.SensitivityLaw(start_window=0, shadows=None), samples)
+    iterated = ends(model, lp.SensitivityLaw(shadows=None), samples)
     assert any("smoother_moved" in estimate.notes for estimate in iterated)
     for one, other in zip(plain, iterated, strict=True):
         np.testing.assert_allclose(other.q, one.q, rtol=1e-8, atol=1e-10)
@@ -91,6 +91,32 @@ def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
     assert len(begun) >= 6
     assert all(end <= first for first, end in begun)
     assert any(end < first - 1.0 for first, end in begun)
+
+
+@pytest.mark.parametrize("explained", [True, False])
+def test_one_beginning_serves_where_all_is_linear_and_explained(monkeypatch, explained):
+    begun = []
+    descended = iterated_smoother._descended
+
+    def watched(samples, best):
+        begun[-1] += 1
+        return descended(samples, best)
+
+    smoothed = iterated_smoother.iterated_smoother
+
+    def counted(work, state):
+        begun.append(0)
+        return smoothed(work, state)
+
+    monkeypatch.setattr(iterated_smoother, "_descended", watched)
+    monkeypatch.setattr(one_member, "iterated_smoother", counted)
+    model = sourced()
+    samples = list(readings(model, [1.5]))
+    if not explained:  # a bias of ten standard deviations, which no source makes
+        samples = [(t, z + np.array([0.2, -0.2, 0.2])) for t, z in samples]
+    ends(model, lp.SensitivityLaw(shadows=None, gate=np.inf), samples)
+    assert begun
+    assert max(begun) == 1 if explained else max(begun) == 3
 
 
 def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():

@@ -28,6 +28,7 @@ from livepde.runs.database import in_use, log_of, written
 from livepde.runs.feeds import Samples
 from livepde.runs.journal import KEPT_EVENTS, Event, Journal
 from livepde.runs.live import CHECKPOINT, Live, Retention
+from livepde.runs.salvage import Salvage
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Rows, json_row
 
@@ -61,7 +62,7 @@ def content(path: Path) -> dict[str, dict[int, tuple]]:
 # --- crashes -------------------------------------------------------------------------------------
 
 
-class Crash(Exception):
+class Crash(BaseException):
     """As good as a kill, within the process."""
 
 
@@ -312,10 +313,10 @@ def test_a_folder_that_may_only_be_read(shared, killed):
 
 def test_a_journal_appears_whole_or_not_at_all(tmp_path):
     path = tmp_path / NAME
-    partial = tmp_path / f"{NAME}.partial"
+    partial = tmp_path / f"{NAME}.0.partial"
     partial.write_bytes(b"SQLite format 3\0 and then it was killed")
     kept = journal(path)
-    assert not partial.exists()
+    assert [*kept] == []
     kept.close()
     with pytest.raises(lp.RunError, match="already; go on with it"):
         journal(path)
@@ -431,7 +432,7 @@ def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, twelv
 
 
 HOSTILE = [
-    "UPDATE meta SET value = '2' WHERE key = 'format'",
+    "UPDATE meta SET value = '1' WHERE key = 'format'",
     "DELETE FROM meta",
     "UPDATE meta SET value = '[' || replace(hex(zeroblob(50000)), '00', '[')",
     "UPDATE meta SET value = replace(hex(zeroblob(50000)), '00', '[') WHERE key = 'layout'",
@@ -460,7 +461,6 @@ HOSTILE = [
     "UPDATE fields SET content = '{}' || x'00'",
     'UPDATE fields SET content = CAST(\'{"told": {}, "profiles": {"u": -1}}\' AS BLOB) || x\'00\'',
     'UPDATE fields SET content = CAST(\'{"told":{},"profiles":{"u":1e99}}\' AS BLOB) || x\'00\'',
-    "UPDATE checkpoints SET state = 'text'",
     "UPDATE checkpoints SET state = x'504b0304'",
     "DROP TABLE samples",
     "DROP TABLE fields; CREATE VIEW fields AS SELECT 1 AS id, 0 AS last, x'' AS content",
@@ -478,19 +478,39 @@ def test_a_file_made_to_do_harm_is_one_sentence(tmp_path, command):
     with sqlite3.connect(path) as raw:
         raw.executescript(command)
     raw.close()
+    with suppress(sqlite3.Error):  # of a table that is no table of a journal any more
+        signed(path)
     refused(path)
+
+
+def signed(path: Path) -> None:
+    """Give all records the checksums of what they hold: they guard against accidents only."""
+    with sqlite3.connect(path) as raw:
+        for (table,) in raw.execute(
+            "SELECT name FROM sqlite_schema WHERE type = 'table'"
+        ).fetchall():
+            names = [row[1] for row in raw.execute(f"PRAGMA table_info({table})")]
+            if "crc" not in names:
+                continue
+            for row in raw.execute(f"SELECT * FROM {table}").fetchall():
+                values = row[1:-1] if table == "events" else row[:-1]
+                key = " AND ".join(f"{name} IS ?" for name in names)
+                total = database.checksum(table, *values)
+                raw.execute(f"UPDATE {table} SET crc = ? WHERE {key}", (total, *row))
+    raw.close()
 
 
 def test_events_and_counts_of_wrong_types_are_one_sentence(tmp_path):
     for command in (
-        "INSERT INTO events (t, kind, channel, message) VALUES ('x', 1, 2, 3)",
-        "INSERT INTO counts VALUES ('a', 'b', 'many')",
+        "INSERT INTO events (t, kind, channel, message, crc) VALUES ('x', 1, 2, 3, 4)",
+        "INSERT INTO counts VALUES ('a', 'b', 'many', 0)",
     ):
         (tmp_path / NAME).unlink(missing_ok=True)
         path = finished(tmp_path)
         with sqlite3.connect(path) as raw:
             raw.execute(command)
         raw.close()
+        signed(path)
         refused(path)
 
 
@@ -538,6 +558,7 @@ def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kin
     with sqlite3.connect(path) as raw:
         raw.execute("UPDATE checkpoints SET state = ?", (state,))
     raw.close()
+    signed(path)
     with pytest.raises(lp.RunError) as caught:
         reads(path)
     assert "\n" not in str(caught.value)
@@ -784,12 +805,13 @@ def test_a_folder_whose_making_was_ended_is_made_again(tmp_path):
         shutil.rmtree(folder)
 
 
-def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path):
+def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
     options = {"version": "1", "case": "a = 1\n"}
     path = tmp_path / "run"
     RunWriter.create(path, command=["x"], title="A run", **options)
-    (path / "run.json.partial").mkdir()
-    with pytest.raises(lp.RunError, match="cannot be written: Is a directory; make room"):
+    monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
+    (path / "run.json.0.partial").mkdir()
+    with pytest.raises(lp.RunError, match="cannot be written: File exists; make room"):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
 
 
@@ -808,3 +830,109 @@ def test_an_error_while_a_journal_is_opened_is_told_once(tmp_path, monkeypatch):
     monkeypatch.setattr("livepde.runs.journal.writer", full)
     with pytest.raises(lp.RunError, match=r"^the disk is full; make room\.$"):
         journal(tmp_path / NAME)
+
+
+# --- checksums -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "UPDATE estimates SET numbers = zeroblob(length(numbers)) WHERE id = 7",
+        "UPDATE estimates SET t = t + 1e-9 WHERE id = 7",
+        "UPDATE estimates SET id = 99 WHERE id = 30",
+        "DELETE FROM estimates WHERE id = 7",
+        "DELETE FROM estimates WHERE id > 20",
+        "UPDATE fields SET content = content || x'00' WHERE id = 1",
+        "UPDATE meta SET value = replace(value, 'a', 'b')",
+        "UPDATE samples SET position = position || ' ' WHERE id = 30",
+        "INSERT INTO counts VALUES ('late', '', 3, 0)",
+    ],
+)
+def test_a_record_that_is_not_as_it_was_is_told(tmp_path, command):
+    path = finished(tmp_path)
+    with sqlite3.connect(path) as raw:
+        raw.execute(command)
+    raw.close()
+    refused(path, match="damaged.*--salvage")
+
+
+@pytest.mark.parametrize("rest", [1, 0])
+def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    for folder in (whole, broken):
+        folder.mkdir()
+        first = started(folder, 2 * CHECKPOINT + 40)
+        first.run()
+        first.journal.close()
+    with sqlite3.connect(broken / NAME) as raw:
+        numbers = [n for (n,) in raw.execute("SELECT id FROM checkpoints ORDER BY id DESC")]
+        assert len(numbers) == 2
+        for number in numbers[: 2 - rest]:
+            wrong = "x'00' || substr(state, 2)"
+            raw.execute(f"UPDATE checkpoints SET state = {wrong} WHERE id = ?", (number,))
+    raw.close()
+    ends = []
+    for folder in (whole, broken):
+        run = started(folder, 2 * CHECKPOINT + 60)
+        again = run.resume()
+        run.run()
+        ends.append((again, run.identifier.dump()))
+        run.journal.close()
+    assert ends[0][0] == 0
+    assert ends[1][0] == (40 if rest else 2 * CHECKPOINT + 40)
+    assert ends[0][1] == ends[1][1]
+    with Journal.open(whole / NAME) as one, Journal.open(broken / NAME) as other:
+        same(one, other)
+
+
+def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
+    run = started(tmp_path, 3 * CHECKPOINT, retention=Retention(span=1.0))
+    run.run()
+    run.journal.close()
+    with sqlite3.connect(tmp_path / NAME) as raw:
+        raw.execute("UPDATE checkpoints SET crc = crc + 1")
+    raw.close()
+    with (
+        Journal.open(tmp_path / NAME, write=True) as kept,
+        pytest.raises(lp.RunError, match="no checkpoint is as it was"),
+    ):
+        kept.rewind()
+
+
+def test_what_is_whole_is_salvaged(tmp_path):
+    path = finished(tmp_path)
+    with Journal.open(path) as kept:
+        before = list(kept)
+    with sqlite3.connect(path) as raw:
+        raw.execute("UPDATE estimates SET numbers = zeroblob(length(numbers)) WHERE id = 7")
+        raw.execute("UPDATE fields SET crc = 0 WHERE id = 11")
+        raw.execute("DELETE FROM estimates WHERE id = 9")
+        raw.execute("DELETE FROM samples")
+    raw.close()
+    with Salvage(path) as kept:
+        found = dict(kept.after(0))
+        assert kept.lost == [7, 9]
+        assert "2 of 30 estimates are not whole" in kept.sentences()[0]
+        assert kept.dataset().sizes["time"] == 28
+    assert sorted(found) == [k for k in range(1, 31) if k not in (7, 9)]
+    assert all(np.array_equal(found[k].numbers, before[k - 1].numbers) for k in found)
+    assert found[11].snapshot is None
+    assert before[10].snapshot is not None
+    with sqlite3.connect(path) as raw:
+        raw.execute("UPDATE meta SET crc = 0 WHERE key = 'layout'")
+    raw.close()
+    with pytest.raises(lp.RunError, match="damaged"):
+        Salvage(path)
+    with pytest.raises(lp.RunError, match="there is no journal"):
+        Salvage(tmp_path / "none")
+
+
+def test_a_journal_that_was_cut_off_is_salvaged(tmp_path):
+    path = finished(tmp_path, 600)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) * 6 // 10])
+    refused(path, match="damaged.*--salvage|malformed")
+    with Salvage(path) as kept:
+        found = sum(1 for _ in kept.after(0))
+    assert 200 < found < 600

@@ -59,6 +59,7 @@ def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(transform: str, la
     assert np.isfinite(data["k_std"].values).all()
 
 
+@pytest.mark.slow
 def test_what_is_reached_is_told():
     unknown = lp.Scalar(0.5, 0.01, transform="log")
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]  # four times the prior: 139 deviations
@@ -72,6 +73,7 @@ def test_what_is_reached_is_told():
     assert not any("held" in text for text in doubts(fair))
 
 
+@pytest.mark.slow
 def test_a_stated_number_counts_and_infinity_is_no_end():
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]
     narrow = {"prior": 0.5, "std": 0.01, "transform": "log"}
@@ -83,10 +85,11 @@ def test_a_stated_number_counts_and_infinity_is_no_end():
     assert "bounded" not in free
 
 
+@pytest.mark.slow
 def test_the_filter_stays_linear_so_that_nothing_is_lost():
     """While the estimate is held, the filter learns as ever: afterwards it is where it would be."""
     values = [5.0] * 3 + [0.0] * 60
-    law = lp.SensitivityLaw(guards=None, gate=np.inf)
+    law = lp.SensitivityLaw(guards=None, gate=np.inf, shadows=None)
     held, free = (
         run(source(lp.Scalar(0.0, 0.2, within=within)), stream(values), law, 0.0)
         for within in (2.0, np.inf)
@@ -101,6 +104,7 @@ def test_the_filter_stays_linear_so_that_nothing_is_lost():
     np.testing.assert_allclose(a["innovation"].values, b["innovation"].values, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_walk_has_no_end():
     walk = lp.Scalar(0.0, 0.1, evolution=lp.RandomWalk(1.0))
     data = run(source(walk), stream([5.0] * 60), u0=0.0).to_xarray()

@@ -89,7 +89,8 @@ def test_an_unread_estimate_holds_no_factor_of_the_stage():
     held = [leaf for leaf in flatten(now).values() if isinstance(leaf, np.ndarray)]
     belief = estimate.belief
     given = [belief.q, belief.u, belief.q_factor, belief.u_factor]
-    assert 0 < sum(x.nbytes for x in held) <= 2 * sum(x.nbytes for x in given)
+    # Beside it the shifts by step and mesh, and the state on the halved mesh.
+    assert 0 < sum(x.nbytes for x in held) <= 3 * sum(x.nbytes for x in given)
     assert not hasattr(estimate, "_read")
 
 

@@ -103,6 +103,7 @@ def test_assembler_with_diagonal_factors():
 
 @given(st.data(), SIZES, SIZES)
 @settings(max_examples=40, deadline=None)
+@pytest.mark.slow
 def test_pattern_keeps_structure_and_positions(data, n, m):
     dense = data.draw(matrices(n, m))
     pattern = Pattern.of(sp.csr_array(dense))
@@ -164,6 +165,7 @@ def test_whether_a_matrix_is_symmetric_may_be_told_by_numpy():
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.slow
 def test_engines_agree_with_dense_algebra(engine, seed):
     rng = np.random.default_rng(seed)
     matrix = regular(25, rng, spd=engine in DEFINITE)

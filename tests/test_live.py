@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 from livepde.stepping import Advance, ImplicitEuler
 from livepde.streams.intake import Habit, Intake, Policy
-from livepde.streams.sources import Follow, Rows, json_row
+from livepde.streams.sources import Follow, Row, Rows, json_row
 from livepde.streams.table import Column
 
 
@@ -39,6 +40,7 @@ def closed():
         OPENED.pop().close()
 
 
+@pytest.mark.slow
 def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     write(tmp_path, 50)
     run = live(tmp_path)
@@ -56,6 +58,7 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     xr.testing.assert_identical(kept.assign_attrs(verdict=found.attrs["verdict"]), found)
 
 
+@pytest.mark.slow
 def test_samples_in_order_go_on_after_the_last_one(tmp_path):
     def samples():
         return (lp.Sample(row.pop("t"), row) for row in rows(20))
@@ -177,13 +180,13 @@ def test_a_second_value_is_counted(repeated, value):
 
 def test_a_clock_that_leaps_does_not_make_the_rest_late():
     intake = Intake(COLUMNS, CLOCK, Policy(leap=10.0))
-    kinds = []
+    kinds, times = [], []
     for t in (0.0, 1.0, 1e9, 2.0, 500.0, 501.0, 502.0):
         outcome = intake.take({"t": t, "a": 0.0, "b": 0.0, "left": 0.0})
         kinds += [remark.kind for remark in outcome.remarks]
-    assert kinds == ["leap", "leap"]
-    (sample,) = intake.take({"t": 503.0, "a": 0.0, "b": 0.0, "left": 0.0}).ready
-    assert sample.t == 503.0
+        times += [ready.t for ready in outcome.ready]
+    assert kinds == ["leap"]  # of the first one: the second is borne out by the next row
+    assert times == [0.0, 1.0, 2.0, 500.0, 501.0, 502.0]
 
 
 def test_each_channel_has_habits_of_its_own():
@@ -389,6 +392,128 @@ def test_silence_is_noticed(tmp_path):
     assert [event.kind for event in run.journal.events] == ["silent", "heard", "silent"]
 
 
+class Sequence_(Rows):
+    """Brings one row a poll, and lets the clock go on; None: nothing then."""
+
+    def __init__(self, rows_, now):
+        super().__init__(())
+        self._each, self._now = iter(rows_), now
+
+    def poll(self, wait):
+        self._now[0] += 1.0
+        try:
+            row = next(self._each)
+        except StopIteration:
+            self._ended = True
+            return []
+        return [] if row is None else [Row(row)]
+
+
+def resumed(run: Live) -> None:
+    run.resume()
+    run.run()
+
+
+def health_of(run: Live) -> list[tuple[str, str]]:
+    return [(e.kind, e.message) for e in run.journal.events if e.kind in ("unwell", "well")]
+
+
+def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
+    now, right = [0.0], [*rows(60)]
+    old = [{**right[0], "t": -1.0 - k} for k in range(10)]
+    source = Sequence_([*right[:5], *old, *right[5:]], now)
+    run = live(tmp_path, source, silence=5.0, clock=lambda: now[0])
+    run.run()
+    (kind, why), *rest = health_of(run)
+    assert kind == "unwell"
+    assert re.match(
+        "rows come and none is taken; the last one: late: t = -[0-9]+ is not later", why
+    )
+    assert [kind for kind, _ in rest] == ["well"]
+    assert run.health["ok"]
+    assert run.journal.health == ""
+
+
+def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):
+    right = [*rows(10)]
+    run = live(tmp_path, Rows([*right, *({**right[0], "t": -1.0 - k} for k in range(9))]))
+    run.run()
+    assert not run.health["ok"]
+    assert run.health["why"] == run.why
+    assert "late" in run.why
+
+
+def test_a_run_whose_directory_is_gone_is_not_well(tmp_path):
+    class Vanishing(Rows):
+        def poll(self, wait):
+            if run.journal.accepted == 5:
+                (tmp_path / "journal.sqlite").unlink(missing_ok=True)
+            return super().poll(wait)
+
+    run = live(tmp_path, Vanishing(rows(10)))
+    run.run()
+    assert not run.health["ok"]
+    assert run.why.startswith("the journal's file is no longer the one in the run directory")
+    assert run.journal.health == run.why
+    (tmp_path / "journal.sqlite").write_text("another")
+    assert not run.health["ok"]
+
+
+def test_steps_that_fail_are_no_health_and_the_stream_goes_on(tmp_path):
+    class Fails(type(identifier())):
+        def step(self, t, z, inputs=None):
+            if 0.35 < t < 0.65:
+                raise error
+            return super().step(t, z, inputs)
+
+    for error in (np.linalg.LinAlgError("SVD did not converge"), KeyError("k")):
+        here = tmp_path / type(error).__name__
+        here.mkdir()
+        run = live(here, Rows(rows(10)))
+        run.identifier.__class__ = Fails
+        run.run()
+        assert [record.t for record in run.journal] == pytest.approx(
+            [0.0, 0.1, 0.2, 0.3, 0.7, 0.8, 0.9]
+        )
+        assert run.journal.counts == {("aside", ""): 3}
+        told = [e.message for e in run.journal.events if e.kind == "aside"]
+        assert len(told) == 3
+        assert type(error).__name__ in told[0]
+        assert health_of(run)[0][1].startswith("the last steps have failed; the last one: t = 0.5")
+        assert run.health["ok"]
+
+
+@pytest.mark.parametrize("deaths", [1, 2, 3])
+def test_a_sample_in_which_the_process_ends_again_and_again_is_set_aside(tmp_path, deaths):
+    """The mark in the journal counts; a process that was killed once or twice loses nothing."""
+
+    class Killed(BaseException):
+        pass
+
+    class Deadly(type(identifier())):
+        def step(self, t, z, inputs=None):
+            if 0.55 < t < 0.65:
+                raise Killed
+            return super().step(t, z, inputs)
+
+    write(tmp_path, 20)
+    for _ in range(deaths):
+        run = live(tmp_path)
+        run.identifier.__class__ = Deadly
+        with pytest.raises(Killed):
+            resumed(run)
+        run.journal.close()
+    run = live(tmp_path)
+    resumed(run)
+    aside = deaths == 3
+    assert len(run.journal) == 20 - aside
+    assert run.journal.counts == ({("aside", ""): 1} if aside else {})
+    assert [e.kind for e in run.journal.events] == ["aside"] * aside
+    run.journal.close()
+    with Journal.open(tmp_path / "journal.sqlite") as kept:
+        assert len(list(kept)) == 20 - aside
+
+
 def test_health_and_metrics(tmp_path):
     def ask(path):
         with urllib.request.urlopen(
@@ -405,6 +530,7 @@ def test_health_and_metrics(tmp_path):
     assert health.pop("seconds") > 0.0
     assert health == {
         "ok": True,
+        "why": "",
         "t": 0.4,
         "samples": 5,
         "waiting": 0,
@@ -425,6 +551,7 @@ def test_health_and_metrics(tmp_path):
     run.silent = True
     assert "livepde_silent 1.0" in ask("/metrics")
     assert "livepde_ok 0.0" in ask("/metrics")
+    assert f'livepde_unwell{{why="{run.why}"}} 1.0' in ask("/metrics")
     with pytest.raises(urllib.error.HTTPError, match="503"):
         ask("/health")
     with pytest.raises(urllib.error.HTTPError, match="404"):
@@ -432,3 +559,26 @@ def test_health_and_metrics(tmp_path):
     with pytest.raises(lp.RunError, match="choose another port"):
         Monitor(Address(port=monitor.port), dict, metrics)
     monitor.close()
+
+
+def test_two_columns_of_one_name_are_told(tmp_path):
+    """And not only missing: nobody would know why."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,a,a,,\n0,1,2,,\n1,1,2,,\n")
+    source = Follow(path)
+    first, *rest = source.poll(0.0)
+    source.close()
+    assert first.broken == "two columns are called 'a', and none of them is taken: rename one"
+    assert [row.values["t"] for row in rest] == ["0", "1"]
+    assert all("a" not in row.values for row in rest)
+
+
+def test_a_followed_file_in_utf_16_is_named(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("t,a\n0,1\n1,2\n", encoding="utf-16")
+    source = Follow(path)
+    found = source.poll(0.0)
+    source.close()
+    assert found
+    assert all("UTF-16" in row.broken for row in found if row.broken)
+    assert found[0].broken == "the file is in UTF-16, not to be followed: write UTF-8"

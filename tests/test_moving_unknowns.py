@@ -156,7 +156,7 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, subste
 def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
     model = linear_model(EVOLUTIONS[name])
     law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0)
-    stream = samples(12, missing=False)
+    stream = samples(10, missing=False)
     check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
 
 
@@ -360,7 +360,7 @@ def test_replays_find_the_most_probable_parameter():
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
         initial=lambda q, v, x: q.w * np.sin(np.pi * x[0]) * v,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
     identifier = lp.Identifier(model, sensors(), law)
     latent, forward, times = model.latent, ForwardStage(model), 0.02 * np.arange(64)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from factories import ROD_CASE
 from skfem import ElementLineP1, ElementQuad1
 
 import livepde as lp
@@ -46,9 +47,10 @@ def estimated(found, std):
     return one, one.run(found).last.belief
 
 
+@pytest.mark.study
 def test_shifts_are_found_and_what_they_cost_is_in_the_interval():
-    inside, without, shifts_inside = 0, 0, 0
-    for seed in range(20):
+    inside, shifts_inside = 0, 0
+    for seed in range(10):
         rng = np.random.default_rng(100 + seed)
         k = 0.1 + 0.03 * float(np.clip(rng.standard_normal(), -2.0, 2.0))
         shifts = 0.02 * rng.standard_normal(3)
@@ -57,15 +59,12 @@ def test_shifts_are_found_and_what_they_cost_is_in_the_interval():
         std = belief.q_std
         inside += abs(belief.q[0] - k) < 1.96 * std[0]
         shifts_inside += int((np.abs(belief.q[1:] - shifts) < 1.96 * std[1:]).sum())
-        _, exact = estimated(found, None)
-        without += abs(exact.q[0] - k) < 1.96 * exact.q_factor[0, 0]
     assert one.model.parameter_space.labels.keys() == {
         "k",
         *(f"position[{name}]" for name in AT),
     }
-    assert inside >= 17
-    assert shifts_inside >= 51
-    assert without < 17
+    assert inside >= 9
+    assert shifts_inside >= 26
 
 
 def test_it_is_a_quadratic_in_the_shift():
@@ -154,27 +153,11 @@ def test_what_does_not_go_together_is_refused():
         base.bind(model.state_space, model.X, model.parameter_space)
 
 
-CASE = """
-equation = "heat"
-initial = "20 degC"
-[mesh]
-from = 0
-to = "1 m"
-cells = 10
-[data]
-file = "rows.csv"
-time = "t"
-time_unit = "s"
-[boundary]
-left = "30 degC"
-right = "20 degC"
-[unknowns.alpha]
-prior = "2e-5 m^2/s"
-std = "1e-5 m^2/s"
+LEFT = '[boundary]\nleft = "30 degC"'
+CASE = f"""{ROD_CASE.replace("[boundary]", LEFT)}
+shadows = false
 [channels]
-T = {{ role = "sensor", column = "T", {place}, unit = "degC", noise = "0.1 K" }}
-[law]
-kind = "sensitivity"
+T = {{{{ role = "sensor", column = "T", {{place}}, unit = "degC", noise = "0.1 K" }}}}
 """
 
 

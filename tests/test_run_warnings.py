@@ -53,6 +53,7 @@ def test_the_right_model_raises_no_doubts():
     assert measures(data)["innovation_ratio"] == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_process_that_is_missing_is_said():
     found = doubts(run(rod(lp.Scalar(0.2, 0.1)), rod(lp.Scalar(0.2), loss=1.0)))
     assert "The model does not explain the data" in found[0]
@@ -68,6 +69,7 @@ def test_a_sensor_that_is_always_off_is_named():
     assert "sensor C" not in found[0]
 
 
+@pytest.mark.slow
 def test_an_estimate_at_its_bound_is_said():
     narrow = rod(lp.Scalar(0.2, 0.1, bounds=(0.0, 0.25)))
     found = doubts(run(narrow, rod(lp.Scalar(0.2))))

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 import signal
+import warnings
 
 import numpy as np
 import pytest
 import xarray as xr
+from commands import call
 
 import livepde as lp
 from livepde import runs
 from livepde.models import heat
+from livepde.result import Result
 from livepde.runs import Check, Outcome, RunWriter, Table, checks_of, drive, measures, tables
 from livepde.runs.directory import markdown, plain
+from livepde.runs.outcome import attempted
 from livepde.runs.summary import digits
 
 TIMES = range(6)
@@ -310,3 +316,109 @@ def test_dataset_is_netcdf_that_others_read(tmp_path, driven):
     with netcdf_file(tmp_path / "run" / "estimates.nc", mmap=False) as file:
         assert "alpha" in file.variables
     assert isinstance(runs.open(tmp_path / "run").dataset, xr.Dataset)
+
+
+# --- the end of a run ----------------------------------------------------------------------------
+
+
+def test_a_figure_that_cannot_be_drawn_is_a_note(tmp_path, driven):
+    def broken():
+        raise ValueError("Axis limits cannot be NaN or Inf\nand more")
+
+    def order():
+        seen.append(sorted(item.name for item in (tmp_path / "run").iterdir()))
+        return broken()
+
+    seen = []
+    writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A run")
+    data = driven.result.to_xarray()
+    writer.finish(status="finished", dataset=data, notes=["mine"], figures={"overview": order})
+    assert seen == [["estimates.nc", "report.md", "run.json"]]  # all else is written before
+    run = runs.open(tmp_path / "run")
+    assert run.status == "finished"
+    assert run.notes[0] == "mine"
+    assert run.notes[1].startswith("The figure 'overview' failed (ValueError: Axis limits")
+    assert run.dataset.sizes == data.sizes
+    report = (tmp_path / "run" / "report.md").read_text()
+    assert "The figure 'overview' failed" in report
+    assert "![" not in report
+
+
+def test_what_cannot_be_written_is_no_failed_diagnostic():
+    def full():
+        raise OSError("no room")
+
+    notes: list[str] = []
+    with pytest.raises(OSError, match="no room"):
+        attempted("The tables", full, None, notes)
+    assert attempted("The tables", lambda: 1 // 0, 7, notes) == 7
+    assert notes == [
+        "The tables failed (ZeroDivisionError: integer division or modulo by zero); "
+        "all else is whole."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "shown"),
+    [
+        (1e-300, 1e300, ("1e-300", "1e+300")),
+        (1e300, 1e-300, ("1e+300", "1e-300")),
+        (5.0, 5e-324, ("5", "4.9e-324")),
+        (5.0, 1e30, ("5", "1e+30")),
+        (1.5e308, 1e308, ("1.5e+308", "1.0e+308")),
+        (math.inf, 1.0, ("inf", "–")),
+    ],
+)
+def test_numbers_of_any_size_have_digits(value, std, shown):
+    assert digits(value, std) == shown
+
+
+def test_a_report_of_numbers_that_overflow(tmp_path, driven):
+    """Tables, figures and the page of what no axis can hold: notes in their place, no crash."""
+    data = driven.result.to_xarray().copy(deep=True)
+    label = data.attrs["scalars"].split("\n")[0]
+    for k, value in ((2, 1e308), (3, -1e308), (-1, 1e300)):
+        data[label].values[k] = value
+        data[f"{label}_std"].values[k] = 1e308
+        data["innovation"].values[k] = 1e308
+    folder = tmp_path / "run"
+    RunWriter.create(folder, version="1", command=[], title="A run").finish(
+        status="finished", dataset=data
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy and Matplotlib say that they overflow
+        code, output = call("report", folder)
+    assert code == 0
+    assert "A run" in output
+
+
+def test_the_last_fields_that_cannot_be_computed_are_an_event(tmp_path, monkeypatch):
+    """The run ends with its data, its checkpoint and its status."""
+
+    usual = Result.snapshot
+
+    def broken(self, estimate):
+        if estimate.t == TIMES[-1]:
+            raise np.linalg.LinAlgError("SVD did not converge")
+        return usual(self, estimate)
+
+    monkeypatch.setattr(Result, "snapshot", broken)
+    driven = drive(identifier(), samples(b=0.0), fields_every=10**9)
+    assert driven.status == "finished"
+    assert len(driven.journal) == len(TIMES)
+    (event,) = driven.journal.events
+    assert event.kind == "unfinished"
+    assert "SVD did not converge" in event.message
+
+
+def test_a_report_holds_no_html_of_titles_and_notes():
+    text = markdown(
+        "<script>alert(1)</script>",
+        [Table("<b>T</b>", ("a<br>",), [("<img src=x>", 1.0)])],
+        [Check("<i>", 1.0, 2.0, "<=")],
+        ["<!-- hidden", "a < b"],
+    )
+    assert not re.search("<[A-Za-z/!?]", text)
+    assert "&lt;script>" in text
+    assert "a < b" in text
+    assert "| <= |" in text

@@ -12,7 +12,9 @@ import tomllib
 import urllib.error
 import urllib.request
 import zipfile
+from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,9 +24,12 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases, checkpoint, runs
+from livepde.atomic_write import replacing, write_bytes
 from livepde.cli.program import app
+from livepde.runs import RunWriter, lobby
+from livepde.runs.lobby import LONGEST_BODY
 from livepde.runs.monitor import Metrics, Monitor
-from livepde.runs.web import LONGEST_BODY, THREADS, Address, Server
+from livepde.runs.web import THREADS, Address, Server
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake
 from livepde.streams.sources import LONGEST, Follow, Lines, Rows, json_row
@@ -389,15 +394,89 @@ def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
     assert all(thread.daemon for thread in begun)
 
 
-def test_slow_visitors_do_not_keep_others_out(serving):
-    server = serving()
-    slow = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(THREADS - 1)]
-    for one in slow:
-        one.sendall(b"GET / HTTP/1.1\r\nHo")
-    assert ask(server)[0] == 200
+@pytest.mark.parametrize("token", ["", TOKEN])
+def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
+    """Many more than there are threads, that send a little now and then: none holds one."""
+    monkeypatch.setattr(lobby, "DEADLINE", 2.0)
+    server = serving(token=token)
+    slow = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(4 * THREADS)]
+    for k, one in enumerate(slow):
+        line = b"GET / HTTP/1.1\r\n", b"POST / HTTP/1.1\r\nContent-Length: 9\r\nHost: a\r\n\r\n"
+        one.sendall(line[k % 2])
+    for k in range(5):
+        assert ask(server, Authorization=f"Bearer {token}")[0] == 200
+        for one in slow[::2]:
+            with suppress(OSError):  # of who has had his time already
+                one.sendall(b"X-%d: 1\r\n" % k)
     for one in slow:
         one.settimeout(PATIENCE)
-        assert b"408" in one.recv(1000)  # they have had their time
+        try:
+            answer = one.recv(1000)
+        except ConnectionResetError:
+            answer = b""
+        assert answer == b"" or b"403" in answer.split(b"\r\n")[0]  # they have had their time
+        one.close()
+    assert ask(server, Authorization=f"Bearer {token}")[0] == 200
+
+
+def test_who_may_not_ask_is_answered_before_a_body_is_read(serving):
+    server = serving(token=TOKEN)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
+    connection.putrequest("POST", "/")
+    connection.putheader("Content-Length", "50000")
+    connection.endheaders(b"a" * 50000)
+    answer = connection.getresponse()
+    assert answer.status == 403
+    assert "token" in answer.read().decode()
+    connection.close()
+
+
+def test_bodies_reach_the_page(serving, monkeypatch):
+    """Those that are there at once, and one that is longer than what is waited for."""
+
+    def size(environ, start):
+        start("200 OK", [("Content-Type", "text/plain")])
+        return [str(len(environ["wsgi.input"].read())).encode()]
+
+    server = Server(size, Address())
+    for length in (0, 10, lobby.WHOLE + 100_000):
+        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
+        for _ in range(2):  # the second one by the same connection
+            connection.request("POST", "/", b"a" * length)
+            answer = connection.getresponse()
+            assert (answer.status, answer.read()) == (200, str(length).encode())
+        connection.close()
+    server.close()
+
+
+def test_who_holds_a_thread_for_too_long_is_sent_away(monkeypatch):
+    """One who may ask, and sends the rest of a long body a byte at a time."""
+    monkeypatch.setattr(lobby, "LONGEST", 0.5)
+
+    def read(environ, start):
+        got.append(len(environ["wsgi.input"].read()))
+        start("200 OK", [])
+        return [b""]
+
+    got: list[int] = []
+    server = Server(read, Address())
+    one = socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE)
+    length = lobby.WHOLE + 1000
+    head = f"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n\r\n"
+    one.sendall(head.encode() + b"a" * (lobby.WHOLE + 10))
+    assert b"200" not in one.recv(1000)
+    one.close()
+    server.close()
+
+
+def test_more_visitors_than_there_is_room_for(serving, monkeypatch):
+    monkeypatch.setattr(lobby, "ROOM", 5)
+    server = serving()
+    waiting = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(20)]
+    for one in waiting:
+        one.sendall(b"GET")
+    assert ask(server)[0] == 200
+    for one in waiting:
         one.close()
 
 
@@ -408,3 +487,45 @@ def test_health_and_metrics_ask_for_the_token_too():
         assert ask(monitor, path, Authorization=f"Bearer {TOKEN}")[0] in (200, 404)
     assert TOKEN not in monitor.shown
     monitor.close()
+
+
+def test_nothing_is_written_through_links_of_a_strangers_directory(tmp_path):
+    """Links named as files in the making lead nowhere; a run with links is not gone on with."""
+    run, victim = tmp_path / "run", tmp_path / "victim"
+    victim.write_text("mine")
+    options = {"version": "1", "case": "a = 1\n"}
+    writer = RunWriter.create(run, command=["x"], title="A run", **options)
+    names = ("run.json.partial", "estimates.nc.partial", "checkpoint.npz.partial", "report.md")
+    for name in (*names, "estimates.nc", "checkpoint.npz", "overview.png", "case.toml"):
+        (run / name).unlink(missing_ok=True)
+        (run / name).symlink_to(victim)
+    who = identifier()
+    found = who.run([lp.Sample(row.pop("t"), row) for row in rows(3)]).to_xarray()
+    plain = SimpleNamespace(savefig=lambda file, **options: file.write(b"a figure"))
+    figures = {"overview": lambda: plain}
+    writer.finish(status="finished", dataset=found, identifier=who, figures=figures)
+    assert victim.read_text() == "mine"
+    for name in ("report.md", "estimates.nc", "checkpoint.npz", "overview.png", "run.json"):
+        assert not (run / name).is_symlink()
+    with pytest.raises(lp.RunError, match="is a link"):
+        RunWriter.reopen(run, command=["x"], settings=(), **options)
+
+
+def test_a_file_in_the_making_is_made_by_nobody_else(tmp_path, monkeypatch):
+    monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    (tmp_path / "a.txt.0.partial").symlink_to(victim)
+    with pytest.raises(FileExistsError):
+        write_bytes(tmp_path / "a.txt", b"new")
+    assert victim.read_text() == "mine"
+    (tmp_path / "a.txt.0.partial").unlink()
+    (tmp_path / "a.txt").symlink_to(victim)
+    write_bytes(tmp_path / "a.txt", b"new", sync=True)
+    assert (tmp_path / "a.txt").read_bytes() == b"new"
+    assert victim.read_text() == "mine"
+    with suppress(ZeroDivisionError), replacing(tmp_path / "a.txt") as partial:
+        partial.write_text("half")
+        _ = 1 // 0
+    assert (tmp_path / "a.txt").read_bytes() == b"new"
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["a.txt", "victim"]

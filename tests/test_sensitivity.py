@@ -54,7 +54,8 @@ def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
     covariance = np.linalg.inv(precision + H.T @ (weights[:, None] * H))
     batch = prior + covariance @ (H.T @ (weights * (z - zero - H @ prior)))
 
-    ident = lp.Identifier(model, SENSORS, lp.SensitivityLaw(replay=replay))
+    law = lp.SensitivityLaw(replay=replay, shadows=None)
+    ident = lp.Identifier(model, SENSORS, law)
     for t, sample in data[1:]:
         estimate = ident.step(t, sample)
     np.testing.assert_allclose(estimate.q, batch, rtol=1e-8)
@@ -126,6 +127,7 @@ def test_bounds_are_never_left():
         assert min(found) >= 0.05
 
 
+@pytest.mark.slow
 def test_drift_and_memory_follow_a_jump():
     model = conductivity()
     times = 0.05 * np.arange(161)
@@ -143,7 +145,7 @@ def test_drift_and_memory_follow_a_jump():
 def test_uncertainty_returns_to_the_prior_with_drift_and_without_data():
     model = conductivity()
     sensors, samples = stream(model, 1.0, 0.1 * np.arange(101))
-    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.5))
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.5, shadows=None))
     seen = [ident.step(*sample).q_std[0] for sample in samples[:11]]
     stds = [ident.step(t, [np.nan, np.nan], inputs).q_std[0] for t, _, inputs in samples[11:]]
     assert seen[-1] < 0.1
@@ -156,7 +158,7 @@ def test_uncertainty_returns_to_the_prior_with_drift_and_without_data():
 def test_a_long_gap_leaves_no_more_uncertainty_than_the_prior():
     model = conductivity()
     sensors, samples = stream(model, 1.0, 0.1 * np.arange(11))
-    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.5))
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(drift=0.5, shadows=None))
     for sample in samples:
         ident.step(*sample)
     t, _, inputs = samples[-1]

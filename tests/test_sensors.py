@@ -337,6 +337,7 @@ def identified(model, sensors, truth, noise, inputs=None, steps=120, check=None)
     return found
 
 
+@pytest.mark.slow
 def test_a_boundary_flux_and_one_point_find_the_conductivity():
     flux = lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))
     sensors = lp.Combined(

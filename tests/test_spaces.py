@@ -190,6 +190,7 @@ def test_bad_unknowns():
         lp.Model(lp.Field(mesh, element), {"R b": lp.Scalar()}, product)
 
 
+@pytest.mark.slow
 def test_prior_variances_are_the_diagonal_of_the_inverse():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (12, 12))
     for inner in ("H1", lp.Sobolev(2.0, 0.3), lp.Sobolev(1.5, 0.3)):

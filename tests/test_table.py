@@ -201,7 +201,8 @@ def test_a_column_that_is_there_twice_is_refused(csv, column):
     with pytest.raises(DataError, match=f"two columns are called '{column}'; rename one"):
         read_csv(path, COLUMNS, Clock("t"))
     with closing(Follow(path)) as source:
-        (row,) = source.poll(0.0)
+        told, row = source.poll(0.0)
+    assert "two columns are called" in told.broken
     assert column not in row.values
 
 

@@ -286,6 +286,7 @@ def test_an_initial_state_is_given_once():
         lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(), u0=1.0)
 
 
+@pytest.mark.slow
 def test_the_gate_refuses_outliers_and_believes_what_lasts():
     times = np.arange(0.0, 8.0, 0.05)
     samples = data(lambda t: 0.3, times)

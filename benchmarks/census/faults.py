@@ -125,7 +125,7 @@ def _shifted(values: Array, samples: float) -> Array:
 
 
 def _scaled(values: Array, factor: float) -> Array:
-    return values[0] + factor * (values - values[0])
+    return np.asarray(values[0] + factor * (values - values[0]))
 
 
 def _errors(change: Callable[[Scene, Array], Array]) -> Change:

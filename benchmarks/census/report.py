@@ -32,7 +32,7 @@ def outcome(scores: Sequence[Score]) -> Outcome:
     checks = [
         Check("wrong by three deviations and trusted", _share(silent, whole), SILENT, "<="),
         Check("nothing wrong and doubted", _share(false, sound), FALSE, "<="),
-        Check("cause among the first two", np.mean([s.named for s in told] or [0.0]), NAMED, ">="),
+        Check("cause among the first two", _share([s for s in told if s.named], told), NAMED, ">="),
         Check("runs that ended early", len(scores) - len(whole), 0, "<="),
     ]
     rows = []

@@ -163,9 +163,9 @@ def _judged(scene: Scene, score: Score) -> Score:
     model = scene.model()
     direct = {k: v for k, v in problem.direct.items() if k in scene.points}
     sensors = lp.Points(scene.points, noise=scene.noise * score.stated, direct=direct)
-    start = {} if model.form_initial is not None else {"u0": scene.u0}
+    u0 = None if model.form_initial is not None else scene.u0
     law = lp.SensitivityLaw()
-    identifier = lp.Identifier(model, sensors, law, scheme=scene.scheme, hold=scene.hold, **start)
+    identifier = lp.Identifier(model, sensors, law, scheme=scene.scheme, hold=scene.hold, u0=u0)
     z = scene.z + scene.noise * scene.errors
     names, half = tuple(problem.channels), int(HALF * scene.length)
     about = FAULTS.get(score.fault)

@@ -31,7 +31,6 @@ from livepde.runs.feeds import Gathered
 from livepde.runs.live import Live
 from livepde.streams.intake import Intake, Ready
 from livepde.streams.intake import Outcome as RowOutcome
-from livepde.streams.sources import Row as SourceRow
 from livepde.streams.sources import Source
 
 __all__ = ["Fed", "broken_messages", "broken_rows", "fed"]
@@ -110,10 +109,11 @@ class _Audited(Gathered):
         super().__init__(source, intake)
         self.reasons: dict[int, set[str]] = {}
 
-    def _outcome(self, row: SourceRow, token: Any) -> RowOutcome:
-        found = super()._outcome(row, token)
-        self.reasons[row.token[1]] = {remark.kind for remark in found.remarks}
-        return found
+    def _used(self, outcome: RowOutcome) -> list[Ready]:
+        for remark in outcome.remarks:
+            _, (_, place) = remark.row
+            self.reasons.setdefault(place, set()).add(remark.kind)
+        return super()._used(outcome)
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def _killed(
 ) -> Outcome:
     rows, rng = rod_rows(plan.samples), np.random.default_rng(plan.seed)
     expected, start = undisturbed(plan.samples)
-    damage, fallen = Damage(), Counter[str]()
+    damage, fallen, progress = Damage(), Counter[str](), 0
     bar = plan.watched(plan.kills, f"kills, {name}")
     next(bar, None)
     while fallen.total() < plan.kills:
@@ -60,9 +60,11 @@ def _killed(
         plant = plants(here, rows, plan.seed + damage.runs)
         with closing(Run(here, plant.source)) as run:
             while run.look() < len(rows) - LEAD[0] and fallen.total() < plan.kills:
+                before = run.look()
                 moment = str(rng.choice([*MOMENTS], p=[*MOMENTS.values()]))
                 if _kill(run, plant, len(rows) - 1, moment, start, rng):
                     fallen[moment] += 1
+                    progress += run.look() > before
                     next(bar, None)
             plant.supply(len(rows))
             run.start()
@@ -71,7 +73,14 @@ def _killed(
         shutil.rmtree(here)
     table = Table(
         f"Kills, {name}: {plan.samples} samples a run",
-        ("runs", *(f"at {moment}" for moment in MOMENTS), "lost", "doubled", "different"),
+        (
+            "runs",
+            *(f"at {moment}" for moment in MOMENTS),
+            "lost",
+            "doubled",
+            "different",
+            "after new samples",
+        ),
         [
             (
                 damage.runs,
@@ -79,6 +88,7 @@ def _killed(
                 damage.lost,
                 damage.doubled,
                 damage.different,
+                progress,
             )
         ],
     )

@@ -17,6 +17,7 @@ class Plan:
     kills: int
     samples: int
     malformed: int
+    flips: int
     seed: int
     progress: bool
 

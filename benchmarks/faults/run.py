@@ -19,7 +19,7 @@ from livepde.errors import RunError
 from livepde.runs import JOURNAL, Journal
 from livepde.runs.database import log_of
 
-__all__ = ["Run", "hearing", "undisturbed"]
+__all__ = ["Run", "hearing", "undisturbed", "undisturbed_journal"]
 
 
 class Run:
@@ -127,6 +127,18 @@ def hearing(rows: Sequence[Row]) -> Iterator[tuple[Mosquitto, Topic, Run]]:
         run = stack.enter_context(closing(Run(folder, topic.source)))
         run.start()
         yield broker, topic, run
+
+
+def undisturbed_journal(folder: Path, count: int) -> Path:
+    """Return the journal of a run in a folder that nobody disturbs."""
+    plant = GrowingFile(folder, rod_rows(count), 0)
+    plant.supply(count)
+    with closing(Run(folder, plant.source)) as run:
+        run.start()
+        run.end(count)
+    path = folder / "run" / JOURNAL
+    Journal.open(path, write=True).close()  # all in one file: nothing is left in the log
+    return path
 
 
 @cache

@@ -8,6 +8,6 @@ autoregressive, heavy-tailed, have a spike, gaps in their channels, or a sensor 
 
 from benchmarks.honest.noise import KINDS
 from benchmarks.honest.problems import PROBLEMS
-from benchmarks.honest.run import honest
+from benchmarks.honest.run import QUICK, honest
 
-__all__ = ["KINDS", "PROBLEMS", "honest"]
+__all__ = ["KINDS", "PROBLEMS", "QUICK", "honest"]

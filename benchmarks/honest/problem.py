@@ -95,6 +95,8 @@ class Problem(ABC):
         Number of coordinates theta.
     channels
         Input channels.
+    moving
+        Unknowns that move.
     u0
         Initial state, a number.
     """
@@ -107,6 +109,7 @@ class Problem(ABC):
     latents: Mapping[str, Latent]
     coordinates: int
     channels: Mapping[str, Signal]
+    moving: tuple[str, ...] = ()
     u0: float = 0.0
     direct: Mapping[str, Any] = MappingProxyType({})
 

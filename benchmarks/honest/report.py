@@ -23,7 +23,9 @@ ENOUGH = 40  # twins from which the bounds of coverage hold as they stand
 CHANCE = 0.005  # probability that chance alone breaks the bound of fewer twins, on each side
 SINGLE = 1e-4  # the same for one unknown at one time, of which there are hundreds
 WIDTH = 1.3  # median width over that of the batch posterior, at most
+SMOOTHED_COVERAGE = (0.90, 0.98)
 ERROR = 1.2  # error over that of the batch fit, at most
+SMOOTHED = 1.1  # error of the smoother over that of the batch fit, at most
 WIDEST = 1.5  # width over that of the prior, at most
 SHIFT = 0.5  # that a spike may move an estimate, in standard deviations
 CONSTANT = 0.90  # least coverage of a constant beside a moving unknown
@@ -48,7 +50,8 @@ def outcome(runs: Iterable[Run]) -> Outcome:
             if r.failure
         }
     )
-    return Outcome([_overview(kept), _details(kept)], checks, [*NOTES, *failures])
+    tables = [_overview(kept), _details(kept), *_smoothed(kept)]
+    return Outcome(tables, checks, [*NOTES, *failures])
 
 
 NOTES = (
@@ -77,6 +80,7 @@ def _checks(key: tuple[str, str], several: Sequence[Run]) -> Iterator[Check]:
             at = list(PROBLEMS[problem].latents).index(MOVING[problem])
             text = f"{name}: coverage of the constant beside the moving unknown"
             yield _coverage(text, covered[:, :, at], (CONSTANT, 1.0), len(several))
+    yield from _smoother_checks(name, problem, several)
     widest = np.array([run.widest for run in several])
     yield Check(f"{name}: widest interval / prior", _largest(widest), WIDEST, "<=")
     if KINDS[kind].right:
@@ -88,6 +92,45 @@ def _checks(key: tuple[str, str], several: Sequence[Run]) -> Iterator[Check]:
         yield Check(text, _largest(shift[:, -1]), SHIFT, "<=")
     failed = sum(bool(run.failure) for run in several)
     yield Check(f"{name}: runs that ended early", failed, 0, "<=")
+
+
+def _smoother_checks(name: str, problem: str, several: Sequence[Run]) -> Iterator[Check]:
+    if not any(run.smoothed for run in several):
+        return
+    for label in PROBLEMS[problem].moving:
+        covered, error, fit = _smoothed_scores(problem, label, several)
+        text = f"{name}: smoother, coverage of {label}"
+        yield _coverage(text, np.array(covered), SMOOTHED_COVERAGE, len(several))
+        yield Check(f"{name}: smoother, error of {label} / batch fit", error / fit, SMOOTHED, "<=")
+
+
+def _smoothed_scores(
+    problem: str, label: str, several: Sequence[Run]
+) -> tuple[float, float, float]:
+    """Return coverage and root mean square errors of smoother and batch fit of an unknown."""
+    j = list(PROBLEMS[problem].latents).index(label)
+    scores = [run.smoothed for run in several if run.smoothed is not None]
+    covered = float(np.mean([one.covered[j] for one in scores]))
+    error, fit = (
+        float(np.sqrt(np.mean([values[j] ** 2 for values in each])))
+        for each in ([one.error for one in scores], [one.fit for one in scores])
+    )
+    return covered, error, fit
+
+
+def _smoothed(found: Found) -> Iterator[Table]:
+    """Yield the table of the smoother, if it was run."""
+    rows = []
+    for (problem, kind), several in found.items():
+        if any(run.smoothed for run in several):
+            for label in PROBLEMS[problem].latents:
+                scores = _smoothed_scores(problem, label, several)
+                rows.append([problem, kind, len(several), label, *scores])
+    if rows:
+        columns = ["problem", "kind", "twins", "unknown", "coverage", "error", "error of fit"]
+        yield Table(
+            "Smoother at all samples; errors in standard deviations of the prior", columns, rows
+        )
 
 
 def _coverage(name: str, covered: Array, bounds: tuple[float, float], twins: int) -> Check:

@@ -14,9 +14,8 @@ from benchmarks.honest.twin import Run, twins
 from livepde.progress import watched
 from livepde.runs.outcome import Outcome
 
-__all__ = ["QUICK", "QUICK_SEEDS", "SEEDS", "honest"]
+__all__ = ["QUICK", "honest"]
 
-SEEDS, QUICK_SEEDS = 40, 5
 QUICK = ("rod", "flux", "column", "borehole")
 """Problems of the quick run."""
 
@@ -24,8 +23,8 @@ QUICK = ("rod", "flux", "column", "borehole")
 def honest(
     only: Sequence[str] = (),
     kinds: Sequence[str] = (),
-    seeds: int = SEEDS,
     *,
+    seeds: int,
     workers: int | None = None,
     progress: bool = False,
 ) -> Outcome:

@@ -16,14 +16,33 @@ from benchmarks.honest.batch import Batch
 from benchmarks.honest.noise import KINDS, Data, disturbed
 from benchmarks.honest.problem import Latent, Problem
 from benchmarks.honest.problems import PROBLEMS
-from livepde.plots import NORMAL_95
+from livepde.plots import NORMAL_95, interval_95
 from livepde.stepping import StepFailed
+from livepde.streams import FillGaps
 
-__all__ = ["SHARES", "Run", "twins"]
+__all__ = ["SHARES", "Run", "Smoothed", "twins"]
 
 Array = NDArray[Any]
 SHARES = (0.10, 0.25, 0.50, 0.75, 1.00)
 """Of the run, after which intervals are looked at."""
+
+
+@dataclass(eq=False)
+class Smoothed:
+    """Scores of the smoother over all samples; arrays have the shape (unknowns,).
+
+    Attributes
+    ----------
+    covered
+        Share of the samples at which the 95 % interval holds the truth.
+    error, fit
+        Root mean square of the errors of the smoother and of the batch fit, in standard deviations
+        of the prior.
+    """
+
+    covered: Array
+    error: Array
+    fit: Array
 
 
 @dataclass(eq=False)
@@ -54,6 +73,8 @@ class Run:
         Steps that were not taken.
     failure
         What ended the run, if anything did.
+    smoothed
+        Where an unknown moves and nothing is wrong with the data.
     """
 
     problem: str
@@ -68,12 +89,17 @@ class Run:
     shift: Array
     missed: int = 0
     failure: str = ""
+    smoothed: Smoothed | None = None
 
 
 @dataclass(eq=False)
 class _Seen:
-    """Latent estimate and interval of each unknown: (share, label) -> centre, low, high."""
+    """Latent estimate and interval of each unknown: (share, label) -> centre, low, high.
 
+    `smoothed` holds those of numbers at all samples, label -> centre, low, high.
+    """
+
+    smoothed: dict[str, tuple[Array, Array, Array]] = field(default_factory=dict)
     values: dict[tuple[int, str], tuple[Array, Array, Array]] = field(default_factory=dict)
     missed: int = 0
     failure: str = ""
@@ -93,7 +119,8 @@ def twins(name: str, seed: int, kinds: Sequence[str]) -> list[Run]:
                 continue
             rng.bit_generator.state = state
             data = disturbed(kind, problem, shown, rng)
-            seen = _identified(problem, data, KINDS[kind].freed)
+            smooths = bool(problem.moving) and KINDS[kind].right
+            seen = _identified(problem, data, KINDS[kind].freed, smooths)
             if kind == "spike" and white is None:
                 rng.bit_generator.state = state
                 without = disturbed("white", problem, shown, rng)
@@ -103,14 +130,19 @@ def twins(name: str, seed: int, kinds: Sequence[str]) -> list[Run]:
             fit = batch.fit(data.z) if KINDS[kind].right else batch.linear(data.right)
             run = _scored(problem, theta, batch, seen, fit)
             run.problem, run.kind, run.seed = name, kind, seed
+            if seen.smoothed:
+                run.smoothed = _smoothed(problem, theta, fit, seen)
             if data.spike is not None and white is not None:
                 run.shift = _shift(problem, seen, white, data.spike)
             runs.append(run)
     return runs
 
 
-def _identified(problem: Problem, data: Data, freed: bool) -> _Seen:
-    """Run the identifier with its defaults and keep what it says after each share of the run."""
+def _identified(problem: Problem, data: Data, freed: bool, smooths: bool = False) -> _Seen:
+    """Run the identifier with its defaults and keep what it says after each share of the run.
+
+    With `smooths` also what it says of all samples at the end.
+    """
     times, seen = problem.times, _Seen()
     at = {round(share * problem.intervals): k for k, share in enumerate(SHARES)}
     moments = {float(times[n]): k for n, k in at.items()}
@@ -129,12 +161,37 @@ def _identified(problem: Problem, data: Data, freed: bool) -> _Seen:
     names = tuple(problem.channels)
     rows = zip(times.tolist(), data.z, data.inputs.tolist(), strict=True)
     stream = ((t, z, dict(zip(names, values, strict=True))) for t, z, values in rows)
+    filled = FillGaps(names)(stream) if names else stream
     identifier = problem.identifier(data.biased if freed else None)
     try:
-        identifier.run(stream, on_estimate=look, fields_every=problem.intervals)
+        result = identifier.run(filled, on_estimate=look, fields_every=problem.intervals)
+        if smooths:
+            hindsight = result.smoothed()
+            for label, latent in problem.latents.items():
+                seen.smoothed[label] = _intervals(hindsight, label, latent)
     except (lp.errors.LivepdeError, StepFailed, ArithmeticError, np.linalg.LinAlgError) as error:
         seen.failure = f"{type(error).__name__}: {error}"
     return seen
+
+
+def _intervals(data: Any, label: str, latent: Latent) -> tuple[Array, Array, Array]:
+    """Return latent centre and interval of a number at all samples of a dataset."""
+    low, high = interval_95(data, label)
+    centre, low, high = (latent.inverse(item) for item in (data[label].values, low, high))
+    return centre, low, high
+
+
+def _smoothed(problem: Problem, theta: Array, fit: Array, seen: _Seen) -> Smoothed:
+    covered, error, fitted = [], [], []
+    for label, latent in problem.latents.items():
+        samples = range(len(problem.times))
+        truth, best = (np.array([latent.value(x, n)[0] for n in samples]) for x in (theta, fit))
+        prior = np.array([_prior(latent, n)[0] for n in samples])
+        centre, low, high = seen.smoothed[label]
+        covered.append(np.mean((low <= truth) & (truth <= high)))
+        error.append(_rms((centre - truth) / prior))
+        fitted.append(_rms((best - truth) / prior))
+    return Smoothed(np.array(covered), np.array(error), np.array(fitted))
 
 
 def _scored(problem: Problem, theta: Array, batch: Batch, seen: _Seen, fit: Array) -> Run:

@@ -101,6 +101,7 @@ from .laws import (
     Residual,
     ResidualDamping,
     SensitivityLaw,
+    Shadows,
     Status,
     diffusion_operator,
 )
@@ -204,6 +205,7 @@ __all__ = [
     "Scalars",
     "Scheme",
     "SensitivityLaw",
+    "Shadows",
     "Sobolev",
     "SpaceError",
     "Status",

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +15,16 @@ from livepde.errors import ConfigurationError, MissingInputError, SampleError
 from livepde.fem import Inputs
 from livepde.linalg import Array
 from livepde.observation import Observed
-from livepde.samples import labelled, number, plan, readings
+from livepde.samples import (
+    Readings,
+    check_noise,
+    labelled,
+    noise_channel,
+    number,
+    plan,
+    readings,
+)
+from livepde.stepping import own_noise
 
 __all__ = ["Channels"]
 
@@ -49,6 +59,10 @@ class Channels:
                 f"channels {both} are both assimilated and withheld: give the sensors names of "
                 'their own, as in Points({"T_30": 0.3}).'
             )
+        if taken := [name for name in self.inputs if name in self.noise]:
+            raise ConfigurationError(
+                f"channel '{taken[0]}' has the name of the noise of a reading: rename it."
+            )
 
     @cached_property
     def hidden(self) -> tuple[str, ...]:
@@ -66,8 +80,13 @@ class Channels:
         return tuple(dict.fromkeys([*self.observed.names, *self.hidden, *self.inputs]))
 
     @cached_property
+    def noise(self) -> dict[str, str]:
+        """Name of the noise of a reading -> its sensor."""
+        return {noise_channel(name): name for name in (*self.observed.names, *self.hidden)}
+
+    @cached_property
     def _known(self) -> frozenset[str]:
-        return frozenset(self.names)
+        return frozenset([*self.names, *self.noise])
 
     @cached_property
     def inputs(self) -> tuple[str, ...]:
@@ -84,35 +103,56 @@ class Channels:
         return found - needed - set(self.forced)
 
     def parse(
-        self, z: ArrayLike | Mapping[str, float], inputs: Mapping[str, float]
-    ) -> tuple[Array, Array, dict[str, float]]:
-        """Return assimilated values, withheld values, and inputs, all checked."""
+        self, z: Readings, inputs: Mapping[str, float]
+    ) -> tuple[Array, Array | None, Array, dict[str, float]]:
+        """Return assimilated values and their noise, withheld values, and inputs, all checked.
+
+        The noise is None if no value has one of its own, NaN where one has none.
+        """
         z = z if isinstance(z, (np.ndarray, dict)) else labelled(z)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
-            measured, withheld, named = self._by_name(z, inputs)
+            measured, noise, withheld, named = self._by_name(z, inputs)
         else:
-            measured = readings(z, self.observed)
+            measured, noise = readings(z, self.observed)
             withheld, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
-        return measured, withheld, named | self._named(inputs) if inputs else named
+        return measured, noise, withheld, named | self._named(inputs) if inputs else named
 
     def _by_name(
-        self, z: Mapping[str, float], inputs: Mapping[str, float]
-    ) -> tuple[Array, Array, dict[str, float]]:
-        """Return assimilated values, withheld values, and the inputs among the values by name."""
+        self, z: Mapping[str, Any], inputs: Mapping[str, float]
+    ) -> tuple[Array, Array | None, Array, dict[str, float]]:
+        """Return what `parse` does, of inputs those among the values by name."""
         if not (self._known.issuperset(z) and self._known.issuperset(inputs)):
             unknown = next(name for name in (*z, *inputs) if name not in self._known)
             raise SampleError(
                 f"unknown channel '{unknown}'; this identifier has {list(self.names)}."
             )
-        values = {}
+        values: dict[str, float] = {}
+        noise: dict[str, float] = {}
         for name, value in z.items():  # words for a message cost more than the usual value
+            if name in self.noise:
+                noise[self.noise[name]] = check_noise(self.noise[name], value)
+                continue
+            if isinstance(value, tuple | list):
+                value, noise[name] = self._pair(name, value)
             usual = type(value) is float and math.isfinite(value)
             values[name] = value if usual else number(value, f"channel '{name}'")
         measured = np.array([values.get(name, math.nan) for name in self.observed.names])
         withheld = NOTHING
         if self.hidden:
             withheld = np.array([values.get(name, math.nan) for name in self.hidden])
-        return measured, withheld, {name: values[name] for name in self.inputs if name in values}
+        own = own_noise([noise.get(name, math.nan) for name in self.observed.names])
+        named = {name: values[name] for name in self.inputs if name in values}
+        return measured, own, withheld, named
+
+    def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
+        """Return value and noise of a reading that is a pair."""
+        if len(given) != 2 or noise_channel(name) not in self.noise:
+            raise SampleError(
+                f"channel '{name}': got {given!r}; expected a number, or of a sensor a pair "
+                "(value, standard deviation of its noise)."
+            )
+        value, std = given
+        return value, check_noise(name, std)
 
     def _named(self, inputs: Mapping[str, float]) -> dict[str, float]:
         """Return inputs, checked."""

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from livepde.atomic_write import write_bytes
 from livepde.errors import RunError
 from livepde.linalg import Array
 
@@ -128,13 +129,8 @@ def _refuse_bombs(members: Iterable[zipfile.ZipInfo], size: int) -> None:
 def write(path: str | os.PathLike[str], content: bytes) -> None:
     """Write an archive; the file appears whole or not at all."""
     target = Path(path)
-    partial = target.with_name(target.name + ".partial")
     try:
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(target)
+        write_bytes(target, content, sync=True)
     except OSError as error:
         raise RunError(
             f"Cannot write the checkpoint {target}: {error.strerror or error}."

@@ -7,8 +7,9 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,7 @@ from livepde import checkpoint
 from livepde.channels import Channels
 from livepde.errors import (
     ConfigurationError,
+    LawError,
     MissingInputError,
     RunError,
     SampleError,
@@ -24,14 +26,18 @@ from livepde.errors import (
 )
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
-from livepde.laws import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.hindsight import Hindsight
+from livepde.laws import AnyLaw, Belief, InitialReading, Law, Problem, Report, Status, numerical
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
-from livepde.samples import Sample, number, numbers, sample_of
+from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
 from livepde.stepping import Advance, Interval, Scheme
 from livepde.verdict import Verdict, WithheldLedger
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["Identifier", "Sample"]
 
@@ -75,7 +81,7 @@ class Identifier:
     u0_from
         Channel -> how u0 changes with its reading at t0, as u0 is given (a function of x, say): for
         a u0 that was made of readings. Their noise is that of the start then, and they are not
-        assimilated once more.
+        assimilated once more. A pair (how, standard deviation): the noise of this reading.
 
     Raises
     ------
@@ -122,12 +128,10 @@ class Identifier:
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
         control = Advance(scheme or law.scheme, dt_max, halvings, hold)
-        self.problem = Problem(
-            model, self.observed, control, self._input_noise(input_noise or {}), {}
-        )
         if u0_from and u0 is None:
             raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
-        self.problem = replace(self.problem, initial_weights=self.weights(u0_from or {}))
+        noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
+        self.problem = Problem(model, self.observed, control, noise, readings, u0)
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
@@ -178,8 +182,8 @@ class Identifier:
                 )
         return dict(given)
 
-    def weights(self, u0_from: Mapping[str, Any]) -> dict[str, Array]:
-        """Return how u0 changes with the readings that it was made of, as coefficients."""
+    def initial_readings(self, u0_from: Mapping[str, Any]) -> dict[str, InitialReading]:
+        """Return the readings that u0 was made of; the way u0 changes with them as coefficients."""
         known = {*self.observed.names, *self.model.channels}
         for name in u0_from:
             if name not in known:
@@ -188,7 +192,11 @@ class Identifier:
                     f"those are {sorted(known)}."
                 )
         space = self.model.state_space
-        return {name: space.interpolate(weight) for name, weight in u0_from.items()}
+        found = {}
+        for name, given in u0_from.items():
+            weight, noise = given if isinstance(given, tuple) else (given, math.nan)
+            found[name] = InitialReading(space.interpolate(weight), check_noise(name, noise))
+        return found
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
         """Return an identifier that goes on by itself; model, law and matrices are shared."""
@@ -237,10 +245,10 @@ class Identifier:
     def step(
         self,
         t: float,
-        z: ArrayLike | Mapping[str, float],
+        z: Readings,
         inputs: Mapping[str, float] | None = None,
     ) -> Estimate:
-        """Take one sample and return the estimate at its time.
+        """Take one sample and return the estimate at its time; parameters as of a `Sample`.
 
         A step that fails numerically changes nothing and says so in `status`; the next sample
         tries again from the last good state. One with the status "departed" takes the sample and
@@ -249,7 +257,8 @@ class Identifier:
         Raises
         ------
         SampleError
-            Wrong shape, text, infinity, or an unknown channel.
+            Wrong shape, text, infinity, or an unknown channel; a noise that is not positive, or one
+            for a law that does not weigh readings.
         TimeOrderError
             t is not later than the sample before.
         MissingInputError
@@ -259,7 +268,8 @@ class Identifier:
         t = number(t, "time t")
         if math.isnan(t):
             raise SampleError("time t is NaN; give the time of the sample.")
-        measured, withheld, named = self._channels.parse(z, inputs or {})
+        measured, noise, withheld, named = self._channels.parse(z, inputs or {})
+        self.check_weighs(noise)
         values, held = self._channels.filled(named, self._inputs)
         first = self._samples == 0
         self._reachable(t)
@@ -269,21 +279,80 @@ class Identifier:
                 "sort the stream, and drop repeated samples."
             )
         if self._state is None:
-            self._begin(values)
+            self._begun_by(values, t)
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
-        if t == self._t:
-            moment = Moment(t, values)
-            belief = self._belief()
-            report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
-            interval = Interval(t, t, values, values, used, used)
-            self._state = self.law.begin(self._work, self._state, interval)
-        else:
-            interval = Interval(self._t, t, self._inputs, values, self._z, used)
-            self._state, report = self.law.step(self._work, self._state, interval)
+        start = self._inputs if t > self._t else values
+        interval = Interval(
+            self._t, t, start, values, self._z if t > self._t else used, used, noise
+        )
+        self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held, scored=True)
+
+    def _begun_by(self, inputs: Inputs, t: float) -> None:
+        """Begin with the inputs of the first sample, unless no finite state comes of them."""
+        try:
+            with _quiet():
+                state = self._start(inputs)
+                finite = self.law.finite(self._work, state)
+        except Exception as error:
+            if numerical(error) is None:
+                raise
+            finite = False
+        if not finite:
+            raise SampleError(
+                f"the sample at t = {t:g} gives no finite initial state: check the values of its "
+                f"inputs {list(self.inputs)}; the run begins with the next one."
+            )
+        self._state, self._inputs = state, inputs
+
+    def _stepped(self, interval: Interval) -> tuple[Any, Report]:
+        """Return state and report after a sample; the state of before where numbers fail.
+
+        Numbers fail where an operation raises, and where what the law believes then is not finite,
+        be it only the squares of its numbers.
+        """
+        before, t0, t1 = self._state, interval.t0, interval.t1
+        try:
+            with _quiet():
+                if t1 > t0:
+                    state, report = self.law.step(self._work, before, interval)
+                else:
+                    state = self.law.begin(self._work, before, interval)
+                    report = Report(Status(), self._expected(interval))
+                if not report.status.taken or self.law.finite(self._work, state):
+                    return state, report
+                failure = Status("not_finite", "what the law believes after it is not finite")
+        except Exception as error:
+            found = numerical(error)
+            if found is None:
+                raise
+            failure = found
+        return before, Report(failure, np.full(self.observed.size, np.nan))
+
+    def _expected(self, interval: Interval) -> Array:
+        """Return what the sensors show of the estimate of now."""
+        belief = self._belief()
+        return self.observed.predict(belief.u, belief.q, interval.end)
+
+    @property
+    def place(self) -> tuple[Any, ...]:
+        """Where it stands, for `return_to`; holds what a step does not change."""
+        return self._state, self._t, self._z, self._inputs, self._samples
+
+    def return_to(self, place: tuple[Any, ...]) -> None:
+        """Stand again where it stood, as if nothing had been taken since then."""
+        self._state, self._t, self._z, self._inputs, self._samples = place
+
+    def check_weighs(self, noise: Array | None) -> None:
+        """Refuse the noise of readings where the law does not weigh them; None: there is none."""
+        if noise is not None and not self.law.weighs_readings():
+            raise SampleError(
+                f"{type(self.law).__name__} does not weigh readings by their noise: leave it out "
+                "of the samples."
+            )
 
     def latent_belief(self) -> Belief:
         """Return what the law itself believes: q and its factor in latent coefficients.
@@ -467,15 +536,68 @@ class Identifier:
             Keep the fields of every so many samples (scalars and innovations of all).
         """
         result = Result(self.model, self.observed, self.withheld, fields_every)
+        begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
+        result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
         for item in _watched(stream, progress, total):
             sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
             result.add(estimate)
+            taken.append(Sample(sample.t, copy.copy(sample.z), copy.copy(sample.inputs)))
             if on_estimate is not None:
                 on_estimate(estimate)
         if result.last is not None:
             result.settle(self.settled(result.last))
         return result
+
+    @property
+    def unsmoothed(self) -> str:
+        """Why the law smooths nothing; empty if it does."""
+        return self.law.unsmoothed(self._work)
+
+    def smoothed(self, stream: Iterable[Any], *, fields_every: int = 1) -> xr.Dataset:
+        """Return what unknowns and state were at each sample of a run, given all of them.
+
+        A fixed-interval smoother: see `livepde.laws.smoother`. All samples are taken by a copy of
+        this identifier, as in a run, and then at least once more; this one stays as it is.
+
+        Parameters
+        ----------
+        stream, fields_every
+            As for `run`.
+
+        Returns
+        -------
+        smoothed
+            As `Result.to_xarray` of the run, without innovations and notes. What is constant has
+            one value at all times: the last one.
+
+        Raises
+        ------
+        ConfigurationError
+            An identifier that has taken a sample.
+        LawError
+            A law without a covariance that a smoother could follow.
+        """
+        if self._samples:
+            raise ConfigurationError(
+                "smoothed takes a run from its first sample on: call it of an identifier that has "
+                "taken none."
+            )
+        if why := self.unsmoothed:
+            raise LawError(f"smoothed: {why}; take SensitivityLaw or AutoLaw.")
+        who, run, before = copy.copy(self), Hindsight(self._q0), self._state
+        for item in stream:
+            sample = sample_of(item)
+            t, z, inputs = who._t, who._z, who._inputs
+            estimate = who.step(sample.t, sample.z, sample.inputs)
+            if before is None:  # the law begins with the inputs of the first sample
+                before, inputs = self._start(who._inputs), who._inputs
+            interval = Interval(t, who._t, inputs, who._inputs, z, who._z)
+            run.add(estimate, interval, who.latent_belief().q)
+        result = Result(self.model, self.observed, self.withheld, fields_every)
+        data = run.fixed_interval(fields_every)
+        beliefs = data and self.law.smoothed(self._work, before, who._state, data)
+        return run.dataset(result, self.problem, beliefs or ())
 
     def _reachable(self, t: float) -> None:
         """Refuse a time that is too many substeps away."""
@@ -558,6 +680,11 @@ class Identifier:
         self._state, self._withheld = state, withheld
         if state is None and not self.inputs:
             self._begin(inputs)
+
+
+def _quiet() -> np.errstate:
+    """Return a context in which NumPy does not warn: what overflows is found in the result."""
+    return np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 def _watched(stream: Iterable[Any], progress: bool, total: int | None) -> Iterable[Any]:

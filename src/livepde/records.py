@@ -25,6 +25,7 @@ __all__ = [
     "FIELD_ENDS",
     "NOTE",
     "NUMBER_ENDS",
+    "SMOOTHED",
     "STATE_ENDS",
     "STATUS_CODES",
     "Layout",
@@ -39,12 +40,18 @@ __all__ = [
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 
 NOTE = "note_"  # what a note is called whose own name is taken
+SMOOTHED = "_smoothed"  # after the name of a variable that is given all samples of a run
 DATE = "date"  # column of an exported table, beside the variables of the dataset
 # What stands beside an unknown or a component of the state: end of the variable's name -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
 INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
 NUMBER_ENDS = {**STATE_ENDS, **INTERVAL_ENDS, "_left": "the share left of the prior deviation"}
-FIELD_ENDS = {**STATE_ENDS, **INTERVAL_ENDS, "_modes": "the number of modes told"}
+FIELD_ENDS = {
+    **STATE_ENDS,
+    **INTERVAL_ENDS,
+    "_modes": "the number of modes told",
+    "_left_out": "the share of modes left out",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +66,14 @@ class Snapshot:
         Field -> of how many modes the data have told, and how many there are.
     correlation
         Of the numbers, shape (unknowns, unknowns); None without covariance.
+    left_out
+        Field -> share of its mean variance that is of modes that the law leaves out.
     """
 
     profiles: Mapping[str, Array]
     told: Mapping[str, tuple[float, int]]
     correlation: Array | None = None
+    left_out: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +258,7 @@ class _SnapshotArrays:
         for profile in snapshot.profiles.values():
             values.frombytes(profile.tobytes())
         values.extend(told for told, _ in snapshot.told.values())
+        values.extend(snapshot.left_out.get(name, math.nan) for name in snapshot.told)
         if snapshot.correlation is not None:
             values.frombytes(snapshot.correlation.tobytes())
         records.append(number)
@@ -284,12 +295,14 @@ class _Structure:
         """Return the snapshot whose numbers are a row."""
         sizes = [size for _, size in self.profiles]
         *parts, rest = np.split(row, np.cumsum(sizes, dtype=int))
-        told, correlation = np.split(rest, [len(self.told)])
+        fields = len(self.told)
+        told, left_out, correlation = np.split(rest, [fields, 2 * fields])
         n = self.correlated
         return Snapshot(
             {name: values for (name, _), values in zip(self.profiles, parts, strict=True)},
             {name: (float(x), count) for (name, count), x in zip(self.told, told, strict=True)},
             None if n is None else correlation.reshape(n, n),
+            {name: float(x) for (name, _), x in zip(self.told, left_out, strict=True)},
         )
 
 
@@ -434,6 +447,9 @@ class Layout:
             told = np.array([snapshot.told[name][0] for snapshot in kept])
             about = {"long_name": "modes that the data have told of", "of": count}
             data[f"{name}_modes"] = ("snapshot", told, about)
+            left = np.array([snapshot.left_out.get(name, np.nan) for snapshot in kept])
+            about = {"long_name": "share of modes that the law leaves out in the variance of"}
+            data[f"{name}_left_out"] = ("snapshot", left, about)
         last = kept[-1].correlation
         if last is not None and len(self.scalars) > 1:
             data["correlation"] = (("unknown", "other"), last)
@@ -482,6 +498,9 @@ def name_clashes(
                 uses[name].append("a note of the law")
             for end, meaning in ends.items():
                 uses.setdefault(f"{name}{end}", []).append(f"{meaning} of '{name}'")
+            for end in ("", *STATE_ENDS, *INTERVAL_ENDS):
+                smoothed = uses.setdefault(f"{name}{SMOOTHED}{end}", [])
+                smoothed.append(f"a smoothed variable of '{name}'")
     return [
         f"in tables and datasets of a run '{name}' would be {' and '.join(both)}: give the "
         f"{'unknown' if any('unknown' in use for use in both) else 'component'} another name."

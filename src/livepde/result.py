@@ -260,6 +260,7 @@ class Result:
         self.fields_every = fields_every
         self.last: Estimate | None = None
         self._settled: Belief | None = None
+        self.smoother: Callable[[], xr.Dataset] | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld)
         self._count = len(self.records) if count is None else count
@@ -276,7 +277,7 @@ class Result:
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
         keeps = self._count % self.fields_every == 0
-        self.records.append(self._record(estimate, keeps))
+        self.records.append(self.record(estimate, keeps))
         self._count += 1
         self._settled = None
         self.last = estimate
@@ -286,7 +287,8 @@ class Result:
         if estimate is not self.last:
             self.last, self._settled = estimate, estimate.belief
 
-    def _record(self, estimate: Estimate, keeps: bool) -> Record:
+    def record(self, estimate: Estimate, keeps: bool) -> Record:
+        """Return what is kept of an estimate; `keeps`: with its fields."""
         return Record(
             estimate.t,
             np.array(self._readout(estimate.belief)),
@@ -300,15 +302,16 @@ class Result:
 
     def snapshot(self, estimate: Estimate) -> Snapshot:
         """Return the fields at the vertices."""
-        space, told = self.model.parameter_space, {}
-        for name in space.fields:
+        space, told, left_out = self.model.parameter_space, {}, {}
+        for name, field in space.fields.items():
             left = estimate.belief.modes_left(space.part(name))
             if len(left):
                 told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
+                left_out[name] = estimate.belief.left_out(field.at_vertices, space.part(name))
         profiles = self._profiles(estimate).items()
         order = vertex_order(self.model)
         ordered = {name: values[order] for name, values in profiles}
-        return Snapshot(ordered, told, _correlation(estimate))
+        return Snapshot(ordered, told, _correlation(estimate), left_out)
 
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
         """Return values and deviations of all fields at the vertices."""
@@ -338,9 +341,10 @@ class Result:
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
         with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
         law with covariance also `_left`, the share of the prior deviation of a number that is left;
-        `_modes`, of how many modes of a field the data have told, over `snapshot`; and
-        `correlation` of the last numbers, over (`unknown`, `other`). The attribute `verdict` is
-        what `Verdict.to_dict` gives, as JSON.
+        `_modes`, of how many modes of a field the data have told, and `_left_out`, the share of the
+        modes that the law leaves out in its mean variance, over `snapshot`; and `correlation` of
+        the last numbers, over (`unknown`, `other`). The attribute `verdict` is what
+        `Verdict.to_dict` gives, as JSON.
         """
         records, last = RecordArrays.of(self.records), None
         if self.last is not None and self._settled is not None:
@@ -354,6 +358,26 @@ class Result:
         if self.last is not None:
             data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
         return data
+
+    def smoothed(self) -> xr.Dataset:
+        """Return a dataset of what unknowns and state were, given all samples of the run.
+
+        Names as in `to_xarray`; intervals are those given all samples. The samples are taken again
+        at least twice: see `Identifier.smoothed`.
+
+        Raises
+        ------
+        ConfigurationError
+            Estimates that were added one by one.
+        LawError
+            A law without a covariance that a smoother could follow.
+        """
+        if self.smoother is None:
+            raise ConfigurationError(
+                "Result.smoothed: the samples of this result are not known; call "
+                "Identifier.smoothed(stream) of a new identifier."
+            )
+        return self.smoother()
 
     def table(self) -> dict[str, dict[str, float]]:
         """Return the last estimates and the root mean square errors of all sensors.

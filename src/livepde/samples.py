@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,8 +13,23 @@ from numpy.typing import ArrayLike
 from livepde.errors import SampleError
 from livepde.linalg import Array
 from livepde.observation import Observed
+from livepde.stepping import own_noise
 
-__all__ = ["Sample", "labelled", "number", "numbers", "plan", "readings", "sample_of"]
+__all__ = [
+    "Readings",
+    "Sample",
+    "by_name",
+    "check_noise",
+    "labelled",
+    "noise_channel",
+    "number",
+    "numbers",
+    "plan",
+    "readings",
+    "sample_of",
+]
+
+Readings: TypeAlias = ArrayLike | Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -27,13 +42,15 @@ class Sample:
         Time, in the unit of the model.
     z
         Measurements: an array of shape (sensors,), or channel name -> value for everything that
-        was measured at t (sensors, inputs, withheld channels). NaN or absent: missing.
+        was measured at t (sensors, inputs, withheld channels). NaN or absent: missing. A sensor
+        may have a pair (value, standard deviation of its noise), an array the shape (sensors, 2),
+        and a mapping the noise by itself: "noise of T_1". NaN: the noise that the sensor states.
     inputs
         Input and boundary channels, if they are not in z.
     """
 
     t: float
-    z: ArrayLike | Mapping[str, float]
+    z: Readings
     inputs: Mapping[str, float] | None = None
 
 
@@ -49,6 +66,47 @@ def sample_of(item: Any) -> Sample:
         f"a stream gives (t, z), (t, z, inputs) or livepde.Sample; got {item!r:.60}; a pandas "
         "table whose index are the times and whose columns are channels gives them by .iterrows()."
     )
+
+
+def noise_channel(name: str) -> str:
+    """Return by which name a sample has the noise of a reading.
+
+    >>> noise_channel("T_1")
+    'noise of T_1'
+    """
+    return f"noise of {name}"
+
+
+def check_noise(name: str, value: Any) -> float:
+    """Return the standard deviation of a reading, NaN if it is that of the sensor."""
+    found = number(value, noise_channel(name))
+    if found <= 0.0:
+        raise SampleError(
+            f"{noise_channel(name)}: got {found:g}; a standard deviation must be positive (NaN: "
+            "that of the sensor)."
+        )
+    return found
+
+
+def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return readings as channel -> number, noise by a name of its own.
+
+    Parameters
+    ----------
+    z
+        Readings of a sample.
+    names
+        Sensors whose values an array holds.
+    """
+    if not isinstance(z, Mapping):
+        z = dict(zip(names, np.atleast_1d(z).tolist(), strict=True))
+    found = {}
+    for name, value in z.items():
+        if isinstance(value, tuple | list) and len(value) == 2:
+            found[name], found[noise_channel(name)] = value
+        else:
+            found[name] = value
+    return found
 
 
 def labelled(z: Any) -> Any:
@@ -100,11 +158,26 @@ def plan(name: str, values: Any, count: int) -> Array:
     return np.broadcast_to(found, (count,))
 
 
-def readings(z: Any, observed: Observed) -> Array:
-    """Return the measurements of all sensors, shape (sensors,), as an array of their own."""
+def _are_pairs(z: Any, size: int) -> bool:
+    """Return whether z holds a pair for each of so many sensors."""
+    try:
+        return bool(np.shape(z) == (size, 2))
+    except ValueError:  # rows of several lengths
+        return False
+
+
+def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
+    """Return the measurements of all sensors, shape (sensors,), as an array of their own.
+
+    And the noise of each, None if none has one of its own.
+    """
     usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
     if usual and np.isfinite(z).all():
-        return np.array(z)
+        return np.array(z), None
+    if _are_pairs(z, observed.size):
+        named = list(zip(observed.names, z, strict=True))
+        noise = own_noise([check_noise(name, std) for name, (_, std) in named])
+        return readings([value for _, (value, _) in named], observed)[0], noise
     if (
         np.asarray(z).dtype.kind in "USb"
         if not isinstance(z, list | tuple)
@@ -120,9 +193,10 @@ def readings(z: Any, observed: Observed) -> Array:
     if array.shape != (observed.size,):
         raise SampleError(
             f"z has shape {array.shape}; the observation has {observed.size} sensors, so it "
-            f"needs ({observed.size},), NaN where a sample is missing."
+            f"needs ({observed.size},), NaN where a sample is missing, or ({observed.size}, 2): "
+            "each with its noise."
         )
     if np.isinf(array).any():
         where = observed.names[int(np.flatnonzero(np.isinf(array))[0])]
         raise SampleError(f"channel '{where}' is infinite; send NaN for a missing sample.")
-    return array.copy()
+    return array.copy(), None

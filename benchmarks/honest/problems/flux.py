@@ -29,6 +29,7 @@ class _Drifting(Problem):
     length, intervals = 10.0, 200
     noise = 0.02
     channels = MappingProxyType({"T_right": waves(10.0, (0.3, 2.0), (0.2, 7.0))})
+    moving = ("J",)
 
     def __init__(self) -> None:
         self.coordinates = 2 + self.intervals

@@ -79,7 +79,10 @@ class Prepared:
     @cached_property
     def identifier(self) -> Identifier:
         """The identifier, before the first sample."""
-        return self.identifier_with(self.case.law)
+        identifier = self.identifier_with(self.case.law)
+        if self.case.smoothed and (why := identifier.unsmoothed):
+            raise self.case.frame.error("output.smoothed", f"{why}; leave it out.")
+        return identifier
 
     def identifier_with(self, law: AnyLaw, sensors: Observation | None = None) -> Identifier:
         """Return an identifier for the same case with another law, and with other sensors."""
@@ -280,6 +283,11 @@ class Case:
     def fields_every(self) -> int:
         """Fields of every so many samples are kept."""
         return self.frame.spec.output.fields_every
+
+    @property
+    def smoothed(self) -> bool:
+        """Whether a finished run ends with the smoother."""
+        return self.frame.spec.output.smoothed
 
     @cached_property
     def mesh(self) -> Any:

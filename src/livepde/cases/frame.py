@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from livepde.cases.limits import LARGEST, SMALLEST
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import CaseSpec, ChannelSpec
 from livepde.cases.units import convert
@@ -64,6 +65,9 @@ class Frame:
         number = self.convert(value, unit, key, difference=True)
         if not number > 0:
             raise self.error(key, f"got {value!r}; expected more than 0.")
+        if not SMALLEST <= number <= LARGEST:
+            text = f"got {value!r}; expected a number from {SMALLEST:g} to {LARGEST:g}."
+            raise self.error(key, text)
         return number
 
     def pair(self, pair: tuple[Any, Any], unit: str, key: str) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.frame import Frame
+from livepde.cases.limits import MEMBERS
 from livepde.cases.schema import CaseSpec, ChannelSpec
 from livepde.fem import MeanReverting, Scalars, Unknown
 from livepde.observation import Calibrated, Observation
@@ -25,6 +26,8 @@ def expanded(frame: Frame) -> Frame:
             continue
         start, stop, count = channel.each
         unit, key = frame.equation.length_unit, f"channels.{name}.each"
+        if count > MEMBERS:
+            raise frame.error(key, f"got {count} channels; expected at most {MEMBERS}.")
         ends = (frame.convert(start, unit, key), frame.convert(stop, unit, key))
         for k, x in enumerate(np.linspace(*ends, count).tolist()):
             member = {"each": None, "at": x, "column": str(channel.column).replace("{}", str(k))}

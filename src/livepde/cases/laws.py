@@ -23,6 +23,7 @@ from livepde.laws import (
     Replay,
     ResidualDamping,
     SensitivityLaw,
+    Shadows,
 )
 
 __all__ = ["law_of"]
@@ -48,7 +49,8 @@ def _gradient(spec: GradientSpec) -> GradientLaw:
 
 def _auto(frame: Frame, spec: AutoSpec) -> AutoLaw:
     noise = None if spec.noise is None else _level(frame, spec.noise)
-    return AutoLaw(spec.modes, noise, gate=spec.gate)
+    shadows = _chosen(Shadows, spec.shadows)
+    return AutoLaw(spec.modes, noise, gate=spec.gate, shadows=shadows)
 
 
 def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
@@ -60,6 +62,7 @@ def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
         "gate": spec.gate,
         "jumps": _jumps(frame, spec),
         "guards": _chosen(Guards, spec.guards),
+        "shadows": _chosen(Shadows, spec.shadows),
     }
     replay = _chosen(Replay, spec.replay)
     return SensitivityLaw(spec.modes, _noise(frame, spec), drift, memory, replay, **more)

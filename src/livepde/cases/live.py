@@ -16,7 +16,7 @@ from livepde.cases.data import read_data
 from livepde.cases.sources import Data, limits_of, policy_of, publishers_of, source_of
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
-from livepde.runs.feeds import Feed, Gathered, Paced, Samples
+from livepde.runs.feeds import Feed, Gathered, Paced, Samples, shifted
 from livepde.runs.journal import Journal
 from livepde.runs.live import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
@@ -56,6 +56,9 @@ class Wiring:
         The case as its first sample found it; None before that.
     silent
         Nothing has come for too long while the first sample was waited for.
+    why
+        Why all is not well meanwhile, in one sentence: the source is silent, or what comes is
+        refused; empty if it is.
 
     Raises
     ------
@@ -75,6 +78,7 @@ class Wiring:
         self.case = case
         self.prepared: Prepared | None = None
         self.silent = False
+        self.why = ""
         # Before anything is connected: a case that is wrong says so at once.
         self._policy, self._limits = policy_of(case.frame), limits_of(case.frame)
         self._path = path
@@ -138,6 +142,8 @@ class Wiring:
             self.prepared, waiting = found
         if self._journal is None:
             self._journal = self._stack.enter_context(self.prepared.journal(self._path))
+        if self._intake is not None:
+            self._intake.past = self._journal
         backlog, retention, silence = self._limits
         live = Live(
             self.prepared.identifier,
@@ -175,10 +181,11 @@ class Wiring:
         while not (stopping.is_set() or self._feed.done):
             found = list(self._feed.poll(LOOK))
             if self._feed.heard():
-                heard, self.silent = time.monotonic(), False
+                heard, self.silent, self.why = time.monotonic(), False, ""
             elif not self.silent and time.monotonic() - heard > silence:
                 self.silent = True
-                LOG.warning("silent: nothing from the source for %.0f s", silence)
+                self.why = f"nothing has come from the source for more than {silence:g} s"
+                LOG.warning("silent: %s", self.why)
             remarks = self._feed.remarks(found)
             new = [one for one in remarks if (one.kind, one.channel) not in irregular]
             for remark in remarks:
@@ -189,6 +196,7 @@ class Wiring:
                     return self.case.begin(Sample(found[0].t, values), self._start), found
                 except DataError as error:
                     why = str(error).removesuffix(".")
+                self.why = f"the run cannot begin yet: {why}"
                 if why != told:
                     told = why
                     LOG.warning("cannot begin yet: %s", why)
@@ -215,6 +223,7 @@ class Wiring:
             self._origin = table.origin
             return Samples(table, after=last)
         begun = None if journal is None else journal.layout.attrs.get("origin")
+        shift, position = shifted("" if journal is None else journal.position)
         self._intake = Intake(
             case.columns,
             case.clock,
@@ -223,9 +232,10 @@ class Wiring:
             origin=None if journal is None else _seconds(begun),
             dates=None if journal is None else begun is not None,
             last=last,
+            shift=shift,
             recent=[(one.t, one.values) for one in journal.recent(RECENT)] if journal else (),
         )
-        position = "" if journal is None else journal.position
+        self._intake.past = journal
         return Gathered(source_of(case.frame, data, position), self._intake)
 
 

@@ -82,7 +82,7 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     ):
         return _advise_moving(prepared, law, list(samples))
     silent = replace(prepared, assimilate_from=np.inf)
-    identifier = silent.identifier_with(SensitivityLaw(law.modes, law.noise))
+    identifier = silent.identifier_with(SensitivityLaw(law.modes, law.noise, shadows=None))
     values, positions, part = _candidates(prepared)
     noise = _noise(identifier, law)
     known: dict[str, float] = {}

@@ -88,7 +88,7 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
     if not isinstance(law, SensitivityLaw):
         return None
     replay = Replay(NEVER, NEVER)
-    return StatedNoise(law.modes, law.noise, law.drift, replay=replay, gate=np.inf)
+    return StatedNoise(law.modes, law.noise, law.drift, replay=replay, gate=np.inf, shadows=None)
 
 
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:

@@ -9,6 +9,7 @@ import numpy as np
 
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import unknowns_of
+from livepde.cases.limits import check_cells
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
@@ -51,9 +52,12 @@ def mesh_of(frame: Frame) -> Any:
         y = [frame.convert(node, unit, "mesh.y") for node in spec.y]
         if isinstance(spec.cells, tuple):
             number = spec.cells
+            check_cells(float(number[0]) * number[1], frame.where("mesh.cells"))
             return _built(frame, "mesh", lambda: rectangle((x[0], x[1]), (y[0], y[1]), number))
+        check_cells(float(len(x)) * len(y), frame.where("mesh"))
         return _built(frame, "mesh", lambda: grid(x, y))
     cells: Any = spec.cells  # a number: the schema has seen to it
+    check_cells(cells, frame.where("mesh.cells"))
     start = frame.convert(spec.start, unit, "mesh.from")
     stop = frame.convert(spec.stop, unit, "mesh.to")
     if not start < stop:

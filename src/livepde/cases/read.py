@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from livepde.cases.limits import check_document, check_text
 from livepde.cases.schema import (
     AutoSpec,
     CaseSpec,
@@ -26,6 +27,7 @@ from livepde.cases.schema import (
     OutputSpec,
     ReplaySpec,
     SensitivitySpec,
+    ShadowsSpec,
     StepsSpec,
     UnknownSpec,
     VariantSpec,
@@ -38,6 +40,7 @@ BLANK = "?"  # how a value begins that is still to be filled in
 LONGEST = 1_000_000  # bytes of a case file
 DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no case
 SHOWN = 60  # characters of a line that is shown
+LONGEST_SHOWN = 200  # characters of a value that is shown
 
 EXPECTED = {
     "int_type": "a whole number",
@@ -63,6 +66,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "unknowns.*": UnknownSpec,
     "channels.*": ChannelSpec,
     "law.guards": GuardsSpec,
+    "law.shadows": ShadowsSpec,
     "law.jumps": JumpsSpec,
     "law.replay": ReplaySpec,
     "variants.*": VariantSpec,
@@ -106,12 +110,17 @@ def _nearest(folder: Path, name: str) -> str:
 
 def read_toml(text: str, where: str) -> dict[str, Any]:
     """Return the document of a case file; raises `CaseError`."""
+    check_text(text, where)
     try:
-        return tomllib.loads(text)
+        document = tomllib.loads(text)
     except RecursionError as error:
         raise CaseError(f"{where}: is not valid TOML: {error}.") from None
     except tomllib.TOMLDecodeError as error:
         raise CaseError(f"{where}: is not valid TOML: {error}{_line(text, str(error))}.") from None
+    except ValueError as error:  # a number or a date that Python cannot hold
+        raise CaseError(f"{where}: is not valid TOML: {error}.") from None
+    check_document(document, where)
+    return document
 
 
 def _line(text: str, reason: str) -> str:
@@ -182,10 +191,10 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
         return f"{key}.kind: got '{tag}'; {did_you_mean(tag, ['auto', 'sensitivity', 'gradient'])}"
     if kind == "literal_error":
         choices = str(context["expected"]).replace(" or ", ", ").replace("'", "").split(", ")
-        return f"{key}: got {got!r}; {did_you_mean(str(got), choices)}"
+        return f"{key}: got {_short(got)}; {did_you_mean(str(got), choices)}"
     if kind == "value_error":
         message = str(context["error"])
-        shown = "" if isinstance(got, dict) else f"got {got!r}; "
+        shown = "" if isinstance(got, dict) else f"got {_short(got)}; "
         return f"{key}: {shown}{message}."
     expected = EXPECTED.get(kind)
     if kind == "greater_than":
@@ -193,7 +202,13 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     if expected is None:
         message = str(found["msg"])
         expected = message.removeprefix("Input should be ").removeprefix("Value should be ")
-    return f"{key}: got {got!r}; expected {expected}."
+    return f"{key}: got {_short(got)}; expected {expected}."
+
+
+def _short(value: Any) -> str:
+    """Return a value as it is shown in a sentence."""
+    text = repr(value)
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
 def _path(loc: tuple[int | str, ...], raw: Any) -> list[str]:

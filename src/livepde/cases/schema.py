@@ -28,7 +28,7 @@ from livepde.cases.values import (
     TimeFormat,
 )
 from livepde.fem import Scalar
-from livepde.laws import Guards, Jumps, Replay, SensitivityLaw
+from livepde.laws import Guards, Jumps, Replay, SensitivityLaw, Shadows
 from livepde.streams.csvfile import UTF_8
 
 __all__ = [
@@ -245,6 +245,7 @@ class ChannelSpec(Spec):
     quantity: str | None = None
     of: Name | None = None
     noise: Quantity | None = None
+    noise_column: Name | None = None
     unit: str | None = None
     offset: Quantity | None = None
     gain: PositiveFloat | None = None
@@ -299,6 +300,8 @@ class ChannelSpec(Spec):
                 'missing = "interpolate" and spikes belong to boundary and input channels; '
                 "values of sensors that are far off are refused by law.gate"
             )
+        if self.noise_column is not None and self.role not in ("sensor", "withheld"):
+            raise ValueError("noise_column belongs to sensors: leave it out")
         if self.role == "position" and self.noise is not None:
             raise ValueError("noise of a channel of role position is not possible: leave it out")
         return self
@@ -337,6 +340,15 @@ class GuardsSpec(Spec):
     past: PositiveInt = Guards.past
 
 
+class ShadowsSpec(Spec):
+    """Which discretisation errors are followed and widen what is reported."""
+
+    step: StrictBool = Shadows.step
+    mesh: StrictBool = Shadows.mesh
+    inputs: StrictBool = Shadows.inputs
+    largest: PositiveInt = Shadows.largest
+
+
 class SensitivitySpec(Spec):
     """The law for sparse, noisy sensors."""
 
@@ -349,6 +361,7 @@ class SensitivitySpec(Spec):
     gate: PositiveFloat = SensitivityLaw.gate
     jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | JumpsSpec = False
     guards: StrictBool | GuardsSpec = True
+    shadows: StrictBool | ShadowsSpec = True
 
 
 class AutoSpec(Spec):
@@ -358,6 +371,7 @@ class AutoSpec(Spec):
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
     gate: PositiveFloat = SensitivityLaw.gate
+    shadows: StrictBool | ShadowsSpec = True
 
 
 class TikhonovSpec(Spec):
@@ -407,12 +421,15 @@ class OutputSpec(Spec):
     fields_every: PositiveInt = 24
     retain: Quantity | None = None
     thin: PositiveInt = 1
+    smoothed: StrictBool = False
     mqtt: PublishSpec | None = None
 
     @model_validator(mode="after")
     def _thins_the_past(self) -> OutputSpec:
         if self.thin > 1 and self.retain is None:
             raise ValueError("thin belongs to retain = the time for which all is kept")
+        if self.smoothed and self.retain is not None:
+            raise ValueError("smoothed takes all samples again, which retain does not keep")
         return self
 
 

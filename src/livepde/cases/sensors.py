@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import partial
+from statistics import fmean
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +29,7 @@ from livepde.observation import (
     Reconstruction,
     Tikhonov,
 )
+from livepde.samples import by_name, noise_channel
 from livepde.streams import Column
 
 __all__ = [
@@ -62,7 +65,20 @@ def columns_of(frame: Frame) -> dict[str, Column]:
             needed,
             decimal=frame.spec.data.decimal,
         )
+        if channel.noise_column is not None:
+            found[noise_channel(name)] = _noise_column(frame, name, channel, rule.factor)
     return found
+
+
+def _noise_column(frame: Frame, name: str, channel: ChannelSpec, factor: float) -> Column:
+    """Return where the noise of the readings of a channel comes from, in its unit."""
+    key = f"channels.{name}.noise_column"
+    if isinstance(frame.spec.law, GradientSpec):
+        raise frame.error(key, "the gradient law does not weigh readings: leave it out.")
+    if noise_channel(name) in frame.spec.channels:
+        raise frame.error(key, f"another channel is called '{noise_channel(name)}': rename it.")
+    decimal = frame.spec.data.decimal
+    return Column((str(channel.noise_column),), factor, decimal=decimal, noise_of=name)
 
 
 def observation_of(
@@ -280,43 +296,61 @@ def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
         return frame.convert(initial, frame.equation.state.unit, "initial")
     if len(mesh.p) != 1:
         raise frame.error("initial", f"'{initial}' needs an interval; give a number.")
-    at, level, _ = _initial_readings(frame, mesh, first)
-    return lambda x: np.interp(x[0], at, level)
+    at, level = _level(_initial_readings(frame, mesh, first))
+    return partial(_interpolated, at, level)
 
 
 def initial_weights(frame: Frame, mesh: Any, first: Sample) -> dict[str, Any]:
-    """Return channel -> how an interpolated initial state changes with its reading, as x -> u.
+    """Return channel -> how an interpolated initial state changes with its reading, and its noise.
 
-    None where readings are taken as exact (`initial = "interpolate-exact"`).
+    As x -> u, and NaN for that of the sensor. Empty where readings are taken as exact (`initial =
+    "interpolate-exact"`).
     """
     if frame.spec.initial != "interpolate" or len(mesh.p) != 1:
         return {}
-    at, _, names = _initial_readings(frame, mesh, first)
-    if len(set(at)) < len(at):  # np.interp takes one of two readings at one place
-        return {}
-    unit = np.eye(len(at))
-    return {
-        name: lambda x, weight=unit[k]: np.interp(x[0], at, weight) for k, name in enumerate(names)
-    }
+    readings = _initial_readings(frame, mesh, first)
+    given = by_name(first.z, ())
+    found = {}
+    for number, one in enumerate(readings):
+        unit = [other._replace(value=float(n == number)) for n, other in enumerate(readings)]
+        weight = partial(_interpolated, *_level(unit))
+        found[one.channel] = (weight, given.get(noise_channel(one.channel), np.nan))
+    return found
 
 
-def _initial_readings(
-    frame: Frame, mesh: Any, first: Sample
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[str, ...]]:
-    """Return positions, values and channels that the initial state is interpolated from."""
+def _interpolated(at: Sequence[float], values: Sequence[float], x: Any) -> Any:
+    return np.interp(x[0], at, values)
+
+
+class _Reading(NamedTuple):
+    """A reading that the initial state is interpolated from."""
+
+    at: float
+    value: float
+    channel: str
+
+
+def _level(readings: Sequence[_Reading]) -> tuple[list[float], list[float]]:
+    """Return the places of readings, in order, and the mean of those at each place."""
+    places = sorted({one.at for one in readings})
+    return places, [fmean(one.value for one in readings if one.at == place) for place in places]
+
+
+def _initial_readings(frame: Frame, mesh: Any, first: Sample) -> list[_Reading]:
+    """Return the readings that the initial state is interpolated from."""
     ends = {"left": float(mesh.p.min()), "right": float(mesh.p.max())}
     values = dict(first.z) if isinstance(first.z, Mapping) else {}
     found = []
     for name, channel in frame.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:
-            found.append((ends[str(channel.at)], values[name], name))
+            found.append(_Reading(ends[str(channel.at)], values[name], name))
         elif channel.role == "sensor" and channel.at is not None:
-            found.append((_position(frame, mesh, name, channel), values[name], name))
-    present = sorted(item for item in found if np.isfinite(item[1]))
+            place = _position(frame, mesh, name, channel)
+            found.append(_Reading(place, values[name], name))
+    present = [one for one in found if np.isfinite(one.value)]
     if not present:
         raise MissingInputError(
             f"{frame.where('initial')}: 'interpolate' found no sensor or boundary with a value in "
             "the first sample; start later, or give a number."
         )
-    at, level, names = zip(*present, strict=True)
-    return at, level, names
+    return present

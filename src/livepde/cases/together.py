@@ -26,7 +26,17 @@ __all__ = ["Block", "blocks"]
 WAITING = 2**23  # numbers that wait to be written
 ALONE = "no other one has their settings and sample times"
 # Members may differ in how a channel is read, and in what is said about a run.
-READ = {"column", "columns", "unit", "valid", "missing", "spikes", "wait", "repeated"}
+READ = {
+    "column",
+    "columns",
+    "noise_column",
+    "unit",
+    "valid",
+    "missing",
+    "spikes",
+    "wait",
+    "repeated",
+}
 TOLD = {"title", "initial", "data", "intake", "reference", "expect", "variants"}
 
 
@@ -185,8 +195,12 @@ class Block:
         if journal.accepted != self._written:
             raise RunError(f"{journal.path.parent} is being written by another process: stop it.")
         table = self._tables[k]
-        columns = [table.names.index(name) for name in journal.channels]
-        rows = table.values[self._written : self._taken, columns]
+        names, rows = journal.channels, table.values[self._written : self._taken]
+        if not set(journal.noise).isdisjoint(table.names):
+            names += journal.noise
+        absent = np.full((len(rows), 1), np.nan)
+        places = [table.names.index(name) if name in table.names else -1 for name in names]
+        rows = np.hstack([rows, absent])[:, places]
         for event in self._events[k]:
             journal.note(event)
         self._events[k].clear()

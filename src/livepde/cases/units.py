@@ -9,13 +9,24 @@ from functools import cache
 from tokenize import TokenError
 from typing import Any
 
+from livepde.cases.limits import LARGEST, check_unit
 from livepde.errors import CaseError
 
 __all__ = ["SI", "Affine", "conversion", "convert", "in_si"]
 
 KINDS = (("s", "min", "h", "d"), ("mm", "cm", "m", "ft"), ("degC", "K", "degF"))  # for hints
 # What pint's parser lets through for text that is no unit at all.
-NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
+NOT_A_UNIT = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    MemoryError,
+    RecursionError,
+    SyntaxError,
+    TokenError,
+    TypeError,
+    ValueError,
+)
 QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$")
 
 
@@ -124,6 +135,8 @@ def convert(value: float | str, unit: str, where: str, *, difference: bool = Fal
             + (f' in {unit}, or text with a unit as "1 {unit}".' if unit else " without a unit.")
         )
     number, given = float(match[1]), match[2]
+    if abs(number) > LARGEST:
+        raise CaseError(f"{where}: got {number:g}; expected less than {LARGEST:g}.")
     if given.startswith(","):
         raise CaseError(f"{where}: got '{value}'; decimals need a point.")
     if not given:
@@ -139,6 +152,7 @@ def conversion(given: str, unit: str, where: str) -> Affine:
         return Affine()
     if (given, unit) in USUAL:
         return Affine(*USUAL[given, unit])
+    check_unit(given, where)
     pint = _pint()
     registry = _registry()
     try:
@@ -168,9 +182,10 @@ def in_si(unit: str) -> SI | None:
     """
     registry = _registry()
     try:
+        check_unit(unit, "a unit")
         parsed = registry.parse_units(unit)
         zero, one, two = (registry.Quantity(k, parsed).to_base_units() for k in (0.0, 1.0, 2.0))
-    except (_pint().PintError, *NOT_A_UNIT):
+    except (_pint().PintError, CaseError, *NOT_A_UNIT):
         return None
     if not math.isclose((two - one).magnitude, (one - zero).magnitude):
         return None

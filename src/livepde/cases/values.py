@@ -61,7 +61,7 @@ def _time_format(value: str) -> str:
     try:
         if datetime.strptime(moment.strftime(value), value).date() == moment.date():
             return value
-    except ValueError:
+    except (ValueError, re.error):  # the latter of a part that stands twice
         pass
     raise ValueError("expected year, month, day and time, as '%d.%m.%Y %H:%M'")
 

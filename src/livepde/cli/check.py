@@ -148,12 +148,12 @@ def _show_wiring(console: Console, case: Case) -> None:
     policy, unit = policy_of(case.frame), case.frame.equation.time_unit
     rows = []
     for name, column in case.columns.items():
-        habit, spec = policy.habit(name), case.frame.spec.channels[name]
+        habit, spec = policy.habit(name), case.frame.spec.channels[column.noise_of or name]
         low, high = column.valid
         rows.append(
             (
                 name,
-                spec.role,
+                "noise" if column.noise_of else spec.role,
                 ", ".join(column.names),
                 "" if math.isinf(high - low) else f"{low:g} to {high:g} {case.frame.unit(name)}",
                 f"{max(policy.wait, habit.wait):g} {unit}".rstrip(),
@@ -205,13 +205,14 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: Sample
         least, largest = (
             (f"{present.min():.4g}", f"{present.max():.4g}") if len(present) else ("–", "–")
         )
+        of = case.columns[name].noise_of
         rows.append(
             (
                 name,
-                case.frame.spec.channels[name].role,
+                "noise" if of else case.frame.spec.channels[name].role,
                 least,
                 largest,
-                case.frame.unit(name),
+                case.frame.unit(of).replace("degC", "K") if of else case.frame.unit(name),
                 len(values) - len(present),
                 _longest_gap(np.isfinite(values)),
             )

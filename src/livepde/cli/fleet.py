@@ -300,8 +300,8 @@ class Runs:
             block.run([self.folder / name / JOURNAL for name in writers])
             for k, (name, writer) in enumerate(writers.items()):
                 with block.ended(k) as (identifier, driven):
-                    case = block.members[name].case
-                    dataset, _, checks, _ = concluded(case, identifier, driven, writer, draw=False)
+                    one = (block.members[name], identifier, driven, writer)
+                    dataset, _, checks, _ = concluded(*one, draw=False)
                 ended[name] = _ended(name, driven, dataset, checks)
         except LivepdeError as error:  # no room, say: it concerns all that are not through
             for name in block.members.keys() - ended.keys():
@@ -319,8 +319,8 @@ class Runs:
             with ExitStack() as stack:
                 write = partial(self._writer, member, case)
                 writer, (_, driven) = batch(prepared, target, write, stack, quiet=True)
-                identifier = prepared.identifier
-                dataset, _, checks, _ = concluded(case, identifier, driven, writer, draw=False)
+                one = (prepared, prepared.identifier, driven, writer)
+                dataset, _, checks, _ = concluded(*one, draw=False)
         except LivepdeError as error:
             return Ended(name, "failed", error=str(error))
         return _ended(name, driven, dataset, checks)

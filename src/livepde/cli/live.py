@@ -104,8 +104,14 @@ class _Health:
 
     def __call__(self) -> Mapping[str, Any]:
         if self.live is None:
-            silent, status = self._wiring.silent, "waits for the first sample"
-            return {"ok": not silent, "samples": 0, "silent": silent, "status": status}
+            why, status = self._wiring.why, "waits for the first sample"
+            return {
+                "ok": not why,
+                "why": why,
+                "samples": 0,
+                "silent": self._wiring.silent,
+                "status": status,
+            }
         return self.live.health
 
 

@@ -56,20 +56,20 @@ def report(
     if theory:
         _report_theory(runs.open(folder), data, as_json, allow_code)
         return
-    from livepde.runs.directory import markdown
+    from livepde.runs.directory import drawn_into, markdown, write_text
+    from livepde.runs.outcome import attempted
 
     opened = runs.open(folder)
-    shown = [*opened.summary(), *opened.arrivals()]
-    checks = opened.checks
+    found, checks, notes = opened.dataset, opened.checks, opened.notes
+    nothing: list[Any] = []
+    shown = attempted("The tables", opened.summary, nothing, notes)
+    shown = [*shown, *attempted("The table of irregular rows", opened.arrivals, nothing, notes)]
     console = terminal(err=as_json)
-    notes = opened.notes
-    figures = figures_of(opened.dataset, opened.title) if can_draw(console) else {}
-    drawn = [f"{name}.png" for name in figures]
+    figures = figures_of(found, opened.title) if can_draw(console) else {}
     try:
-        for name, draw in figures.items():
-            draw().savefig(folder / f"{name}.png", dpi=120)
+        drawn = drawn_into(folder, figures, notes)
         text = markdown(opened.title, shown, checks, notes, drawn)
-        (folder / "report.md").write_text(text, encoding="utf-8")
+        write_text(folder / "report.md", text)
     except OSError as error:
         raise RunError(f"{folder} cannot be written: {error.strerror or error}.") from error
     if as_json:

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -36,7 +36,7 @@ from livepde.cli.printing import (
     show,
     terminal,
 )
-from livepde.errors import ConfigurationError
+from livepde.errors import ConfigurationError, LivepdeError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -169,8 +169,7 @@ def run(
             writer.finish(status="interrupted", notes=["Ended before the first sample."])
             raise typer.Exit(INTERRUPTED)
         prepared, driven = taken
-        identifier = prepared.identifier
-        dataset, shown, checks, notes = concluded(loaded, identifier, driven, writer)
+        dataset, shown, checks, notes = concluded(prepared, prepared.identifier, driven, writer)
     if driven.error is not None:
         raise driven.error
     if as_json:
@@ -258,7 +257,12 @@ def batch(
 
 
 def concluded(
-    loaded: Case, identifier: Identifier, driven: Driven, writer: RunWriter, *, draw: bool = True
+    prepared: Prepared,
+    identifier: Identifier,
+    driven: Driven,
+    writer: RunWriter,
+    *,
+    draw: bool = True,
 ) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
     """Write what a run gave; return its dataset, tables, checks and notes.
 
@@ -277,14 +281,24 @@ def concluded(
         verdict,
         verdict_table,
     )
+    from livepde.runs.outcome import attempted
 
-    dataset = driven.result.to_xarray()
-    found = verdict(dataset)
-    judged = [verdict_table(found)] if len(driven.result) else []
-    shown = [*judged, *tables(dataset), *arrivals(driven.journal)]
-    checks = checks_of(loaded.expected, dataset)
+    loaded = prepared.case
+    notes: list[str] = []
+    nothing: list[Any] = []
+    found = attempted("The estimate of the end", driven.result.to_xarray, None, notes)
+    dataset = driven.journal.dataset() if found is None else found
+    writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
+    judged = attempted("The verdict", lambda: [verdict_table(verdict(dataset))], nothing, notes)
+    shown = [
+        *(judged if len(driven.result) else []),
+        *attempted("The tables", lambda: tables(dataset), nothing, notes),
+        *attempted("The table of irregular rows", lambda: arrivals(driven.journal), nothing, notes),
+    ]
+    checks = attempted("The checks", lambda: checks_of(loaded.expected, dataset), nothing, notes)
     driving = loaded.frame.roles("boundary", "input")
-    notes = [*loaded.notes, *doubts(dataset), *input_notes(driven.journal, driving)]
+    notes[:0] = [*loaded.notes, *attempted("The doubts", lambda: doubts(dataset), nothing, notes)]
+    notes += input_notes(driven.journal, driving)
     if (engine := in_use()) is not None:
         notes.append(f"Large systems were solved by {engine.reason}.")
         if "resumed" in writer.record:
@@ -293,7 +307,11 @@ def concluded(
                 "these solvers, not to the last digit."
             )
     if len(driven.result):
-        notes += _traded(loaded, identifier)
+        notes += attempted("Identifiability", lambda: _traded(loaded, identifier), nothing, notes)
+        if loaded.smoothed:
+            smooth = partial(_with_smoothed, prepared, driven, dataset)
+            dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
+            notes += told
     if driven.status == "interrupted":
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
@@ -308,6 +326,23 @@ def concluded(
         figures=figures_of(dataset, loaded.title) if draw and can_draw(terminal(err=True)) else {},
     )
     return dataset, shown, checks, notes
+
+
+def _with_smoothed(
+    prepared: Prepared, driven: Driven, dataset: xr.Dataset
+) -> tuple[xr.Dataset, list[str]]:
+    """Return the dataset of a run with what is smoothed beside it, or a note why it is not."""
+    from livepde.hindsight import with_smoothed
+
+    if driven.status != "finished" or not len(driven.result):
+        return dataset, ["Nothing is smoothed: the run has not come to its end."]
+    samples = ((taken.t, taken.values) for taken in driven.journal.taken())
+    begun = prepared.identifier_with(prepared.case.law)
+    try:
+        smoothed = begun.smoothed(samples, fields_every=prepared.case.fields_every)
+    except LivepdeError as error:  # what the run has found is kept
+        return dataset, [f"Nothing is smoothed: {error}"]
+    return with_smoothed(dataset, smoothed), []
 
 
 def _traded(loaded: Case, identifier: Identifier) -> list[str]:

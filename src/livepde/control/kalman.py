@@ -129,7 +129,8 @@ class Kalman:
             if unknown:
                 raise SampleError(f"unknown sensor '{unknown[0]}'; there are {list(sensors)}.")
             z = [number(z.get(name), f"sensor '{name}'") for name in sensors]
-        seen = readings(z, self.model.frame.sensors)
+        seen, own = readings(z, self.model.frame.sensors)
+        noise = self._noise if own is None else np.where(np.isnan(own), self._noise, own)
         if not np.isnan(self._t):
             h = t - self._t
             if not h > 0.0:
@@ -146,11 +147,11 @@ class Kalman:
         H = np.hstack([H, np.zeros((len(H), len(self._moving)))])
         used = np.isfinite(seen) & np.isfinite(expected)
         H, missed = H[used], (seen - expected)[used]
-        S = H @ self._P @ H.T + np.diag(self._noise[used] ** 2)
+        S = H @ self._P @ H.T + np.diag(noise[used] ** 2)
         gain = np.linalg.solve(S, H @ self._P).T
         self._x = self._x + gain @ missed
         left = np.eye(len(self._x)) - gain @ H  # Joseph's form stays symmetric and positive
-        self._P = left @ self._P @ left.T + (gain * self._noise[used] ** 2) @ gain.T
+        self._P = left @ self._P @ left.T + (gain * noise[used] ** 2) @ gain.T
         offset = np.zeros(len(self.model.channels))
         offset[self._moving] = self._x[r:]
         return Known(

@@ -127,6 +127,8 @@ def verdict(seen: Seen) -> list[Any]:
     if seen.status == "silent":
         last = [event for event in seen.events if event.kind == "silent"][-1]
         found.append(("bad", f"The source is silent: {last.message}."))
+    if seen.unwell:
+        found.append(("bad", f"Not well: {seen.unwell}."))
     data = seen.dataset
     if data is not None and data.sizes["time"]:
         code = STATUS_CODES[int(data["status"].values[-1])]

@@ -102,6 +102,8 @@ class Seen:
         True while there is more to read.
     events, counts
         Of the journal.
+    unwell
+        Why the run is not well, as /health says it; empty if it is.
     doubts, notes, checks
         What speaks against the estimates; what the run said else; its checks.
     written
@@ -119,6 +121,7 @@ class Seen:
     reading: bool = False
     events: Sequence[Event] = ()
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    unwell: str = ""
     doubts: Sequence[str] = ()
     notes: Sequence[str] = ()
     checks: Sequence[Check] = ()
@@ -225,7 +228,7 @@ class View:
             # The last one again: its fields may have been kept after it.
             new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]
             layout, count = journal.layout, journal.estimated
-            events, counts = journal.events, journal.counts
+            events, counts, unwell = journal.events, journal.counts, journal.health
             verdict = journal.verdict
         for number, record in new:
             self._add(number, record)
@@ -245,6 +248,7 @@ class View:
             reading=len(new) == AT_ONCE,
             events=events[-SHOWN:],
             counts=counts,
+            unwell=unwell if status == "running" else "",
         )
 
     def _add(self, number: int, record: Record) -> None:

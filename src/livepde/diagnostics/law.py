@@ -200,6 +200,9 @@ class _Wrapped(Law[Any, Any]):
 
     law: AnyLaw
 
+    def weighs_readings(self) -> bool:
+        return self.law.weighs_readings()
+
     def prepare(self, problem: Problem) -> Any:
         return self.law.prepare(problem)
 

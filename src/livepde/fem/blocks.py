@@ -88,6 +88,10 @@ class Block(ABC):
     def jet(self, parts: Local, values: Array) -> Any:
         """Return what a form gets for component values of shape (components, ..., E, P)."""
 
+    def prolongation(self, finer: Any) -> sp.csr_array:
+        """Return the matrix from coefficients to those of the same unknown on a finer mesh."""
+        return sp.csr_array(sp.eye_array(self.size))
+
     @abstractmethod
     def prior(self) -> Array:
         """Return the prior mean as coefficients, shape (size,)."""
@@ -461,6 +465,21 @@ class FieldBlock(Block):
             else:
                 u[dofs] = value
         return u
+
+    def prolongation(self, finer: FieldBlock) -> sp.csr_array:
+        """Return the matrix from coefficients to those of the same function on a finer mesh.
+
+        Raises
+        ------
+        SpaceError
+            The element is not of first order: its coefficients are not values.
+        """
+        if not self.nodal:
+            raise SpaceError(
+                f"{type(self.field.element).__name__} is not an element of first order, whose "
+                "coefficients are values."
+            )
+        return self.probe(finer.doflocs)
 
     @cached_property
     def box(self) -> tuple[Array, Array]:

@@ -295,6 +295,12 @@ class FunctionSpace:
         """Return the matrix (k, dim) that evaluates a component at points of shape (d, k)."""
         return self.widen(self.component(of)[0].probe(points, what), of)
 
+    def prolongation(self, finer: FunctionSpace) -> sp.csr_array:
+        """Return the matrix from coefficients to those of the same functions on a finer mesh."""
+        pairs = zip(self.blocks.values(), finer.blocks.values(), strict=True)
+        parts = [block.prolongation(other) for block, other in pairs]
+        return sp.csr_array(sp.block_diag(parts, format="csr"))
+
     def impose(self, coefficients: Array, moment: Moment) -> Array:
         """Return a copy of the coefficients with the Dirichlet values of all components."""
         if len(self.blocks) == 1:

@@ -30,11 +30,12 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import layout_of
-from livepde.stepping import Scheme, Span
+from livepde.samples import check_noise, noise_channel
+from livepde.stepping import Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 3  # of the checkpoint
+FORMAT = 4  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -117,13 +118,16 @@ class Fleet:
         self.model = model = self._one.model
         self.law = law
         self.problem = self._one.problem
+        if any(u0 is not u0s[0] for u0 in u0s):
+            self.problem = replace(self.problem, initial=None)
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
         self._engine: Engine = Separately(law, self._work, self.problem)
         self.note = law.stepped_alone(self._work)
         if not self.note:
-            self._engine = Together(law, self._work, [self._one.weights(one) for one in made_of])
+            readings = [self._one.initial_readings(one) for one in made_of]
+            self._engine = Together(law, self._work, readings, u0s)
         elif any(one.keys() != made_of[0].keys() for one in made_of):
             raise ConfigurationError(
                 "u0_from differs between members, which are stepped separately, as "
@@ -206,8 +210,9 @@ class Fleet:
         t
             Time, the same for all.
         z
-            Measurements, shape (members, sensors), NaN where missing; or channel name -> a number
-            for all members, or one for each.
+            Measurements, shape (members, sensors), NaN where missing, or (members, sensors, 2) with
+            the noise of each; or channel name -> a number for all members, or one for each, noise
+            as "noise of T_1".
         inputs
             Input channels, each a number for all members, or one for each; NaN holds the last one.
 
@@ -219,7 +224,8 @@ class Fleet:
         t = float(t)
         if not np.isfinite(t):
             raise SampleError(f"time t is {t}; give the time of the sample.")
-        measured, withheld, named = self._parsed(z, inputs or {})
+        measured, noise, withheld, named = self._parsed(z, inputs or {})
+        self._one.check_weighs(noise)
         last = float(self._t.max())
         if t < last or (t == last and self._samples):
             raise TimeOrderError(
@@ -237,11 +243,12 @@ class Fleet:
             self._begin(values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
         if t == last:
-            span = Span(self._t, t, self.inputs, values, values, used, used)
+            span = Span(self._t, t, self.inputs, values, values, used, used, noise=noise)
             report = self._expected(span)
             self._state = self._engine.begin(self._state, span)
         else:
-            span = Span(self._t, t, self.inputs, self._inputs, values, self._z, used)
+            ends = self._inputs, values, self._z, used
+            span = Span(self._t, t, self.inputs, *ends, noise=noise)
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
         good = np.array([status.ok for status in report.statuses])
@@ -328,14 +335,15 @@ class Fleet:
 
     def _parsed(
         self, z: Values, inputs: Mapping[str, ArrayLike]
-    ) -> tuple[Array, Array, dict[str, Array]]:
-        """Return assimilated and withheld values and inputs, all checked."""
+    ) -> tuple[Array, Array | None, Array, dict[str, Array]]:
+        """Return assimilated values and their noise, withheld values and inputs, all checked."""
         hidden = self.withheld.names if self.withheld else ()
         named: dict[str, Array] = {}
         if isinstance(z, Mapping):
             channels = self._one.channels
+            noisy = {noise_channel(name): name for name in (*self.observed.names, *hidden)}
             for name in z:
-                if name not in channels:
+                if name not in channels and name not in noisy:
                     raise SampleError(f"unknown channel '{name}'; this fleet has {list(channels)}.")
             columns = {name: self._column(name, values) for name, values in z.items()}
             nothing = np.full(len(self), np.nan)
@@ -345,10 +353,19 @@ class Fleet:
                 rows = [columns.get(name, nothing) for name in names]
                 return np.array(rows).T.reshape(*shape) if rows else np.zeros((len(self), 0))
 
+            for name in noisy.keys() & columns.keys():
+                _check_positive(noisy[name], columns[name])
             measured, withheld = table(self.observed.names), table(hidden)
+            noise = table([noise_channel(name) for name in self.observed.names])
             named = {name: columns[name] for name in self.inputs if name in columns}
         else:
-            measured = self._measured(z)
+            array = _numbers("z", z)
+            noise = np.full((len(self), self.observed.size), np.nan)
+            if array.shape == (*noise.shape, 2):
+                array, noise = array[:, :, 0], array[:, :, 1]
+            measured = self._measured(array)
+            for name, column in zip(self.observed.names, noise.T, strict=True):
+                _check_positive(name, column)
             withheld = np.full((len(self), len(hidden)), np.nan)
         for name, values in inputs.items():
             if name not in self.inputs:
@@ -356,10 +373,9 @@ class Fleet:
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
             named[name] = self._column(name, values)
-        return measured, withheld, named
+        return measured, own_noise(noise), withheld, named
 
-    def _measured(self, z: ArrayLike) -> Array:
-        array = _numbers("z", z)
+    def _measured(self, array: Array) -> Array:
         expected = (len(self), self.observed.size)
         if array.shape != expected:
             raise SampleError(
@@ -474,6 +490,12 @@ class Fleet:
         self._state = state
         if state is None and not self.inputs:
             self._begin(self._inputs)
+
+
+def _check_positive(name: str, noise: Array) -> None:
+    """Refuse a standard deviation of readings that is not positive and not NaN."""
+    for value in noise.tolist():
+        check_noise(name, value)
 
 
 def _numbers(what: str, values: ArrayLike) -> Array:

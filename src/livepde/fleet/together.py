@@ -10,7 +10,7 @@ import numpy as np
 from livepde import checkpoint
 from livepde.fem import Moment
 from livepde.fleet.engine import Beliefs, Factors
-from livepde.laws import Belief, MemberReports
+from livepde.laws import Belief, InitialReading, MemberReports
 from livepde.laws.members import join, take
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array
@@ -22,15 +22,20 @@ __all__ = ["Together"]
 class Together:
     """Steps all members of one model by `SensitivityLaw.step_members`.
 
-    `weights` say of each member which readings its initial state was made of.
+    `readings` are those that the initial state of each member was made of, `initial` how it was
+    given.
     """
 
     def __init__(
-        self, law: Any, work: SensitivityWork, weights: Sequence[Mapping[str, Array]]
+        self,
+        law: Any,
+        work: SensitivityWork,
+        readings: Sequence[Mapping[str, InitialReading]],
+        initial: Sequence[Any],
     ) -> None:
         self.law = law
         self.work = work
-        self._begins = [work.made_of(one) for one in weights]
+        self._begins = [work.made_of(*one) for one in zip(readings, initial, strict=True)]
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
 from livepde.laws.auto import AutoLaw
-from livepde.laws.base import AnyLaw, Belief, Law, Problem, Report, Status
+from livepde.laws.base import (
+    AnyLaw,
+    Belief,
+    FixedInterval,
+    InitialReading,
+    Law,
+    Problem,
+    Report,
+    Status,
+    numerical,
+)
 from livepde.laws.bounds import (
     Constants,
     ExactBound,
@@ -22,6 +32,7 @@ from livepde.laws.operators import diffusion_operator
 from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
+from livepde.laws.shadows import Shadows
 
 __all__ = [
     "AnyLaw",
@@ -33,8 +44,10 @@ __all__ = [
     "Damping",
     "ExactBound",
     "ExcitationGate",
+    "FixedInterval",
     "GradientLaw",
     "Guards",
+    "InitialReading",
     "Jumps",
     "KueglerLaw",
     "Law",
@@ -47,8 +60,10 @@ __all__ = [
     "Residual",
     "ResidualDamping",
     "SensitivityLaw",
+    "Shadows",
     "SmoothedBound",
     "Status",
     "diffusion_operator",
+    "numerical",
     "unobserved_damping",
 ]

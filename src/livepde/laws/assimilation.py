@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -149,7 +150,7 @@ def _absorbed(
         zero = np.zeros(len(x))
         finite: Mask = np.isfinite((x.u + x.du).sum(axis=1) + x.U.sum(axis=(1, 2)))
         return x, Assimilation(predicted, steps, OK, finite, zero, zero)
-    noise = filter_.noise[None]
+    noise = filter_.noise_of(span)
     if options.adaptive or x.level[0] != 1.0:
         noise = np.sqrt(x.level)[:, None] * noise
     Y, d = Y / noise[:, None], d / noise
@@ -170,9 +171,15 @@ def _absorbed(
     if filter_.judge is not None:
         x = _judged(filter_.judge, filter_, x, Y, d, used, noise, predicted, span)
     new, made = filter_.update(x, Y, d)
-    parts = {"innovations": x.innovations.add(e, measured, newest), "refused": refused}
+    parts: dict[str, Any] = {
+        "innovations": x.innovations.add(e, measured, newest),
+        "refused": refused,
+    }
     if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
+    if filter_.shadows is not None:
+        weights = used / noise
+        parts["shadows"] = filter_.shadows.updated(x, new, made, weights, span.end)
     # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
     # overflows would leave statistics that are not finite.
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)

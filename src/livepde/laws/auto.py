@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -22,7 +22,7 @@ from livepde.laws.bank import (
     say_the_same,
     scaled,
 )
-from livepde.laws.base import Belief, Law, Notes, Problem, Report
+from livepde.laws.base import Belief, FixedInterval, Law, Notes, Problem, Report
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guess import first_guess
 from livepde.laws.history import (
@@ -43,6 +43,8 @@ from livepde.laws.sensitivity_state import (
     new_window,
     restarted,
 )
+from livepde.laws.shadows import Shadows
+from livepde.laws.smoother import evidence, smoothed
 from livepde.laws.verdict import judged
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Alexander2, Interval, Scheme
@@ -95,7 +97,7 @@ class AutoLaw(Law[Bank, AutoState]):
         samples, which are assimilated then.
     replay
         Of the members whose unknowns stay; see `Replay`.
-    gate, gate_patience
+    gate, gate_patience, shadows
         As for `SensitivityLaw`.
     """
 
@@ -104,6 +106,7 @@ class AutoLaw(Law[Bank, AutoState]):
     replay: Replay = field(default_factory=Replay)
     gate: float = SensitivityLaw.gate
     gate_patience: int = 10
+    shadows: Shadows | None = field(default_factory=Shadows)
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
 
@@ -127,14 +130,18 @@ class AutoLaw(Law[Bank, AutoState]):
             replay=self.replay,
             gate=self.gate,
             gate_patience=self.gate_patience,
+            shadows=self.shadows,
         )
+
+    def weighs_readings(self) -> bool:
+        return True
 
     def prepare(self, problem: Problem) -> Bank:
         stated = self.noise is not None or problem.observed.noise is not None
         law = self.member
         if not stated:  # until it is guessed; nor is that of an initial state known
             law = replace(self.member, noise=1.0)
-            problem = replace(problem, initial_weights={})
+            problem = replace(problem, initial_readings={})
         work = law.prepare(problem)
         reduction = work.filter.reduction
         # A factor costs in proportion to its columns, and a field that drifts is the exception.
@@ -260,24 +267,29 @@ class AutoLaw(Law[Bank, AutoState]):
             weights=weights,
             count=state.count + bool(interval.present.any()),
         )
-        rested, alarm = self._rested(work, state, now)
-        return rested, self._report(work, now, members.now.member, good, reports, before, alarm)
+        rested, onset = self._rested(work, state, now)
+        return rested, self._report(work, now, members.now.member, good, reports, before, onset)
 
-    def _rested(self, work: Bank, before: AutoState, state: AutoState) -> tuple[AutoState, bool]:
-        """Return the state after those that are not needed sleep, or all wake; was it an alarm."""
+    def _rested(self, work: Bank, before: AutoState, state: AutoState) -> tuple[AutoState, int]:
+        """Return the state after those that are not needed sleep, or all wake.
+
+        Second, after an alarm, of how many samples, up to this one, innovations are too large; or
+        0.
+        """
         if state.count == before.count:
-            return state, False
+            return state, 0
         at = state.at(state.leader)
         innovations = state.members.now.innovations.newest[[at]]
         watch, alarms = JUMPS.add(state.watch, innovations)
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
+        onset = JUMPS.onset(before.watch, innovations) if alarm else 0
         stayed, stays = (work.candidates[s.leader].drift == 0.0 for s in (before, state))
         if stayed and not stays and state.count >= 2 * TRIAL:
             soon = min(state.due, state.count + TRIAL)
             state = changed(state, due=soon, pause=TRIAL)
         if alarm or state.count >= state.due:
-            return self._woken(work, state, alarm), alarm
-        return (state if state.count % CHECKED else self._pruned(work, state)), False
+            return self._woken(work, state, alarm), onset
+        return (state if state.count % CHECKED else self._pruned(work, state)), 0
 
     def _pruned(self, work: Bank, state: AutoState) -> AutoState:
         """Return the state after those members sleep that have had their time and say nothing."""
@@ -350,7 +362,7 @@ class AutoLaw(Law[Bank, AutoState]):
         good: Mask,
         reports: MemberReports,
         before: Array,
-        alarm: bool,
+        onset: int,
     ) -> Report:
         """Return the report of the mixture: predictions by the weights before the sample."""
         share = before[numbers] * good
@@ -368,7 +380,8 @@ class AutoLaw(Law[Bank, AutoState]):
                 "drift": float(weights @ drifts),
                 "drifting": float(weights @ (drifts > 0.0)),
                 "prior_scale": float(np.exp(weights @ work.scales)),
-                "jump": float(alarm),
+                "jump": float(onset > 0),
+                **({"jump_samples": float(onset)} if onset else {}),
                 "awake": float(len(awake)),
             }
 
@@ -380,9 +393,36 @@ class AutoLaw(Law[Bank, AutoState]):
         members = self.member.settled(filters, state.members)
         return state if members is state.members else changed(state, members=members)
 
+    def unsmoothed(self, work: Bank) -> str:
+        return ""
+
+    def smoothed(
+        self, work: Bank, before: AutoState, after: AutoState, data: FixedInterval
+    ) -> Iterator[Belief]:
+        """Smooth by the one member that makes all samples most probable.
+
+        Who leads at the end need not have led before.
+        """
+        if not after.known:
+            return iter([self.belief(work, after)] * (1 + len(data.intervals)))
+        after = self.settled(work, after)
+        last = take(after.members.now, after.at(after.leader))
+        begun = before if before.known else self._initial(work, before.start, after.noise)
+        filters = replace(work.filters(after.tick, after.noise), jumps=JUMPS)
+        each, chances = [], []
+        for k, chance in enumerate(work.chances.tolist()):
+            first, now = take(begun.members, begun.at(k)), changed(last, member=np.array([k]))
+            each.append((filters, first, now, data))
+            chances.append(chance + evidence(*each[-1]))
+        best = each[int(np.argmax(chances))]
+        return (self.member.member_belief(filters, x, 0) for x in smoothed(*best))
+
     def suspended(self, work: Bank, state: AutoState) -> AutoState:
         filters = work.filters(state.tick, np.ones_like(state.noise))
         return changed(state, members=self.member.suspended(filters, state.members))
+
+    def finite(self, work: Bank, state: AutoState) -> bool:
+        return self.member.finite(work.work, state.members)
 
     def belief(self, work: Bank, state: AutoState) -> Belief:
         return self.reader(work, state)()

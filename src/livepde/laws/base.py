@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from livepde.errors import LawError, LinearAlgebraError
 from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.model import Model
@@ -17,8 +18,20 @@ from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 from livepde.verdict import Verdict
 
-__all__ = ["Belief", "Law", "Notes", "Problem", "Report", "Status"]
+__all__ = [
+    "Belief",
+    "FixedInterval",
+    "InitialReading",
+    "Law",
+    "Notes",
+    "Problem",
+    "Report",
+    "Status",
+    "finite",
+    "numerical",
+]
 
+LARGEST = 1e150  # of a sum of squares: the product of two of them is finite
 REMEDIES = {
     "ok": "",
     "not_converged": "Take a smaller dt_max, a smaller gain, or less damping.",
@@ -68,6 +81,21 @@ class Status:
         return self.code if self.ok else f"{self.code}: {self.detail}. {self.remedy}"
 
 
+class InitialReading(NamedTuple):
+    """A reading that the initial state was made of.
+
+    Attributes
+    ----------
+    weight
+        How the initial state changes with it, shape (n,).
+    noise
+        Its standard deviation; NaN: that of the sensor or channel.
+    """
+
+    weight: Array
+    noise: float = np.nan
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A model and what is observed of it: where the two meet.
@@ -78,15 +106,18 @@ class Problem:
         The process, its sensors, and how steps are taken.
     input_noise
         Channel of the model -> standard deviation of its noise.
-    initial_weights
-        Channel -> how the initial state changes with its reading at the initial time, shape (n,).
+    initial_readings
+        Channel -> its reading at the initial time, if the initial state was made of it.
+    initial
+        The initial state as it was given: a number, a function of x, coefficients, or a mapping.
     """
 
     model: Model
     observed: Observed
     control: Advance
     input_noise: Mapping[str, float] = field(default_factory=dict)
-    initial_weights: Mapping[str, Array] = field(default_factory=dict)
+    initial_readings: Mapping[str, InitialReading] = field(default_factory=dict)
+    initial: Any = None
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
@@ -95,7 +126,7 @@ class Problem:
 
     def unread(self, interval: Interval) -> Interval:
         """Return an interval without the readings that the initial state was made of."""
-        used = [name in self.initial_weights for name in self.observed.names]
+        used = [name in self.initial_readings for name in self.observed.names]
         return replace(interval, z1=np.where(used, np.nan, interval.z1)) if any(used) else interval
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
@@ -172,6 +203,18 @@ class Belief:
             return None
         std = _deviation(rows @ self.q_factor[part])
         return std if self.rest is None else np.hypot(std, abs(rows) @ self.rest[part])
+
+    def left_out(self, rows: Any, part: slice) -> float:
+        """Return the share of the modes that the law leaves out in the variance of rows @ q[part].
+
+        Of the mean over the rows; 0 without a law that leaves out modes, or without variance.
+        """
+        std = self.deviation(rows, part)
+        if std is None or self.rest is None:
+            return 0.0
+        variance = float(std @ std)
+        rest = abs(rows) @ self.rest[part]
+        return float(rest @ rest) / variance if variance > 0.0 else 0.0
 
     def left(self, rows: Any) -> Array:
         """Return the share of the prior deviation that is left of each of some coefficients of q.
@@ -260,6 +303,54 @@ class Report:
     notes: Mapping[str, float] = field(default_factory=dict)
 
 
+def finite(*arrays: Array | None) -> bool:
+    """Return whether products of the squares of some arrays are finite; None counts as empty."""
+    return all(float(np.vdot(a, a)) <= LARGEST for a in arrays if a is not None)
+
+
+def numerical(error: Exception) -> Status | None:
+    """Return the status of a step that an operation on numbers has ended, None for other errors.
+
+    Such operations raise `ArithmeticError` (overflow, a singular matrix), NumPy's `LinAlgError`,
+    the `ValueError` of SciPy for arrays that are not finite, or the `RuntimeError` of SuperLU.
+    """
+    text = str(error).rstrip(".") or type(error).__name__
+    if isinstance(error, StepFailed):
+        return Status.of(error)
+    if isinstance(error, LinearAlgebraError | np.linalg.LinAlgError | ZeroDivisionError):
+        return Status("singular", text)
+    if isinstance(error, RuntimeError) and "singular" in text:
+        return Status("singular", text)
+    if isinstance(error, ArithmeticError) or (isinstance(error, ValueError) and "infs" in text):
+        return Status("not_finite", text)
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class FixedInterval:
+    """The samples of a run and its estimates, for a smoother.
+
+    Attributes
+    ----------
+    opening
+        The sample at the initial time as an interval without length, NaN where there is none.
+    intervals
+        From the initial time to the first sample that was taken later, and so on to the last.
+    q
+        Latent parameters estimated at the initial time and after each interval.
+    jumps
+        Numbers of the intervals in which unknowns may have jumped.
+    fields
+        Where the state is asked for: 0 at the initial time, k after the k-th interval.
+    """
+
+    opening: Interval
+    intervals: Sequence[Interval]
+    q: Sequence[Array]
+    jumps: Collection[int]
+    fields: Collection[int]
+
+
 Work = TypeVar("Work")
 State = TypeVar("State")
 
@@ -312,6 +403,10 @@ class Law(ABC, Generic[Work, State]):
         """
         return state
 
+    def weighs_readings(self) -> bool:
+        """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
+        return False
+
     def suspended(self, work: Work, state: State) -> State:
         """Return the state without what `step` does in parts and has not ended; here the same.
 
@@ -319,12 +414,38 @@ class Law(ABC, Generic[Work, State]):
         """
         return state
 
+    def unsmoothed(self, work: Work) -> str:
+        """Return why the law smooths nothing, empty if it has `smoothed`."""
+        return f"{type(self).__name__} has no covariance that a smoother could follow"
+
+    def smoothed(
+        self, work: Work, before: State, after: State, data: FixedInterval
+    ) -> Iterator[Belief]:
+        """Iterate over beliefs given all samples of a run, from the last one to the initial time.
+
+        Where the state is not asked for the belief has no coefficients of it.
+
+        Parameters
+        ----------
+        before, after
+            State before the first and after the last sample.
+        """
+        raise LawError(f"smoothed: {self.unsmoothed(work)}.")
+
     def stepped_alone(self, work: Work) -> str:
         """Return why the members of a fleet are stepped one by one; empty if as arrays.
 
         A law that steps them as arrays has `begin_members`, `step_members` and `member_belief`.
         """
         return f"{type(self).__name__} steps one at a time"
+
+    def finite(self, work: Work, state: State) -> bool:
+        """Return whether what is believed is finite, with its squares; here it is computed.
+
+        A law whose belief is not cheap overrides this by the arrays that it is made of.
+        """
+        belief = self.belief(work, state)
+        return finite(belief.q, belief.u, belief.q_factor, belief.u_factor)
 
     @abstractmethod
     def belief(self, work: Work, state: State) -> Belief:

@@ -15,24 +15,27 @@ For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import lapack
 
+from livepde.fem import Moment
 from livepde.laws.base import Problem
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.members import changed
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensors import MemberSensors
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, BlockFactor, IntArray, Mask
 from livepde.stepping import (
     Interval,
     MemberStage,
+    Moments,
     Span,
     StageOfMembers,
     StepFailed,
@@ -40,7 +43,7 @@ from livepde.stepping import (
 )
 from livepde.verdict import Judge
 
-__all__ = ["Filter", "Update"]
+__all__ = ["Filter", "FollowedErrors", "MeanFilter", "Update"]
 
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once
@@ -75,6 +78,32 @@ class Update(NamedTuple):
         return spread
 
 
+class FollowedErrors(Protocol):
+    """Errors of the discretisation, followed beside a filter: `livepde.laws.shadows`."""
+
+    def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
+        """Return what is known of one member at the start; None stands for no moment yet."""
+        ...
+
+    def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
+        """Return the state after a span, from those before and after, with the errors in it."""
+        ...
+
+    def updated(
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
+    ) -> ShadowState:
+        """Return what is known after a sample; weights: one over noise, (members, sensors)."""
+        ...
+
+    def notes(self, x: FilterState) -> dict[str, Array]:
+        """Return notes on the errors, each of shape (members,)."""
+        ...
+
+    def widening(self, x: FilterState) -> tuple[Array, Array]:
+        """Return the row of [U C] that is reported for all of them, (members, 1, n or k)."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Filter:
     """Predicts and updates, linear about the point of a `FilterState`.
@@ -97,6 +126,8 @@ class Filter:
         Time after which what the state knows of the unknowns has faded to 1/e.
     judge
         Keeps the sums that a verdict is drawn from; None: there is none.
+    shadows
+        What follows the discretisation error; None: nothing does.
     """
 
     problem: Problem
@@ -109,6 +140,7 @@ class Filter:
     drift: Array
     fading: float = np.inf
     judge: Judge | None = None
+    shadows: FollowedErrors | None = None
 
     def drifts(self, member: IntArray) -> Array:
         """Return the drift of some members."""
@@ -122,6 +154,16 @@ class Filter:
     def span(self, interval: Interval) -> Span:
         """Return the interval of one process as that of its one member."""
         return Span.of(self.problem.control.over(interval), self.problem.channels)
+
+    def noise_of(self, z: Span | Interval) -> Array:
+        """Return the standard deviation of each reading at the end, shape (members or 1, sensors).
+
+        That of the reading where it has one, else that of the sensor.
+        """
+        if z.noise is None:
+            return self.noise[None]
+        noise: Array = np.where(np.isnan(z.noise), self.noise, z.noise)
+        return np.atleast_2d(noise)
 
     def estimate(self, x: FilterState) -> Array:
         """Return the estimated latent parameters, not yet bounded, shape (members, m)."""
@@ -154,6 +196,7 @@ class Filter:
             past=_extended(x.past, len(grows)),
             causes=_extended(x.causes, len(grows)),
             age=x.age + h,
+            shadows=changed(x.shadows, a=x.shadows.a @ F.T),
         )
 
     def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
@@ -161,14 +204,16 @@ class Filter:
 
         What unknowns gain in one substep is independent of what they gain in the next.
         """
-        end, taken, failure = self._propagated(x, span)
+        end, taken, failure = self.carried(x, span)
         if failure is None and self.problem.input_noise:
-            end, failure = with_input_noise(self._propagated, self.problem, x, end, span)
+            end, failure = with_input_noise(self.carried, self.problem, x, end, span)
         if failure is not None:
             return x, taken, failure
+        if self.shadows is not None:
+            end = self.shadows.predicted(x, end, span)
         return self._faded(end, span), taken, None
 
-    def _propagated(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+    def carried(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a span whose inputs are known exactly."""
         length = span.t1 - span.start
         count = self.problem.control.count(length) if self.moves else 1
@@ -193,10 +238,15 @@ class Filter:
         """Return the state at the end of a part of a span."""
         end, kept, deviates = self.predict_unknowns(x, stop - start), x.kept, not x.centred
         off = x.off_centre if deviates else np.zeros(len(x), dtype=bool)
+        shadows = x.shadows.u.shape[1]
 
         def directions(at: FilterState) -> Array:
             C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C
-            return self.reduction.directions(at.q, C)
+            found = self.reduction.directions(at.q, C)
+            if not shadows:  # which change no number of the others
+                return found
+            apart = self.reduction.directions(at.q, at.shadows.a)
+            return np.concatenate([found, apart], axis=1)
 
         at_end = directions(end)
         factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
@@ -208,18 +258,23 @@ class Filter:
                 now = self.predict_unknowns(x, t - start)
                 q, along = now.q, directions(now)
             same = factors if q is end.q else {}
-            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same)
+            work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same, shadows)
             y, kept = self.stage.advance(columns, work)
             return y
 
         last = [end.du[None]] if deviates else []
+        if shadows:
+            last.append(end.shadows.u.transpose(1, 0, 2))
         columns = np.concatenate([end.u[None], end.U.transpose(1, 0, 2), *last])
         columns, steps, failure = advance(self.problem.control, stage, columns, start, stop)
         if failure is not None:
             return x, steps, failure
         rows = end.U.shape[1]
-        U, du = columns[1 : 1 + rows].transpose(1, 0, 2), columns[-1] if deviates else end.du
+        U, du = columns[1 : 1 + rows].transpose(1, 0, 2), columns[1 + rows] if deviates else end.du
         new = changed(end, u=columns[0], U=U, du=du, kept=kept)
+        if shadows:
+            u = columns[-shadows:].transpose(1, 0, 2)
+            new = changed(new, shadows=changed(end.shadows, u=u))
         return self._compressed(new) if rows > self.rank else new, steps, None
 
     @staticmethod
@@ -296,8 +351,9 @@ class Filter:
         U, du, da = np.zeros((members, k, x.u.shape[1])), np.zeros_like(x.du), np.zeros_like(x.da)
         past = np.zeros((members, k, x.past.shape[2]))
         causes = np.zeros((members, k, x.causes.shape[2]))
-        u = x.u + x.du
-        return changed(x, u=u, q=prior, du=du, da=da, U=U, C=C, past=past, causes=causes)
+        shadows = changed(x.shadows, a=np.zeros_like(x.shadows.a))
+        new = changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past, causes=causes)
+        return changed(new, shadows=shadows)
 
     def _compressed(self, x: FilterState) -> FilterState:
         """Return the state with a square root of `rank` rows.
@@ -322,6 +378,23 @@ class Filter:
         causes = rotation.transpose(0, 2, 1) @ x.causes
         causes = np.concatenate([causes[:, :k], leading @ causes[:, k:]], axis=1)
         return changed(x, U=U, C=C, past=past, causes=causes)
+
+
+class MeanFilter(Filter):
+    """The filter without covariance: what it expects, and nothing of how uncertain that is."""
+
+    @classmethod
+    def of(cls, filter_: Filter) -> MeanFilter:
+        """Return the same filter without covariance, noise of inputs, judge and shadows."""
+        parts = {item.name: getattr(filter_, item.name) for item in fields(filter_)}
+        return cls(**(parts | {"judge": None, "shadows": None}))
+
+    def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
+        """Return the state whose unknowns have moved for a time h as they are expected to."""
+        if not self.moves or h == 0.0:
+            return x
+        F = self.reduction.transition(h)
+        return changed(x, q=self.reduction.predict(x.q, h), da=x.da @ F.T, age=x.age + h)
 
 
 def _extended(rows: Array, count: int) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.laws.innovations import Innovations
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
@@ -49,6 +50,8 @@ class FilterState:
         What the verdict is drawn from: by how much possible causes of misfit have moved the
         estimate, as coordinates on the rows of the square root, (members, r, columns), and running
         sums; see `livepde.verdict`. The filter itself never reads them.
+    shadows
+        What is known of the discretisation error.
     """
 
     member: IntArray
@@ -69,6 +72,7 @@ class FilterState:
     kept: KeptFactors
     causes: Array = field(metadata={"grows": 1})
     ledger: Ledger
+    shadows: ShadowState
 
     def __len__(self) -> int:
         return len(self.member)

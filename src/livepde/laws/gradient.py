@@ -128,7 +128,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 "GradientLaw: a component of the state has no mass term, so that M is no inner "
                 "product of X: use SensitivityLaw, or give M a term for each component."
             )
-        if problem.input_noise or problem.initial_weights:
+        if problem.input_noise or problem.initial_readings:
             raise LawError(
                 "GradientLaw has no covariance that input_noise or u0_from could enter: leave them "
                 "out, or use SensitivityLaw."

@@ -1,17 +1,20 @@
 """The samples since a law may have to begin again, of all members: a log that only grows.
 
-A log has the shape (members, rows, 1 + sensors + channels): time, measurements and inputs. Rows
-of a member that did not take a sample have the time NaN.
+A log has the shape (members, rows, 1 + 2 sensors + channels): time, measurements, their noise (NaN:
+that of the sensor) and inputs. Rows of a member that did not take a sample have the time NaN.
 """
 
 from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from livepde.fem import Inputs
 from livepde.laws.base import Problem
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import Interval, Span
+from livepde.stepping import Interval, Span, own_noise
 
 __all__ = [
     "added",
@@ -31,7 +34,7 @@ ROWS = 64  # least room of a log
 
 def empty_log(members: int, sensors: int, channels: int) -> Array:
     """Return a log without rows."""
-    return np.zeros((members, 0, 1 + sensors + channels))
+    return np.zeros((members, 0, 1 + 2 * sensors + channels))
 
 
 def opened(log: Array, span: Span) -> Array:
@@ -43,7 +46,7 @@ def opened(log: Array, span: Span) -> Array:
     row[:] = np.nan
     row[:, 0] = span.t0
     # Withheld sensors of a fleet may read more channels, which come last.
-    row[:, 1 + sensors :] = span.inputs0[:, : log.shape[2] - 1 - sensors]
+    row[:, 1 + 2 * sensors :] = span.inputs0[:, : log.shape[2] - 1 - 2 * sensors]
     return begun
 
 
@@ -53,7 +56,8 @@ def added(log: Array, span: Span, taken: Mask) -> Array:
     row, sensors = longer[:, -1], span.z1.shape[1]
     row[:, 0] = span.t1
     row[:, 1 : 1 + sensors] = span.z1
-    row[:, 1 + sensors :] = span.inputs1[:, : log.shape[2] - 1 - sensors]
+    row[:, 1 + sensors : 1 + 2 * sensors] = np.nan if span.noise is None else span.noise
+    row[:, 1 + 2 * sensors :] = span.inputs1[:, : log.shape[2] - 1 - 2 * sensors]
     row[~taken] = np.nan
     return longer
 
@@ -88,28 +92,37 @@ def trimmed(log: Array, first: int) -> Array:
     return log[:, first:].copy()
 
 
-def _rows(log: Array, sensors: int) -> list[tuple[float, Array, Array]]:
-    """Return time, measurements and inputs of the rows of the one member of a log."""
-    taken = log[0][np.isfinite(log[0, :, 0])]
-    return [(float(row[0]), row[1 : 1 + sensors], row[1 + sensors :]) for row in taken]
+class _Row(NamedTuple):
+    """A row of the log of one member."""
+
+    t: float
+    z: Array
+    noise: Array | None
+    inputs: Inputs
+
+
+def _rows(log: Array, channels: tuple[str, ...]) -> list[_Row]:
+    """Return the rows that the one member of a log took."""
+    sensors = (log.shape[2] - 1 - len(channels)) // 2
+    found = []
+    for row in log[0][np.isfinite(log[0, :, 0])]:
+        t, z, noise, inputs = np.split(row, [1, 1 + sensors, 1 + 2 * sensors])
+        named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
+        found.append(_Row(float(t[0]), z, own_noise(noise), named))
+    return found
 
 
 def first_interval(log: Array, channels: tuple[str, ...]) -> Interval:
     """Return what one member measured in the first row, as an interval without length."""
-    sensors = log.shape[2] - 1 - len(channels)
-    ((t, z, inputs),) = _rows(log[:, :1], sensors)
-    named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
-    return Interval(t, t, named, named, z, z)
+    (row,) = _rows(log[:, :1], channels)
+    return Interval(row.t, row.t, row.inputs, row.inputs, row.z, row.z, row.noise)
 
 
 def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
     """Return the intervals between the rows of one member, in time order."""
-    sensors = log.shape[2] - 1 - len(channels)
-    rows = _rows(log, sensors)
-    named = [Inputs(dict(zip(channels, row[2].tolist(), strict=True))) for row in rows]
     return [
-        Interval(rows[k - 1][0], rows[k][0], named[k - 1], named[k], rows[k - 1][1], rows[k][1])
-        for k in range(1, len(rows))
+        Interval(first.t, last.t, first.inputs, last.inputs, first.z, last.z, last.noise)
+        for first, last in pairwise(_rows(log, channels))
     ]
 
 
@@ -125,8 +138,11 @@ def span_between(log: Array, rows: IntArray, row: int, problem: Problem) -> Span
     """Return what members measured in one row, with one row before of each, as an interval."""
     sensors = problem.observed.size
     first, last = log[np.arange(len(log)), rows], log[:, row]
-    inputs0, inputs1 = first[:, 1 + sensors :], last[:, 1 + sensors :]
+    inputs0, inputs1 = first[:, 1 + 2 * sensors :], last[:, 1 + 2 * sensors :]
     if problem.control.hold:
         inputs0 = inputs1
     z0, z1 = first[:, 1 : 1 + sensors], last[:, 1 : 1 + sensors]
-    return Span(first[:, 0], float(last[0, 0]), problem.channels, inputs0, inputs1, z0, z1)
+    noise = own_noise(last[:, 1 + sensors : 1 + 2 * sensors])
+    return Span(
+        first[:, 0], float(last[0, 0]), problem.channels, inputs0, inputs1, z0, z1, noise=noise
+    )

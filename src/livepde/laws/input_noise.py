@@ -27,7 +27,7 @@ ROWS = 10
 
 def input_rank(problem: Problem) -> int:
     """Return how many rows of the square root the noise of inputs and initial readings needs."""
-    return ROWS * len(problem.input_noise) + len(problem.initial_weights)
+    return ROWS * len(problem.input_noise) + len(problem.initial_readings)
 
 
 def with_input_noise(
@@ -110,13 +110,13 @@ def initial_rows(
     seen = np.zeros((k, observed.size))
     if H_q is not None:
         seen = reduction.directions(q[None], np.eye(k)[None])[0] @ H_q.T
-    for name, weight in problem.initial_weights.items():
+    for name, reading in problem.initial_readings.items():
+        std, direction = problem.input_noise.get(name, 0.0), free * reading.weight
         if name in observed.names:
             sensor = observed.names.index(name)
-            own.append(noise[sensor] * free * weight)
-            unknown -= np.outer(seen[:, sensor], free * weight)
-        else:
-            own.append(problem.input_noise.get(name, 0.0) * free * weight)
+            std = noise[sensor] if np.isnan(reading.noise) else reading.noise
+            unknown -= np.outer(seen[:, sensor], direction)
+        own.append(std * direction)
     C = np.vstack([np.eye(k), np.zeros((len(own), k))])
     return np.vstack([unknown, *own]), C
 
@@ -125,7 +125,7 @@ def with_initial_rows(
     x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
 ) -> FilterState:
     """Return the state at the start with the uncertainty of the readings that it was made of."""
-    if not problem.initial_weights:
+    if not problem.initial_readings:
         return x
     U, C = initial_rows(problem, reduction, noise, x.q[0], x.u[0], moment)
     causes = np.zeros((1, len(C), x.causes.shape[2]))

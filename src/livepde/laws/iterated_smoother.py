@@ -9,8 +9,8 @@ probable, and serves unknowns that stay and unknowns that move.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -22,15 +22,25 @@ from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
-__all__ = ["apart", "iterated_smoother", "learns"]
+__all__ = [
+    "apart",
+    "expecting",
+    "iterated_smoother",
+    "learns",
+    "missed",
+    "moved",
+    "without_shadows",
+]
 
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 4  # of a step that makes samples and prior less probable
 CONVERGED = 0.3  # standard deviations that a step moves the trajectory by, at the end of it
+HOLDS = 0.1  # the same, of the first step, for a linearisation that holds
 STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
 
@@ -41,6 +51,8 @@ class _Pass:
 
     Attributes
     ----------
+    about
+        What was asked for, None for each estimate.
     trajectory, smoothed
         Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
         which the filter was linear, and those that it then estimates from all samples.
@@ -50,6 +62,7 @@ class _Pass:
         Minus twice the logarithm of the probability of the trajectory, up to a constant.
     """
 
+    about: Array | None
     trajectory: Array
     smoothed: Array
     x: FilterState
@@ -64,28 +77,63 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     problem = work.filter.problem
     log = state.log[:, int(state.window[0]) :]
     opening = first_interval(log, problem.channels)
-    samples = _Samples(work, state, opening, intervals_since(log, problem.channels))
+    intervals = intervals_since(log, problem.channels)
+    samples = _Samples(*without_shadows(work, state), opening, intervals)
     shape = (1 + len(samples.intervals), state.now.C.shape[2])
-    begun = [samples.about(np.zeros(shape))]
-    plain = samples.relinearised()
-    if not work.filter.moves:  # where the filter has come to, with its safeguards
-        begun.append(samples.about(np.broadcast_to(samples.reached, shape)))
-    if plain is not None:
-        begun.append(samples.about(plain.smoothed))
-    ends = [_descended(samples, one) for one in begun if one is not None]
+    ends = []
+    for trajectory in _beginnings(samples, shape):
+        one = samples.about(trajectory)
+        if one is not None:
+            ends.append(_descended(samples, one))
+        if one is not None and _holds(one) and one.misfit <= samples.usual_misfit:
+            break  # linear where the filter is, and that explains the samples
     if not ends:
         return None
-    best = min(ends, key=lambda one: one.misfit)
+    best: _Pass | None = min(ends, key=lambda one: one.misfit)
+    if best is not None and work.filter.shadows is not None:
+        # Shadows change no other number: they follow the last pass only.
+        best = _Samples(work, state, opening, samples.intervals).about(best.about)
+    if best is None:
+        return None
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
+
+
+def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
+    """Return trajectories to begin at, the most promising one first."""
+    if not samples.work.filter.moves:  # where the filter has come to, with its safeguards
+        yield np.broadcast_to(samples.reached, shape)
+    plain = samples.relinearised()
+    if plain is not None:
+        yield plain.smoothed
+    yield np.zeros(shape)
+
+
+def without_shadows(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityWork, SensitivityState]:
+    """Return a filter that follows no discretisation error, and one member of it."""
+    if work.filter.shadows is None:
+        return work, state
+    start, now = (
+        changed(x, shadows=ShadowState.none(len(x), x.u.shape[1], x.C.shape[2]))
+        for x in (state.start, state.now)
+    )
+    plain = replace(work, filter=replace(work.filter, shadows=None))
+    return plain, changed(state, start=start, now=now)
+
+
+def _holds(one: _Pass) -> bool:
+    """True if samples and prior together are most probable where the pass is linear."""
+    return _deviations(one.x, (one.smoothed - one.trajectory)[-1]) <= HOLDS
 
 
 def _descended(samples: _Samples, best: _Pass) -> _Pass:
     """Return the pass about a most probable trajectory near that of another."""
     for _ in range(ITERATIONS):
         step = best.smoothed - best.trajectory
-        step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
         if _deviations(best.x, step[-1]) <= CONVERGED:
             break
+        step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
         better = _damped(samples, best, step)
         if better is None:
             break
@@ -136,6 +184,16 @@ class _Samples:
         self.intervals = intervals
 
     @property
+    def usual_misfit(self) -> float:
+        """Return what minus twice the logarithm of the probability rarely exceeds.
+
+        Squared misfits of m readings, each in standard deviations of its noise, sum up to m, give
+        or take the square root of 2 m.
+        """
+        readings = sum(int(np.isfinite(one.z1).sum()) for one in self.intervals)
+        return float(readings + 3.0 * np.sqrt(2.0 * readings))
+
+    @property
     def reached(self) -> Array:
         """Reduced unknowns as the filter estimates them now, shape (k,)."""
         filter_ = self.work.filter
@@ -143,7 +201,7 @@ class _Samples:
         reached: Array = filter_.reduction.reduced(estimate)[0]
         return reached
 
-    def about(self, trajectory: Array) -> _Pass | None:
+    def about(self, trajectory: Array | None) -> _Pass | None:
         """Assimilate the samples, linear about a trajectory; None if that fails."""
         return self._run(trajectory)
 
@@ -159,26 +217,30 @@ class _Samples:
         q = known if trajectory is None else prior + beyond + reduction.Phi @ trajectory[0]
         x, misfit = self._placed(q), 0.0
         if self.state.opening[0]:
-            misfit += self._missed(x, self.opening)
+            misfit += missed(filter_, x, self.opening)
             x = assimilate_at_once(filter_, x, filter_.span(self.opening), self.work.options)
         x = self._remembered(x)
         followed = [reduction.reduced(x.q[0] - prior)]
+        nothing = np.zeros((1, reduction.size))
         misfit += float(followed[0] @ followed[0])
         for number, interval in enumerate(self.intervals, start=1):
             h = interval.t1 - interval.t0
             if trajectory is None:
                 x = filter_.relinearised(x)
             elif filter_.moves:
-                x = _about(filter_, x, trajectory[number], h)
+                x = expecting(filter_, x, trajectory[number], h)
             x, told = assimilate(filter_, x, filter_.span(interval), self.work.options)
             if not (told.status.ok and told.finite[0]):
                 return None
             x = self._remembered(x)
             followed.append(reduction.reduced(x.q[0] - prior))
-            misfit += self._missed(x, interval) + self._moved(followed[-2], followed[-1], h)
+            misfit += missed(filter_, x, interval)
+            if filter_.moves:
+                gained = reduction.gained(h, nothing, filter_.drifts(x.member))[0]
+                misfit += moved(filter_, followed[-2], followed[-1], h, gained)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
         smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
-        return _Pass(np.array(followed), smoothed, x, misfit)
+        return _Pass(trajectory, np.array(followed), smoothed, x, misfit)
 
     def _remembered(self, x: FilterState) -> FilterState:
         return self.work.filter.remembered(x) if self.work.filter.moves else x
@@ -190,28 +252,30 @@ class _Samples:
         window = Window(state.start, now, state.start.q[0], initial, opening.end, length)
         return placed(self.work.filter, window, self.work.filter.reduction.bounded(q))
 
-    def _missed(self, x: FilterState, interval: Interval) -> float:
-        """Return the squared misfit of the linearisation point at the end of an interval."""
-        filter_ = self.work.filter
-        alone = changed(x, du=np.zeros_like(x.du), da=np.zeros_like(x.da))
-        predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
-        noise = np.sqrt(x.level[0]) * filter_.noise
-        e = np.abs((interval.z1 - predicted[0]) / noise)
-        beyond = 2.0 * OUTLIER**2 * np.log(np.maximum(e / OUTLIER, 1.0))
-        return float(np.nansum(np.minimum(e, OUTLIER) ** 2 + beyond))
 
-    def _moved(self, before: Array, after: Array, h: float) -> float:
-        """Return the squared increment of a trajectory in a time h, in units of what it gains."""
-        filter_, reduction = self.work.filter, self.work.filter.reduction
-        if not filter_.moves:
-            return 0.0
-        nothing = np.zeros((1, len(before)))
-        gained = reduction.gained(h, nothing, filter_.drifts(self.state.now.member))[0]
-        increment = after - reduction.transition(h) @ before
-        return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())
+def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
+    """Return the squared misfit of the linearisation point at the end of an interval."""
+    alone = changed(x, du=np.zeros_like(x.du), da=np.zeros_like(x.da))
+    predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
+    noise = np.sqrt(x.level[0]) * filter_.noise_of(interval)[0]
+    e = np.abs((interval.z1 - predicted[0]) / noise)
+    beyond = 2.0 * OUTLIER**2 * np.log(np.maximum(e / OUTLIER, 1.0))
+    return float(np.nansum(np.minimum(e, OUTLIER) ** 2 + beyond))
 
 
-def _about(filter_: Filter, x: FilterState, a: Array, h: float) -> FilterState:
+def moved(filter_: Filter, before: Array, after: Array, h: float, gained: Array) -> float:
+    """Return the squared increment of a trajectory in a time h, in units of what it gains.
+
+    Parameters
+    ----------
+    gained
+        Variance that each coordinate gains in that time, shape (k,).
+    """
+    increment = after - filter_.reduction.transition(h) @ before
+    return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())
+
+
+def expecting(filter_: Filter, x: FilterState, a: Array, h: float) -> FilterState:
     """Return a filter whose linearisation point is expected to have the unknowns a in a time h."""
     reduction = filter_.reduction
     now = np.linalg.solve(reduction.transition(h), a)

@@ -177,7 +177,7 @@ def _rescued(
 
     Whatever led there is not used again: the state is only carried on from the past.
     """
-    noise = np.sqrt(state.now.level)[:, None] * work.filter.noise
+    noise = np.sqrt(state.now.level)[:, None] * work.filter.noise_of(interval)
     z = interval.z1[None]
     scale = state.scale.add(z, z - report.predicted)
 
@@ -260,4 +260,5 @@ def _watched(
         else:
             now = work.filter.relinearised(new.now)
             new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)
+        report = replace(report, notes={**report.notes, "jump_samples": float(len(known) - before)})
     return new, replace(report, notes={**report.notes, "jump": float(alarm)})

@@ -276,7 +276,7 @@ class Reduction:
         if latent.dim == latent.space.dim:
             return along
         return np.asarray(latent.V @ along.reshape(-1, latent.dim).T).T.reshape(
-            *along.shape[:2], -1
+            *along.shape[:2], latent.V.shape[0]
         )
 
     def traced(self, q: Array, start: Array, h: float, drift: float) -> Array:

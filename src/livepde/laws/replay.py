@@ -28,9 +28,9 @@ class Replay:
     A replay of more than 32 samples takes `slice` stored samples again for each new one, so that no
     step takes much longer than others; shorter ones are taken at once, since estimates about a poor
     first reference may go astray. Until it has caught up, estimates are linear about the reference
-    of before. Where it ends does not depend on the slices: its references come from the samples
-    that were there when it began. A run ends with what the replay under way finds
-    (`Identifier.settled`).
+    of before. Where it ends does not depend on the slices while each replay ends before the next is
+    due: its references come from the samples that were there when it began. A run ends with what
+    the replay under way finds (`Identifier.settled`).
 
     Parameters
     ----------

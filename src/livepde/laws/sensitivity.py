@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -17,9 +17,9 @@ from livepde.laws.assimilation import (
     assimilate,
     assimilate_at_once,
 )
-from livepde.laws.base import Belief, Law, Problem, Report
-from livepde.laws.covariance import robust_factors
-from livepde.laws.filter import Filter
+from livepde.laws.base import Belief, FixedInterval, Law, Problem, Report, finite
+from livepde.laws.covariance import reported_factors
+from livepde.laws.filter import Filter, MeanFilter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.guards import Guards, Scale
@@ -41,6 +41,9 @@ from livepde.laws.sensitivity_state import (
     stored,
 )
 from livepde.laws.sensors import MemberSensors
+from livepde.laws.shadow_state import ShadowState
+from livepde.laws.shadows import Shadows, ShadowSet
+from livepde.laws.smoother import smoothed
 from livepde.laws.verdict import judge_of, judged
 from livepde.linalg import Array, Mask
 from livepde.stepping import (
@@ -116,6 +119,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         `livepde.laws.iterated_smoother`. 0: never. Not where a `Replay` does the like.
     guards
         What to do when a linearisation is overconfident or the estimate runs away; None: nothing.
+    shadows
+        Which discretisation errors widen what is reported; None: none does.
     verdict
         Judge the run as it goes on (`Estimate.verdict`): True; "cheap", without the directions that
         cost solves, those of terms that the process may lack; False: not at all.
@@ -132,6 +137,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     jumps: Jumps | None = None
     start_window: int = 64
     guards: Guards | None = field(default_factory=Guards)
+    shadows: Shadows | None = field(default_factory=Shadows)
     verdict: bool | str = True
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
@@ -158,7 +164,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def _check_parts(self) -> None:
         """Refuse parts that are of another kind, and gates that let nothing through."""
-        for name, kind in (("replay", Replay), ("jumps", Jumps), ("guards", Guards)):
+        kinds = (("replay", Replay), ("jumps", Jumps), ("guards", Guards), ("shadows", Shadows))
+        for name, kind in kinds:
             value = getattr(self, name)
             if not (value is None or isinstance(value, kind)):
                 raise LawError(
@@ -172,9 +179,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
 
     @property
-    def _keeps_all(self) -> bool:
-        """True if nothing that was learned of unknowns that stay is forgotten."""
-        return not self.drift and bool(np.isinf(self.memory))
+    def fades(self) -> bool:
+        """True if what the state knows of the unknowns fades."""
+        return bool(np.isfinite(self.memory))
+
+    def weighs_readings(self) -> bool:
+        return True
 
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
@@ -218,11 +228,20 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 kept=not (self.drift or self.memory < np.inf),
             ),
         )
+        if self.shadows is not None:
+            followed = ShadowSet.of(filter_, MeanFilter.of(filter_), self.shadows)
+            filter_ = replace(filter_, shadows=followed)
         options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
         iterated = 0 if self.replay else self.start_window
         return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps, iterated)
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
+        return self._init(work, q0, u0, None)
+
+    def _init(
+        self, work: SensitivityWork, q0: Array, u0: Array, moment: Moment | None
+    ) -> SensitivityState:
+        """Return the state before the first sample; its shadows begin at a moment."""
         filter_, problem = work.filter, work.filter.problem
         k, n, sensors = filter_.reduction.size, len(u0), problem.observed.size
         one, zero = np.ones(1), np.zeros(1, dtype=np.int64)
@@ -245,7 +264,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             kept=filter_.stage.kept(1),
             causes=np.zeros((1, k, filter_.judge.columns if filter_.judge else 0)),
             ledger=filter_.judge.start() if filter_.judge else Ledger.start(0, 0, 0, 0, 0, 0, 0, 0),
+            shadows=ShadowState.none(1, n, k),
         )
+        if filter_.shadows is not None:
+            given = problem.initial
+            x = changed(x, shadows=filter_.shadows.begun(x, moment, given))
         no = np.zeros(1, dtype=bool)
         return SensitivityState(
             now=x,
@@ -270,7 +293,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def start(
         self, work: SensitivityWork, q0: Array, u0: Array, moment: Moment
     ) -> SensitivityState:
-        state, model = self.init(work, q0, u0), work.filter.problem.model
+        state, model = self._init(work, q0, u0, moment), work.filter.problem.model
         if model.form_initial is None:
             filter_ = work.filter
             parts = (filter_.problem, filter_.reduction, filter_.noise)
@@ -404,7 +427,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             d = span.z1 - told.predicted
             scale = scale.add(span.z1, d)
             if told.largest.max() > guards.runaway:
-                noise = np.sqrt(before.level)[:, None] * filter_.noise
+                noise = np.sqrt(before.level)[:, None] * filter_.noise_of(span)
                 usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
         if (jumps := self.jumps) is not None and present.any():
             e = x.innovations.newest
@@ -430,6 +453,25 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         due = np.full_like(state.due, NEVER - 1)  # a replay is known as such, and none begins
         return changed(state, replay=ReplayState.none(state.start), due=due)
 
+    def finite(self, work: SensitivityWork, state: SensitivityState) -> bool:
+        x = state.now
+        return finite(x.u, x.q, x.du, x.da, x.U, x.C)
+
+    def unsmoothed(self, work: SensitivityWork) -> str:
+        return "memory= lets the past fade, which no smoother can follow" if self.fades else ""
+
+    def smoothed(
+        self,
+        work: SensitivityWork,
+        before: SensitivityState,
+        after: SensitivityState,
+        data: FixedInterval,
+    ) -> Iterator[Belief]:
+        if self.fades:
+            return super().smoothed(work, before, after, data)
+        now = self.settled(work, after).now
+        return (self.member_belief(work, x, 0) for x in smoothed(work, before, now, data))
+
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)
 
@@ -442,7 +484,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""
-        return robust_factors(work.filter, x)
+        return reported_factors(work.filter, x)
 
     def member_belief(self, work: SensitivityWork, now: FilterState, k: int) -> Belief:
         """Return what is believed of one member, in latent coefficients."""
@@ -466,7 +508,5 @@ def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
 
 
 def without_factors(x: FilterState) -> FilterState:
-    """Return a filter without what its last stage has left: what estimates hold."""
-    if not x.kept.trend.size:
-        return x
-    return changed(x, kept=KeptFactors.none(len(x)))
+    """Return a filter without what its last stages have left: what estimates hold."""
+    return changed(x, kept=KeptFactors.none(len(x)), shadows=x.shadows.without_stages())

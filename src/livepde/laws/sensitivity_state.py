@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
-from livepde.laws.base import Notes
+from livepde.laws.base import InitialReading, Notes
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards, Scale
@@ -19,7 +19,7 @@ from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.members import changed, where
 from livepde.laws.replay import Replay, ReplayState
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import Span
+from livepde.stepping import KeptFactors, Span
 
 __all__ = [
     "NEVER",
@@ -55,9 +55,9 @@ class SensitivityWork:
     jumps: Jumps | None
     start_window: int
 
-    def made_of(self, weights: Mapping[str, Array]) -> SensitivityWork:
-        """Return the same for a member whose initial state was made of some readings."""
-        problem = replace(self.filter.problem, initial_weights=weights)
+    def made_of(self, readings: Mapping[str, InitialReading], initial: Any) -> SensitivityWork:
+        """Return the same for a member whose initial state was given so, and made of readings."""
+        problem = replace(self.filter.problem, initial_readings=readings, initial=initial)
         return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property
@@ -198,7 +198,9 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
     """Return what the members report after a sample."""
     # Not all of the filter is kept for what may never be read.
     members, innovations, level, q, da = len(now), now.innovations, now.level, now.q, now.da
-    reduction = work.filter.reduction
+    reduction, shadows = work.filter.reduction, work.filter.shadows
+    if shadows is not None:
+        now = changed(now, kept=KeptFactors.none(members))
 
     def notes() -> dict[str, Array]:
         found = {
@@ -211,6 +213,8 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
             found["refused"] = told.refused
         if work.jumps is not None:
             found["jump"] = np.zeros(members)
+        if shadows is not None:
+            found |= shadows.notes(now)
         estimate = q + da @ reduction.Phi.T
         if reduction.bounded(estimate) is not estimate:
             held = reduction.held(estimate)

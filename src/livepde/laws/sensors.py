@@ -53,6 +53,13 @@ class MemberSensors:
             rows.append(Y[: len(x.U[k])])
         return np.array(predicted), np.array(rows)
 
+    def rows(self, x: FilterState, U: Array, C: Array, at: Moments) -> Array:
+        """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
+        if self.fixed:
+            return self._rows(U)
+        each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
+        return np.array(list(each))
+
     def _rows(self, U: Array) -> Array:
         members, r, n = U.shape
         return np.asarray((self._G @ U.reshape(-1, n).T).T.reshape(members, r, -1))

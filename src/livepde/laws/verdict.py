@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from livepde.laws.base import Problem
-from livepde.laws.covariance import robust_factors
+from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.input_noise import input_rank
@@ -54,7 +54,7 @@ def judge_of(
     )
     sizes = problem.observed.size, reduction.size, model.X.dim
     # Noise of inputs, and of the readings of the start, adds rows before they are compressed.
-    rows = rank + input_rank(problem) + len(problem.initial_weights)
+    rows = rank + input_rank(problem) + len(problem.initial_readings)
     return Judge(dictionary, *sizes, rows, still=still)
 
 
@@ -85,7 +85,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     """Return where the estimates of one member stand."""
     problem, reduction = filter_.problem, filter_.reduction
     space, latent = problem.model.parameter_space, problem.model.latent
-    _, C = robust_factors(filter_, x)
+    _, C = reported_factors(filter_, x)
     std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
     std = np.where(std > 0.0, std, np.inf)
     moved = (reduction.Phi @ (x.C[0].T @ x.causes[0])) / std[:, None]  # (m, columns)

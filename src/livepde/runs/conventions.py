@@ -24,6 +24,7 @@ BESIDE = {  # end of a name -> what such a variable says of the one without it
     "_high": "upper end of the 95 % interval of {}",
     "_left": "share of the prior deviation of {} that is left",
     "_modes": "number of modes of {} that the data have told of",
+    "_left_out": "share of modes that the law leaves out in the variance of {}",
 }
 LONG_NAMES = {
     "snapshot": "time of the fields",

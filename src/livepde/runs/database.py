@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sqlite3
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -13,12 +15,15 @@ from livepde.errors import RunError
 
 __all__ = [
     "AGAIN",
+    "checksum",
+    "damaged",
     "in_memory",
     "in_use",
     "locked",
     "log_of",
     "reader",
     "released",
+    "salvager",
     "sound",
     "told",
     "writer",
@@ -38,6 +43,7 @@ DAMAGE = (
     ValueError,
 )
 AGAIN = "run the case again into another folder"
+SALVAGE = f"'livepde export RUN FILE --salvage' reads what is whole, or {AGAIN}"
 REMEDIES = {  # primary result code of SQLite -> what to do
     sqlite3.SQLITE_FULL: "make room, and go on with --resume",
     sqlite3.SQLITE_IOERR: "make room or mend the disk, and go on with --resume",
@@ -46,9 +52,8 @@ REMEDIES = {  # primary result code of SQLite -> what to do
     sqlite3.SQLITE_PERM: "let the folder and its files be read and written",
     sqlite3.SQLITE_BUSY: "stop the other program that holds it, and go on with --resume",
     sqlite3.SQLITE_LOCKED: "stop the other program that holds it, and go on with --resume",
-    sqlite3.SQLITE_CORRUPT: f"the file is damaged: {AGAIN}",
-    sqlite3.SQLITE_NOTADB: f"the file is damaged: {AGAIN}",
 }
+CORRUPT = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 def in_memory() -> sqlite3.Connection:
@@ -78,6 +83,13 @@ def reader(path: Path) -> sqlite3.Connection:
         # A folder in which nothing can be made, and nobody writes.
         connection.close()
         connection = _connect(path, "immutable=1")
+    return connection
+
+
+def salvager(path: Path) -> sqlite3.Connection:
+    """Open a damaged file to read what is whole, also where it has been cut off."""
+    connection = _connect(path, "mode=ro")
+    connection.execute("PRAGMA writable_schema = ON")  # no look at the size of the file
     return connection
 
 
@@ -163,11 +175,29 @@ def sound(path: Path) -> Iterator[None]:
         yield
     except DAMAGE as error:
         reason = str(error).split("\n", 1)[0] or type(error).__name__
-        raise RunError(f"{path} is damaged ({reason[:200]}): {AGAIN}.") from error
+        raise RunError(damaged(path, reason[:200])) from error
 
 
 def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
     """Return what failed, and what to do, in words."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
+    if code & 0xFF in CORRUPT:
+        return damaged(path, str(error))
     remedy = REMEDIES.get(code & 0xFF, "mend the folder, and go on with --resume")
     return f"{path}: {error}. What was written before is safe; {remedy}."
+
+
+def damaged(path: Path, why: str) -> str:
+    """Return what is wrong with a damaged journal, and what to do, in words."""
+    return f"{path} is damaged ({why}): {SALVAGE}."
+
+
+def checksum(table: str, *values: Any) -> int:
+    """Return the checksum of a record: its table, its number and all else that is kept of it."""
+    total = zlib.crc32(table.encode())
+    for value in values:
+        if not isinstance(value, bytes):
+            # SQLite keeps no sign of a zero.
+            value = repr(value + 0.0 if isinstance(value, float) else value).encode()
+        total = zlib.crc32(value, zlib.crc32(b"\0", total))
+    return total

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import io
 import json
 import math
 import os
@@ -25,10 +26,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
-from livepde.runs.outcome import Check, FigureFactory, Table
+from livepde.runs.outcome import Check, FigureFactory, Table, attempted
+from livepde.runs.salvage import Salvage
 from livepde.runs.summary import arrivals, tables
 
 if TYPE_CHECKING:
@@ -49,8 +52,9 @@ FORMAT = 1
 RUNS = "runs"  # where the command line puts them
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
-JOURNAL, PARTIAL = "journal.sqlite", "run.json.partial"
+JOURNAL = "journal.sqlite"
 LONGEST = 10_000_000  # bytes of a record
+MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
 WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
 
 
@@ -77,7 +81,8 @@ def refuse_taken(path: Path) -> None:
 def _only_begun(path: Path, case: str) -> bool:
     """Return whether a kill or a full disk has ended the making of this very folder."""
     names = {item.name for item in path.iterdir()} if path.is_dir() else set()
-    if CASE not in names or names - {CASE, PARTIAL}:
+    names = {name for name in names if not name.endswith(PARTIAL)}
+    if names != {CASE}:
         return False
     return case.encode().startswith((path / CASE).read_bytes())
 
@@ -97,6 +102,13 @@ def _nearest(folder: Path) -> str:
 
 def _runs_in(folder: Path) -> list[str]:
     return sorted(item.parent.name for item in folder.glob(f"*/{RECORD}"))
+
+
+def _refuse_links(path: Path) -> None:
+    """Raise `RunError` where a file of a run is a link: what is written to it lands elsewhere."""
+    for item in path.iterdir():
+        if item.is_symlink():
+            raise RunError(f"{item} is a link: a run is gone on with in files of its own only.")
 
 
 class RunWriter:
@@ -149,7 +161,7 @@ class RunWriter:
                 "status": "running",
             }
             if case is not None:
-                (path / CASE).write_text(case, encoding="utf-8")
+                write_text(path / CASE, case)
                 record["case_sha256"] = hashlib.sha256((original or case).encode()).hexdigest()
             if settings:
                 record["settings"] = list(settings)
@@ -173,7 +185,10 @@ class RunWriter:
             There is no such run, or it was of another case.
         """
         run = open_run(path)
+        _refuse_links(path)
         run.refuse_other(command, case, settings)
+        for left in filter(Path.is_file, path.glob(f"*{PARTIAL}")):  # by one that was killed
+            left.unlink(missing_ok=True)
         resumed = [*run.record.get("resumed", []), {"at": _now(), "livepde": version}]
         record = run.record | {"status": "running", "resumed": resumed}
         writer = cls(path, {"command": _without_token(command)} | record)
@@ -191,40 +206,35 @@ class RunWriter:
         notes: Iterable[str] = (),
         figures: Mapping[str, FigureFactory] | None = None,
     ) -> None:
-        """Write what a run gave: dataset, checkpoint, report, figures; at last the record."""
-        checks, notes = list(checks), list(notes)
+        """Write what a run gave: dataset, checkpoint, report and record; figures at last."""
+        shown, checks, notes = list(shown), list(checks), list(notes)
+        title = str(self.record["title"])
         try:
             if dataset is not None:
                 write_dataset(dataset, self.path / ESTIMATES)
+                self.record["samples"] = int(dataset.sizes.get("time", 0))
             if identifier is not None:
                 identifier.save(self.path / CHECKPOINT)
-            drawn = []
-            for name, draw in (figures or {}).items():
-                draw().savefig(self.path / f"{name}.png", dpi=120)
-                drawn.append(f"{name}.png")
-            text = markdown(str(self.record["title"]), shown, checks, notes, drawn)
-            (self.path / REPORT).write_text(text, encoding="utf-8")
-            self.record |= {
-                "status": status,
-                "ended": _now(),
-                "checks": [check.to_dict() for check in checks],
-                "notes": notes,
-            }
-            if dataset is not None:
-                self.record["samples"] = int(dataset.sizes.get("time", 0))
-            self._save_record()
+            self.record |= {"status": status, "ended": _now()}
+            self._report(markdown(title, shown, checks, notes), checks, notes)
+            drawn = drawn_into(self.path, figures or {}, notes)
+            if figures:
+                self._report(markdown(title, shown, checks, notes, drawn), checks, notes)
         except RunError:
             raise
         except OSError as error:
             raise RunError(f"{self.path}: cannot be written: {error}.") from error
 
+    def _report(self, text: str, checks: Sequence[Check], notes: Sequence[str]) -> None:
+        """Write the report, and the record."""
+        write_text(self.path / REPORT, text)
+        self.record |= {"checks": [check.to_dict() for check in checks], "notes": list(notes)}
+        self._save_record()
+
     def _save_record(self) -> None:
-        target = self.path / RECORD
-        partial = target.with_name(PARTIAL)
         text = json.dumps(plain(self.record), indent=2, ensure_ascii=False)
         try:
-            partial.write_text(text + "\n", encoding="utf-8")
-            partial.replace(target)
+            write_text(self.path / RECORD, text + "\n")
         except OSError as error:
             raise RunError(
                 f"{self.path} cannot be written: {error.strerror or error}; make room or mend the "
@@ -284,6 +294,13 @@ class Run:
             return xr.load_dataset(path, engine="scipy", mmap=False)
         except (OSError, ValueError, TypeError, LookupError, MemoryError) as error:
             raise RunError(f"{path} is damaged: {error}.") from error
+
+    def salvage(self) -> list[str]:
+        """Take as dataset what is whole in a damaged journal; return what is not, in words."""
+        kept = Salvage(self.path / JOURNAL)
+        with kept:
+            self.__dict__["dataset"] = kept.dataset()
+        return kept.sentences()
 
     def case_file(self) -> Path:
         """Return the case to take a run's samples again: where it was run, if it is unchanged.
@@ -378,15 +395,36 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     return Run(folder, record)
 
 
+def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[str]) -> list[str]:
+    """Draw figures into a folder; return their files. One that cannot be drawn is a note."""
+    drawn = []
+    for name, draw in figures.items():
+        file = f"{name}.png"
+
+        def saved(draw: FigureFactory = draw, file: str = file) -> bool:
+            image = io.BytesIO()
+            draw().savefig(image, format="png", dpi=120)
+            write_bytes(folder / file, image.getvalue())
+            return True
+
+        if attempted(f"The figure '{name}'", saved, False, notes):
+            drawn.append(file)
+    return drawn
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file; it appears whole or not at all, and in the place of a link."""
+    write_bytes(path, text.encode())
+
+
 def write_dataset(data: xr.Dataset, path: Path) -> None:
     """Write a dataset as netCDF 3; the file appears whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
     # netCDF 3 knows no dimension without members.
     empty = [name for name, size in data.sizes.items() if size == 0 and name != "time"]
     kept = data.drop_dims(empty)
     kept.attrs = {key: plain(value) for key, value in data.attrs.items()}
-    kept.to_netcdf(partial, engine="scipy")
-    partial.replace(path)
+    with replacing(path) as partial:
+        kept.to_netcdf(partial, engine="scipy")
 
 
 def markdown(
@@ -413,7 +451,7 @@ def markdown(
         parts.append(_markdown_table(Table("Checks", ("number", "value", "", "bound", ""), rows)))
     parts += [f"> {note}" for note in notes]
     parts += [f"![{name.removesuffix('.png')}]({name})" for name in figures]
-    return "\n\n".join(parts) + "\n"
+    return MARKUP.sub("&lt;", "\n\n".join(parts)) + "\n"
 
 
 def bound_text(check: Check) -> str:

@@ -24,11 +24,22 @@ MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: 
 LEFT = 1.0  # deviations between estimate and reference after the last replay
 BELIEVED = 0.5  # weight of the members of a bank that drift
 DRIFTING = 0.03  # share of the samples in which they are believed
+MOST_NAMED = 6  # unknowns
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 LEAVES = 1.0  # squared distance from the prior over what model and prior allow
 REFUSED = 0.02  # share of the readings that a gate refuses
+LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
+SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+REMEDIES = {
+    "step": ("the time step", "take a smaller dt_max (steps.dt_max), or a scheme of second order"),
+    "mesh": ("the mesh", "take more elements, where the state bends most"),
+    "input": (
+        "the straight lines between readings of the input channels",
+        "read these channels more often",
+    ),
+}
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 
 
@@ -42,8 +53,11 @@ def verdict(data: xr.Dataset) -> Verdict:
     from their prior than, with a right model, they do in one of a million cases. With a fixed gain
     an estimate wanders, in the last half of a run, by more than 0.3 of what it has learned. In more
     than 0.03 of the samples a bank believes that unknowns drift. Latent values were held where they
-    would have left their prior. Something jumped. Where no law has judged the innovations: their
-    mean square, over the last 500 samples, is more than four times what was expected.
+    would have left their prior. Of the mean variance of a field more than a quarter is that of
+    modes that the law leaves out. Time step, mesh and straight lines between readings of inputs
+    have together shifted an unknown by more than two standard deviations. Something jumped. Where
+    no law has judged the innovations: their mean square, over the last 500 samples, is more than
+    four times what was expected.
     """
     stored = data.attrs.get("verdict")
     own = Verdict.from_dict(json.loads(stored)) if stored else Verdict.unjudged()
@@ -58,6 +72,8 @@ def verdict(data: xr.Dataset) -> Verdict:
             *_said("refused", "caution", _refused(data)),
             *_unknowns(data),
             *_said("held", "do not trust", _held(data)),
+            *_said("left out", "note", _left_out(data)),
+            *_discretised(data),
             *_said("rest", "note", _rests(data) if gradient else []),
             *_said("lost", "caution", _lost(data) if gradient else []),
             *_said("guards", "caution", [] if gradient else _guards(data)),
@@ -175,6 +191,28 @@ def _held(data: xr.Dataset) -> list[str]:
         "than its deviations allow (within, by default 10 of them), and they were held there: the "
         "prior is much too narrow, or a unit, a sensor or the model is wrong."
     ]
+
+
+def _left_out(data: xr.Dataset) -> list[str]:
+    """Return how much of the interval of a field is that of modes that the law leaves out."""
+    found = []
+    for name in str(data.attrs.get("fields", "")).split():
+        if f"{name}_left_out" not in data:
+            continue
+        share, count = float(data[f"{name}_left_out"][-1]), int(data[f"{name}_modes"].attrs["of"])
+        if not share > LEFT_OUT:
+            continue
+        std = float(np.sqrt((data[f"{name}_std"].values[-1] ** 2).mean()))
+        unit = str(data[name].attrs.get("units", ""))
+        much = f"{share:.0%}" if share < 0.99 else "more than 99%"
+        found.append(
+            f"{name}: {much} of its variance is that of details finer than the {count} modes "
+            "of the law, which no data narrow: its standard deviation (root mean square) is "
+            + f"{std:.2g} {unit}".rstrip()
+            + f", and of the {count} modes alone {std * math.sqrt(max(1.0 - share, 0.0)):.2g}. "
+            "Give law.modes a larger number, or the field a longer length."
+        )
+    return found
 
 
 def _jumps(data: xr.Dataset) -> list[str]:
@@ -298,6 +336,30 @@ def _departure(data: xr.Dataset) -> list[str]:
         "prior is too narrow. Take kind = 'sensitivity', refine the mesh and the steps, state a "
         "larger noise, or a larger std of the unknowns."
     ]
+
+
+def _discretised(data: xr.Dataset) -> list[Finding]:
+    """Return whether the discretisation has shifted the unknowns at the end, and by what."""
+    total = note(data, "discretisation_shift")
+    if total is None or not total[-1] > SHIFTED:
+        return []
+    notes = {kind: note(data, f"{kind}_shift") for kind in REMEDIES}
+    sizes = {kind: abs(float(values[-1])) for kind, values in notes.items() if values is not None}
+    kind = max(sizes, key=lambda kind: sizes[kind])
+    what, remedy = REMEDIES[kind]
+    shift: dict[str, float] = {}
+    for label in scalars(data):
+        moved = note(data, f"{label}_{kind}_shift")
+        if moved is not None and np.isfinite(moved[-1]):
+            shift[label] = float(moved[-1])
+    parts = [f"{label} by {size:+.2g}" for label, size in [*shift.items()][:MOST_NAMED]]
+    moved_by = f" ({', '.join(parts)})" if parts else ""
+    text = (
+        f"The discretisation has shifted the unknowns by {total[-1]:.1f} standard deviations, and "
+        f"most of it is {what}{moved_by}. The intervals were widened by that."
+    )
+    remedy = f"{remedy[0].upper()}{remedy[1:]}."
+    return [Finding("discretisation", "caution", text, evidence=float(total[-1]), remedy=remedy)]
 
 
 def _gain(data: xr.Dataset) -> list[str]:

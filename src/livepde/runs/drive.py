@@ -86,6 +86,8 @@ def conduct(live: Live, *, patient: bool = False) -> Driven:
             driven.status = "interrupted"
         except DataError as error:
             driven.status, driven.error = "failed", error
+        finally:
+            driven.result = live.result
     return driven
 
 

@@ -5,16 +5,27 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
 from livepde.identifier import Sample
+from livepde.samples import by_name
 from livepde.streams.intake import Intake, Outcome, Ready, Remark, gather
 from livepde.streams.sources import Row, Source
 
-__all__ = ["Feed", "Gathered", "Paced", "Samples"]
+__all__ = ["Feed", "Gathered", "Paced", "Samples", "shifted"]
+
+SHIFTED = "shifted by "  # how a position begins where the clock was set back
+
+
+def shifted(position: str) -> tuple[float, str]:
+    """Return by how much times are shifted at a position, and the position of the source."""
+    if not position.startswith(SHIFTED):
+        return 0.0, position
+    shift, _, place = position.removeprefix(SHIFTED).partition(" ")
+    return float(shift), place
 
 
 class Feed(Protocol):
@@ -64,6 +75,7 @@ class Gathered:
         self.intake = intake
         self._heard = False
         self._remarks: list[Remark] = []
+        self._begun = intake.shift
         self._rows = 0  # a token is the number of the row, and what the source gave with it
         self._flushed = False
 
@@ -120,8 +132,19 @@ class Gathered:
         return list(found.values())
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return where the source stands if these samples are still to be taken."""
-        return self.source.position(_given(self._waiting(waiting)))
+        """Return where the source stands if these samples are still to be taken.
+
+        With it what is added there to the times of rows, if that ever was anything.
+        """
+        tokens = self._waiting(waiting)
+        place = self.source.position(_given(tokens))
+        anchors = self.intake.anchors
+        if not (anchors or self.intake.shift):
+            return place
+        first = min((number for number, _ in tokens), default=math.inf)
+        before = [shift for (number, _), shift in anchors if number <= first]
+        shift = before[-1] if before else self._begun
+        return f"{SHIFTED}{shift!r} {place}"
 
     def acknowledge(self, ready: Ready) -> None:
         """Tell the source."""
@@ -176,10 +199,7 @@ class Samples:
         return []
 
     def _values(self, sample: Sample) -> dict[str, float]:
-        values = sample.z
-        if not isinstance(values, Mapping):
-            values = dict(zip(self._names, np.atleast_1d(values).tolist(), strict=True))
-        return {**values, **(sample.inputs or {})}
+        return {**by_name(sample.z, self._names), **(sample.inputs or {})}
 
     def heard(self) -> bool:
         """Samples that are there are never silent."""

@@ -12,6 +12,10 @@ A process that is killed loses nothing. A power cut leaves the file whole, but m
 of the last moments: a sync for each of them would cost more than the step. A file that is followed
 brings them again; a broker that was told of them does not.
 
+Each record has a checksum, which is compared on each read, and numbers follow one another without
+gaps but those that the journal knows of: what is damaged or gone is told, and `salvage` reads the
+rest.
+
 A write that fails (a full disk) is the end of a journal's writer: it takes nothing more, so that no
 checkpoint can pass over what was lost. What was written before is there, and a new one goes on.
 """
@@ -19,6 +23,7 @@ checkpoint can pass over what was lost. What was written before is there, and a 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sqlite3
 from array import array
@@ -31,42 +36,69 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock
 
+from livepde.atomic_write import replacing
 from livepde.errors import RunError
 from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
-from livepde.runs.database import AGAIN, in_memory, locked, reader, released, sound, told, writer
+from livepde.runs.database import (
+    AGAIN,
+    checksum,
+    damaged,
+    in_memory,
+    locked,
+    reader,
+    released,
+    sound,
+    told,
+    writer,
+)
 from livepde.runs.packing import layout_from, packed, unpacked
+from livepde.samples import noise_channel
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["Event", "Journal", "Taken"]
 
-FORMAT = 1
+LOG = logging.getLogger("livepde.run")
+FORMAT = 2
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
+FEW = 64  # samples that are looked at to know a row again
 TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
 LONGEST = 2000  # characters of the message of an event
 
 SCHEMA = (
-    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID",
+    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) "
+    "WITHOUT ROWID",
     "CREATE TABLE samples (id INTEGER PRIMARY KEY, t REAL NOT NULL, channels BLOB NOT NULL, "
-    "position TEXT NOT NULL)",
+    "position TEXT NOT NULL, crc INTEGER NOT NULL)",
     "CREATE TABLE estimates (id INTEGER PRIMARY KEY, t REAL NOT NULL, status INTEGER NOT NULL, "
-    "steps INTEGER NOT NULL, numbers BLOB NOT NULL, notes TEXT NOT NULL)",
-    "CREATE TABLE fields (id INTEGER PRIMARY KEY, last INTEGER NOT NULL, content BLOB NOT NULL)",
-    "CREATE TABLE checkpoints (id INTEGER PRIMARY KEY, state BLOB NOT NULL)",
+    "steps INTEGER NOT NULL, numbers BLOB NOT NULL, notes TEXT NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE fields (id INTEGER PRIMARY KEY, last INTEGER NOT NULL, content BLOB NOT NULL, "
+    "crc INTEGER NOT NULL)",
+    "CREATE TABLE checkpoints (id INTEGER PRIMARY KEY, state BLOB NOT NULL, crc INTEGER NOT NULL)",
     "CREATE TABLE events (id INTEGER PRIMARY KEY, t REAL NOT NULL, kind TEXT NOT NULL, "
-    "channel TEXT NOT NULL, message TEXT NOT NULL, UNIQUE (t, kind, channel, message))",
-    "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, "
+    "channel TEXT NOT NULL, message TEXT NOT NULL, crc INTEGER NOT NULL, "
+    "UNIQUE (t, kind, channel, message))",
+    "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, crc INTEGER NOT NULL, "
     "PRIMARY KEY (kind, channel)) WITHOUT ROWID",
+    "CREATE TABLE withdrawn (id INTEGER PRIMARY KEY)",
+    "CREATE TABLE tries (id INTEGER PRIMARY KEY, number INTEGER NOT NULL)",
+)
+ESTIMATES = (
+    "SELECT id, t, status, steps, numbers, notes, estimates.crc, last, content, fields.crc "
+    "FROM estimates LEFT JOIN fields USING (id) WHERE "
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """An accepted sample: its number, time, the values of all channels (NaN: missing)."""
+    """An accepted sample: its number, time, the values of all channels (NaN: missing).
+
+    And the noise of its readings, by the names that `noise_channel` gives, if it has any.
+    """
 
     id: int
     t: float
@@ -92,6 +124,8 @@ class Journal:
         The SQLite file.
     channels
         Names of all channels of a sample, in the order in which they are kept.
+    noise
+        Names of the noise of their readings, which a sample that has any keeps after them.
     layout
         What the numbers of the records mean.
 
@@ -110,10 +144,21 @@ class Journal:
         with sound(path):
             self.channels = tuple(map(str, json.loads(meta["channels"])))
             self.layout = layout_from(meta["layout"])
+        self.noise = tuple(map(noise_channel, self.channels))
         self._vertices = max(map(len, self.layout.coordinates.values()), default=0)
+        self._thinned = 0
+        self._file = None if path is MEMORY else _identity(path)
+        self._stand()
+
+    def _stand(self) -> None:
+        """Find the numbers of the last records."""
         self._last = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
         self._current = self._last
-        self._thinned = 0
+        self._newest = max(self.accepted, *self._withdrawn(), 0)
+        kept = int(self._one("SELECT COALESCE(MAX(id), 0) FROM checkpoints"))
+        if kept > self._last:
+            text = f"the estimates after {self._last} are gone"
+            raise RunError(damaged(self.path, text))
 
     # --- opening -------------------------------------------------------------------------------
 
@@ -139,12 +184,9 @@ class Journal:
                     f"{path}: there is a journal already; go on with it (--resume), or choose "
                     "another folder."
                 )
-            partial = path.with_name(path.name + ".partial")
-            partial.unlink(missing_ok=True)
-            with closing(sqlite3.connect(partial)) as new:
+            with replacing(path) as partial, closing(sqlite3.connect(partial)) as new:
                 new.execute("PRAGMA journal_mode = MEMORY")  # no second file beside it
                 _fill(new, meta)
-            partial.replace(path)
             return cls(path, writer(path), lock)
 
     @classmethod
@@ -209,16 +251,24 @@ class Journal:
         position
             Where its source stands after it, to go on from there.
         """
-        row = array("d", [values.get(name, math.nan) for name in self.channels])
+        names = self.channels
+        if not values.keys().isdisjoint(self.noise):
+            names += self.noise
+        row = array("d", [values.get(name, math.nan) for name in names])
         self._enter(t, row.tobytes(), position)
         self._write(self._db.commit)
-        return Taken(self._current, t, dict(zip(self.channels, row, strict=True)))
+        return Taken(self._current, t, self._named(row.tolist()))
 
     def _enter(self, t: float, channels: bytes, position: str) -> None:
-        cursor = self._execute(
-            "INSERT INTO samples (t, channels, position) VALUES (?, ?, ?)", t, channels, position
-        )
-        self._current = int(cursor.lastrowid or 0)
+        self._newest += 1
+        self._insert("samples", self._newest, float(t), channels, position)
+        self._current = self._newest
+
+    def _insert(self, table: str, *values: Any, conflict: str = "") -> None:
+        """Write a record with its checksum."""
+        places = ", ".join("?" * (len(values) + 1))
+        command = f"INSERT INTO {table} VALUES ({places}) {conflict}"
+        self._execute(command, *values, checksum(table, *values))
 
     def extend(self, rows: Iterable[tuple[Array, Record]], state: bytes) -> None:
         """Keep samples with their estimates and the state after them: all of it, or nothing.
@@ -226,7 +276,8 @@ class Journal:
         Parameters
         ----------
         rows
-            Values of the channels of each sample, and its estimate.
+            Values of the channels of each sample, with or without their noise after them, and its
+            estimate.
         state
             The identifier's.
         """
@@ -237,9 +288,26 @@ class Journal:
 
     def withdraw(self) -> None:
         """Forget the last sample, of which nothing could be made."""
-        self._execute("DELETE FROM samples WHERE id = ?", self._current)
+        self._forget(self._current)
         self._write(self._db.commit)
         self._current = self._last
+
+    def _forget(self, number: int) -> None:
+        for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
+            self._execute(f"DELETE FROM {table} WHERE id = ?", number)
+        if number == self._newest:
+            self._newest -= 1
+        else:
+            self._execute("INSERT OR IGNORE INTO withdrawn VALUES (?)", number)
+
+    def mark(self) -> int:
+        """Note, for good, that the last sample is tried again; return how often it has been."""
+        self._execute(
+            "INSERT INTO tries VALUES (?, 1) ON CONFLICT (id) DO UPDATE SET number = number + 1",
+            self._current,
+        )
+        self._write(self._db.commit)
+        return int(self._one("SELECT number FROM tries WHERE id = ?", self._current))
 
     def append(self, record: Record, /) -> None:
         """Keep the estimate of the last sample that `accept` or `samples` has returned.
@@ -247,14 +315,15 @@ class Journal:
         One that was kept before a crash is found again, and stays as it is.
         """
         found = (record.numbers, record.innovation, record.withheld_error)
-        self._execute(
-            "INSERT INTO estimates VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO NOTHING",
+        self._insert(
+            "estimates",
             self._current,
-            record.t,
+            float(record.t),
             record.status,
             record.steps,
             b"".join(np.asarray(values, dtype=float).tobytes() for values in found),
             json.dumps(dict(record.notes)),
+            conflict="ON CONFLICT (id) DO NOTHING",
         )
         if record.snapshot is not None:
             self._keep(record.snapshot)
@@ -265,19 +334,16 @@ class Journal:
         self._keep(snapshot, last=True)
 
     def _keep(self, snapshot: Snapshot, last: bool = False) -> None:
-        self._execute(
-            "INSERT INTO fields VALUES (?, ?, ?) ON CONFLICT (id) DO UPDATE SET last = "
-            "min(last, excluded.last)",
-            self._last if last else self._current,
-            int(last),
-            packed(snapshot),
-        )
+        # Fields that are kept for good stay so when they are the last, too.
+        number = self._last if last else self._current
+        stays = "WHERE last > excluded.last"
+        conflict = "ON CONFLICT (id) DO UPDATE SET last = excluded.last, "
+        conflict += f"content = excluded.content, crc = excluded.crc {stays}"
+        self._insert("fields", number, int(last), packed(snapshot), conflict=conflict)
 
     def checkpoint(self, state: bytes) -> None:
         """Keep the identifier's state after the last sample that was estimated."""
-        self._execute(
-            "INSERT INTO checkpoints VALUES (?, ?) ON CONFLICT (id) DO NOTHING", self._last, state
-        )
+        self._insert("checkpoints", self._last, state, conflict="ON CONFLICT (id) DO NOTHING")
         self._execute(
             "DELETE FROM checkpoints WHERE id NOT IN "
             "(SELECT id FROM checkpoints ORDER BY id DESC LIMIT ?)",
@@ -295,7 +361,17 @@ class Journal:
         """
         if position is not None:
             stands = json.dumps([self.accepted, position])
-            self._execute("INSERT OR REPLACE INTO meta VALUES ('position', ?)", stands)
+            self._say("position", stands)
+        self._write(self._db.commit)
+
+    def _say(self, key: str, value: str) -> None:
+        """Note something about the journal itself."""
+        conflict = "ON CONFLICT (key) DO UPDATE SET value = excluded.value, crc = excluded.crc"
+        self._insert("meta", key, value, conflict=conflict)
+
+    def say_health(self, why: str) -> None:
+        """Note why the run is not well, for good; empty if it is."""
+        self._say("health", why[:LONGEST].encode(errors="replace").decode())
         self._write(self._db.commit)
 
     def judge(self, verdict: Mapping[str, Any]) -> None:
@@ -309,24 +385,23 @@ class Journal:
 
     def note(self, event: Event) -> None:
         """Keep an event; one that was kept before a crash is not kept twice."""
+        message = event.message[:LONGEST].encode(errors="replace").decode()
+        told = (float(event.t), event.kind, event.channel, message)
         self._execute(
-            "INSERT INTO events (t, kind, channel, message) VALUES (?, ?, ?, ?) "
+            "INSERT INTO events (t, kind, channel, message, crc) VALUES (?, ?, ?, ?, ?) "
             "ON CONFLICT DO NOTHING",
-            event.t,
-            event.kind,
-            event.channel,
-            event.message[:LONGEST].encode(errors="replace").decode(),
+            *told,
+            checksum("events", *told),
         )
 
     def count(self, kind: str, channel: str = "", number: int = 1) -> None:
         """Count something that is not worth an event each."""
-        self._execute(
-            "INSERT INTO counts VALUES (?, ?, ?) "
-            "ON CONFLICT (kind, channel) DO UPDATE SET number = number + excluded.number",
-            kind,
-            channel,
-            number,
-        )
+        known = "SELECT number FROM counts WHERE kind = ? AND channel = ?"
+        before = self._read(known, kind, channel)
+        conflict = "ON CONFLICT (kind, channel) DO UPDATE SET number = excluded.number, "
+        conflict += "crc = excluded.crc"
+        total = number + (int(before[0][0]) if before else 0)
+        self._insert("counts", kind, channel, total, conflict=conflict)
 
     # --- reading -------------------------------------------------------------------------------
 
@@ -334,10 +409,56 @@ class Journal:
         """Return what the journal says about itself, if it is one."""
         found = self._read("SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL")
         if {str(sql) for (sql,) in found} == set(SCHEMA):
-            meta = dict(self._read("SELECT key, value FROM meta"))
+            meta = dict(self._sound("meta", self._read("SELECT * FROM meta")))
             if meta.get("format") == str(FORMAT):
                 return meta
         raise RunError(f"{self.path} is not a journal of this version of livepde: {AGAIN}.")
+
+    def _sound(self, table: str, rows: Iterable[Sequence[Any]]) -> list[Any]:
+        """Return records without their checksums, once those fit."""
+        found = []
+        for *values, crc in rows:
+            if checksum(table, *values) != crc:
+                raise RunError(damaged(self.path, f"{table}: {values[0]!r:.40} is not as it was"))
+            found.append(values)
+        return found
+
+    def _withdrawn(self) -> set[int]:
+        return {int(number) for (number,) in self._read("SELECT id FROM withdrawn")}
+
+    def _follow(self, table: str, before: int, numbers: Iterable[int]) -> None:
+        """Refuse records that are gone: numbers follow one another, unless it is known why not."""
+        known: tuple[set[int], int, int] | None = None
+        for number in numbers:
+            for gone in range(before + 1, number):
+                # What is read after the records has the reason for all that was missing then.
+                known = known or (self._withdrawn(), *self._thinning())
+                withdrawn, end, every = known
+                if not (gone in withdrawn or (gone < end and (table == "samples" or gone % every))):
+                    raise RunError(damaged(self.path, f"{table}: {gone} is gone"))
+            before = number
+
+    def _thinning(self) -> tuple[int, int]:
+        """Return before which number one estimate of so many is kept, and of how many."""
+        with sound(self.path):
+            end, every = json.loads(self._meta().get("thinned", "[0, 1]"))
+            return int(end), int(every)
+
+    @property
+    def health(self) -> str:
+        """Why the run is not well, as its writer has said last; empty if it is."""
+        return self._meta().get("health", "")
+
+    @property
+    def in_place(self) -> bool:
+        """Whether the file that was opened is the one that has its name now."""
+        if self._file is None:
+            return True
+        try:
+            named = self.path.stat()
+        except OSError:
+            return False
+        return (named.st_dev, named.st_ino) == self._file
 
     @property
     def accepted(self) -> int:
@@ -352,26 +473,56 @@ class Journal:
     @property
     def first(self) -> Taken | None:
         """The first accepted sample, which describes the start; None before any."""
-        rows = self._read("SELECT id, t, channels FROM samples ORDER BY id LIMIT 1")
-        return self._taken(*rows[0]) if rows else None
+        return next(self._samples("ORDER BY id LIMIT 1"), None)
 
     @property
     def last(self) -> float:
         """Time of the last accepted sample, -inf before any."""
-        rows = self._read("SELECT t FROM samples ORDER BY id DESC LIMIT 1")
-        with sound(self.path):
-            return float(rows[0][0]) if rows else -np.inf
+        last = next(self._samples("ORDER BY id DESC LIMIT 1"), None)
+        return -np.inf if last is None else last.t
 
     def recent(self, count: int) -> list[Taken]:
         """Return the last accepted samples, oldest first."""
-        rows = self._read("SELECT id, t, channels FROM samples ORDER BY id DESC LIMIT ?", count)
-        return [self._taken(*row) for row in reversed(rows)]
+        return [*self._samples("ORDER BY id DESC LIMIT ?", count)][::-1]
+
+    def between(self, low: float, high: float) -> list[tuple[float, dict[str, float]]]:
+        """Return the first samples from one time to another, at most a few."""
+        start = self._number_at(low)
+        found = self._samples("WHERE id >= ? ORDER BY id LIMIT ?", start, FEW)
+        return [(one.t, one.values) for one in found if one.t <= high]
+
+    def _number_at(self, t: float) -> int:
+        """Return the number of the first sample that is not earlier than a time: by halving."""
+        low, high = 0, self._newest + 1
+        while low < high:
+            middle = (low + high) // 2
+            rows = self._read("SELECT id, t FROM samples WHERE id >= ? ORDER BY id LIMIT 1", middle)
+            if not rows or rows[0][1] >= t:
+                high = middle
+            else:
+                low = rows[0][0] + 1
+        return low
+
+    def returns_to(self, t: float) -> bool:
+        """Return whether all samples later than a time can be withdrawn."""
+        before = self._number_at(math.nextafter(t, math.inf)) - 1
+        numbers = [n for (n,) in self._read("SELECT id FROM checkpoints WHERE id <= ?", before)]
+        return before > 0 and bool(numbers or not self._thinning()[0])
+
+    def go_back(self, t: float) -> None:
+        """Withdraw all samples later than a time, with what came of them; for good."""
+        first = self._number_at(math.nextafter(t, math.inf))
+        later = self._read("SELECT id FROM samples WHERE id >= ? ORDER BY id DESC", first)
+        for (number,) in later:
+            self._forget(int(number))
+        self._write(self._db.commit)
+        self._last = self._current = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
 
     @property
     def position(self) -> str:
         """Where the source stood after the last accepted sample, or what came after it."""
-        rows = self._read("SELECT id, position FROM samples ORDER BY id DESC LIMIT 1")
-        last, position = rows[0] if rows else (0, "")
+        rows = self._sound("samples", self._read("SELECT * FROM samples ORDER BY id DESC LIMIT 1"))
+        last, _, _, position = rows[0] if rows else (0, 0.0, b"", "")
         with sound(self.path):
             after, later = json.loads(self._meta().get("position", '[-1, ""]'))
             return str(later if after == last else position)
@@ -381,33 +532,67 @@ class Journal:
 
         `samples` then brings what has to be taken again.
         """
-        rows = self._read("SELECT id, state FROM checkpoints ORDER BY id DESC LIMIT 1")
-        number, state = rows[0] if rows else (0, None)
-        if not isinstance(state, bytes | None):
-            raise RunError(f"{self.path} is damaged (a checkpoint is no archive): {AGAIN}.")
+        numbers = [n for (n,) in self._read("SELECT id FROM checkpoints ORDER BY id DESC")]
+        number, state = 0, None
+        for number in numbers:
+            state = self._state(number)
+            if state is not None:
+                break
+            self._execute("DELETE FROM checkpoints WHERE id = ?", number)
+        if state is None and numbers:
+            first = self.first
+            if self._thinning()[0] or first is None:
+                raise RunError(damaged(self.path, "no checkpoint is as it was"))
+            number = 0  # all is taken again
+        if numbers and number < numbers[0]:
+            LOG.warning("%s: the newest checkpoint is damaged: went back further", self.path)
         self._execute("DELETE FROM fields WHERE last")  # there will be later ones
         self._write(self._db.commit)
         self._last = self._current = int(number)
         return state
 
+    def _state(self, number: int) -> bytes | None:
+        """Return the state of a checkpoint, None if it is damaged."""
+        try:
+            rows = self._read("SELECT * FROM checkpoints WHERE id = ?", number)
+            ((_, state),) = self._sound("checkpoints", rows)
+        except (RunError, ValueError):
+            return None
+        return state if isinstance(state, bytes) else None
+
     def samples(self) -> Iterator[Taken]:
         """Iterate over the samples after the last one that was estimated."""
-        while True:
-            rows = self._read(
-                "SELECT id, t, channels FROM samples WHERE id > ? ORDER BY id LIMIT 1",
-                self._current,
-            )
-            if not rows:
-                return
-            self._current = int(rows[0][0])
-            yield self._taken(*rows[0])
+        while (
+            found := next(self._samples("WHERE id > ? ORDER BY id LIMIT 1", self._current), None)
+        ) is not None:
+            self._follow("samples", self._current, [found.id])
+            self._current = found.id
+            yield found
 
-    def _taken(self, number: int, t: float, channels: bytes) -> Taken:
-        with sound(self.path):
-            if len(channels) != 8 * len(self.channels):
-                raise ValueError(f"sample {number} has not the size of the others")
-            values = np.frombuffer(channels).tolist()
-            return Taken(number, float(t), dict(zip(self.channels, values, strict=True)))
+    def taken(self) -> Iterator[Taken]:
+        """Iterate over all accepted samples that are kept."""
+        number, found = 0, True
+        while found:
+            found = False
+            for taken in self._samples("WHERE id > ? ORDER BY id LIMIT ?", number, TOGETHER):
+                number, found = taken.id, True
+                yield taken
+
+    def _samples(self, which: str, *values: Any) -> Iterator[Taken]:
+        """Iterate over samples."""
+        rows = self._read(f"SELECT * FROM samples {which}", *values)
+        for number, t, channels, _ in self._sound("samples", rows):
+            with sound(self.path):
+                if len(channels) not in (8 * len(self.channels), 16 * len(self.channels)):
+                    raise ValueError(f"sample {number} has not the size of the others")
+                named = self._named(np.frombuffer(channels).tolist())
+            yield Taken(number, float(t), named)
+
+    def _named(self, row: Sequence[float]) -> dict[str, float]:
+        """Return what is kept of a sample by name: all channels, and the noise that is there."""
+        values = dict(zip(self.channels, row, strict=False))
+        noise = zip(self.noise, row[len(self.channels) :], strict=False)
+        return values | {name: std for name, std in noise if not math.isnan(std)}
 
     def __len__(self) -> int:
         return int(self._one("SELECT COUNT(*) FROM estimates"))
@@ -418,18 +603,24 @@ class Journal:
     def after(self, number: int) -> Iterator[tuple[int, Record]]:
         """Iterate over the estimates of the samples after one, with their numbers."""
         while True:
-            rows = self._read(
-                "SELECT id, t, status, steps, numbers, notes, content "
-                "FROM estimates LEFT JOIN fields USING (id) WHERE id > ? ORDER BY id LIMIT ?",
-                number,
-                TOGETHER,
-            )
-            for number, *content in rows:
-                with sound(self.path):
-                    record = self._record(*content)
-                yield number, record
+            rows = self._read(f"{ESTIMATES} id > ? ORDER BY id LIMIT ?", number, TOGETHER)
+            self._follow("estimates", number, [row[0] for row in rows])
+            for row in rows:
+                number = row[0]
+                yield number, self._estimate(row)
             if len(rows) < TOGETHER:
                 return
+
+    def _estimate(self, row: Sequence[Any]) -> Record:
+        """Return an estimate with its fields, once both checksums fit."""
+        number = row[0]
+        ((_, *content),) = self._sound("estimates", [row[:7]])
+        fields = None
+        if row[9] is not None:
+            ((_, _, fields),) = self._sound("fields", [(number, *row[7:])])
+        with sound(self.path):
+            parts: list[Any] = [*content, fields]
+            return self._record(*parts)
 
     def _record(
         self, t: float, status: int, steps: int, numbers: bytes, notes: str, content: bytes | None
@@ -458,14 +649,14 @@ class Journal:
     @property
     def events(self) -> list[Event]:
         """All events, in the order in which they happened."""
-        rows = self._read("SELECT t, kind, channel, message FROM events ORDER BY id")
+        rows = self._read("SELECT t, kind, channel, message, crc FROM events ORDER BY id")
         with sound(self.path):
-            return [Event(float(t), *map(str, words)) for t, *words in rows]
+            return [Event(float(t), *map(str, words)) for t, *words in self._sound("events", rows)]
 
     @property
     def counts(self) -> dict[tuple[str, str], int]:
         """(kind, channel) -> how often."""
-        rows = self._read("SELECT kind, channel, number FROM counts ORDER BY kind, channel")
+        rows = self._sound("counts", self._read("SELECT * FROM counts ORDER BY kind, channel"))
         with sound(self.path):
             return {(str(kind), str(channel)): int(number) for kind, channel, number in rows}
 
@@ -486,11 +677,20 @@ class Journal:
         self._execute(
             "DELETE FROM estimates WHERE id >= ? AND id < ? AND id % ?", self._thinned, end, every
         )
+        self._execute("DELETE FROM withdrawn WHERE id < ? AND id % ?", end, every)
+        self._execute("DELETE FROM tries WHERE id < ?", end)
         self._execute(
             "DELETE FROM events WHERE id <= (SELECT MAX(id) FROM events) - ?", KEPT_EVENTS
         )
+        self._say("thinned", json.dumps([max(end, self._thinning()[0]), every]))
         self._write(self._db.commit)
         self._thinned = max(self._thinned, end)
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """Return by what a file is known, whatever its name."""
+    found = path.stat()
+    return found.st_dev, found.st_ino
 
 
 def _fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
@@ -499,4 +699,5 @@ def _fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
         connection.execute("BEGIN")  # one commit for all
         for command in SCHEMA:
             connection.execute(command)
-        connection.executemany("INSERT INTO meta VALUES (?, ?)", meta.items())
+        rows = [(key, value, checksum("meta", key, value)) for key, value in meta.items()]
+        connection.executemany("INSERT INTO meta VALUES (?, ?, ?)", rows)

@@ -9,16 +9,18 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from livepde.errors import DataError, LivepdeError
+from livepde.errors import DataError, LivepdeError, RunError
 from livepde.identifier import Identifier
+from livepde.laws import numerical
 from livepde.result import Estimate, Result
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
+from livepde.runs.outcome import attempted
 from livepde.streams.intake import Ready, Remark
 from livepde.verdict import LEVELS
 
@@ -28,7 +30,10 @@ CHECKPOINT = 256  # samples between two checkpoints
 JUDGED = 50  # samples between two looks at the verdict, of which a change is an event
 LOOK = 0.5  # seconds between two looks at whether to stop
 LONGEST = 500  # characters of an event
-HARMLESS = frozenset({"heard", "missing", "disordered", "outside"})
+TRIES = 2  # times that a sample in whose step the process has ended is tried again
+REFUSED = 20  # rows and values refused in a row, after which a run is not well
+UNUSED = frozenset({"malformed", "late", "leap", "outside", "skipped"})  # rows of no use
+HARMLESS = frozenset({"heard", "well", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
 
 
@@ -67,6 +72,8 @@ class Backlog:
         oldest = [waiting.popleft() for _ in range(excess)]
         if self.overflow == "merge":
             waiting.appendleft(_merged([*oldest, waiting.popleft()]))
+        elif waiting:
+            waiting[0] = replace(waiting[0], since=_since([*oldest, waiting[0]]))
         return oldest
 
     def has_room(self, waiting: deque[Ready]) -> bool:
@@ -97,7 +104,13 @@ def _merged(samples: Sequence[Ready]) -> Ready:
             if np.isfinite(value):
                 values.setdefault(channel, []).append(value)
     mean = {channel: float(np.mean(several)) for channel, several in values.items()}
-    return Ready(samples[-1].t, mean, tuple(t for sample in samples for t in sample.tokens))
+    tokens = tuple(t for sample in samples for t in sample.tokens)
+    return Ready(samples[-1].t, mean, tokens, _since(samples))
+
+
+def _since(samples: Iterable[Ready]) -> float | None:
+    """Return the earliest time after which samples are to be taken back, None for none."""
+    return min((s.since for s in samples if s.since is not None), default=None)
 
 
 class Live:
@@ -129,6 +142,12 @@ class Live:
         Ends the run when it is set; it may be set already.
     clock
         Seconds that pass.
+
+    Attributes
+    ----------
+    ailments
+        Each returns why the run is not well, in one sentence, or nothing; the first that does is
+        what /health, the metrics, the log and the page say. A verdict on the estimate joins here.
     """
 
     def __init__(
@@ -150,6 +169,7 @@ class Live:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
+        self._begun = identifier.dump()
         self.feed = feed
         self.journal = journal
         self.sinks = list(sinks)
@@ -162,7 +182,16 @@ class Live:
         self.stopping = stopping or threading.Event()
         self.busy = False  # a step is taken
         self._clock = clock
-        self._heard = clock()
+        self._heard = self._taken = clock()
+        self._refused = self._failed = 0  # in a row
+        self._refusal = self._failure = ""
+        self._unwell, self._told = "", (-1, "well")
+        self.ailments: list[Callable[[], str]] = [
+            self._unlinked,
+            self._silence,
+            self._refusing,
+            self._failing,
+        ]
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._remarked = set(self._counts)
@@ -175,17 +204,30 @@ class Live:
         self._count(irregular)
 
     def resume(self) -> int:
-        """Take again what the journal holds after its last checkpoint; return how many samples."""
+        """Take again what the journal holds after its last checkpoint; return how many samples.
+
+        A sample with which the process has ended again and again is set aside.
+        """
+        again = self._again(self.journal.estimated)
+        if again and self.result.last is not None:
+            self._put(self.result.last)
+        return again
+
+    def _again(self, reached: int) -> int:
+        """Go back to the last checkpoint and take again what came after it, `reached` at most."""
         state = self.journal.rewind()
-        if state is not None:
-            self.identifier.restore(state, str(self.journal.path))
+        self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
         self.result = self._read()
         again = 0
         for taken in self.journal.samples():
+            new = taken.id > reached
+            if new and self.journal.mark() > TRIES:
+                self._set_aside(taken.t, f"the process has ended {TRIES + 1} times in its step")
+                continue
             self._step(taken, again=True)
+            if new:
+                self.journal.commit()  # its step did end
             again += 1
-        if again and self.result.last is not None:
-            self._put(self.result.last)
         return again
 
     def _read(self) -> Result:
@@ -214,13 +256,20 @@ class Live:
     def _conclude(self) -> None:
         if self.journal.accepted > self.journal.estimated:
             return  # stopped within a step: from the checkpoint before, it is taken again
+        notes: list[str] = []
+        attempted("What is under way at the end", self._settled, None, notes)
+        for note in notes:
+            self._tell("unfinished", note)
+        self.journal.checkpoint(self.identifier.dump())
+
+    def _settled(self) -> None:
+        """Keep the estimate and the fields of the end."""
         last = self.result.last
         if last is not None:
             self.result.settle(last := self.identifier.settled(last))
             self.journal.judge(last.verdict.to_dict())
         if self.journal.estimated:
             self.journal.keep(self.result.snapshot(last or self.identifier.estimate()))
-        self.journal.checkpoint(self.identifier.dump())
 
     def _run(self) -> None:
         while not self.stopping.is_set():
@@ -228,12 +277,13 @@ class Live:
                 self._settle()  # who reads the journal sees all before it is waited for more
             if self.backlog.has_room(self._waiting):
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
-                self._watch(self.feed.heard())
+                self._listen(self.feed.heard())
             self._relieve()
             if self._waiting:
                 self._take(self._waiting.popleft())
             elif self.feed.done:
                 break
+            self._look()
         self._settle()
 
     def _settle(self) -> None:
@@ -254,9 +304,12 @@ class Live:
     def _count(self, remarks: Iterable[Remark]) -> None:
         """Count remarks; the first of each kind and channel is an event, with its words."""
         for remark in remarks:
+            if remark.kind in UNUSED:
+                self._refused += remark.number
+                self._refusal = f"{remark.kind}: {remark.message}"
             self._counts[remark.kind, remark.channel] += remark.number
             self.journal.count(remark.kind, remark.channel, remark.number)
-            if (remark.kind, remark.channel) not in self._remarked:
+            if remark.kind == "clock" or (remark.kind, remark.channel) not in self._remarked:
                 self._remarked.add((remark.kind, remark.channel))
                 self._tell(remark.kind, remark.message, remark.channel)
 
@@ -271,12 +324,13 @@ class Live:
 
     @property
     def health(self) -> dict[str, Any]:
-        """What a watchdog should know: ok, unless the source is silent or steps fail."""
+        """What a watchdog should know: ok, or why not, in one sentence."""
         last = self.result.last
         counts = self._counts.copy()  # who asks does so from another thread
-        failed = last is not None and not last.status.ok
+        why = self.why
         return {
-            "ok": not (self.silent or failed),
+            "ok": not why,
+            "why": why,
             "t": self.identifier.t,
             "samples": len(self.result),
             "waiting": len(self._waiting),
@@ -288,37 +342,134 @@ class Live:
             "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
 
+    @property
+    def why(self) -> str:
+        """Why the run is not well, in one sentence; empty if it is.
+
+        As long as it ails of the same the sentence stays as it was when that began.
+        """
+        ailing, why = self._ailing()
+        return self._unwell if ailing == self._told[0] else why
+
+    def _ailing(self) -> tuple[int, str]:
+        """Return the number of the first ailment that there is, -1 for none, and what it says."""
+        found = ((k, why) for k, ailment in enumerate(self.ailments) if (why := ailment()))
+        return next(found, (-1, ""))
+
+    def _unlinked(self) -> str:
+        if self.journal.in_place:
+            return ""
+        return (
+            "the journal's file is no longer the one in the run directory, and what is written "
+            "ends with this process: stop it, and run the case into a new folder"
+        )
+
+    def _silence(self) -> str:
+        if not self.silent:
+            return ""
+        return f"nothing has come from the source for more than {self.silence:g} s"
+
+    def _refusing(self) -> str:
+        long = self._clock() - self._taken > self.silence
+        if not (long or self._refused >= REFUSED):
+            return ""
+        if not self._refused:
+            return f"no sample has been taken for more than {self.silence:g} s"
+        return f"rows come and none is taken; the last one: {self._refusal}"
+
+    def _failing(self) -> str:
+        last = self.result.last
+        if self._failed > 1:
+            return f"the last steps have failed; the last one: {self._failure}"
+        return "" if last is None or last.status.ok else f"the last step: {last.status}"
+
+    def _look(self) -> None:
+        """Say in the log, and to who reads the journal, what has changed of the run's health."""
+        ailing, why = self._ailing()
+        before, kind = self._told
+        if ailing == before:
+            return
+        self._unwell = why
+        self._told = ailing, "silent" if self.silent else "unwell" if why else "well"
+        self.journal.say_health(why)
+        if why:
+            self._tell(self._told[1], why)
+        elif kind == "unwell":  # of the end of a silence it has been said that it is heard
+            self._tell("well", "all is well again")
+
     def _take(self, ready: Ready) -> None:
+        if ready.since is not None:
+            self._go_back(ready.since)
         position = self.feed.position(self._waiting)
         self._count(self.feed.remarks(self._waiting))
         taken = self.journal.accept(ready.t, ready.values, position)
         self.feed.acknowledge(ready)
         self._step(taken)
 
+    def _go_back(self, t: float) -> None:
+        """Take back the samples later than a time, and stand where they had not come yet."""
+        self.journal.go_back(t)
+        self._again(self.journal.estimated)
+
     def _step(self, taken: Taken, *, again: bool = False) -> None:
         self.busy = True
         try:
-            self._estimate(taken, again)
-        except DataError as error:
-            if not self.strict:
-                self._tell("refused", str(error))
-            self.journal.withdraw()
-            # Those that wait are later: they are taken, or refused in their turn.
-            self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
-            if self.strict:
-                raise
+            estimate = self._estimate(taken)
+            if estimate is not None:
+                self._hand_on(estimate, again)
         finally:
             self.busy = False
 
-    def _estimate(self, taken: Taken, again: bool) -> None:
-        begun = time.monotonic()
-        estimate = self.identifier.step(taken.t, taken.values)
-        self._seconds += time.monotonic() - begun
-        self.result.add(estimate)
+    def _estimate(self, taken: Taken) -> Estimate | None:
+        """Take a step; return None where the sample was refused or set aside."""
+        before, begun = self.identifier.place, time.monotonic()
+        try:
+            estimate = self.identifier.step(taken.t, taken.values)
+            self._seconds += time.monotonic() - begun
+            self.result.add(estimate)
+        except DataError as error:
+            if not self.strict:
+                self._tell("refused", str(error))
+                self._refused += 1
+                self._refusal = str(error)
+            self._withdraw()
+            if self.strict:
+                raise
+        except RunError:  # of the journal
+            raise
+        except Exception as error:
+            if self.strict and numerical(error) is None:
+                raise
+            self.identifier.return_to(before)
+            self._set_aside(taken.t, f"{type(error).__name__}: {error}")
+        else:
+            return estimate
+        return None
+
+    def _withdraw(self) -> None:
+        """Forget the last sample; those that wait are later, and taken or refused in their turn."""
+        self.journal.withdraw()
+        self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
+
+    def _set_aside(self, t: float, why: str) -> None:
+        """Forget a sample with which a step cannot end; the stream goes on."""
+        self._failed += 1
+        self._failure = f"t = {t:g} was set aside: {why}"
+        self._tell("aside", self._failure)
+        self._counts["aside", ""] += 1
+        self.journal.count("aside")
+        self._withdraw()
+
+    def _hand_on(self, estimate: Estimate, again: bool) -> None:
+        """Tell of an estimate, and keep a checkpoint from time to time."""
         if not again:
             self._put(estimate)
+        if estimate.status.taken:
+            self._taken, self._refused = self._clock(), 0
+        self._failed = 0 if estimate.status.ok else self._failed + 1
         if not estimate.status.ok:
-            self._tell(estimate.status.code, str(estimate.status))
+            self._failure = str(estimate.status)
+            self._tell(estimate.status.code, self._failure)
         self._steps += 1
         if len(self.result) % JUDGED == 0:
             self._judge(estimate)
@@ -345,12 +496,11 @@ class Live:
                 self.sinks.remove(sink)
                 self._tell("sink", f"{type(sink).__name__} is given up: {error}")
 
-    def _watch(self, heard: bool) -> None:
+    def _listen(self, heard: bool) -> None:
         now = self._clock()
         if heard:
             if self.silent:
                 self._tell("heard", f"the source is heard again after {now - self._heard:.0f} s")
             self._heard, self.silent = now, False
-        elif not self.silent and now - self._heard > self.silence:
+        elif now - self._heard > self.silence:
             self.silent = True
-            self._tell("silent", f"nothing from the source for {now - self._heard:.0f} s")

@@ -24,8 +24,9 @@ class Metrics:
 
     `livepde_estimate{unknown}`, `livepde_deviation{unknown}`, `livepde_innovation{sensor}`,
     `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`. A `Monitor` adds what its
-    run's health says: `livepde_ok`, `livepde_silent`, `livepde_waiting_samples`,
-    `livepde_verdict`, `livepde_step_seconds_total`, `livepde_remarks_total{kind, channel}`.
+    run's health says: `livepde_ok`, `livepde_unwell{why}`, `livepde_silent`,
+    `livepde_waiting_samples`, `livepde_verdict`, `livepde_step_seconds_total`,
+    `livepde_remarks_total{kind, channel}`.
 
     Parameters
     ----------
@@ -94,7 +95,7 @@ class _Health:
 
         found = self._health()
         for name, key, text in (
-            ("ok", "ok", "1 while the source is heard and steps succeed"),
+            ("ok", "ok", "1 while samples come, are taken, and steps succeed"),
             ("silent", "silent", "1 while nothing comes from the source"),
             ("waiting_samples", "waiting", "Samples that wait for their step"),
         ):
@@ -104,6 +105,10 @@ class _Health:
             text = "0 trusted, 1 caution, 2 do not trust"
             level = float(LEVELS.index(found["verdict"]))
             yield GaugeMetricFamily("livepde_verdict", text, level)
+        unwell = GaugeMetricFamily("livepde_unwell", "1 with the reason, if any", labels=["why"])
+        if why := str(found.get("why", "")):
+            unwell.add_metric([why], 1.0)
+        yield unwell
         if "seconds" in found:
             text = "Seconds spent in steps"
             yield CounterMetricFamily("livepde_step_seconds", text, found["seconds"])

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Bound", "Check", "FigureFactory", "Outcome", "Sense", "Table"]
+__all__ = ["Bound", "Check", "FigureFactory", "Outcome", "Sense", "Table", "attempted"]
+
+T = TypeVar("T")
 
 Sense: TypeAlias = Literal["<=", ">=", "in"]
 Bound: TypeAlias = float | tuple[float, float]
@@ -126,3 +128,19 @@ class Outcome:
             "tables": [table.to_dict() for table in self.tables],
             "notes": list(self.notes),
         }
+
+
+def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str]) -> T:
+    """Return what is computed from a run; where that fails something else, and a note says why.
+
+    A run has its data whatever one of its diagnostics makes of them. `OSError`, and so `RunError`
+    (a directory that cannot be written), is raised.
+    """
+    try:
+        return compute()
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001  whatever it is, it is told
+        reason = str(error).split("\n", 1)[0].rstrip(".") or "no reason given"
+        notes.append(f"{what} failed ({type(error).__name__}: {reason[:200]}); all else is whole.")
+        return otherwise

@@ -20,7 +20,7 @@ __all__ = ["layout_from", "packed", "unpacked"]
 def packed(snapshot: Snapshot) -> bytes:
     """Return a snapshot as names and sizes in JSON, a zero byte, and the numbers."""
     arrays = dict(snapshot.profiles)
-    head: dict[str, Any] = {"told": snapshot.told}
+    head: dict[str, Any] = {"told": snapshot.told, "left_out": snapshot.left_out}
     head["profiles"] = {name: len(values) for name, values in arrays.items()}
     body = [values.tobytes() for values in arrays.values()]
     if snapshot.correlation is not None:
@@ -41,7 +41,8 @@ def unpacked(content: bytes) -> Snapshot:
     *parts, rest = np.split(numbers, np.cumsum(sizes))
     told = {name: (float(told), int(count)) for name, (told, count) in head["told"].items()}
     correlation: Array | None = None if n is None else rest.reshape(n, n)
-    return Snapshot(dict(zip(head["profiles"], parts, strict=True)), told, correlation)
+    left_out = {str(name): float(share) for name, share in head.get("left_out", {}).items()}
+    return Snapshot(dict(zip(head["profiles"], parts, strict=True)), told, correlation, left_out)
 
 
 def layout_from(text: str) -> Layout:

@@ -34,6 +34,7 @@ __all__ = [
 ]
 
 MOST_ROWS = 40
+DIGITS = 15  # of a number
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
 ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, too
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
@@ -57,7 +58,9 @@ def digits(value: float, std: float) -> tuple[str, str]:
     if value and not 1e-3 <= abs(value) < 1e5:
         power = math.floor(math.log10(abs(value)))
     scale = 10.0**power
-    places = max(0, 1 - math.floor(math.log10(std / scale)))
+    places = max(0, 1 + power - math.floor(math.log10(std)))
+    if places > DIGITS or std / scale > 10.0**DIGITS:  # no digits of one in the other
+        return f"{value:.5g}", f"{std:.2g}"
     exponent = f"e{power:+03d}" if power else ""
     return f"{value / scale:.{places}f}{exponent}", f"{std / scale:.{places}f}{exponent}"
 
@@ -242,8 +245,8 @@ def tables(data: xr.Dataset) -> list[Table]:
             deviation = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
             numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
             unit = data[name].attrs.get("units", "")
-            rows.append((name, *numbers, shown(deviation, ".2g"), unit))
-        columns = ("field", "least", "mean", "largest", "mean deviation", "unit")
+            rows.append((name, *numbers, shown(deviation, ".2g"), _left_out(data, name), unit))
+        columns = ("field", "least", "mean", "largest", "mean deviation", "left-out modes", "unit")
         result.append(Table("Estimated fields", columns, rows))
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
@@ -260,6 +263,12 @@ def tables(data: xr.Dataset) -> list[Table]:
     columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))
     return result + [table for table in (_told(data, labels), _jumped(data)) if table.rows]
+
+
+def _left_out(data: xr.Dataset, name: str) -> str:
+    """Return the share of the mean variance of a field that is of modes that the law leaves out."""
+    share = float(data[f"{name}_left_out"][-1]) if f"{name}_left_out" in data else math.nan
+    return shown(100 * share, ".2g", " %")
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:

@@ -8,7 +8,7 @@ import re
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from livepde.errors import RunError
+from livepde.runs.lobby import LONGEST_BODY, LONGEST_HEADER, Lobby
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -25,9 +26,9 @@ __all__ = ["Address", "Server"]
 COOKIE = "livepde_token"
 THREADS = 16  # so many visitors may be slow at a time
 TIMEOUT = 5  # seconds that a visitor may be silent within a request
-LONGEST_HEADER = 16_384  # bytes
-LONGEST_BODY = 1_000_000  # bytes
 SHORTEST_TOKEN = 16  # characters, where anyone may try
+NOT_HERE = "this page is for this machine only: ask for localhost"
+NO_TOKEN = "add ?token=... as it was printed where this was started"
 HEADERS = [
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
@@ -120,7 +121,10 @@ class Server:
         except ImportError:
             raise RunError("Serving needs cheroot: pip install 'livepde[service]'.") from None
         place = (address.host, address.port)
-        self._server: Any = Cheroot(place, _guarded(application, address), numthreads=THREADS)
+        server: Callable[..., Any] = Cheroot
+        self._server = server(place, _headed(application, address), numthreads=THREADS)
+        self._lobby = Lobby(self._server.process_conn, lambda e: _why_not(e, address), TIMEOUT)
+        self._server.process_conn = self._receive
         self._server.timeout = TIMEOUT
         self._server.max_request_header_size = LONGEST_HEADER
         self._server.max_request_body_size = LONGEST_BODY
@@ -153,45 +157,61 @@ class Server:
         prepared.set_result(None)
         self._server.serve()
 
+    def _receive(self, connection: Any) -> None:
+        """Let a visitor wait until the request is there; who sends two at once gets one answer."""
+        if connection.rfile.has_data():
+            connection.close()
+        else:
+            self._lobby.admit(connection)
+
     def wait(self) -> None:
         """Serve until it is closed."""
         self._thread.join()
 
     def close(self) -> None:
         """Stop listening."""
+        self._lobby.close()
         self._server.stop()
         self._thread.join()
 
 
-def _guarded(application: WSGIApplication, address: Address) -> WSGIApplication:
-    """Return an application that answers only who may ask."""
+def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
+    """Return an application with our headers, and with a cookie for who knows the token."""
 
     def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
-        start = _adding(begin, HEADERS)
-        if not address.token:
-            # A page elsewhere must not reach this machine under a name of its own.
-            if _loopback(_host(environ)):
-                return application(environ, start)
-            return _refused(start, "this page is for this machine only: ask for localhost")
-        given = parse_qs(environ.get("QUERY_STRING", "")).get("token", [""])[0]
-        if _same(given, address.token):
-            cookie = f"{COOKIE}={given}; HttpOnly; SameSite=Strict; Path=/"
-            return application(environ, _adding(start, [("Set-Cookie", cookie)]))
-        if any(_same(known, address.token) for known in _known(environ)):
-            return application(environ, start)
-        return _refused(start, "add ?token=... as it was printed where this was started")
+        if why := _why_not(environ, address):  # should the lobby have read the header otherwise
+            begin("403 Forbidden", [("Content-Type", "text/plain"), ("Connection", "close")])
+            return [f"{why}\n".encode()]
+        given = _given(environ)
+        known = bool(address.token) and _same(given, address.token)
+        cookie = f"{COOKIE}={given}; HttpOnly; SameSite=Strict; Path=/"
+        more = [("Set-Cookie", cookie)] if known else []
+        return application(environ, _adding(begin, HEADERS + more))
 
     return answer
 
 
-def _host(environ: WSGIEnvironment) -> str:
+def _why_not(environ: Mapping[str, Any], address: Address) -> str:
+    """Return why a request is refused, by its header; empty if it is not."""
+    if not address.token:
+        # A page elsewhere must not reach this machine under a name of its own.
+        return "" if _loopback(_host(environ)) else NOT_HERE
+    tokens = [_given(environ), *_known(environ)]
+    return "" if any(_same(token, address.token) for token in tokens) else NO_TOKEN
+
+
+def _given(environ: Mapping[str, Any]) -> str:
+    return parse_qs(str(environ.get("QUERY_STRING", ""))).get("token", [""])[0]
+
+
+def _host(environ: Mapping[str, Any]) -> str:
     host = str(environ.get("HTTP_HOST") or environ.get("SERVER_NAME", ""))
     if host.startswith("["):
         return host.partition("]")[0].strip("[")
     return host.partition(":")[0]
 
 
-def _known(environ: WSGIEnvironment) -> list[str]:
+def _known(environ: Mapping[str, Any]) -> list[str]:
     """Return the tokens that a visitor has sent with the request."""
     found = [str(environ.get("HTTP_AUTHORIZATION", "")).removeprefix("Bearer ").strip()]
     try:
@@ -212,8 +232,3 @@ def _adding(start: StartResponse, more: list[tuple[str, str]]) -> Any:
         return start(status, [*headers, *more], *rest)
 
     return begin
-
-
-def _refused(start: StartResponse, why: str) -> Iterable[bytes]:
-    start("403 Forbidden", [("Content-Type", "text/plain")])
-    return [f"{why}\n".encode()]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from livepde.stepping.corrections import Kept
-from livepde.stepping.interval import Advance, Interval, advance
+from livepde.stepping.interval import Advance, Interval, advance, own_noise
 from livepde.stepping.members import (
     BandedStage,
     KeptFactors,
@@ -39,5 +39,6 @@ __all__ = [
     "StepFailed",
     "advance",
     "member_stage",
+    "own_noise",
     "simulate",
 ]

@@ -86,6 +86,14 @@ class Corrections:
     factor_at: At
     spent: float
 
+    def once(self, start: Array, b: Array) -> Array:
+        """Return x with matrix x = b, by one correction: a share of the change is left.
+
+        At most `SLOW`, or the factor would have been made again; mostly less than a hundredth.
+        """
+        r = (b - self.matrix @ start) * self.free[:, None]
+        return start + solved(self.factor(*self.factor_at), r)
+
     def solve(self, before: Array, start: Array, b: Array, tolerance: float, passes: int) -> Array:
         """Return x with matrix x = b on the free coefficients.
 

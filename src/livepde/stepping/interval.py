@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
@@ -16,7 +17,7 @@ from livepde.linalg import Array
 from livepde.stepping.newton import StepFailed
 from livepde.stepping.schemes import Scheme, Stage
 
-__all__ = ["Advance", "Interval", "advance"]
+__all__ = ["Advance", "Interval", "advance", "own_noise"]
 
 MOST_HALVINGS = 30  # beyond, a substep is shorter than what times resolve
 
@@ -33,6 +34,9 @@ class Interval:
         Input channels at both ends.
     z0, z1
         Measurements at both ends, shape (sensors,), NaN where missing.
+    noise
+        Standard deviation of each value of z1, shape (sensors,), NaN where it is that of the
+        sensor; None if all are.
     """
 
     t0: float
@@ -41,6 +45,7 @@ class Interval:
     inputs1: Mapping[str, float]
     z0: Array
     z1: Array
+    noise: Array | None = None
 
     def _weight(self, t: float) -> float:
         return (t - self.t0) / (self.t1 - self.t0)
@@ -99,6 +104,12 @@ class Interval:
         return change
 
 
+def own_noise(noise: ArrayLike) -> Array | None:
+    """Return the standard deviations of readings, None if all are those of the sensors (NaN)."""
+    found: Array = np.asarray(noise, dtype=float)
+    return None if np.isnan(found).all() else found
+
+
 @dataclass(frozen=True)
 class Advance:
     """How a step is controlled.
@@ -114,12 +125,15 @@ class Advance:
     hold
         Whether inputs are held between samples at what the later one brings, as an actuator that
         is set anew at each sample leaves them; else they change linearly.
+    parts
+        Every substep is divided into so many: for the same interval with shorter steps.
     """
 
     scheme: Scheme
     dt_max: float = np.inf
     halvings: int = 8
     hold: bool = False
+    parts: int = 1
 
     def __post_init__(self) -> None:
         given: Any = self.halvings
@@ -138,7 +152,7 @@ class Advance:
     def count(self, length: float) -> int:
         """Return the number of even substeps of an interval of that length."""
         ratio = length / self.dt_max
-        return max(1, math.ceil(ratio * (1 - 1e-12)))
+        return self.parts * max(1, math.ceil(ratio * (1 - 1e-12)))
 
 
 def _width(t: float, stop: float) -> float:

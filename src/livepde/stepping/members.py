@@ -95,6 +95,9 @@ class StageOfMembers(NamedTuple):
     factors
         Of the matrices for the same q by the length of their stage, which a stage may use and add
         to: those of one step of a time scheme.
+    apart
+        How many of the last tangents are solved apart from all others, whose numbers are then what
+        they are without them.
     """
 
     members: IntArray
@@ -105,6 +108,7 @@ class StageOfMembers(NamedTuple):
     kept: KeptFactors
     off_centre: Mask
     factors: dict[float, BlockFactor]
+    apart: int = 0
 
 
 class MemberStage(ABC):
@@ -113,6 +117,10 @@ class MemberStage(ABC):
     @abstractmethod
     def kept(self, members: int) -> KeptFactors:
         """Return what is kept before any stage."""
+
+    @abstractmethod
+    def twin(self) -> MemberStage:
+        """Return a stage of the same model with factors of its own: for other steps."""
 
     @abstractmethod
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
@@ -145,6 +153,11 @@ class SeparateStages(MemberStage):
             self._stages.append(self._stages[0].twin())
         return self._stages[k]
 
+    def twin(self) -> SeparateStages:
+        other = SeparateStages(self.model)
+        other._stages = [self._stage(0).twin()]
+        return other
+
     def kept(self, members: int) -> KeptFactors:
         stage = self._stage(0)
         if not stage.keeps or not stage.solver.price:
@@ -162,6 +175,7 @@ class SeparateStages(MemberStage):
                 stage.at.member(k),
                 kept.member(k),
                 ESTIMATE if stage.off_centre[k] else GAIN,
+                stage.apart,
             )
             new[:, k] = y.T
             left.append(after)
@@ -252,12 +266,17 @@ class BandedStage(MemberStage):
         whole.eliminate_zeros()  # an unknown of a layer has an effect there only
         return compact(whole)
 
+    def twin(self) -> BandedStage:
+        return self  # it keeps no factor
+
     def kept(self, members: int) -> KeptFactors:
         return KeptFactors.none(members)
 
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
         # The equations times h: so nothing of the size of all columns has to be divided by it.
         (size, n), h, at = columns.shape[1:], stage.h, stage.at
+        together = len(columns) - stage.apart
+        columns, apart = columns[:together], columns[together:]
         unknowns = self.model.latent.value(stage.q.T).T
         factor = stage.factors.get(h)
         if factor is None:
@@ -281,11 +300,18 @@ class BandedStage(MemberStage):
         driven = (self._slopes @ new[0].T).T.reshape(size, -1, n)
         if offset is not None:
             driven = driven + offset
-        new[1:] -= ((h * stage.directions) @ driven).transpose(1, 0, 2)
-        new[1:] = factor.solve(new[1:])
+        if together > 1:
+            along = stage.directions[:, : together - 1]
+            new[1:] -= ((h * along) @ driven).transpose(1, 0, 2)
+            new[1:] = factor.solve(new[1:])
         if not self._boundary.zero:
             new[0] += self._boundary(at)
-        return new, stage.kept
+        if not len(apart):
+            return new, stage.kept
+        # Products of other shapes may round in another way: none is shared with the rest.
+        known = np.array((self._mass @ apart.reshape(-1, n).T).T, order="C").reshape(apart.shape)
+        known -= ((h * stage.directions[:, together - 1 :]) @ driven).transpose(1, 0, 2)
+        return np.concatenate([new, factor.solve(known)]), stage.kept
 
 
 def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:

@@ -59,6 +59,9 @@ class Span:
         Measurements at both ends, shape (members, sensors), NaN where missing; or (1, sensors).
     interval
         The interval of a single process, None for members of a fleet.
+    noise
+        Standard deviation of each value of z1, of its shape, NaN where it is that of the sensor;
+        None if all are.
     """
 
     t0: Array
@@ -69,6 +72,7 @@ class Span:
     z0: Array
     z1: Array
     interval: Interval | None = None
+    noise: Array | None = None
 
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
@@ -80,7 +84,8 @@ class Span:
             if interval.inputs0 is not interval.inputs1:
                 first = np.array([[interval.inputs0[name] for name in channels]])
         t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
-        return cls(t0, interval.t1, channels, first, last, z0, z1, interval)
+        noise = None if interval.noise is None else interval.noise[None]
+        return cls(t0, interval.t1, channels, first, last, z0, z1, interval, noise)
 
     def __len__(self) -> int:
         return len(self.t0)
@@ -130,4 +135,5 @@ class Span:
             Inputs(dict(zip(self.channels, inputs[k].tolist(), strict=True)))
             for inputs in (self.inputs0, self.inputs1)
         )
-        return Interval(float(self.t0[k]), self.t1, first, last, self.z0[k], self.z1[k])
+        noise = None if self.noise is None else self.noise[k]
+        return Interval(float(self.t0[k]), self.t1, first, last, self.z0[k], self.z1[k], noise)

@@ -284,6 +284,7 @@ class ForwardStage:
         moment: Moment,
         kept: Kept,
         tolerance: float = STATE,
+        apart: int = 0,
     ) -> tuple[Array, Kept]:
         """Return state and tangents at the end of a stage, and what it leaves to the next.
 
@@ -303,18 +304,28 @@ class ForwardStage:
         tolerance
             Bound on the error of the tangents, relative to the norm of all of them; it is a
             hundredth of their change, too.
+        apart
+            How many of the last tangents are solved apart from all others, by one correction.
 
         Raises
         ------
         StepFailed
             The stage has no solution that is found.
         """
-        model, begin, start = self.model, c[:, 0], c[:, 1:]
-        new = np.empty_like(c)
+        model, begin, free = self.model, c[:, 0], self.model.X.free[:, None]
+        new, end = np.empty_like(c), c.shape[1] - apart
+        groups = [part for part in (slice(1, end), slice(end, None)) if c[0, part].size]
+
+        def driven(u: Array, part: slice) -> Array:
+            along = directions[:, part.start - 1 : part.stop - 1 if part.stop else None]
+            return self._driven(u, c[:, part], q, along, h, moment)
+
         if not self.keeps or not self.solver.price:
             new[:, 0] = u = self.solve(begin, q, h, moment)
-            known = self._driven(u, start, q, directions, h, moment)
-            new[:, 1:] = solved(self.tangent(u, q, h, moment), known * model.X.free[:, None])
+            if groups:
+                tangent = self.tangent(u, q, h, moment)
+                for part in groups:
+                    new[:, part] = solved(tangent, driven(u, part) * free)
             return new, kept
         at, keeps = At(q, h), len(kept.q) > 0
         guess = begin + h * kept.trend if keeps else begin
@@ -330,8 +341,12 @@ class ForwardStage:
             kept.spent,
         )
         new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
-        known = self._driven(u, start, q, directions, h, moment)
-        new[:, 1:] = corrected.solve(start, start, known, tolerance, PASSES - 1)
+        for part in groups:
+            start, known = c[:, part], driven(u, part)
+            if part.stop is None:
+                new[:, part] = corrected.once(start, known)
+            else:
+                new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
         return new, Kept(*corrected.factor_at, corrected.spent, (u - begin) / h)
 
     def _driven(

@@ -21,6 +21,7 @@ __all__ = [
     "Clock",
     "guessed_format",
     "has_decimal_comma",
+    "is_naive",
     "number_of",
     "origin_at",
     "read_times",
@@ -81,6 +82,17 @@ class Clock:
         here = datetime.fromtimestamp(t / self.second, self.zone)
         return here.replace(fold=0).utcoffset() != here.replace(fold=1).utcoffset()
 
+    def repeated_hour(self, t: float) -> float:
+        """Return how much later the clocks show a time again, given since 1970, or 0."""
+        try:
+            here = datetime.fromtimestamp(t / self.second, self.zone)
+        except (ValueError, OverflowError, OSError):
+            return 0.0
+        first, again = here.replace(fold=0).utcoffset(), here.replace(fold=1).utcoffset()
+        if first is None or again is None:
+            return 0.0
+        return (first - again).total_seconds() * self.second
+
     def stamp(self, value: Any, form: str = "") -> float | None:
         """Return seconds since 1970 of a date or a date as text, None if it is neither."""
         try:
@@ -135,11 +147,28 @@ def read_times(
     return times * (clock.second if dates else clock.factor), dates
 
 
+def is_naive(cell: Any, clock: Clock) -> bool:
+    """Return whether a cell is a date without a zone of its own."""
+    try:
+        if isinstance(cell, str):
+            text = cell.strip()
+            cell = (
+                datetime.strptime(text, clock.format)
+                if clock.format
+                else datetime.fromisoformat(text)
+            )
+    except ValueError:
+        return False
+    return isinstance(cell, datetime) and cell.tzinfo is None
+
+
 def number_of(cell: Any, decimal: str = ".") -> float | None:
     """Return a number or a number as text, None if it is neither."""
     try:
-        if isinstance(cell, str) and decimal != ".":
-            cell = cell.translate(POINT)
+        if isinstance(cell, str):
+            if "_" in cell:  # which Python reads as 1000 in 1_000
+                return None
+            cell = cell if decimal == "." else cell.translate(POINT)
         return None if isinstance(cell, bool) else float(cell)
     except (TypeError, ValueError, OverflowError):
         return None

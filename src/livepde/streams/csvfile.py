@@ -22,7 +22,7 @@ from livepde.streams.clock import (
     number_of,
     read_times,
 )
-from livepde.streams.names import check_columns, no_file
+from livepde.streams.names import check_columns, is_data, no_file
 from livepde.streams.table import Column, Table, cell_number, to_table
 
 __all__ = ["UTF_8", "Written", "how_written", "read_csv", "too_wide"]
@@ -221,7 +221,7 @@ def _cells(
         if header is None:
             raise csv.Error("it is empty")
         _check_separator(path, header, separator, encoding, clock)
-        check_columns(str(path), needed, header)
+        check_columns(str(path), needed, header, told=is_data(path))
         for name in needed:
             if header.count(name) > 1:
                 raise SampleError(f"{path}: two columns are called '{name}'; rename one.")
@@ -278,6 +278,8 @@ def _numbers(
     try:
         plain = cells if decimal == "." else [cell.translate(POINT) for cell in cells]
         found: Array = np.array([c if c else "nan" for c in plain], dtype=float)
+        if any("_" in cell for cell in plain):
+            raise ValueError("digits with a line between them")
     except ValueError:
         found = np.full(len(cells), np.inf)
     if np.isinf(found).any():

@@ -79,12 +79,11 @@ def _residuals(t: Array, x: Array) -> _Residuals:
 def _threshold(x: Array, size: Array, beyond: float) -> Array:
     """Return above which size a residual is implausible: global and local scale."""
     absolute = np.abs(size)
-    local = median_filter(absolute, size=LOCAL)
-    half = LOCAL // 2
-    if len(local) > LOCAL:  # at the ends the window lies inside: a spike does not fill it
+    local = np.full_like(absolute, np.median(absolute))
+    if len(absolute) > LOCAL:  # where shorter, SciPy before 1.15.3 corrupts memory
+        half = LOCAL // 2  # at the ends the window lies inside: a spike does not fill it
+        local = median_filter(absolute, size=LOCAL)
         local[:half], local[-half:] = local[half], local[-half - 1]
-    else:
-        local[:] = np.median(absolute)
     steps = np.abs(np.diff(x))
     # Values that mostly repeat have a residual of zero: one step of their resolution is no spike.
     resolution = steps[steps > 0.0].min(initial=math.inf)

@@ -8,16 +8,25 @@ from pathlib import Path
 
 from livepde.errors import DataError, SampleError
 
-__all__ = ["check_columns", "hint", "no_file"]
+__all__ = ["check_columns", "hint", "is_data", "no_file"]
 
 MOST = 12  # names that are listed
+SHOWN = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".log", ".jsonl", ".ndjson", ".parquet")
 
 
-def check_columns(where: str, needed: Iterable[str], known: list[str]) -> None:
-    """Raise `SampleError` with a hint if a column is not there."""
+def check_columns(
+    where: str, needed: Iterable[str], known: list[str], *, told: bool = True
+) -> None:
+    """Raise `SampleError` if a column is not there; with `told` the error names those there are."""
     for name in needed:
         if name not in known:
-            raise SampleError(f"{where}: there is no column '{name}'{hint(name, known)}")
+            ending = hint(name, known) if told else "."
+            raise SampleError(f"{where}: there is no column '{name}'{ending}")
+
+
+def is_data(path: Path) -> bool:
+    """Return whether a file is data by its name: a case may name any other file as its data."""
+    return path.suffix.lower() in SHOWN
 
 
 def hint(name: str, known: list[str]) -> str:

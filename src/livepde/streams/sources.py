@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import json
@@ -264,9 +265,15 @@ class Follow:
         try:
             cells = self._cells(line)
         except (UnicodeError, csv.Error) as error:
+            if self._head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+                return Row({}, token, "the file is in UTF-16, not to be followed: write UTF-8")
             return Row({}, token, f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
             self._header = _names(cells)
+            twice = sorted({name for name in cells if name and cells.count(name) > 1})
+            if twice:
+                text = f"two columns are called '{twice[0]}', and none of them is taken: rename one"
+                return Row({}, token, text)
             return None
         if too_wide(cells, self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"

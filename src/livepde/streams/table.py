@@ -37,6 +37,7 @@ __all__ = [
     "row_time",
     "tabulated",
     "to_table",
+    "without_noise",
 ]
 
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
@@ -58,6 +59,9 @@ class Column:
         A sample without this channel is left out.
     decimal
         Of numbers as text: "." or ",".
+    noise_of
+        Channel whose readings have this standard deviation; "": none. One that is not positive
+        makes the reading missing; where it is missing itself, that of the sensor counts.
     """
 
     names: tuple[str, ...]
@@ -66,6 +70,7 @@ class Column:
     valid: tuple[float, float] = (-math.inf, math.inf)
     needed: bool = False
     decimal: str = "."
+    noise_of: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +88,9 @@ class Table:
     origin
         The first sample's date, if times are dates.
     remarks
-        (kind, channel) -> how many values were not valid ("invalid"), and samples left out because
-        a channel is missing that they need ("skipped").
+        (kind, channel) -> how many values were not valid ("invalid"), or without a noise of their
+        own ("missing"), and samples left out because a channel is missing that they need
+        ("skipped").
     """
 
     t: Array
@@ -241,7 +247,7 @@ def to_table(
         ]
         or [np.zeros((len(use), 0))]
     )
-    remarks: dict[tuple[str, str], int] = {}
+    remarks = _noise_remarks(columns, values)
     kept = np.full(len(use), True)
     for k, (name, channel) in enumerate(columns.items()):
         low, high = channel.valid
@@ -249,7 +255,8 @@ def to_table(
         values[wrong, k] = np.nan
         lacking = kept & np.isnan(values[:, k]) & channel.needed
         kept &= ~lacking
-        remarks |= {("invalid", name): int(wrong.sum()), ("skipped", name): int(lacking.sum())}
+        remarks["invalid", name] = remarks.get(("invalid", name), 0) + int(wrong.sum())
+        remarks["skipped", name] = int(lacking.sum())
     if not kept.any():
         raise DataError(f"{source}: no sample has all channels that it needs.")
     t, values, origin = times[use][kept], values[kept], None
@@ -258,6 +265,30 @@ def to_table(
         t = t - t[0]
     told = {key: number for key, number in remarks.items() if number}
     return Table(t, values, tuple(columns), origin, told)
+
+
+def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[str, str], int]:
+    """Take readings away whose noise is not positive; return how many, and how many have none."""
+    remarks, places = {}, {name: k for k, name in enumerate(columns)}
+    for name, column in columns.items():
+        if not column.noise_of:
+            continue
+        noise, reading = values[:, places[name]], values[:, places[column.noise_of]]
+        wrong = noise <= 0.0
+        remarks["invalid", column.noise_of] = int((wrong & np.isfinite(reading)).sum())
+        noise[wrong] = reading[wrong] = np.nan
+        remarks["missing", name] = int((np.isnan(noise) & np.isfinite(reading)).sum())
+    return remarks
+
+
+def without_noise(columns: Mapping[str, Column], values: dict[str, float]) -> list[str]:
+    """Take the readings of a sample away whose noise is not positive; return their channels."""
+    refused = []
+    for name, column in columns.items():
+        if column.noise_of and values.get(name, math.nan) <= 0.0:
+            values[name] = values[column.noise_of] = math.nan
+            refused.append(column.noise_of)
+    return refused
 
 
 class JsonLines:
@@ -311,6 +342,7 @@ class JsonLines:
                 low, high = column.valid
                 if not low <= values[channel] <= high:
                     values[channel] = math.nan
+            without_noise(self._columns, values)
             if not any(
                 math.isnan(values[c]) for c, column in self._columns.items() if column.needed
             ):

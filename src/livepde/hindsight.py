@@ -1,0 +1,112 @@
+"""What a run would have said of each time, had it known all samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from livepde.laws import Belief, FixedInterval, Problem, Status
+from livepde.linalg import Array
+from livepde.records import SMOOTHED, Record, bare
+from livepde.result import Estimate, Result
+from livepde.stepping import Interval
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Hindsight", "with_smoothed"]
+
+
+class Hindsight:
+    """The samples of a run as they were taken, and its estimates of the unknowns.
+
+    Parameters
+    ----------
+    q0
+        Latent parameter before the first sample.
+    """
+
+    def __init__(self, q0: Array) -> None:
+        self._q = [q0]
+        self._opening: Interval | None = None
+        self._intervals: list[Interval] = []
+        self._jumps: set[int] = set()
+        self._estimates: list[tuple[int, float, Status]] = []  # with the number of intervals
+
+    def add(self, estimate: Estimate, interval: Interval, q: Array) -> None:
+        """Add a sample.
+
+        Parameters
+        ----------
+        interval
+            From the sample before; the last one that was taken.
+        q
+            Latent parameter after it.
+        """
+        taken = estimate.status.taken
+        opens = taken and interval.t0 == interval.t1
+        if self._opening is None:
+            t, z, inputs = interval.t0, interval.z0, interval.inputs0
+            self._opening = interval if opens else Interval(t, t, inputs, inputs, z, z)
+        if opens:
+            self._q = [q]
+        elif taken:
+            self._intervals.append(interval)
+            self._q.append(q)
+        if onset := int(estimate.notes.get("jump_samples", 0)):
+            self._jumps.add(len(self._intervals) - onset)
+        self._estimates.append((len(self._intervals), estimate.t, estimate.status))
+
+    def fixed_interval(self, fields_every: int) -> FixedInterval | None:
+        """Return the samples, with states where fields are kept; None if there are none."""
+        if self._opening is None:
+            return None
+        last = len(self._estimates) - 1
+        kept = {n for k, (n, *_) in enumerate(self._estimates) if k in (0, last)}
+        kept |= {n for n, *_ in self._estimates[::fields_every]}
+        return FixedInterval(self._opening, self._intervals, self._q, self._jumps, kept)
+
+    def dataset(self, result: Result, problem: Problem, beliefs: Iterable[Belief]) -> xr.Dataset:
+        """Return beliefs after all intervals, the last first, as a dataset of the run."""
+        records = list(self._records(result, problem, beliefs))
+        data = result.layout.dataset(reversed(records))
+        return data.drop_vars("steps").drop_dims(["sensor", "withheld"])
+
+    def _records(
+        self, result: Result, problem: Problem, beliefs: Iterable[Belief]
+    ) -> Iterator[Record]:
+        """Iterate over the records, the last one first."""
+        count = len(self._estimates)
+        said = groupby(reversed(list(enumerate(self._estimates))), key=lambda item: item[1][0])
+        for (_, estimates), belief in zip(said, beliefs, strict=False):  # none may be at the start
+            known = problem.physical(belief)
+            for k, (_, t, status) in estimates:
+                keeps = k % result.fields_every == 0 or k == count - 1
+                yield result.record(self._estimate(result, t, known, status), keeps)
+
+    @staticmethod
+    def _estimate(result: Result, t: float, belief: Belief, status: Status) -> Estimate:
+        nothing: dict[str, Any] = {}
+        withheld = 0 if result.withheld is None else result.withheld.size
+        unseen = np.full(result.observed.size, np.nan), np.full(withheld, np.nan)
+        return Estimate(t, belief, *unseen, status, 0, nothing, (), result.model.parameter_space)
+
+
+def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:
+    """Return the dataset of a run with what is smoothed beside it: `k_smoothed`, `k_smoothed_std`.
+
+    Parameters
+    ----------
+    smoothed
+        Of the same samples, as `Identifier.smoothed` returns it.
+    """
+    attrs, found = data.attrs, {}
+    own = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}
+    for key, variable in smoothed.data_vars.items():
+        name = key if key in own else bare(str(key))
+        if name in own:
+            found[f"{name}{SMOOTHED}{str(key).removeprefix(str(name))}"] = variable.variable
+    return data.assign(found)

@@ -1,0 +1,154 @@
+"""The process on a mesh whose elements are halved: for the shadow of the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.fem import FieldBlock, Moment
+from livepde.laws.base import Problem
+from livepde.linalg import Array, IntArray, compact
+from livepde.model import Model
+from livepde.observation import Observed
+from livepde.stepping import KeptFactors, MemberStage, StageOfMembers, member_stage
+
+__all__ = ["HalvedMesh", "refusal"]
+
+
+@dataclass(frozen=True, eq=False)
+class HalvedMesh:
+    """A model on the halved mesh, its sensors, and the maps between both meshes.
+
+    Attributes
+    ----------
+    model, observed, stage
+        The process, what is observed of it, and its implicit stage.
+    P, unknowns
+        Prolongation of the state, shape (N, n), and of the latent parameter, shape (M, m).
+    at
+        Which coefficient of the halved mesh is that of each of the mesh, shape (n,).
+    """
+
+    model: Model
+    observed: Observed
+    stage: MemberStage
+    P: sp.csr_array | Array
+    unknowns: sp.csr_array
+    at: IntArray
+
+    @classmethod
+    def of(cls, problem: Problem) -> HalvedMesh:
+        """Return the process of a problem on the halved mesh.
+
+        Raises
+        ------
+        LivepdeError
+            Something that the model or the sensors were made of belongs to the given mesh alone.
+        """
+        coarse, fine = problem.model, problem.model.refined()
+        spaces = (fine.state_space, fine.X, fine.parameter_space)
+        observed = problem.observed.observation.bind(*spaces)
+        P = coarse.state_space.prolongation(fine.state_space)
+        pairs = zip(coarse.latent.parts.values(), fine.latent.parts.values(), strict=True)
+        blocks = [
+            sp.kron(sp.eye_array(one.evolution.copies), one.block.prolongation(other.block))
+            for one, other in pairs
+        ]
+        unknowns = sp.csr_array(sp.block_diag(blocks, format="csr"))
+        stage: MemberStage = member_stage(fine)
+        if any(isinstance(part.block, FieldBlock) for part in coarse.latent.parts.values()):
+            stage = _Prolonged(stage, unknowns)
+        # A node of the mesh is one of the halved mesh: its row has a single one.
+        alone = np.flatnonzero(np.abs(P.max(axis=1).toarray().ravel() - 1.0) < 1e-9)
+        at = np.empty(P.shape[1], dtype=np.int64)
+        at[np.asarray(P[alone].argmax(axis=1)).ravel()] = alone
+        return cls(fine, observed, stage, compact(P), unknowns, at)
+
+    @cached_property
+    def G(self) -> sp.csr_array | Array | None:
+        """What the sensors see of the state, shape (sensors, N), if that is always the same."""
+        observation = self.observed.observation
+        if type(self.observed) is not Observed or observation.directs or observation.inputs:
+            return None
+        return compact(self.observed.G)
+
+    def prolonged(self, u: Array) -> Array:
+        """Return states on the halved mesh, shape (members, N) for (members, n)."""
+        return np.asarray((self.P @ u.T).T)
+
+    def begun(self, given: Any, q: Array, u: Array, moment: Moment | None) -> Array:
+        """Return the initial state there minus that of the mesh, shape (N,).
+
+        Parameters
+        ----------
+        given
+            The initial state as a user gave it; coefficients say nothing of what is between them.
+        moment
+            None before any: nothing is known then.
+        q, u
+            Latent parameter and initial state, shapes (m,) and (n,).
+        """
+        coarse = self.prolonged(u[None])[0]
+        if moment is None:
+            return np.zeros_like(coarse)
+        if self.model.form_initial is not None:
+            return np.asarray(self.model.initial_state(self.unknowns @ q, moment) - coarse)
+        if given is None or not _pointwise(given):
+            return np.zeros_like(coarse)
+        return np.asarray(self.model.initial(given, moment) - coarse)
+
+    def seen(self, u: Array, q: Array, difference: Array, moment: Moment) -> Array:
+        """Return what sensors see of a difference of the state there, shape (sensors,).
+
+        Parameters
+        ----------
+        u, q
+            State and latent parameter of the mesh, about which sensors are linear.
+        """
+        if self.G is not None:
+            return np.asarray(self.G @ difference)
+        physical = self.model.latent.value(self.unknowns @ q)
+        H_u, _ = self.observed.jacobian(self.prolonged(u[None])[0], physical, moment)
+        return np.asarray(H_u @ difference)
+
+
+def refusal(problem: Problem, largest: int) -> str:
+    """Return why a process is not followed on the halved mesh; empty if it is."""
+    model = problem.model
+    size = model.X.dim * 2 ** model.mesh.dim()
+    if size > largest:
+        return f"the state has about {size} coefficients there, more than {largest}"
+    if not problem.observed.observation.portable:
+        return "the readings of its sensors are coefficients of the given mesh"
+    return ""
+
+
+def _pointwise(given: Any) -> bool:
+    """Return whether an initial state is given at every point of the domain."""
+    if isinstance(given, Mapping):
+        return all(_pointwise(part) for part in given.values())
+    return callable(given) or np.ndim(given) == 0
+
+
+class _Prolonged(MemberStage):
+    """A stage on the halved mesh that takes unknown fields as those of the mesh have them."""
+
+    def __init__(self, stage: MemberStage, unknowns: sp.csr_array) -> None:
+        self.stage = stage
+        self.unknowns = unknowns
+
+    def twin(self) -> _Prolonged:
+        return _Prolonged(self.stage.twin(), self.unknowns)
+
+    def kept(self, members: int) -> KeptFactors:
+        return self.stage.kept(members)
+
+    def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
+        q = np.asarray((self.unknowns @ stage.q.T).T)
+        none = np.zeros((len(q), 0, self.unknowns.shape[0]))
+        return self.stage.advance(columns, stage._replace(q=q, directions=none))

@@ -1,0 +1,112 @@
+"""What is known of the discretisation error of each member: see `livepde.laws.shadows`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livepde.linalg import Array, IntArray
+from livepde.stepping import KeptFactors
+
+__all__ = ["ShadowState"]
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowState:
+    """Shifts of the estimates of each member; the leading axis of every array is the members.
+
+    Attributes
+    ----------
+    u, a
+        By how much the discretisation has shifted state and reduced unknowns, a row for each
+        shadow, shapes (members, shadows, n) and (members, shadows, k).
+    count, last, due
+        Steps so far, and at which the shadows were taken last and are taken next, (members,).
+    rate, usual, jumped
+        Change of the state per unit of time in the last step, how much that usually differs from
+        one step to the next, and the count of steps at which it last differed by much more; shapes
+        (members, n), (members,) and (members,).
+    size
+        Norm of what the step shadow found last, (members,); infinite before.
+    begun, u0, inputs0
+        Time, state and inputs where the shadows were taken last; the state without columns if no
+        shadow needs it. Shapes (members,), (members, n) and (members, channels).
+    length, slope
+        Of the last interval, infinite before the first, and how inputs changed in it per unit of
+        time; shapes (members,) and (members, channels).
+    bend, missed
+        Integral of what straight lines have missed of the inputs in the last interval, and of all
+        that no shadow has stepped with yet, shapes (members, channels).
+    halves, blocks
+        What the last stages of halved steps, and of a block of steps, have left.
+    fine, fine_stage
+        The state on the halved mesh minus that of the filter, shape (members, N), and what the last
+        stage there has left.
+    seen
+        What the sensors see of that until the next shadow, shape (members, sensors).
+    failed
+        How many shadow steps had no solution, shape (members,).
+    """
+
+    u: Array
+    a: Array
+    count: IntArray
+    last: IntArray
+    due: IntArray
+    rate: Array
+    usual: Array
+    jumped: IntArray
+    size: Array
+    begun: Array
+    u0: Array
+    inputs0: Array
+    length: Array
+    slope: Array
+    bend: Array
+    missed: Array
+    halves: KeptFactors
+    blocks: KeptFactors
+    fine: Array
+    fine_stage: KeptFactors
+    seen: Array
+    failed: IntArray
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    @classmethod
+    def none(cls, members: int, n: int, k: int) -> ShadowState:
+        """Return the value without any shadow."""
+        zero, nothing = np.zeros(members, dtype=np.int64), np.zeros((members, 0))
+        time, kept = np.zeros(members), KeptFactors.none(members)
+        u, a = np.zeros((members, 0, n)), np.zeros((members, 0, k))
+        return cls(
+            u,
+            a,
+            count=zero,
+            last=zero,
+            due=zero,
+            rate=np.zeros((members, n)),
+            usual=time,
+            jumped=zero,
+            size=time + np.inf,
+            begun=time,
+            u0=nothing,
+            inputs0=nothing,
+            length=time + np.inf,
+            slope=nothing,
+            bend=nothing,
+            missed=nothing,
+            halves=kept,
+            blocks=kept,
+            fine=nothing,
+            fine_stage=kept,
+            seen=nothing,
+            failed=zero,
+        )
+
+    def without_stages(self) -> ShadowState:
+        """Return the shifts alone, without what the next steps need."""
+        kept, nothing = KeptFactors.none(len(self)), np.zeros((len(self), 0))
+        return replace(self, halves=kept, blocks=kept, fine_stage=kept, u0=nothing, inputs0=nothing)

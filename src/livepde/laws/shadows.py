@@ -1,0 +1,567 @@
+"""The discretisation error of a filter: what step, mesh and input lines have shifted it by.
+
+The filter and one without discretisation error would take the same samples with the same gain. What
+the former is off by, e of the state and s of the unknowns, follows
+
+    predict   [e; s]+ = T [e; s] + d,      T the linearised step, d the error that this step adds
+    update    [e; s] <- [e; s] - K H [e; s]
+
+with the filter's own T, H and gain K, for unknowns that stay and for unknowns that move. Each
+shadow says what d is, by Richardson's extrapolation: the step from two halved steps, the input
+lines from the curvature of the readings. The mesh has a trajectory of its own on the halved mesh,
+with the unknowns of the filter: what it differs by is no d, but is seen by the sensors.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from livepde.errors import LawError, LivepdeError
+from livepde.fem import Moment
+from livepde.laws.covariance import robust_factors
+from livepde.laws.filter import Filter, Update
+from livepde.laws.filter_state import FilterState
+from livepde.laws.halved_mesh import HalvedMesh, refusal
+from livepde.laws.members import changed, put, take
+from livepde.laws.shadow_state import ShadowState
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import TINY, KeptFactors, Moments, Span
+
+__all__ = ["KINDS", "ShadowSet", "Shadows"]
+
+FIRST = 32  # steps that are all shadowed: where a run begins the error changes from step to step
+CALM = 4  # steps after a jump that are all shadowed
+JUMP = 4.0  # times the usual difference of two changes of the state: something has jumped
+USUAL = 16.0  # steps over which that is averaged
+ALIKE = 3.0  # ratio of the errors of two steps that others between them have, too
+AHEAD = 0.5  # share of the last change of the mesh error that is expected to follow
+# Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
+# phase alone; on average 8, of which each stands for those before it.
+LATER = np.array([5, 11, 7, 9])
+LONG = 256  # steps from which on they are twice as many: one of 256 tells little
+MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
+KINDS = ("step", "mesh", "input")
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """Which discretisation errors the sensitivity law follows beside its estimates.
+
+    Their signed shifts are summed, and widen what is reported: variance plus square of the sum. The
+    estimate itself, and the filter, stay as they are.
+
+    The first 32 steps are shadowed, later one of eight, from 256 on one of sixteen, which stands
+    for those around it: an error that changes much faster is found on average only.
+
+    Parameters
+    ----------
+    step
+        The time step, by halved steps.
+    mesh
+        The mesh, by the halved mesh: for states and unknown fields of first order and sensors that
+        mean the same on every mesh.
+    inputs
+        The straight line between readings of a channel, by the curvature of three readings; not
+        where inputs are held.
+    largest
+        Coefficients of the state on the halved mesh beyond which it is not followed, because that
+        would cost more than the filter.
+    """
+
+    step: bool = True
+    mesh: bool = True
+    inputs: bool = True
+    largest: int = 4000
+
+    def __post_init__(self) -> None:
+        if not (self.step or self.mesh or self.inputs):
+            raise LawError("Shadows: none is left; write shadows=None to follow no error.")
+        if self.largest < 1:
+            raise LawError(f"Shadows: largest must be at least 1; got {self.largest}.")
+
+
+class Steps(NamedTuple):
+    """The steps of some members that a shadow stands for.
+
+    Attributes
+    ----------
+    x, end
+        The filter before and after the last of them.
+    span, block
+        The last of them, and all since the shadow was taken before.
+    waited, next
+        The number of the latter, and of those that follow until the next is taken, (members,).
+    jumps
+        Members of which something jumped in the last step, shape (members,).
+    """
+
+    x: FilterState
+    end: FilterState
+    span: Span
+    block: Span
+    waited: IntArray
+    next: IntArray
+    jumps: Mask
+
+
+class Found(NamedTuple):
+    """What a shadow has found.
+
+    Attributes
+    ----------
+    error
+        What the state is off by more, shape (members, n); None for nothing.
+    parts
+        Fields of `ShadowState` to exchange.
+    failed
+        Members whose shadow could not be stepped, shape (members,); nothing is added for them.
+    """
+
+    error: Array | None
+    parts: dict[str, Any]
+    failed: Mask
+
+
+class Shadow(ABC):
+    """Abstract source of a discretisation error."""
+
+    kind: ClassVar[str]
+
+    @abstractmethod
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
+        """Return what is known before the first step, of one member.
+
+        Parameters
+        ----------
+        moment, given
+            Time and inputs, None before any; and the initial state as it was given.
+        """
+
+    @abstractmethod
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        """Return what the shadow has found about some steps."""
+
+    def seen(self, s: ShadowState) -> Array | None:
+        """Return what sensors see of an error beside that in `ShadowState.u`; None if nothing."""
+        return None
+
+    def beside(self, s: ShadowState) -> Array | None:
+        """Return the error of the state beside that in `ShadowState.u`, shape (members, n)."""
+        return None
+
+
+@dataclass(frozen=True, eq=False)
+class StepShadow(Shadow):
+    """The error of the time step: one step less two halved ones, from the same state.
+
+    One step stands for half of those since the shadow before and half of those until the next,
+    unless its error is much larger than that of the shadow before.
+
+    Attributes
+    ----------
+    halves
+        The filter without covariance, by halved steps.
+    factor
+        2^p/(2^p - 1) for a scheme of order p.
+    """
+
+    halves: Filter
+    factor: float
+
+    kind = "step"
+
+    @classmethod
+    def of(cls, mean: Filter) -> StepShadow:
+        """Return the shadow of a filter without covariance."""
+        control = mean.problem.control
+        finer = replace(mean.problem, control=replace(control, parts=2 * control.parts))
+        ratio = 2.0**control.scheme.order
+        return cls(replace(mean, problem=finer, stage=mean.stage.twin()), ratio / (ratio - 1.0))
+
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
+        return changed(s, halves=self.halves.stage.kept(1))
+
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        u, kept, failed = _followed(self.halves, steps.x, steps.x.u, s.halves, steps.span)
+        error = self.factor * (steps.end.u - u)
+        size = np.linalg.norm(error, axis=1)
+        # An error much larger than the one before is that of this step alone.
+        alike = np.where(size <= ALIKE * s.size, 1.0, s.size / np.maximum(size, TINY))
+        weight = 1.0 + (0.5 * (steps.waited + steps.next) - 1.0) * alike
+        parts = {"halves": kept, "size": np.where(steps.jumps | failed, s.size, size)}
+        return Found(weight[:, None] * error, parts, failed)
+
+
+@dataclass(frozen=True, eq=False)
+class InputShadow(Shadow):
+    """The error of the straight line between two readings of a channel.
+
+    The mean of a line misses that of a curve by h^2/12 times its second derivative, which the last
+    three readings tell. Second differences of noise add up to nothing.
+
+    Attributes
+    ----------
+    mean
+        The filter without covariance.
+    """
+
+    mean: Filter
+
+    kind = "input"
+
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
+        nothing = np.zeros((1, len(self.mean.problem.channels)))
+        return changed(s, slope=nothing, bend=nothing, missed=nothing)
+
+    @staticmethod
+    def read(s: ShadowState, span: Span) -> ShadowState:
+        """Return what straight lines have missed after one more interval."""
+        length, slope = span.t1 - span.t0, span.inputs1 - span.inputs0
+        if len(length) < len(s):  # the members of a bank have their samples in common
+            length = np.repeat(length, len(s))
+        if len(slope) < len(s):
+            slope = np.repeat(slope, len(s), axis=0)
+        h = length[:, None]
+        slope = slope / h
+        bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
+        return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
+
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        ahead = (0.5 * (steps.next - 1))[:, None] * s.bend  # of half of the steps until the next
+        missed = s.missed + ahead
+        missed = np.where(np.isfinite(missed), missed, 0.0)  # not so for positions of sensors
+        left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
+        if not missed.any():
+            return Found(None, left, np.zeros(len(missed), dtype=bool))
+        span = steps.span
+        off = missed / (span.t1 - span.t0)[:, None]
+        first, last = span.inputs0 + off, span.inputs1 + off
+        moved = replace(span, inputs0=first, inputs1=last, interval=None)
+        u, _, failed = _followed(self.mean, steps.x, steps.x.u, steps.x.kept, moved)
+        return Found(u - steps.end.u, left, failed)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshShadow(Shadow):
+    """The error of the mesh: a trajectory on the halved mesh beside one on the mesh.
+
+    It has the unknowns of the filter, and follows where samples move the state: only its difference
+    to the state of the filter is kept. Several steps are taken at once on both meshes. Until the
+    next the sensors see the difference as it is expected to be halfway.
+
+    Attributes
+    ----------
+    mean
+        The filter without covariance.
+    fine
+        The same on the halved mesh.
+    mesh
+        That mesh.
+    """
+
+    mean: Filter
+    fine: Filter
+    mesh: HalvedMesh
+
+    kind = "mesh"
+
+    @classmethod
+    def of(cls, mean: Filter) -> MeshShadow:
+        """Return the shadow of a filter without covariance; raises `LivepdeError`."""
+        mesh = HalvedMesh.of(mean.problem)
+        finer = replace(mean.problem, model=mesh.model)
+        fine = replace(mean, problem=finer, stage=mesh.stage)
+        return cls(replace(mean, stage=mean.stage.twin()), fine, mesh)
+
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
+        if moment is None:
+            difference = np.zeros((1, self.mesh.model.X.dim))
+            seen = np.zeros((1, self.mesh.observed.size))
+        else:
+            difference = self.mesh.begun(given, x.q[0], x.u[0], moment)[None]
+            seen = self.mesh.seen(x.u[0], x.q[0], difference[0], moment)[None]
+        kept = {"blocks": self.mean.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
+        return changed(s, u0=x.u, fine=difference, seen=seen, **kept)
+
+    def found(self, s: ShadowState, steps: Steps) -> Found:
+        x, end, mesh = steps.x, steps.end, self.mesh
+        coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
+        if (steps.waited > 1).any():
+            coarse, blocks, failed = _followed(self.mean, x, s.u0, blocks, steps.block)
+        start = mesh.prolonged(s.u0) + s.fine
+        u, kept, wrong = _followed(self.fine, x, start, s.fine_stage, steps.block)
+        failed = (failed | wrong)[:, None]
+        fine = np.where(failed, s.fine, u - mesh.prolonged(coarse))
+        ahead = np.minimum(0.5 * (steps.next - 1) / steps.waited, AHEAD)
+        halfway = fine + ahead[:, None] * (fine - s.fine)
+        at = steps.block.end
+        each = enumerate(zip(end.u, end.q, halfway, strict=True))
+        seen = np.array([mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in each])
+        parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
+        return Found(None, parts, failed[:, 0])
+
+    def seen(self, s: ShadowState) -> Array | None:
+        return -MESH * s.seen
+
+    def beside(self, s: ShadowState) -> Array | None:
+        return -MESH * s.fine[:, self.mesh.at]
+
+
+def _followed(
+    mean: Filter, x: FilterState, u: Array, kept: KeptFactors, span: Span
+) -> tuple[Array, KeptFactors, Mask]:
+    """Return the states of members after a span, what the last stage left, and who failed.
+
+    Parameters
+    ----------
+    mean
+        A filter without covariance.
+    x, u
+        The filter at the start, and the states that are followed in the place of its own.
+    """
+    members, n = u.shape
+    k = x.C.shape[2]
+    bare = changed(
+        x,
+        u=u,
+        du=np.zeros_like(u),
+        da=np.zeros((members, k)),
+        U=np.zeros((members, 0, n)),
+        C=np.zeros((members, 0, k)),
+        past=x.past[:, :0],
+        kept=kept,
+        shadows=ShadowState.none(members, n, k),
+    )
+    end, _, failure = mean.carried(bare, span)
+    failed: Mask = np.asarray(~np.isfinite(end.u).all(axis=1))
+    if failure is not None:
+        failed[:] = True
+    return end.u, end.kept if failure is None else kept, failed
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowSet:
+    """The shadows of a filter.
+
+    Attributes
+    ----------
+    filter
+        The filter itself, without shadows.
+    shadows
+        One for each row of `ShadowState.u`.
+    refused
+        Why the mesh has none; empty if it has, or none was asked for.
+    """
+
+    filter: Filter
+    shadows: tuple[Shadow, ...]
+    refused: str = ""
+
+    @classmethod
+    def of(cls, filter_: Filter, mean: Filter, options: Shadows) -> ShadowSet:
+        """Return the shadows of a filter, from the same without covariance."""
+        problem, refused = filter_.problem, ""
+        found: list[Shadow] = []
+        if options.step:
+            found.append(StepShadow.of(mean))
+        if options.mesh and not (refused := refusal(problem, options.largest)):
+            try:
+                found.append(MeshShadow.of(mean))
+            except LivepdeError as error:
+                refused = f"on the halved mesh: {error}"
+        if options.inputs and problem.model.channels and not problem.control.hold:
+            found.append(InputShadow(mean))
+        return cls(filter_, tuple(found), refused)
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """Kind of each shadow."""
+        return tuple(shadow.kind for shadow in self.shadows)
+
+    def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
+        """Return the shadows of one member at the start; None stands for no moment yet."""
+        n, k = x.u.shape[1], x.C.shape[2]
+        rows = len(self.shadows)
+        nothing = np.zeros((1, len(self.filter.problem.channels)))
+        s = changed(
+            ShadowState.none(1, n, k),
+            u=np.zeros((1, rows, n)),
+            a=np.zeros((1, rows, k)),
+            inputs0=nothing,
+        )
+        for shadow in self.shadows:
+            s = shadow.begun(s, x, moment, given)
+        return s
+
+    def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
+        """Return the state after a span with the errors that have come about in it.
+
+        Parameters
+        ----------
+        x, end
+            Before and after the span; `end` with the errors of before, propagated.
+        """
+        s = end.shadows
+        fresh = s.count == s.last
+        if fresh.any():
+            s = _opened(s, fresh, x, span, "mesh" in self.kinds)
+        if "input" in self.kinds:
+            s = InputShadow.read(s, span)
+        s, jumps = _watched(s, x, end, span)
+        due = (s.count >= s.due) | jumps
+        for t in np.unique(s.begun[due]) if due.any() else ():
+            group = np.flatnonzero(due & (s.begun == t))
+            if len(group) == len(s):
+                s = self._taken(s, x, end, span, jumps)
+            else:
+                some, one, after = take(s, group), take(x, group), take(end, group)
+                taken = self._taken(some, one, after, _part(span, group), jumps[group])
+                s = put(s, group, taken)
+        return changed(end, shadows=s)
+
+    def _taken(
+        self, s: ShadowState, x: FilterState, end: FilterState, span: Span, jumps: Mask
+    ) -> ShadowState:
+        """Return members that began together after their shadows were taken."""
+        waited, block = s.count - s.last, span
+        if (waited > 1).any():
+            block = replace(span, t0=s.begun, inputs0=s.inputs0, interval=None)
+        wait = np.where(s.count - s.jumped < CALM, 1, _wait(s.count))
+        steps, u = Steps(x, end, span, block, waited, wait, jumps), s.u.copy()
+        for row, shadow in enumerate(self.shadows):
+            found = shadow.found(s, steps)
+            if found.error is not None:
+                u[:, row] += np.where(found.failed[:, None], 0.0, found.error)
+            s = changed(s, **found.parts, failed=s.failed + found.failed)
+        return changed(s, u=u, last=s.count, due=s.count + wait)
+
+    def updated(
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
+    ) -> ShadowState:
+        """Return the shadows after a sample.
+
+        Parameters
+        ----------
+        x, new
+            The filter before and after it.
+        weights
+            One over the noise of each value that was used, zero for others, (members, sensors).
+        """
+        s = x.shadows
+        seen = self.filter.sensors.rows(x, s.u, s.a, at)
+        for row, shadow in enumerate(self.shadows):
+            more = shadow.seen(s)
+            if more is not None:
+                seen[:, row] += more
+        used = (weights > 0.0)[:, None]
+        half = (np.where(used, seen, 0.0) * weights[:, None]) @ made.left.transpose(0, 2, 1)
+        return changed(s, u=s.u - half @ new.U, a=s.a - half @ new.C)
+
+    def shifts(self, x: FilterState) -> tuple[Array, Array]:
+        """Return what the state and the reduced unknowns are off by, (members, rows, n or k)."""
+        s, u = x.shadows, x.shadows.u.copy()
+        for row, shadow in enumerate(self.shadows):
+            more = shadow.beside(s)
+            if more is not None and u.size:  # of a state that is asked for
+                u[:, row] += more
+        return u, s.a
+
+    def notes(self, x: FilterState) -> dict[str, Array]:
+        """Return notes on the shifts of the unknowns, each of shape (members,).
+
+        Of each number by kind in its unit (`k_step_shift`), and in standard deviations of what is
+        reported without them: of all kinds together where that is largest
+        (`discretisation_shift`), and of each kind there (`step_shift`).
+        """
+        reduction, latent = self.filter.reduction, self.filter.problem.model.latent
+        C = robust_factors(self.filter, x)[1]
+        found: dict[str, list[float]] = {}
+        for k, a in enumerate(x.shadows.a):
+            q = reduction.bounded(x.q[k] + reduction.Phi @ x.da[k])
+            each = latent.tangent(q, reduction.Phi @ a.T)  # (m, shadows)
+            std = np.linalg.norm(latent.tangent(q, reduction.Phi @ C[k].T), axis=1)
+            shift = each / np.where(std > 0.0, std, np.inf)[:, None]
+            total = np.abs(shift.sum(axis=1))
+            worst = int(np.argmax(np.where(np.isfinite(total), total, -1.0)))
+            numbers = {"discretisation_shift": float(total[worst])}
+            for row, kind in enumerate(self.kinds):
+                numbers[f"{kind}_shift"] = float(shift[worst, row])
+                for label, at in latent.space.labels.items():
+                    numbers[f"{label}_{kind}_shift"] = float(each[at, row])
+            for name, value in numbers.items():
+                found.setdefault(name, []).append(value)
+        told = {name: np.array(values) for name, values in found.items()}
+        if x.shadows.failed.any():
+            told["shadow_failed"] = x.shadows.failed.astype(float)
+        if self.refused:
+            told["mesh_unfollowed"] = np.ones(len(x))
+        return told
+
+    def widening(self, x: FilterState) -> tuple[Array, Array]:
+        """Return the row of the square root [U C] that is reported for all shifts together.
+
+        Shapes (members, 1, n) and (members, 1, k). It is no longer than one prior standard
+        deviation: what the data tell wrongly is known as well as before, and the linear filter is
+        nothing to count more.
+        """
+        u, a = (rows.sum(axis=1, keepdims=True) for rows in self.shifts(x))
+        size = np.linalg.norm(self.filter.reduction.in_prior_units(a, x.age), axis=2)
+        good = np.isfinite(size) & np.isfinite(u).all(axis=2)
+        factor = np.where(good, 1.0 / np.maximum(size, 1.0), 0.0)[:, :, None]
+        return np.where(good[..., None], u, 0.0) * factor, np.where(
+            good[..., None], a, 0.0
+        ) * factor
+
+
+def _watched(
+    s: ShadowState, x: FilterState, end: FilterState, span: Span
+) -> tuple[ShadowState, Mask]:
+    """Return members after one more step, and of whom something jumped in it."""
+    rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
+    differs = np.linalg.norm(rate - s.rate, axis=1)
+    jumps = (differs > JUMP * s.usual) & (s.count > CALM)
+    # Before the second step nothing is known; a jump does not count as usual.
+    told = np.where(s.count > CALM, np.minimum(differs, JUMP * s.usual), differs)
+    usual = np.where(
+        s.count > 1, s.usual + (told - s.usual) / np.minimum(s.count + 1.0, USUAL), differs
+    )
+    count = s.count + 1
+    jumped = np.where(jumps, count, s.jumped)
+    return changed(s, rate=rate, usual=usual, count=count, jumped=jumped), jumps
+
+
+def _wait(count: IntArray) -> IntArray:
+    """Return after how many more steps shadows are taken that were taken after so many."""
+    later = LATER[count // 8 % len(LATER)] * np.where(count < LONG, 1, 2)
+    return np.where(count < FIRST, 1, later)
+
+
+def _opened(s: ShadowState, fresh: Mask, x: FilterState, span: Span, mesh: bool) -> ShadowState:
+    """Return members of which some begin a block of steps with a span."""
+    rows = fresh[:, None]
+    begun, u0 = np.where(fresh, span.t0, s.begun), np.where(rows, x.u, s.u0) if mesh else s.u0
+    return changed(s, begun=begun, u0=u0, inputs0=np.where(rows, span.inputs0, s.inputs0))
+
+
+def _part(span: Span, group: IntArray) -> Span:
+    """Return the span of some members."""
+
+    def some(values: Array) -> Array:
+        return values[group] if len(values) > 1 else values
+
+    parts = {item.name: getattr(span, item.name) for item in fields(span)}
+    arrays = {name: some(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+    return Span(**(parts | arrays))

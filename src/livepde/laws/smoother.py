@@ -1,0 +1,279 @@
+"""Fixed-interval smoother: state and unknowns at each sample, given those before and after it.
+
+The filter carries x = m + [U C]^T xi with xi ~ N(0, I). From one sample to the next xi' is made of
+xi and of what is gained in between by rotations, truncations and the contraction of the update, so
+that the two are jointly Gaussian:
+
+    xi = g + T^T xi' + R^T zeta,    T = E[xi' xi^T | z'],  g = E[xi | z'],  R^T R = I - P^T P,
+
+P being T before the update and zeta ~ N(0, I) what the truncation forgets. (`FilterState.past` and
+`dpast` follow xi through predict and update: T and g are what has become of I and 0.) So given all
+samples xi ~ N(mu, B^T B) follows backward, in as many coordinates as the square root has rows, from
+mu = 0 and B = I at the end (Rauch, Tung and Striebel 1965):
+
+    mu = g + T^T mu',    B = upper triangle of a QR factorisation of [B' T; R]
+
+All is linear about one trajectory of the unknowns. It begins at the estimates of the run, of what
+stays at its last one, and is moved to the smoothed one by damped Gauss-Newton steps that make
+samples and prior together more probable (Bell 1994), until these change it by less than a tenth of
+a standard deviation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.laws.assimilation import assimilate_at_once
+from livepde.laws.base import FixedInterval
+from livepde.laws.filter_state import FilterState
+from livepde.laws.gauss_newton import Window, placed
+from livepde.laws.iterated_smoother import expecting, missed, moved, without_shadows
+from livepde.laws.members import changed
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.linalg import Array
+from livepde.stepping import KeptFactors
+
+__all__ = ["evidence", "smoothed"]
+
+ITERATIONS = 6  # Gauss-Newton steps at most
+HALVINGS = 2  # of a step that makes samples and prior less probable
+CONVERGED = 0.1  # standard deviations that a step moves the trajectory by, at the end of it
+STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
+ROUNDING = 1e-12  # share of a variance
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A filter after a sample, with g and T since the one before as `dpast` and `past`, and R."""
+
+    x: FilterState
+    R: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """The samples, filtered about a trajectory of reduced unknowns, shape (1 + intervals, k).
+
+    `misfit` is minus twice the logarithm of the trajectory's probability, up to a constant.
+    """
+
+    trajectory: Array
+    points: list[_Point]
+    misfit: float
+
+
+def smoothed(
+    work: SensitivityWork, before: SensitivityState, after: FilterState, data: FixedInterval
+) -> Iterator[FilterState]:
+    """Iterate over the smoothed filters of one member, the last one first.
+
+    States that are not asked for have no coefficients.
+
+    Parameters
+    ----------
+    before, after
+        The member before the first sample, and its filter after the last one in the run: its noise
+        level and the statistics of its innovations are those of all samples.
+    """
+    work, before = without_shadows(work, before)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # not finite: not used
+        best = _descended(_FixedInterval(work, before, after, data))
+    return _backward(best, after)
+
+
+def evidence(
+    work: SensitivityWork, before: SensitivityState, after: FilterState, data: FixedInterval
+) -> float:
+    """Return the logarithm of the likelihood of all samples, linear about the run's estimates.
+
+    Minus infinity where they cannot be followed. Parameters as for `smoothed`.
+    """
+    work, before = without_shadows(work, before)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        samples = _FixedInterval(work, before, after, data)
+        samples.work = replace(work, options=replace(work.options, adaptive=True))
+        found = samples.about(samples.estimated)
+    return float(found.points[-1].x.evidence[0]) if found is not None else -np.inf
+
+
+def _descended(samples: _FixedInterval) -> _Pass:
+    """Return the pass about a most probable trajectory."""
+    best = samples.about(samples.estimated) or samples.relinearised()
+    if best is None:
+        raise LawError(
+            "smoothed: the samples cannot be followed about any trajectory of the unknowns; take a "
+            "smaller dt_max, or a prior closer to what the run found."
+        )
+    for _ in range(ITERATIONS):
+        found = [
+            (x.C[0], _reduced(samples.work, x, x.da)) for x in _backward(best, best.points[-1].x)
+        ]
+        target = np.array([a for _, a in reversed(found)])
+        std = np.array([np.linalg.norm(C, axis=0) for C, _ in reversed(found)])
+        step = target - best.trajectory
+        if (np.abs(step) <= CONVERGED * std + ROUNDING).all():
+            break
+        step *= min(1.0, STRIDE / float(np.abs(step).max()))
+        tried = (samples.about(best.trajectory + 0.5**k * step) for k in range(HALVINGS + 1))
+        better = next((one for one in tried if one and one.misfit < best.misfit), None)
+        if better is None:
+            break
+        best = better
+    return best
+
+
+def _backward(best: _Pass, after: FilterState) -> Iterator[FilterState]:
+    """Iterate backward over the filters given all samples.
+
+    Innovations are those of the run, and so is by how much discretisation has shifted the unknowns
+    in the end; of the state the shift is known at the end only.
+    """
+    rows = best.points[-1].x.C.shape[1]
+    mu, B = np.zeros(rows), np.eye(rows)
+    shadows = after.shadows
+    for point in reversed(best.points):
+        x = point.x
+        yield changed(
+            x,
+            du=x.du + mu @ x.U[0],
+            da=x.da + mu @ x.C[0],
+            U=B @ x.U,
+            C=B @ x.C,
+            innovations=after.innovations,
+            shadows=changed(shadows, u=shadows.u[:, :, : x.u.shape[1]]),
+        )
+        shadows = changed(shadows, u=0.0 * shadows.u, fine=0.0 * shadows.fine)
+        T = x.past[0]
+        mu = x.dpast[0] + mu @ T
+        B = np.asarray(np.linalg.qr(np.vstack([B @ T, point.R]), mode="r"))
+
+
+def _reduced(work: SensitivityWork, x: FilterState, da: Array | float = 0.0) -> Array:
+    """Return the reduced unknowns of a linearisation point and a deviation, shape (k,)."""
+    reduction = work.filter.reduction
+    a: Array = (reduction.reduced(x.q - work.filter.problem.model.latent.prior) + da)[0]
+    return a
+
+
+class _FixedInterval:
+    """The samples of one member, ready to be filtered about trajectories of its unknowns."""
+
+    def __init__(
+        self,
+        work: SensitivityWork,
+        before: SensitivityState,
+        after: FilterState,
+        data: FixedInterval,
+    ) -> None:
+        options = replace(work.options, adaptive=False)  # the level is that of all samples
+        self.work = replace(work, options=options)
+        self.data = data
+        self.jumps = set(data.jumps) if work.jumps is not None else set()
+        self.moves = work.filter.moves or bool(self.jumps)
+        start, opening, intervals = before.now, data.opening, data.intervals
+        length = intervals[-1].t1 - opening.t1 if intervals else 0.0
+        initial = bool(before.initial[0])
+        self.window = Window(start, after, start.q[0], initial, opening.end, length)
+
+    @property
+    def estimated(self) -> Array:
+        """Trajectory of the run's estimates; what gains nothing is traced back from later ones."""
+        reduction, none = self.work.filter.reduction, np.zeros((1, self.work.filter.reduction.size))
+        prior = self.work.filter.problem.model.latent.prior
+        a = np.atleast_2d(reduction.reduced(np.array(self.data.q) - prior))
+        for number, interval in reversed(list(enumerate(self.data.intervals))):
+            h = interval.t1 - interval.t0
+            back = np.linalg.solve(reduction.transition(h), a[number + 1])
+            a[number] = np.where(self._gained(none, number, h) > 0.0, a[number], back)
+        return a
+
+    def about(self, trajectory: Array) -> _Pass | None:
+        """Filter the samples, linear about a trajectory; None if that fails."""
+        return self._run(trajectory)
+
+    def relinearised(self) -> _Pass | None:
+        """Filter the samples, linear about each estimate; None if that fails."""
+        return self._run(None)
+
+    def _run(self, trajectory: Array | None) -> _Pass | None:
+        x, misfit = self._started(trajectory)
+        rows = x.C.shape[1]
+        nothing = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))  # lies before
+        points = [self._kept(nothing, 0, np.zeros((0, rows)))]
+        followed = [_reduced(self.work, x)]
+        filter_ = self.work.filter
+        for number, interval in enumerate(self.data.intervals, start=1):
+            h = interval.t1 - interval.t0
+            if trajectory is None:
+                x = filter_.relinearised(x)
+            elif self.moves:
+                x = expecting(filter_, x, trajectory[number], h)
+            gained = self._gained((x.C**2).sum(axis=1), number - 1, h)
+            x, P = self._predicted(x, number - 1)
+            if P is None:
+                return None
+            x = assimilate_at_once(filter_, x, filter_.span(interval), self.work.options)
+            if not np.isfinite((x.u + x.du).sum() + x.da.sum() + x.C.sum()):
+                return None
+            points.append(self._kept(x, number, _forgotten(P)))
+            followed.append(_reduced(self.work, x))
+            misfit += missed(filter_, x, interval)
+            misfit += moved(filter_, followed[-2], followed[-1], h, gained) if self.moves else 0.0
+        if trajectory is None or not np.isfinite(misfit):
+            misfit = np.inf  # of what follows no single trajectory
+        return _Pass(np.array(followed), points, misfit)
+
+    def _started(self, trajectory: Array | None) -> tuple[FilterState, float]:
+        """Return the filter after a sample at the start, and the misfit of both."""
+        filter_, opening, start = self.work.filter, self.data.opening, self.window.start
+        q, shift = start.q[0], np.zeros(start.C.shape[2])
+        if trajectory is not None:
+            shift = trajectory[0] - _reduced(self.work, start)
+            q = q + filter_.reduction.Phi @ shift
+        x = placed(filter_, self.window, filter_.reduction.bounded(q))
+        weights = np.linalg.lstsq(start.C[0].T, shift, rcond=None)[0]
+        misfit = float(weights @ weights)
+        span = filter_.span(filter_.problem.unread(opening))
+        if filter_.sensors.observe(x, span.end)[1].any():  # as the law begins
+            misfit += missed(filter_, x, opening)
+            x = assimilate_at_once(filter_, x, span, self.work.options)
+        return x, misfit
+
+    def _gained(self, variance: Array, number: int, h: float) -> Array:
+        """Return the variance that coordinates gain in an interval, with a jump, shape (k,)."""
+        filter_, jumps = self.work.filter, self.work.jumps
+        drifts = filter_.drifts(self.window.now.member)
+        gained = filter_.reduction.gained(h, variance, drifts)[0]
+        if jumps is not None and number in self.jumps:
+            F = filter_.reduction.transition(h)
+            gained = gained + jumps.size**2 * (F**2 @ self.work.jumping)
+        return np.asarray(gained)
+
+    def _predicted(self, x: FilterState, number: int) -> tuple[FilterState, Array | None]:
+        """Return the filter before the update at the end of an interval, and P."""
+        filter_, jumps, rows = self.work.filter, self.work.jumps, x.C.shape[1]
+        x = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))
+        if jumps is not None and number in self.jumps:
+            x = filter_.inflated(x, jumps.size, self.work.jumping)
+        span = filter_.span(self.data.intervals[number])
+        x, _, failure = filter_.predict(x, span)
+        return x, x.past[0] if failure is None else None
+
+    def _kept(self, x: FilterState, number: int, R: Array) -> _Point:
+        """Return a point with the state where it is asked for."""
+        x = changed(x, kept=KeptFactors.none(1))
+        if number not in self.data.fields:
+            x = changed(x, u=x.u[:, :0], du=x.du[:, :0], U=x.U[:, :, :0])
+        return _Point(x, R)
+
+
+def _forgotten(P: Array) -> Array:
+    """Return R with R^T R = I - P^T P."""
+    values, vectors = np.linalg.eigh(np.eye(P.shape[1]) - P.T @ P)
+    lost = values > ROUNDING
+    R: Array = np.sqrt(values[lost])[:, None] * vectors[:, lost].T
+    return R

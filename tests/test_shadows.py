@@ -1,0 +1,281 @@
+"""What step, mesh and input lines have shifted an estimate by: predicted against actual shifts."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.models import heat
+from livepde.runs.doubts import doubts
+from livepde.stepping import Alexander2, ImplicitEuler
+from livepde.streams import AbsoluteNoise, Twin
+
+NOISE, WIDTH, COUNT = 0.003, 0.1, 150
+TRUE = {"k": 1.3, "h": 0.8}
+
+
+def rod(cells: int, **k: Any) -> lp.Model:
+    """Return a rod with unknown conductivity and loss, heated by a channel at its left end."""
+    mesh = lp.interval(0.0, 1.0, cells)
+    field = lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0})
+    unknowns = {"k": lp.Scalar(1.0, std=0.3, **k), "h": lp.Scalar(1.0, std=0.3)}
+    return lp.Model(
+        field,
+        unknowns,
+        A=lambda q, u, v, x: 0.1 * q.k * lp.dot(lp.grad(u), lp.grad(v)) + 0.3 * q.h * u * v,
+    )
+
+
+SENSORS = lp.Points({"a": 0.3, "b": 0.6}, noise=NOISE)
+
+
+@cache
+def exact(width: float = WIDTH) -> np.ndarray[Any, Any]:
+    """Return what the sensors show of the exact state at the samples, (samples, 2)."""
+    model, times = rod(160), width * np.arange(round(COUNT * WIDTH / width) + 1)
+    twin = Twin(
+        model=model,
+        observation=SENSORS,
+        q_true=TRUE,
+        u0=0.0,
+        times=times,
+        truth="fine",
+        fine=model,
+        fine_dt=0.005,
+        inputs=lambda t: {"T": float(np.sin(t))},
+    )
+    return np.array(twin.exact_data)
+
+
+def samples(seed: int = 0, width: float = WIDTH) -> list[tuple[float, Any, dict[str, float]]]:
+    z = exact(width)
+    noise = NOISE * np.random.default_rng(seed).standard_normal(z.shape)
+    rows = enumerate(z + noise)
+    return [(width * k, row, {"T": float(np.sin(width * k))}) for k, row in rows]
+
+
+def identifier(cells: int = 160, law: Any = None, **k: Any) -> lp.Identifier:
+    return lp.Identifier(rod(cells), SENSORS, law or lp.SensitivityLaw(), u0=0.0, **k)
+
+
+def ran(given: lp.Identifier, rows: Any) -> Any:
+    for t, z, inputs in rows:
+        estimate = given.step(t, z, inputs)
+    return estimate
+
+
+def shifts(estimate: Any, kind: str) -> np.ndarray[Any, Any]:
+    return np.array([estimate.notes[f"{name}_{kind}_shift"] for name in ("k", "h")])
+
+
+def assert_predicts(predicted: Any, actual: Any, std: Any, band: float) -> None:
+    """Assert that shifts agree to a share of the largest of them, counted in deviations."""
+    predicted, actual = predicted / std, actual / std
+    assert np.abs(predicted - actual).max() < band * np.abs(actual).max(), (predicted, actual)
+
+
+PLAIN = lp.SensitivityLaw(shadows=None)
+
+
+@cache
+def reference(width: float = WIDTH) -> Any:
+    """Return the estimate on a fine mesh with short steps."""
+    return ran(identifier(law=PLAIN, dt_max=WIDTH / 8), samples(width=width))
+
+
+def test_predicts_the_shift_by_the_step() -> None:
+    estimate = ran(identifier(scheme=ImplicitEuler()), samples())
+    actual = estimate.q - reference().q
+    assert np.abs(actual / reference().q_std).max() > 8.0
+    assert_predicts(shifts(estimate, "step"), actual, reference().q_std, 0.2)
+
+
+def test_predicts_the_shift_by_steps_across_jumps() -> None:
+    """A heater that goes on and off: the jumps are shadowed, and each counts once."""
+    mesh = lp.interval(0.0, 0.4, 20)
+    model = heat(
+        mesh,
+        alpha=lp.Scalar(5e-5, 3e-5, transform="log"),
+        dirichlet={"left": lambda x, t: 20.0 + 30.0 * (t % 3600.0 < 600.0)},
+    )
+    sensors = lp.Points([0.1, 0.2], noise=0.05)
+    times = np.arange(0.0, 7200.0, 60.0)
+    truth = Twin(
+        model=model,
+        observation=sensors,
+        q_true={"alpha": 9.7e-5},
+        u0=20.0,
+        times=times,
+        dt_max=2.0,
+        noise=AbsoluteNoise(0.05),
+    )
+    rows, ends = list(truth), []
+    for width in (30.0, 2.0):
+        given = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=20.0, dt_max=width)
+        ends.append([given.step(sample.t, sample.z) for sample in rows][-1])
+    coarse, fine = ends
+    (label,) = coarse.parameters
+    predicted, actual = coarse.notes[f"{label}_step_shift"], (coarse.q - fine.q)[0]
+    assert abs(actual) > 2.0 * fine.q_std[0]
+    assert predicted == pytest.approx(actual, rel=0.4)
+
+
+def test_the_second_order_scheme_is_shifted_little() -> None:
+    estimate = ran(identifier(), samples())
+    actual = estimate.q - reference().q
+    assert_predicts(shifts(estimate, "step"), actual, reference().q_std, 0.4)
+    assert np.abs(actual / reference().q_std).max() < 1.0
+
+
+@pytest.mark.parametrize("cells", [5, 10])
+def test_predicts_the_shift_by_the_mesh(cells: int) -> None:
+    estimate = ran(identifier(cells, dt_max=WIDTH / 8), samples())
+    actual = estimate.q - reference().q
+    assert np.abs(actual / reference().q_std).max() > 2.0
+    assert_predicts(shifts(estimate, "mesh"), actual, reference().q_std, 0.75)
+
+
+def test_predicts_the_shift_by_input_lines() -> None:
+    """Against a run that is told the inputs ten times for each reading of the sensors."""
+    rows = samples()
+    estimate = ran(identifier(dt_max=WIDTH / 8), rows)
+    told = identifier(law=PLAIN)
+    for (t, z, inputs), k in zip(rows, range(len(rows)), strict=True):
+        for part in range(1, 10) if k else ():
+            s = t - WIDTH + WIDTH * part / 10
+            told.step(s, [np.nan, np.nan], {"T": float(np.sin(s))})
+        better = told.step(t, z, inputs)
+    actual = estimate.q - better.q
+    assert np.abs(actual / better.q_std).max() > 0.5
+    assert_predicts(shifts(estimate, "input"), actual, better.q_std, 0.5)
+
+
+@pytest.mark.parametrize("evolution", [None, lp.RandomWalk(0.01)])
+def test_no_number_of_the_filter_moves(evolution: Any) -> None:
+    found = []
+    for law in (lp.SensitivityLaw(), PLAIN):
+        more = {} if evolution is None else {"evolution": evolution}
+        given = lp.Identifier(rod(10, **more), SENSORS, law, u0=0.0)
+        found.append((ran(given, samples()[:60]), given._state.now))
+    (one, x), (other, y) = found
+    np.testing.assert_array_equal(one.q, other.q)
+    np.testing.assert_array_equal(one.u, other.u)
+    for part in ("U", "C", "du", "da", "evidence"):
+        np.testing.assert_array_equal(getattr(x, part), getattr(y, part))
+    assert (one.q_std >= other.q_std).all()
+
+
+@pytest.mark.study
+def test_intervals_hold_on_a_coarse_mesh() -> None:
+    """The plain 95 % intervals miss a constant in most runs on five cells; these hold it."""
+    held, plain = [], []
+    for seed in range(12):
+        rows = samples(seed)[:100]
+        for law, into in ((lp.SensitivityLaw(), held), (PLAIN, plain)):
+            low, high = ran(identifier(5, law), rows).interval("k")
+            into.append(low <= TRUE["k"] <= high)
+    assert np.mean(plain) < 0.5
+    assert np.mean(held) >= 0.9
+
+
+def test_where_nothing_is_wrong_intervals_grow_little() -> None:
+    rows = samples(width=WIDTH / 2)
+    widened = ran(identifier(), rows)
+    plain = ran(identifier(law=PLAIN), rows)
+    assert (widened.q_std / plain.q_std < 1.1).all()
+    assert widened.notes["discretisation_shift"] < 2.0
+
+
+def test_no_interval_is_much_wider_than_that_of_the_prior() -> None:
+    """Two samples far apart on a mesh of two cells: whatever the shifts, the prior bounds them."""
+    given = identifier(2, scheme=ImplicitEuler())
+    estimate = ran(given, [(t, [0.1, 0.05], {"T": 50.0 * t}) for t in (0.0, 3.0, 6.0)])
+    assert (estimate.q_std <= 1.5 * 0.3).all()
+
+
+@pytest.mark.parametrize("replay", [None, lp.Replay()])
+def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> None:
+    law, rows = lp.SensitivityLaw(replay=replay), samples()[:90]
+    whole = identifier(8, law)
+    ran(whole, rows[:50])
+    whole.save(tmp_path / "state.npz")
+    again = identifier(8, law)
+    again.load(tmp_path / "state.npz")
+    one, other = ran(whole, rows[50:]), ran(again, rows[50:])
+    np.testing.assert_array_equal(one.q_std, other.q_std)
+    assert dict(one.notes) == dict(other.notes)
+
+
+def test_a_replay_restarts_its_shadows() -> None:
+    """About a reference that stays, shifts are those of the plain filter."""
+    plain = ran(identifier(8, scheme=ImplicitEuler()), samples())
+    law = lp.SensitivityLaw(replay=lp.Replay())
+    replayed = ran(identifier(8, law, scheme=ImplicitEuler()), samples())
+    for kind in ("step", "mesh"):
+        one, other = shifts(plain, kind), shifts(replayed, kind)
+        assert np.abs(one - other).max() < 0.3 * np.abs(one).max()
+
+
+def test_holds_with_gaps_and_for_the_bank() -> None:
+    rows = samples()
+    gappy = [(t, z, i) if k % 7 else (t, [np.nan, np.nan], i) for k, (t, z, i) in enumerate(rows)]
+    estimate = ran(identifier(8), gappy)
+    assert abs(estimate.notes["k_mesh_shift"]) > 0.0
+    bank = ran(identifier(8, lp.AutoLaw()), rows[:60])
+    assert bank.notes["discretisation_shift"] > 0.0
+
+
+def test_a_field_is_prolonged() -> None:
+    mesh = lp.interval(0.0, 1.0, 8)
+    line = lp.linear(mesh)
+    model = lp.Model(
+        lp.Field(mesh, line, dirichlet={"left": lp.Channel("T"), "right": 0.0}),
+        lp.Field(mesh, line, inner="H1", prior=1.0, std=0.1),
+        A=lambda q, u, v, x: 0.1 * q * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    law = lp.SensitivityLaw(modes=4)
+    given = lp.Identifier(model, SENSORS, law, u0=0.0)
+    estimate = ran(given, samples()[:60])
+    assert "mesh_unfollowed" not in estimate.notes
+    assert abs(estimate.notes["mesh_shift"]) > 0.0
+
+
+def test_says_where_the_mesh_is_not_followed() -> None:
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = lp.Model(
+        lp.Field(mesh, lp.quadratic(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0}),
+        lp.Scalar(1.0, std=0.3),
+        A=lambda q, u, v, x: 0.1 * q * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    given = lp.Identifier(model, SENSORS, lp.SensitivityLaw(), u0=0.0)
+    assert ran(given, samples()[:10]).notes["mesh_unfollowed"] == 1.0
+    few = lp.SensitivityLaw(shadows=lp.Shadows(largest=10))
+    assert ran(identifier(8, few), samples()[:10]).notes["mesh_unfollowed"] == 1.0
+
+
+def test_speaks_and_names_the_cause() -> None:
+    def said(cells: int, **k: Any) -> list[str]:
+        data = identifier(cells, **k).run(samples()).to_xarray()
+        return [text for text in doubts(data) if "discretisation" in text]
+
+    assert "the mesh" in said(5)[0]
+    assert "the time step" in said(160, scheme=ImplicitEuler())[0]
+    assert not said(160, dt_max=WIDTH / 8)
+
+
+def test_refuses_shadows_of_nothing() -> None:
+    with pytest.raises(lp.LawError, match="Shadows: none is left"):
+        lp.Shadows(step=False, mesh=False, inputs=False)
+    with pytest.raises(lp.LawError, match="shadows must be a Shadows"):
+        lp.SensitivityLaw(shadows=True)  # type: ignore[arg-type]
+    with pytest.raises(lp.LawError, match="largest must be at least 1"):
+        lp.Shadows(largest=0)
+
+
+def test_orders_of_both_schemes_are_known() -> None:
+    assert (ImplicitEuler.order, Alexander2.order) == (1, 2)
