@@ -118,7 +118,7 @@ def test_an_offset_is_named_with_its_size():
 
 def test_a_lag_is_named_with_its_size_and_what_it_does_to_the_estimate():
     z = shown().copy()
-    lag = 3 * (TIMES[1] - TIMES[0])
+    lag = 4 * (TIMES[1] - TIMES[0])
     z[:, 2] = np.interp(TIMES - lag, TIMES, z[:, 2])
     z += errors()
     estimate = run(z)[1]

@@ -480,7 +480,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return lambda: self.member_belief(work, now, 0)
 
     def judge(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Verdict]:
-        return judged(work.filter, state.now, 0)
+        return judged(work.filter, without_factors(state.now), 0)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

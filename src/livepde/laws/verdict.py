@@ -12,7 +12,7 @@ from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.input_noise import input_rank
-from livepde.laws.members import take
+from livepde.laws.members import changed, take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.verdict import WINDOWS, Dictionary, Finding, Judge, Position, Verdict, assess
@@ -65,11 +65,11 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
         return lambda: Verdict.of((), ("innovations: verdict = False",))
     if not x.ledger.seen[member]:
         return lambda: Verdict.of([_unseen()])
-    one = take(x, member)
-    ledger = replace(one.ledger, process=one.ledger.process[:, :0])
+    x = changed(x, ledger=changed(x.ledger, process=x.ledger.process[:, :0]))
 
     def found() -> Verdict:
-        w, settled = judge.settled(ledger, one.causes)
+        one = take(x, member)
+        w, settled = judge.settled(one.ledger, one.causes)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             at = _position(filter_, replace(one, causes=w, ledger=settled))
             return assess(judge.dictionary, at)

@@ -376,7 +376,7 @@ class Journal:
 
     def judge(self, verdict: Mapping[str, Any]) -> None:
         """Keep the verdict on the run so far, as `Verdict.to_dict` gives it."""
-        self._execute("INSERT OR REPLACE INTO meta VALUES ('verdict', ?)", json.dumps(verdict))
+        self._say("verdict", json.dumps(verdict))
 
     @property
     def verdict(self) -> str:
