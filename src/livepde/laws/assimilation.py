@@ -199,8 +199,14 @@ def _judged(
     span: Span,
 ) -> FilterState:
     """Return the state before an update with what the verdict keeps of the sample."""
-    q, reduction = filter_.estimate(x), filter_.reduction
-    a = reduction.reduced(q - filter_.problem.model.latent.prior)
+    prior = filter_.problem.model.latent.prior
+
+    def q() -> Array:
+        return filter_.estimate(x)
+
+    def a() -> Array:
+        return filter_.reduction.reduced(q() - prior)
+
     u = x.u + x.du
     seen = Seen(x.C, x.causes, a, q, u, Y, d, used, span.z1, predicted, noise, span.end)
     causes, ledger = judge.heard(x.ledger, seen)

@@ -531,14 +531,16 @@ def _watched(
 ) -> tuple[ShadowState, Mask]:
     """Return members after one more step, and of whom something jumped in it."""
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
-    differs = np.linalg.norm(rate - s.rate, axis=1)
-    jumps = (differs > JUMP * s.usual) & (s.count > CALM)
-    # Before the second step nothing is known; a jump does not count as usual.
-    told = np.where(s.count > CALM, np.minimum(differs, JUMP * s.usual), differs)
-    usual = np.where(
-        s.count > 1, s.usual + (told - s.usual) / np.minimum(s.count + 1.0, USUAL), differs
-    )
-    count = s.count + 1
+    more = rate - s.rate
+    differs, most = np.sqrt((more * more).sum(axis=1)), JUMP * s.usual
+    count, settled = s.count + 1, s.count > CALM
+    jumps = settled & (differs > most)
+    # A jump does not count as usual.
+    told = np.minimum(differs, most)
+    if not settled.all():  # before the second step nothing is known
+        told = np.where(settled, told, differs)
+    weight = 1.0 / np.minimum(count, USUAL)
+    usual = s.usual + (told - s.usual) * np.where(count > 2, weight, 1.0)
     jumped = np.where(jumps, count, s.jumped)
     return changed(s, rate=rate, usual=usual, count=count, jumped=jumped), jumps
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ SHIFT = 0.02  # of the length of the domain
 JUMP = 0.3  # prior standard deviations of an unknown
 MOST_JUMPS = 8  # coordinates of unknowns that may jump
 MOST_SUMS = 12_000  # numbers in one kind of sum
-AXES = "xyz"
+MOST_DENSE = 10_000  # entries of a matrix that is cheaper when dense
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,37 @@ class Direction:
     size: float = np.nan
     unit: str = ""
     axis: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Shifts:
+    """How readings change if sensors are shifted, as a matrix on the coefficients that matter.
+
+    Attributes
+    ----------
+    axes
+        Number of axes.
+    used, rows
+        Coefficients of the state, (m,), and the matrix of all axes one after the other, (axes *
+        sensors, m): dense where it has few columns.
+    """
+
+    axes: int
+    used: IntArray
+    rows: Any
+
+    @classmethod
+    def of(cls, shifts: Sequence[sp.csr_array]) -> Shifts:
+        """Return the value of the matrices of all axes, each (sensors, n)."""
+        rows = sp.csc_array(sp.vstack(shifts))
+        used = np.flatnonzero(np.diff(rows.indptr))
+        rows = rows[:, used]
+        dense = rows.shape[0] * rows.shape[1] <= MOST_DENSE
+        return cls(len(shifts), used, rows.toarray() if dense else sp.csr_array(rows))
+
+    def of_readings(self, u: Array) -> Array:
+        """Return the changes of readings with states u, (members, axes * sensors)."""
+        return np.asarray((self.rows @ u[:, self.used].T).T)
 
 
 class Dictionary:
@@ -116,7 +148,9 @@ class Dictionary:
                     self.directions.append(Direction(kind, name, size, of, axis))
                     self.owner.append(k)
             self.parts[kind] = slice(start, len(self.directions))
-        self.shifts = None if position is None or "position" not in kinds else position[0]
+        self.shifts: Shifts | None = None
+        if position is not None and "position" in kinds:
+            self.shifts = Shifts.of(position[0])
         start = len(self.directions)
         self.jumps = [place for _, place in jumps]
         self.directions += [Direction("jump", label, JUMP) for label, _ in jumps]
@@ -133,7 +167,7 @@ class Dictionary:
         """Return how readings change with shifts of their sensors, (members, axes * sensors)."""
         if self.shifts is None:
             return np.zeros((len(u), 0))
-        return np.concatenate([(shift @ u.T).T for shift in self.shifts], axis=1)
+        return self.shifts.of_readings(u)
 
     def signals(
         self, noise: Array, h: Array, first: Array, last: Array, share: Array, moved: Array

@@ -25,6 +25,7 @@ estimate of the unknowns is off for each unit of the cause.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -53,8 +54,10 @@ class Seen:
     C, causes
         Square root of the covariance of the unknowns, (members, r, k), and [T Z_1 ...], (members,
         r, columns).
-    a, q, u
-        Reduced and latent unknowns and the state, as they are estimated.
+    a, q
+        Return reduced and latent unknowns, as they are estimated: not every judge asks.
+    u
+        The state, as it is estimated.
     Y, d, used
         Observed square root, (members, r, sensors), innovations and which values are used.
     z, predicted, noise
@@ -65,8 +68,8 @@ class Seen:
 
     C: Array
     causes: Array
-    a: Array
-    q: Array
+    a: Callable[[], Array]
+    q: Callable[[], Array]
     u: Array
     Y: Array
     d: Array
@@ -113,9 +116,10 @@ class Judge:
             "predicted": sensors,
             "spread": sensors if wide else sensors**2,
             "A": sensors * self.columns,
-            "moved": sensors * len(dictionary.shifts or ()),
+            "moved": sensors * (dictionary.shifts.axes if dictionary.shifts else 0),
             "answers": self.terms * sensors,
-            "told": sensors if self.recorded else 0,
+            "a": unknowns if self.recorded else 0,
+            "C": unknowns**2 if self.recorded else 0,
             "Y": unknowns * sensors if self.recorded else 0,
         }
         ends = np.cumsum(list(sizes.values())).tolist()
@@ -148,40 +152,36 @@ class Judge:
         causes, full = seen.causes, ledger.waiting == self.batch
         if full.any() or not ledger.seen.all():
             causes, ledger = self._begun(ledger, seen, full)
-        used, Yt = seen.used.astype(float), seen.Y.transpose(0, 2, 1)
-        A = Yt @ causes
+        Yt = seen.Y.transpose(0, 2, 1)
         wide = sensors > MOST_WHITENED
-        spread = (seen.Y * seen.Y).sum(axis=1) if wide else Yt @ seen.Y
-        noise, z = (np.broadcast_to(part, seen.d.shape) for part in (seen.noise, seen.z))
-        each = [used, seen.d, noise, z, seen.predicted]
-        each += [spread, A]
+        each: dict[str, Array | Mask] = {
+            "used": seen.used,
+            "d": seen.d,
+            "noise": seen.noise,
+            "z": seen.z,
+            "predicted": seen.predicted,
+            "spread": (seen.Y * seen.Y).sum(axis=1) if wide else Yt @ seen.Y,
+            "A": Yt @ causes,
+        }
         parts: dict[str, Any] = {}
         if self.dictionary.shifts is not None:
-            each.append(self.dictionary.moved(seen.u))
-        if self.terms:
-            parts = self._answered(ledger, seen) if members <= MOST_MEMBERS else {}
-            nothing = np.zeros((members, self.terms * sensors))
-            each.append(_between(parts, seen.at.t) if parts else nothing)
-        if self.recorded:
-            each += self._record(seen, used)
+            each["moved"] = self.dictionary.moved(seen.u)
+        if self.terms and members <= MOST_MEMBERS:
+            parts = self._answered(ledger, seen)
+            each["answers"] = _between(parts, seen.at.t)
+        if self.recorded and seen.C.shape[1] == self.unknowns:
+            each |= {"a": seen.a(), "C": seen.C, "Y": seen.Y}
         rows, causes = ledger.rows.copy(), causes.copy()
         for k, filled in enumerate(ledger.waiting.tolist()):
-            rows[k, filled, 0] = seen.at.t
-            rows[k, filled, 1:] = np.concatenate([part[k].ravel() for part in each])
+            row = rows[k, filled]
+            row[:] = 0.0
+            row[0] = seen.at.t
+            for name, part in each.items():
+                row[self._at[name]] = part[k if len(part) > 1 else 0].ravel()
             begin = self.rank + filled * sensors
             causes[k, :, begin : begin + sensors] = seen.Y[k]
         more = {"seen": ledger.seen + 1, "waiting": ledger.waiting + 1, "rows": rows}
         return causes, _changed(ledger, more | parts)
-
-    def _record(self, seen: Seen, used: Array) -> list[Array]:
-        """Return residuals at the prior mean and sensitivities to the unknowns, of the record."""
-        members, sensors = seen.d.shape
-        Y = None
-        if seen.C.shape[1] == self.unknowns:
-            Y = _sensitivity(seen.C, seen.Y)
-        if Y is None:
-            return [np.zeros_like(seen.d), np.zeros((members, self.unknowns, sensors))]
-        return [(seen.d + (seen.a[:, None] @ Y)[:, 0]) * used, Y]
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # counted as nothing
     def settled(self, ledger: Ledger, causes: Array) -> tuple[Array, Ledger]:
@@ -221,8 +221,8 @@ class Judge:
         names = ("sums", "noise", "before", "present")
         parts: dict[str, Any] = dict(zip(names, summed(ledger, due, r, g, used), strict=True))
         if self.recorded:
-            Y = rows[:, :, at["Y"]].reshape(members, batch, self.unknowns, sensors)
-            Y, told = Y * used[:, :, None], rows[:, :, at["told"]] * there[:, :, None]
+            Y, told = self._record(rows)
+            Y, told = Y * used[:, :, None], told * used
             new = blocked(ledger, ledger.seen - ledger.waiting, Y, told)
             parts |= dict(zip(("score", "information", "length"), new, strict=True))
         waited = ledger.waiting[:, None]
@@ -236,6 +236,19 @@ class Judge:
             "times": np.where(waited > 0, _replaced(ledger.times, last[:, at["t"]]), ledger.times),
         }
         return causes @ whole, replace(ledger, **parts)
+
+    def _record(self, rows: Array) -> tuple[Array, Array]:
+        """Return sensitivities to the unknowns, and residuals at the prior mean, of the record.
+
+        Shapes (members, batch, k, sensors) and (members, batch, sensors).
+        """
+        members, batch, _ = rows.shape
+        k, at = self.unknowns, self._at
+        C = rows[:, :, at["C"]].reshape(members, batch, k, k)
+        Y = rows[:, :, at["Y"]].reshape(members, batch, k, self.sensors)
+        Y = _sensitivity(C, Y)
+        told: Array = rows[:, :, at["d"]] + (rows[:, :, None, at["a"]] @ Y)[:, :, 0]
+        return Y, told
 
     @staticmethod
     def _unit(ledger: Ledger, k: int, t: float) -> float:
@@ -258,14 +271,16 @@ class Judge:
 
     def _stuck(self, ledger: Ledger, there: Mask) -> dict[str, Any]:
         """Return how often in a row sensors have shown the same value, and that value."""
-        stuck, value = ledger.stuck, ledger.value
-        values = ledger.rows[:, :, self._at["z"]]
-        for k in range(self.batch):
-            z = np.where(there[:, k : k + 1], values[:, k], np.nan)
-            seen, same = np.isfinite(z), np.abs(z - value) <= SAME * np.abs(z)
-            stuck = np.where(same, stuck + 1, np.where(seen, 0, stuck))
-            value = np.where(seen, z, value)
-        return {"stuck": stuck, "value": value}
+        values = np.where(there[:, :, None], ledger.rows[:, :, self._at["z"]], np.nan)
+        z = np.concatenate([ledger.value[:, None], values], axis=1)
+        order, seen = np.arange(self.batch + 1)[:, None], np.isfinite(z)
+        latest = np.maximum.accumulate(np.where(seen, order, 0), axis=1)
+        value = np.take_along_axis(z, latest, axis=1)  # the last one that was shown
+        same = np.abs(z[:, 1:] - value[:, :-1]) <= SAME * np.abs(z[:, 1:])
+        changes = np.where(seen[:, 1:] & ~same, order[1:], 0).max(axis=1)
+        since = (seen[:, 1:] & (order[1:] > changes[:, None])).sum(axis=1)
+        stuck = np.where(changes > 0, 0, ledger.stuck) + since
+        return {"stuck": stuck, "value": value[:, -1]}
 
     def _begun(self, ledger: Ledger, seen: Seen, full: Mask) -> tuple[Array, Ledger]:
         """Return [T Z_1 ...] and the ledger of members whose batch is full, or the first one."""
@@ -337,10 +352,10 @@ class Judge:
         if process is None or not behind.any():
             return {"readings": ledger.readings, "reached": ledger.reached}
         p, readings = ledger.process.copy(), ledger.readings.copy()
-        reached = ledger.reached.copy()
+        reached, q = ledger.reached.copy(), seen.q()
         for k in np.flatnonzero(behind).tolist():
             rest = float(np.nanmean(ledger.first[k])) if np.isfinite(ledger.first[k]).any() else 0.0
-            now = Now(seen.u[k], seen.q[k], seen.at.member(k), self._unit(ledger, k, t), rest)
+            now = Now(seen.u[k], q[k], seen.at.member(k), self._unit(ledger, k, t), rest)
             if not np.isfinite(reached[k, 1]):
                 p[k] = process.begun()
                 readings[k] = process.shown(p[k], now)
@@ -358,11 +373,11 @@ class Judge:
 
 def _between(parts: dict[str, Any], t: float) -> Array:
     """Return the answers of the process at a time, (members, terms, sensors)."""
-    (begin, end), (low, high) = parts["reached"].T, parts["readings"].transpose(1, 0, 2, 3)
-    width = np.where(end > begin, end - begin, 1.0)
-    along = np.clip((t - begin) / width, 0.0, 1.0)[:, None, None]
-    found: Array = (1.0 - along) * low + along * high
-    return found
+    found = []
+    for (begin, end), (low, high) in zip(parts["reached"].tolist(), parts["readings"], strict=True):
+        along = (t - begin) / (end - begin) if end > begin else 0.0
+        found.append(low + min(max(along, 0.0), 1.0) * (high - low))
+    return np.stack(found) if len(found) > 1 else found[0][None]
 
 
 def _whitening(spread: Array) -> Array:
@@ -397,9 +412,9 @@ def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:
     return Ledger(**{item.name: either(item.name) for item in fields(Ledger)})
 
 
-def _sensitivity(C: Array, Y: Array) -> Array | None:
-    """Return how readings change with the unknowns, (members, k, sensors); None if not known."""
-    try:
-        return np.asarray(np.linalg.solve(C, Y))
-    except np.linalg.LinAlgError:
-        return None
+def _sensitivity(C: Array, Y: Array) -> Array:
+    """Return how readings change with the unknowns, (..., k, sensors); zero where not known."""
+    known = np.isfinite(C).all(axis=(-2, -1)) & (np.abs(np.linalg.det(C)) > 0.0)
+    one = np.eye(C.shape[-1])
+    safe = np.where(known[..., None, None], C, one)
+    return np.asarray(np.where(known[..., None, None], np.linalg.solve(safe, Y), 0.0))

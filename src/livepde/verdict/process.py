@@ -25,7 +25,7 @@ REACH = 64.0  # samples in which a source of amplitude one moves the state by th
 DEVIATIONS = 3.0
 GAIN = 0.1  # of a channel of a source or flux
 LOSS = 0.1  # in `REACH` samples
-MOST_STRIDE = 8  # samples of one step
+MOST_STRIDE = 16  # samples of one step
 MOST_ENDS = 4  # boundaries of the mesh that are looked at
 
 
