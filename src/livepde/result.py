@@ -18,7 +18,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
-from livepde.verdict import FLAT, Finding, Verdict, at_bound, flat
+from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -134,7 +134,8 @@ class Estimate:
 
         It is found when it is first read, and takes about a millisecond.
         """
-        return self.judge().with_findings(known_badly(self.belief, self.space))
+        shifted = discretised(self.notes, self.space.labels)
+        return self.judge().with_findings([*known_badly(self.belief, self.space), *shifted])
 
     @property
     def q(self) -> Array:

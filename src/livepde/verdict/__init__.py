@@ -12,6 +12,7 @@ from livepde.verdict.findings import (
     Severity,
     Verdict,
     at_bound,
+    discretised,
     flat,
 )
 from livepde.verdict.judge import Judge, Seen
@@ -37,5 +38,6 @@ __all__ = [
     "WithheldLedger",
     "assess",
     "at_bound",
+    "discretised",
     "flat",
 ]

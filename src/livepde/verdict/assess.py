@@ -7,31 +7,33 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.stats import chi2
 
 from livepde.linalg import Array
 from livepde.verdict.directions import DRIFT, LAG, OFFSET, Dictionary, Direction
 from livepde.verdict.evidence import (
+    CAUSES,
+    RECORD,
     CauseEvidence,
     causes_of,
     constancy,
     disagreement,
+    following,
     levels,
+    quiet,
 )
-from livepde.verdict.findings import Cause, Finding, Verdict
+from livepde.verdict.findings import Cause, Finding, Severity, Verdict
 from livepde.verdict.ledger import Ledger
 
 __all__ = ["Position", "assess"]
 
-ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
-CAUSES = 0.5 * ALPHA  # for the e-value of all directions
-RECORD = 0.05 * ALPHA  # for each test of the record of the unknowns, and of following errors
 PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
 FEWEST = 20  # samples before which there is nothing to judge by
-FOLLOWING = 0.2  # correlation of successive errors that is worth a word
 LARGER = 1.5  # times the stated noise that is worth a note
 SMALLER = 0.5
 FAR = 3.0  # standard deviations between a sensor that stands still and its prediction
+REFUSED = 0.02  # share of the readings that a gate refuses
+MENDED = 128  # samples of a new window after which a fault may count as mended
 STANDS = 10  # equal readings in a row
 MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
 EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
@@ -85,7 +87,7 @@ def assess(dictionary: Dictionary, at: Position) -> Verdict:
     findings = list(_misfit(dictionary, at, evidence))
     if not findings:
         findings += _records(at, evidence)
-    findings += [*_noise(at), *_stuck(at), *_prior(at)]
+    findings += [*_noise(at), *_stuck(at), *_refused(at), *_prior(at)]
     return Verdict.of(findings, dictionary.left_out, _unseen(dictionary, at))
 
 
@@ -118,8 +120,13 @@ def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
 def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
     """Return whether innovations go with a cause more than chance allows."""
     limit = -math.log(CAUSES)
+    recent = _mended(at, evidence)
     if evidence.total < limit:
-        yield from _following(at, evidence)
+        yield from _following(at, -1 if recent else 0)
+        return
+    order = _ranked(evidence)
+    if recent and _recovered(at, evidence, order):
+        yield _past(at)
         return
     if evidence.whitened < limit:
         worst = float(evidence.correlation.max(initial=0.0))
@@ -130,7 +137,6 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
         e = math.exp(min(evidence.total, 700.0))
         yield Finding("following", "caution", text, evidence=e, measure="e-value")
         return
-    order = _ranked(evidence)
     causes = tuple(_cause(dictionary.directions[d], w, evidence, at, d) for w, d in order[:NAMED])
     w, d = order[0]
     shift = {name: float(moved[w, d] * evidence.size[w, d]) for name, moved in at.moved.items()}
@@ -150,6 +156,38 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
         causes=causes,
         shift=shift,
     )
+
+
+def _mended(at: Position, evidence: CauseEvidence) -> bool:
+    """Return whether what speaks against the model is long past.
+
+    Nothing does in the windows that begin anew, neither in those of now nor, as long as the longest
+    of them is young, in the one before it.
+    """
+    ledger, k = at.ledger, at.member
+    if not ledger.epoch[k, -1] or not (ledger.sound[k] or ledger.age[k, -1] >= MENDED):
+        return False
+    return quiet(ledger, k, evidence.log_e)
+
+
+def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int, int]]) -> bool:
+    """Return whether no likely cause has left the estimate off by a standard deviation."""
+    limit = -math.log(CAUSES)
+    likely = [(w, d) for w, d in order if evidence.log_e[w, d] > limit] or list(order[:NAMED])
+    return all(
+        abs(float(moved[w, d] * evidence.size[w, d])) < MOVES
+        for w, d in likely
+        for moved in at.moved.values()
+    )
+
+
+def _past(at: Position) -> Finding:
+    count = int(at.ledger.age[at.member, -1])
+    text = (
+        f"The data did not fit the model earlier; in the last {count} samples nothing speaks "
+        "against it, and what was wrong moves no unknown by a standard deviation any more."
+    )
+    return Finding("past", "note", text, evidence=float(count))
 
 
 def _many(log_e: float) -> str:
@@ -251,29 +289,25 @@ def _words(direction: Direction, size: float, at: Position) -> tuple[str, str]:
     return words[direction.kind]
 
 
-def _following(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
+def _following(at: Position, window: int) -> Iterator[Finding]:
     """Return whether successive errors of a sensor are correlated though no cause explains it."""
-    noise = at.ledger.noise[at.member][:, 0]
-    _, _, squares, products, pairs = noise
-    rho = products / np.maximum(squares, 1e-300)
-    z = rho * np.sqrt(np.maximum(pairs, 1.0))
-    worst = int(np.argmax(z))
-    p = min(1.0, float(norm.sf(z[worst])) * len(z))
-    if p > RECORD or rho[worst] < FOLLOWING:
+    found = following(at.ledger, at.member, window)
+    if found is None:
         return
+    name = at.sensors[found.sensor]
     text = (
-        f"Successive errors of sensor {at.sensors[worst]} follow each other (correlation "
-        f"{rho[worst]:.2f}): something slow is not in the model, or the noise is not white. The "
-        "intervals are widened for it."
+        f"Successive errors of sensor {name} follow each other (correlation "
+        f"{found.correlation:.2f}): something slow is not in the model, or the noise is not white. "
+        "The intervals are widened for it."
     )
-    name = at.sensors[worst]
-    yield Finding("following", "caution", text, name, p, "p-value")
+    yield Finding("following", "caution", text, name, found.p_value, "p-value")
 
 
 def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
     """Return whether the unknowns changed, and whether sensors disagree on them."""
     rho = float(evidence.correlation.max(initial=0.0))
     wider = (1.0 + rho) / (1.0 - rho)
+    severity: Severity = "caution" if _mended(at, evidence) else "do not trust"
     change = constancy(at.ledger, at.member, wider)
     if change is not None and change.p_value < RECORD:
         name = at.unknowns[int(np.argmax(np.abs(change.change)))]
@@ -281,13 +315,13 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
         remedy = "Let it: law.jumps = true, or an evolution of the unknown."
         cause = Cause("jump", name, f"{name} has changed during the run", remedy=remedy)
         p = change.p_value
-        yield Finding("constancy", "do not trust", text, name, p, "p-value", (cause,))
+        yield Finding("constancy", severity, text, name, p, "p-value", (cause,))
     found = disagreement(at.ledger, at.member, wider)
     if found is not None and found[0] < RECORD:
         name = at.sensors[int(np.argmax(found[1]))]
         text = f"The sensors disagree on the unknowns, {name} the most."
         cause = Cause("position", name, f"sensor {name} is not where, or what, the case says")
-        yield Finding("disagreement", "do not trust", text, name, found[0], "p-value", (cause,))
+        yield Finding("disagreement", severity, text, name, found[0], "p-value", (cause,))
 
 
 def _noise(at: Position) -> Iterator[Finding]:
@@ -307,6 +341,22 @@ def _stuck(at: Position) -> Iterator[Finding]:
         text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
         cause = Cause("stuck", name, f"sensor {name} stands still", remedy=f"Look at {name}.")
         yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
+
+
+def _refused(at: Position) -> Iterator[Finding]:
+    """Return whether the gate refuses more readings than a mishap now and then."""
+    shown, refused = at.ledger.shown[at.member]
+    share = refused.sum() / max(int(shown.sum()), 1)
+    if share <= REFUSED:
+        return
+    worst = int(np.argmax(refused / np.maximum(shown, 1)))
+    name = at.sensors[worst]
+    text = (
+        f"{share:.1%} of the readings were not used ({refused.sum()}, most of them of {name}): "
+        "they lie more than law.gate standard deviations from what was expected."
+    )
+    remedy = f"Look at {name}, state a larger noise, or open the gate."
+    yield Finding("refused", "caution", text, name, float(share), remedy=remedy)
 
 
 def _prior(at: Position) -> Iterator[Finding]:

@@ -9,15 +9,34 @@ martingale that begins at one, and so is a mean of several: the probability that
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from livepde.linalg import Array
 from livepde.verdict.ledger import BLOCKS, Ledger
 
-__all__ = ["CauseEvidence", "Constancy", "causes_of", "constancy", "disagreement", "levels"]
+__all__ = [
+    "ALPHA",
+    "CAUSES",
+    "RECORD",
+    "CauseEvidence",
+    "Constancy",
+    "Following",
+    "causes_of",
+    "constancy",
+    "disagreement",
+    "following",
+    "levels",
+    "quiet",
+]
+
+ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
+CAUSES = 0.5 * ALPHA  # for the e-value of all directions
+RECORD = 0.05 * ALPHA  # for each test of the record of the unknowns, and of following errors
+FOLLOWING = 0.2  # correlation of successive errors that is worth a word
 
 NU = 10.0  # degrees of freedom of the prior of the noise level
 TRUSTED_LEVEL = 20.0  # samples for which the level of all of the run counts in a window
@@ -76,6 +95,41 @@ def causes_of(ledger: Ledger, member: int = 0) -> CauseEvidence:
     white, _, _ = _tested(sums, noise, left, rho)
     whitened = float(logsumexp(white + weights)) if white.size else 0.0
     return CauseEvidence(log_e, size, share, total, min(total, whitened), rho[0])
+
+
+class Following(NamedTuple):
+    """Sensor whose successive errors follow each other: its number, their correlation, p-value."""
+
+    sensor: int
+    correlation: float
+    p_value: float
+
+
+def following(ledger: Ledger, member: int, window: int) -> Following | None:
+    """Return the sensor whose successive errors are correlated most, None if by chance."""
+    _, _, squares, products, pairs = ledger.noise[member][:, window]
+    rho = products / np.maximum(squares, 1e-300)
+    z = rho * np.sqrt(np.maximum(pairs, 1.0))
+    worst = int(np.argmax(z))
+    p = min(1.0, float(norm.sf(z[worst])) * len(z))
+    if p > RECORD or rho[worst] < FOLLOWING:
+        return None
+    return Following(worst, float(rho[worst]), p)
+
+
+def quiet(ledger: Ledger, member: int, log_e: Array) -> bool:
+    """Return whether nothing speaks against the model in the windows that begin anew.
+
+    Parameters
+    ----------
+    log_e
+        Of all windows and directions.
+    """
+    if log_e.size:
+        each = logsumexp(log_e[1:], axis=1) - np.log(log_e.shape[1])
+        if not (each < -np.log(CAUSES)).all():
+            return False
+    return following(ledger, member, -1) is None
 
 
 def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array, Array, Array]:

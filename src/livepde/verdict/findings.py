@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
@@ -18,6 +18,7 @@ __all__ = [
     "Severity",
     "Verdict",
     "at_bound",
+    "discretised",
     "flat",
 ]
 
@@ -30,6 +31,19 @@ RANK = {"note": 0, "trusted": 0, "caution": 1, "do not trust": 2}
 FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly anything
 TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
 MOST = 5  # findings that are said unasked
+SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+REFINE = {
+    "step": (
+        "the time step",
+        "Take a smaller dt_max (steps.dt_max), or a scheme of second order.",
+    ),
+    "mesh": ("the mesh", "Take more elements, where the state bends most."),
+    "input": (
+        "the straight lines between readings of the input channels",
+        "Read these channels more often.",
+    ),
+}
+"""Kind of a discretisation error -> its name, and the remedy."""
 LARGEST = 1e99  # evidence beyond is written as that
 
 
@@ -164,6 +178,32 @@ def flat(label: str, left: float) -> Finding:
         "is left."
     )
     return Finding("flat", "caution", text, label, left, remedy=TELLING)
+
+
+def discretised(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[Finding]:
+    """Return whether the discretisation has shifted the unknowns, and by what.
+
+    Parameters
+    ----------
+    notes
+        Of an estimate: `discretisation_shift`, and for each kind `step_shift` and `k_step_shift`.
+    labels
+        Of the unknown numbers.
+    """
+    total = notes.get("discretisation_shift", math.nan)
+    sizes = {kind: abs(notes[f"{kind}_shift"]) for kind in REFINE if f"{kind}_shift" in notes}
+    if not total > SHIFTED or not sizes:
+        return
+    kind = max(sizes, key=lambda kind: sizes[kind])
+    what, remedy = REFINE[kind]
+    moved = {label: notes.get(f"{label}_{kind}_shift", math.nan) for label in labels}
+    parts = [f"{label} by {size:+.2g}" for label, size in moved.items() if math.isfinite(size)]
+    by = f" ({', '.join(parts[:MOST])})" if parts else ""
+    text = (
+        f"The discretisation has shifted the unknowns by {total:.1f} standard deviations, and most "
+        f"of it is {what}{by}. The intervals were widened by that."
+    )
+    yield Finding("discretisation", "caution", text, evidence=total, remedy=remedy)
 
 
 @dataclass(frozen=True)

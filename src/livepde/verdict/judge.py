@@ -34,6 +34,7 @@ import numpy as np
 from livepde.linalg import Array, Mask
 from livepde.stepping import Moments
 from livepde.verdict.directions import JUMP, Dictionary
+from livepde.verdict.evidence import causes_of, quiet
 from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, summed
 from livepde.verdict.process import Now, stride
 
@@ -227,6 +228,10 @@ class Judge:
             parts |= dict(zip(("score", "information", "length"), new, strict=True))
         waited = ledger.waiting[:, None]
         parts |= self._stuck(ledger, there)
+        parts["sound"] = _sounded(ledger, due)
+        shown = np.isfinite(rows[:, :, at["z"]]) & there[:, :, None]
+        refused = shown & ~(used > 0.0)
+        parts["shown"] = ledger.shown + np.stack([shown.sum(axis=1), refused.sum(axis=1)], axis=1)
         last = rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
         parts |= {
             "waiting": np.zeros_like(ledger.waiting),
@@ -369,6 +374,17 @@ class Judge:
             readings[k, 1] = process.shown(p[k], now)
             reached[k] = begin, begin + h
         return {"process": p, "readings": readings, "reached": reached}
+
+
+def _sounded(ledger: Ledger, due: Mask) -> Mask:
+    """Return whether nothing spoke against the model in the longest window that ended last."""
+    ends = due[:, -1] & (ledger.age[:, -1] > 0)
+    if not ends.any():
+        return ledger.sound
+    sound = ledger.sound.copy()
+    for k in np.flatnonzero(ends).tolist():
+        sound[k] = quiet(ledger, k, causes_of(ledger, k).log_e)
+    return sound
 
 
 def _between(parts: dict[str, Any], t: float) -> Array:

@@ -67,6 +67,11 @@ class Ledger:
     readings, reached
         What the sensors see of those at two times, (members, 2, terms, sensors), and these times,
         (members, 2).
+    sound
+        Whether nothing spoke against the model in the longest window that ended last, (members,).
+    shown
+        How many readings each sensor has shown, and how many of them a gate has refused, (members,
+        2, sensors).
     stuck, value
         How often in a row each sensor has shown the same value, and that value, shapes (members,
         sensors).
@@ -91,6 +96,8 @@ class Ledger:
     process: Array
     readings: Array
     reached: Array
+    sound: Mask
+    shown: IntArray
     stuck: IntArray
     value: Array
 
@@ -138,6 +145,8 @@ class Ledger:
             process=np.zeros((1, terms, n)),
             readings=np.zeros((1, 2, terms, sensors)),
             reached=np.full((1, 2), np.nan),
+            sound=np.zeros(1, dtype=bool),
+            shown=np.zeros((1, 2, sensors), dtype=np.int64),
             stuck=np.zeros((1, sensors), dtype=np.int64),
             value=never,
         )
