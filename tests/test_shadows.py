@@ -11,7 +11,7 @@ import pytest
 
 import livepde as lp
 from livepde.models import heat
-from livepde.runs.doubts import doubts
+from livepde.runs.judgement import doubts
 from livepde.stepping import Alexander2, ImplicitEuler
 from livepde.streams import AbsoluteNoise, Twin
 

@@ -12,7 +12,7 @@ import pytest
 import livepde as lp
 from livepde.errors import LawError
 from livepde.runs import doubts, verdict
-from livepde.verdict import LEVELS, Finding, Verdict, WithheldLedger
+from livepde.verdict import LEVELS, Finding, Verdict, WithheldLedger, discretised
 
 TIMES = np.linspace(0.0, 8.0, 161)
 NOISE = 0.02
@@ -36,7 +36,12 @@ def driven(t: Any) -> Any:
 
 
 @cache
-def shown(k: float = 0.13, loss: float = 0.0, places: tuple[float, ...] = (0.25, 0.5, 0.75)) -> Any:
+def shown(
+    k: float = 0.13,
+    loss: float = 0.0,
+    places: tuple[float, ...] = (0.25, 0.5, 0.75),
+    count: int = len(TIMES),
+) -> Any:
     """Return what sensors show: method of lines on a finer grid, steps by the matrix exponential.
 
     A code of its own: central differences on 160 cells, and the input as a staircase of 20 steps
@@ -55,7 +60,7 @@ def shown(k: float = 0.13, loss: float = 0.0, places: tuple[float, ...] = (0.25,
     once = np.linalg.solve(D, E @ source - source)
     u, rows = np.zeros(n), []
     at = [round(p * cells) - 1 for p in places]
-    for t in TIMES:
+    for t in (TIMES[1] * np.arange(count)).tolist():
         rows.append(u[at])
         for part in range(parts):
             u = E @ u + once * driven(t + (part + 0.5) * dt)
@@ -157,6 +162,49 @@ def test_a_jump_is_named_and_turns_the_verdict_soon():
     assert turned is not None
     assert turned - half <= 30
     assert ("jump", "k") in named(estimate.verdict)
+
+
+def test_the_verdict_turns_back_when_a_fault_is_mended():
+    count, begin, end = 700, 150, 300
+    rng = np.random.default_rng(1)
+    z = shown(count=count) + NOISE * rng.standard_normal((count, len(PLACES)))
+    z[begin:end, 1] += 0.08
+    sensors = lp.Points(PLACES, noise=NOISE)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    levels = []
+    for k in range(count):
+        t = float(TIMES[1] * k)
+        estimate = identifier.step(t, z[k], {"T_left": driven(t)})
+        levels.append(estimate.verdict.level if k % 10 == 0 or k == count - 1 else "")
+    assert "trusted" not in levels[begin + 40 : end]
+    assert levels[-1] == "trusted"
+    assert estimate.verdict.findings[0].what == "past"
+    assert "in the last" in estimate.verdict.sentences[0]
+
+
+def test_readings_that_the_gate_refuses_are_a_finding():
+    z = shown() + errors()
+    z[40::12, 0] += 50.0
+    found = [f for f in run(z)[1].verdict.findings if f.what == "refused"]
+    assert [finding.subject for finding in found] == ["A"]
+    assert "were not used" in found[0].text
+    quiet = run(shown() + errors())[1].verdict
+    assert not [f for f in quiet.findings if f.what == "refused"]
+
+
+def test_a_shift_by_the_discretisation_is_a_finding_of_the_estimate():
+    notes = {
+        "discretisation_shift": 2.5,
+        "step_shift": -0.5,
+        "mesh_shift": 3.0,
+        "k_mesh_shift": 0.2,
+    }
+    (found,) = discretised(notes, ["k"])
+    assert "2.5 standard deviations" in found.text
+    assert "the mesh (k by +0.2)" in found.text
+    assert "more elements" in found.sentence
+    assert list(discretised({**notes, "discretisation_shift": 1.9}, ["k"])) == []
+    assert list(discretised({}, ["k"])) == []
 
 
 def test_a_sensor_that_stands_still_is_named():

@@ -147,7 +147,8 @@ class Live:
     ----------
     ailments
         Each returns why the run is not well, in one sentence, or nothing; the first that does is
-        what /health, the metrics, the log and the page say. A verdict on the estimate joins here.
+        what /health, the metrics, the log and the page say. The last is a verdict of "do not
+        trust", which is looked at every 50 samples.
     """
 
     def __init__(
@@ -185,12 +186,13 @@ class Live:
         self._heard = self._taken = clock()
         self._refused = self._failed = 0  # in a row
         self._refusal = self._failure = ""
-        self._unwell, self._told = "", (-1, "well")
+        self._unwell, self._told, self._doubt = "", (-1, "well"), ""
         self.ailments: list[Callable[[], str]] = [
             self._unlinked,
             self._silence,
             self._refusing,
             self._failing,
+            self._doubted,
         ]
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
@@ -327,7 +329,7 @@ class Live:
         """What a watchdog should know: ok, or why not, in one sentence."""
         last = self.result.last
         counts = self._counts.copy()  # who asks does so from another thread
-        why = self.why
+        why, verdict = self.why, None if last is None else last.verdict
         return {
             "ok": not why,
             "why": why,
@@ -337,8 +339,8 @@ class Live:
             "silent": self.silent,
             "status": "" if last is None else last.status.code,
             "seconds": self._seconds,
-            "verdict": "" if last is None else last.verdict.level,
-            "findings": [] if last is None else last.verdict.sentences,
+            "verdict": "" if verdict is None else verdict.level,
+            "findings": [] if verdict is None else verdict.sentences,
             "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
 
@@ -382,6 +384,9 @@ class Live:
         if self._failed > 1:
             return f"the last steps have failed; the last one: {self._failure}"
         return "" if last is None or last.status.ok else f"the last step: {last.status}"
+
+    def _doubted(self) -> str:
+        return self._doubt
 
     def _look(self) -> None:
         """Say in the log, and to who reads the journal, what has changed of the run's health."""
@@ -482,6 +487,8 @@ class Live:
         """Tell of a verdict that is another one than before."""
         verdict = estimate.verdict
         self.journal.judge(verdict.to_dict())
+        grave = verdict.level == LEVELS[-1] and verdict.sentences
+        self._doubt = f"do not trust the estimates: {verdict.sentences[0]}" if grave else ""
         if verdict.level != self._level:
             self._level = verdict.level
             said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"

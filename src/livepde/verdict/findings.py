@@ -11,6 +11,7 @@ __all__ = [
     "FLAT",
     "LEVELS",
     "MOST",
+    "REFINE",
     "TELLING",
     "Cause",
     "Finding",

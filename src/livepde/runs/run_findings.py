@@ -1,8 +1,7 @@
-"""The verdict of a run: that of its law, and findings from its dataset."""
+"""What the dataset and the journal of a run say against its estimates, as findings."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -11,40 +10,37 @@ import numpy as np
 
 from livepde.plots.dataset import note, scalars
 from livepde.runs.dates import when
-from livepde.runs.outcome import Table
-from livepde.runs.summary import digits, jumps, shown
-from livepde.verdict import FLAT, MOST, Finding, Severity, Verdict, at_bound, flat
+from livepde.runs.summary import digits, jumps
+from livepde.verdict import FLAT, REFINE, Finding, Severity, at_bound, discretised, flat
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["doubts", "severities", "unexplained", "verdict", "verdict_table"]
+    from livepde.runs.journal import Journal
+
+__all__ = ["findings_of", "input_findings"]
 
 MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: twice as large
 LEFT = 1.0  # deviations between estimate and reference after the last replay
 BELIEVED = 0.5  # weight of the members of a bank that drift
 DRIFTING = 0.03  # share of the samples in which they are believed
-MOST_NAMED = 6  # unknowns
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 LEAVES = 1.0  # squared distance from the prior over what model and prior allow
 REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
-SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
-REMEDIES = {
-    "step": ("the time step", "take a smaller dt_max (steps.dt_max), or a scheme of second order"),
-    "mesh": ("the mesh", "take more elements, where the state bends most"),
-    "input": (
-        "the straight lines between readings of the input channels",
-        "read these channels more often",
-    ),
-}
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
+HELD = 0.02  # share of the samples in which the last value of an input was held
+INPUT_KINDS = {
+    "spike": "values far off those before and after were refused as spikes",
+    "interpolated": "gaps were interpolated between the values before and after",
+    "missing": "missing values were not between known ones: the last value was held",
+}
 
 
-def verdict(data: xr.Dataset) -> Verdict:
-    """Return the verdict of a run: that of its law (`Estimate.verdict`), and what its dataset says.
+def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
+    """Return what the dataset of a run says against its estimates.
 
     An unknown ends at a bound, or keeps more than 0.9 of its prior standard deviation: the data did
     not tell. The gate has refused more than 2 % of the readings. The last replay ended more than
@@ -58,64 +54,47 @@ def verdict(data: xr.Dataset) -> Verdict:
     have together shifted an unknown by more than two standard deviations. Something jumped. Where
     no law has judged the innovations: their mean square, over the last 500 samples, is more than
     four times what was expected.
+
+    Parameters
+    ----------
+    judged
+        Whether the law has judged innovations and refused readings itself.
     """
-    stored = data.attrs.get("verdict")
-    own = Verdict.from_dict(json.loads(stored)) if stored else Verdict.unjudged()
-    if not data.sizes["time"]:
-        return own
     gradient = note(data, "residual") is not None
-    judged = not any(text.startswith(("innovations", "everything")) for text in own.untested)
-    return own.with_findings(
-        [
-            *([] if judged else _model_error(data)),
-            *_said("replay", "do not trust", _replays(data)),
-            *_said("refused", "caution", _refused(data)),
-            *_unknowns(data),
-            *_said("held", "do not trust", _held(data)),
-            *_said("left out", "note", _left_out(data)),
-            *_discretised(data),
-            *_said("rest", "note", _rests(data) if gradient else []),
-            *_said("lost", "caution", _lost(data) if gradient else []),
-            *_said("guards", "caution", [] if gradient else _guards(data)),
-            *_said("drift", "caution", _drifts(data)),
-            *_said("departure", "do not trust", _departure(data)),
-            *_said("gain", "caution", _gain(data)),
-            *_said("jump", "caution", _jumps(data)),
-        ]
-    )
-
-
-def verdict_table(found: Verdict) -> Table:
-    """Return a verdict as a table: its level, and a row for each finding."""
-    rows = [
-        (
-            finding.severity,
-            finding.what,
-            finding.subject or "–",
-            shown(finding.evidence, ".2g"),
-            finding.measure,
-            "; ".join(cause.text for cause in finding.causes[:2]) or "–",
-        )
-        for finding in found.findings[:MOST]
+    own = [] if judged else [*_model_error(data), *_said("refused", "caution", _refused(data))]
+    return [
+        *own,
+        *_said("replay", "do not trust", _replays(data)),
+        *_unknowns(data),
+        *_said("held", "do not trust", _held(data)),
+        *_said("left out", "note", _left_out(data)),
+        *_discretised(data),
+        *_said("rest", "note", _rests(data) if gradient else []),
+        *_said("lost", "caution", _lost(data) if gradient else []),
+        *_said("guards", "caution", [] if gradient else _guards(data)),
+        *_said("drift", "caution", _drifts(data)),
+        *_said("departure", "do not trust", _departure(data)),
+        *_said("gain", "caution", _gain(data)),
+        *_said("jump", "caution", _jumps(data)),
     ]
-    columns = ("severity", "finding", "of", "evidence", "measure", "likely causes")
-    return Table(f"Verdict: {found.level}", columns, rows)
 
 
-def doubts(data: xr.Dataset) -> list[str]:
-    """Return what a user should know before he believes the estimates: the findings of a run."""
-    found = verdict(data).findings
-    return list(dict.fromkeys(finding.sentence for finding in found))
+def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
+    """Return gaps and spikes of the channels that drive the model, if any.
 
-
-def severities(data: xr.Dataset) -> dict[str, Severity]:
-    """Return how grave each sentence of `doubts` is."""
-    return {finding.sentence: finding.severity for finding in verdict(data).findings}
-
-
-def unexplained(data: xr.Dataset) -> bool:
-    """Return whether a run says that its model does not explain the data."""
-    return any(finding.what == "misfit" for finding in verdict(data).findings)
+    A value that was held is worth a caution where more than 2 % of the samples have one.
+    """
+    found = []
+    for name in channels:
+        counts = {kind: n for (kind, channel), n in journal.counts.items() if channel == name}
+        parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
+        if not parts:
+            continue
+        held = counts.get("missing", 0) / max(len(journal), 1)
+        severity: Severity = "caution" if held > HELD else "note"
+        text = f"Channel {name}: {'; '.join(parts)}."
+        found.append(Finding("input", severity, text, name, held))
+    return found
 
 
 def _said(what: str, severity: Severity, sentences: Iterable[str]) -> list[Finding]:
@@ -340,26 +319,12 @@ def _departure(data: xr.Dataset) -> list[str]:
 
 def _discretised(data: xr.Dataset) -> list[Finding]:
     """Return whether the discretisation has shifted the unknowns at the end, and by what."""
-    total = note(data, "discretisation_shift")
-    if total is None or not total[-1] > SHIFTED:
-        return []
-    notes = {kind: note(data, f"{kind}_shift") for kind in REMEDIES}
-    sizes = {kind: abs(float(values[-1])) for kind, values in notes.items() if values is not None}
-    kind = max(sizes, key=lambda kind: sizes[kind])
-    what, remedy = REMEDIES[kind]
-    shift: dict[str, float] = {}
-    for label in scalars(data):
-        moved = note(data, f"{label}_{kind}_shift")
-        if moved is not None and np.isfinite(moved[-1]):
-            shift[label] = float(moved[-1])
-    parts = [f"{label} by {size:+.2g}" for label, size in [*shift.items()][:MOST_NAMED]]
-    moved_by = f" ({', '.join(parts)})" if parts else ""
-    text = (
-        f"The discretisation has shifted the unknowns by {total[-1]:.1f} standard deviations, and "
-        f"most of it is {what}{moved_by}. The intervals were widened by that."
-    )
-    remedy = f"{remedy[0].upper()}{remedy[1:]}."
-    return [Finding("discretisation", "caution", text, evidence=float(total[-1]), remedy=remedy)]
+    labels = scalars(data)
+    kinds = [f"{kind}_shift" for kind in ("discretisation", *REFINE)]
+    names = [*kinds, *(f"{label}_{kind}" for label in labels for kind in kinds[1:])]
+    noted = {name: note(data, name) for name in names}
+    last = {name: float(values[-1]) for name, values in noted.items() if values is not None}
+    return list(discretised(last, labels))
 
 
 def _gain(data: xr.Dataset) -> list[str]:
