@@ -419,7 +419,7 @@ def health_of(run: Live) -> list[tuple[str, str]]:
 
 
 def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
-    now, right = [0.0], [*rows(60)]
+    now, right = [0.0], [*rows(45)]  # so few that no verdict is looked at
     old = [{**right[0], "t": -1.0 - k} for k in range(10)]
     source = Sequence_([*right[:5], *old, *right[5:]], now)
     run = live(tmp_path, source, silence=5.0, clock=lambda: now[0])
@@ -432,6 +432,18 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
     assert [kind for kind, _ in rest] == ["well"]
     assert run.health["ok"]
     assert run.journal.health == ""
+
+
+def test_a_verdict_of_no_trust_is_no_health_and_is_told(tmp_path):
+    run = live(tmp_path, Rows(rows(101)))
+    run.run()
+    levels = [e.message.partition(":")[0] for e in run.journal.events if e.kind == "verdict"]
+    assert levels[:1] == ["do not trust"]
+    grave = levels[-1] == "do not trust"
+    assert run.health["ok"] == (not grave)
+    assert health_of(run)[0] == ("unwell", "the verdict on the estimates is 'do not trust'")
+    kinds = [kind for kind, _ in health_of(run)]
+    assert kinds[-1] == ("unwell" if grave else "well")
 
 
 def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):

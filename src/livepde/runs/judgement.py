@@ -47,8 +47,8 @@ def verdict_table(found: Verdict) -> Table:
 
 
 def doubts(data: xr.Dataset) -> list[str]:
-    """Return what a user should know before he believes the estimates: at most five sentences."""
-    return verdict(data).sentences
+    """Return what a user should know before he believes the estimates: all findings, each once."""
+    return list(dict.fromkeys(finding.sentence for finding in verdict(data).findings))
 
 
 def severities(data: xr.Dataset) -> dict[str, Severity]:

@@ -487,8 +487,8 @@ class Live:
         """Tell of a verdict that is another one than before."""
         verdict = estimate.verdict
         self.journal.judge(verdict.to_dict())
-        grave = verdict.level == LEVELS[-1] and verdict.sentences
-        self._doubt = f"do not trust the estimates: {verdict.sentences[0]}" if grave else ""
+        grave = verdict.level == LEVELS[-1]
+        self._doubt = f"the verdict on the estimates is {verdict.level!r}" if grave else ""
         if verdict.level != self._level:
             self._level = verdict.level
             said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
