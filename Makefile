@@ -16,7 +16,7 @@ endif
 PYTHON ?= python3
 
 # The tiers of the tests, by the markers of pyproject.toml.
-PYTEST := pytest --numprocesses auto --maxprocesses 8 --dist loadfile
+PYTEST := pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 USERS := -m "not (study or process or broker or browser or pages)"
 SYSTEM := -m "not study and (process or broker or browser or pages)"
 FAST := -m "not (slow or study or process or broker or browser or pages)"

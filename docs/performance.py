@@ -58,9 +58,8 @@ The page, its figures and the numbers behind them (`docs/performance/*.json`) ar
 
 ![One step over one forward step](performance/step.png)
 
-*Solid: the median of the pairs. Dashed, in the same colour: what was promised. The forward step
-is a step of the same model, by the law's own scheme, with a known parameter, its matrix factorised
-once.*
+*Solid: the median of the pairs. Dashed, in the same colour: what was promised. The forward step is
+one of the same model, by the law's own scheme, with a known parameter, its matrix factorised once.*
 
 On rods, and on a square of 10 000 nodes, `python -m benchmarks step` times the laws for a few
 numbers from the first sample on: medians, and beside them means, which have the first sample and

@@ -32,6 +32,7 @@ from livepde.dashboard.view import Spread, View
 from livepde.models import heat
 from livepde.result import layout_of
 from livepde.runs import JOURNAL, Journal, RunWriter, drive, journal_of
+from livepde.runs.database import checksum
 from livepde.runs.journal import Event
 from livepde.runs.web import Address
 
@@ -486,8 +487,9 @@ def rewrite_layout(path: Path, **changes) -> None:
 
     with closing(sqlite3.connect(path)) as db, db:
         (content,) = db.execute("SELECT value FROM meta WHERE key = 'layout'").fetchone()
-        layout = {**json.loads(content), **changes}
-        db.execute("UPDATE meta SET value = ? WHERE key = 'layout'", (json.dumps(layout),))
+        text = json.dumps({**json.loads(content), **changes})
+        whole = text, checksum("meta", "layout", text)
+        db.execute("UPDATE meta SET value = ?, crc = ? WHERE key = 'layout'", whole)
     db.close()
 
 

@@ -588,8 +588,8 @@ class Journal:
             with sound(self.path):
                 if len(channels) not in (8 * len(self.channels), 16 * len(self.channels)):
                     raise ValueError(f"sample {number} has not the size of the others")
-                named = self._named(np.frombuffer(channels).tolist())
-            yield Taken(number, float(t), named)
+                taken = Taken(number, float(t), self._named(np.frombuffer(channels).tolist()))
+            yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:
         """Return what is kept of a sample by name: all channels, and the noise that is there."""
