@@ -45,6 +45,8 @@ BESIDE: tuple[tuple[str, Shadows | None, bool | str], ...] = (
 )
 """What the sensitivity law follows beside its estimates."""
 
+SETTLED = 24  # steps after which one of some is shadowed
+
 
 Row: TypeAlias = tuple[int, str, float, float, float, float, float | None]
 
@@ -104,7 +106,7 @@ def problem(size: int) -> Problem:
         model, omega = seed.build(nodes=size)
         points = Points(np.linspace(0.1, 0.9, SENSORS).tolist())
         return Problem(
-            model, omega, points, seed.q_true, seed.u_true, 0.625, 10, steps, stretches, runs
+            model, omega, points, seed.q_true, seed.u_true, 0.625, SETTLED, steps, stretches, runs
         )
     cells = round(np.sqrt(size)) - 1
     mesh = rectangle((0.0, 1.0), (0.0, 1.0), (cells, cells)).to_meshtri()
@@ -119,7 +121,7 @@ def problem(size: int) -> Problem:
     omega = Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87))
     side = np.linspace(0.1, 0.9, round(np.sqrt(SENSORS)))
     points = Points([(x, y) for x in side for y in side])
-    return Problem(model, omega, points, _q_true, _u_true, 0.0625, 10, 6, 3, 1)
+    return Problem(model, omega, points, _q_true, _u_true, 0.0625, SETTLED, 16, 2, 1)
 
 
 def _q_true(x: Any) -> Any:
@@ -176,9 +178,9 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
     note = (
         "Ratios of processor times taken in one process; the forward step is livepde.simulate with "
         f"the factor kept. Gradient law: the first {FIRST} samples, each step over the median "
-        "forward step; sensitivity law: stretches of steps from the tenth on, no iterated start, "
-        "with and without its shadows of the discretisation error and its verdict. A forward step "
-        "is one of the law's own scheme."
+        f"forward step; sensitivity law: stretches of steps after the first {SETTLED}, no iterated "
+        "start, with and without its shadows of the discretisation error and its verdict. A forward "
+        "step is one of the law's own scheme."
     )
     return Outcome(tables=[table], checks=checks, notes=[note])
 

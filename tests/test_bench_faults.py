@@ -81,6 +81,7 @@ def test_clocks_go_wrong_and_are_told():
     assert outcome.tables[0].rows[0] == ("none", 500, 0, "–")
 
 
+@pytest.mark.slow
 def test_slow_visitors_keep_nobody_out(monkeypatch):
     monkeypatch.setattr("benchmarks.faults.visitors.PAUSE", 0.0)
     monkeypatch.setattr("benchmarks.faults.visitors.SOON", 60.0)  # no timed test

@@ -60,6 +60,7 @@ def test_a_row_days_ahead_of_fast_ones_is_refused(tmp_path):
     assert run.health["ok"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [1, 2, AGREE])
 @pytest.mark.parametrize("step", [0.1, 1000.0])
 def test_rows_far_ahead_that_agree_are_taken_back(tmp_path, wrong, step):
@@ -175,6 +176,7 @@ def test_the_hour_that_clocks_show_twice(tmp_path):
     assert found == [60.0 * k for k in range(240)]
 
 
+@pytest.mark.slow
 def test_the_hour_twice_without_a_zone_is_a_clock_set_back(tmp_path):
     given = right(400)
     given[200:] = moved(given[200:], -10.0)

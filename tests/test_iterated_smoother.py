@@ -75,6 +75,7 @@ def test_a_poor_prior_leaves_no_error_behind():
     assert abs(high - low) < 0.25 * std
 
 
+@pytest.mark.slow
 def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
     begun, descended = [], iterated_smoother._descended
 

@@ -857,6 +857,7 @@ def test_a_record_that_is_not_as_it_was_is_told(tmp_path, command):
     refused(path, match="damaged.*--salvage")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rest", [1, 0])
 def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -886,6 +887,7 @@ def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
         same(one, other)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
     run = started(tmp_path, 3 * CHECKPOINT, retention=Retention(span=1.0))
     run.run()
@@ -928,6 +930,7 @@ def test_what_is_whole_is_salvaged(tmp_path):
         Salvage(tmp_path / "none")
 
 
+@pytest.mark.slow
 def test_a_journal_that_was_cut_off_is_salvaged(tmp_path):
     path = finished(tmp_path, 600)
     whole = path.read_bytes()

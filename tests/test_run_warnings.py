@@ -113,6 +113,7 @@ def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
     assert any("unknowns that drift" in note for note in doubts(data)) == said
 
 
+@pytest.mark.slow
 def test_samples_of_which_nothing_could_be_learned_are_said():
     model = rod(lp.Scalar(0.5, 0.3))
     data = run(model, model)

@@ -394,6 +394,7 @@ def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
     assert all(thread.daemon for thread in begun)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("token", ["", TOKEN])
 def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
     """Many more than there are threads, that send a little now and then: none holds one."""
@@ -469,6 +470,7 @@ def test_who_holds_a_thread_for_too_long_is_sent_away(monkeypatch):
     server.close()
 
 
+@pytest.mark.slow
 def test_more_visitors_than_there_is_room_for(serving, monkeypatch):
     monkeypatch.setattr(lobby, "ROOM", 5)
     server = serving()

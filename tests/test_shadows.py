@@ -88,6 +88,7 @@ def reference(width: float = WIDTH) -> Any:
     return ran(identifier(law=PLAIN, dt_max=WIDTH / 8), samples(width=width))
 
 
+@pytest.mark.slow
 def test_predicts_the_shift_by_the_step() -> None:
     estimate = ran(identifier(scheme=ImplicitEuler()), samples())
     actual = estimate.q - reference().q
@@ -95,6 +96,7 @@ def test_predicts_the_shift_by_the_step() -> None:
     assert_predicts(shifts(estimate, "step"), actual, reference().q_std, 0.2)
 
 
+@pytest.mark.slow
 def test_predicts_the_shift_by_steps_across_jumps() -> None:
     """A heater that goes on and off: the jumps are shadowed, and each counts once."""
     mesh = lp.interval(0.0, 0.4, 20)
@@ -132,6 +134,7 @@ def test_the_second_order_scheme_is_shifted_little() -> None:
     assert np.abs(actual / reference().q_std).max() < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [5, 10])
 def test_predicts_the_shift_by_the_mesh(cells: int) -> None:
     estimate = ran(identifier(cells, dt_max=WIDTH / 8), samples())
@@ -140,6 +143,7 @@ def test_predicts_the_shift_by_the_mesh(cells: int) -> None:
     assert_predicts(shifts(estimate, "mesh"), actual, reference().q_std, 0.75)
 
 
+@pytest.mark.slow
 def test_predicts_the_shift_by_input_lines() -> None:
     """Against a run that is told the inputs ten times for each reading of the sensors."""
     rows = samples()
@@ -258,6 +262,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     assert ran(identifier(8, few), samples()[:10]).notes["mesh_unfollowed"] == 1.0
 
 
+@pytest.mark.slow
 def test_speaks_and_names_the_cause() -> None:
     def said(cells: int, **k: Any) -> list[str]:
         data = identifier(cells, **k).run(samples()).to_xarray()

@@ -168,6 +168,7 @@ def test_what_is_constant_has_one_value_at_all_times():
     np.testing.assert_allclose(spread, data.a_std[-1], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_names_times_and_fields_are_those_of_the_run():
     result = run(evolution=lp.RandomWalk(0.2), fields_every=50)
     data, smoothed = result.to_xarray(), result.smoothed()
@@ -185,6 +186,7 @@ def test_names_times_and_fields_are_those_of_the_run():
     assert float(smoothed.u_std.mean()) < 0.8 * float(data.u_std.mean())
 
 
+@pytest.mark.slow
 def test_a_run_stays_as_it_is():
     identifier = lp.Identifier(conducting(), SENSORS, lp.SensitivityLaw())
     result = identifier.run(swinging(lambda t: 0.12))
@@ -199,6 +201,7 @@ def test_a_run_stays_as_it_is():
     assert new.t == 0.0
 
 
+@pytest.mark.slow
 def test_a_jump_stays_a_jump():
     """Before and after it the unknown is what it was there, as certain as all samples make it."""
     result = run(lp.SensitivityLaw(jumps=lp.Jumps()), q=lambda t: 0.1 if t < 7.0 else 0.3)
@@ -222,6 +225,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHANGES)
 def test_the_bank_smooths_by_the_member_that_explains_all_samples(name):
     """With `jumps` a member leads at the end whose unknown has stayed since."""

@@ -34,7 +34,7 @@ from livepde.stepping import TINY, KeptFactors, Moments, Span
 
 __all__ = ["KINDS", "ShadowSet", "Shadows"]
 
-FIRST = 32  # steps that are all shadowed: where a run begins the error changes from step to step
+FIRST = 16  # steps that are all shadowed: where a run begins the error changes from step to step
 CALM = 4  # steps after a jump that are all shadowed
 JUMP = 4.0  # times the usual difference of two changes of the state: something has jumped
 USUAL = 16.0  # steps over which that is averaged
@@ -55,7 +55,7 @@ class Shadows:
     Their signed shifts are summed, and widen what is reported: variance plus square of the sum. The
     estimate itself, and the filter, stay as they are.
 
-    The first 32 steps are shadowed, later one of eight, from 256 on one of sixteen, which stands
+    The first 16 steps are shadowed, later one of eight, from 256 on one of sixteen, which stands
     for those around it: an error that changes much faster is found on average only.
 
     Parameters
