@@ -96,7 +96,7 @@ LAWS = {
 }
 
 
-def samples(fleet, steps=18, seed=0):
+def samples(fleet, steps=16, seed=0):
     """Return what members with values near the prior show, with gaps and a few outliers."""
     rng = np.random.default_rng(seed)
     members, model = len(fleet), fleet.model
@@ -162,11 +162,19 @@ def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
     return fleet, estimate
 
 
+# One model with every law, and every model with the laws that go the farthest ways.
+PAIRS = [
+    (model, law)
+    for model in MODELS
+    for law in LAWS
+    if model == "rod" or law in ("plain", "gate, noise", "replay")
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("law", LAWS.values(), ids=LAWS.keys())
-@pytest.mark.parametrize("build", MODELS.values(), ids=MODELS.keys())
-def test_equals_separate_identifiers(build, law):
-    fleet, _ = compare(build(), law)
+@pytest.mark.parametrize(("model", "law"), PAIRS)
+def test_equals_separate_identifiers(model, law):
+    fleet, _ = compare(MODELS[model](), LAWS[law])
     assert fleet.together, fleet.note
 
 

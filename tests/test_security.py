@@ -26,9 +26,9 @@ import livepde as lp
 from livepde import cases, checkpoint, runs
 from livepde.atomic_write import replacing, write_bytes
 from livepde.cli.program import app
-from livepde.runs import RunWriter, lobby
-from livepde.runs.lobby import LONGEST_BODY
+from livepde.runs import RunWriter, pending_connections
 from livepde.runs.monitor import Metrics, Monitor
+from livepde.runs.pending_connections import LONGEST_BODY
 from livepde.runs.web import THREADS, Address, Server
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake
@@ -398,7 +398,7 @@ def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
 @pytest.mark.parametrize("token", ["", TOKEN])
 def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
     """Many more than there are threads, that send a little now and then: none holds one."""
-    monkeypatch.setattr(lobby, "DEADLINE", 2.0)
+    monkeypatch.setattr(pending_connections, "DEADLINE", 2.0)
     server = serving(token=token)
     slow = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(4 * THREADS)]
     for k, one in enumerate(slow):
@@ -440,7 +440,7 @@ def test_bodies_reach_the_page(serving, monkeypatch):
         return [str(len(environ["wsgi.input"].read())).encode()]
 
     server = Server(size, Address())
-    for length in (0, 10, lobby.WHOLE + 100_000):
+    for length in (0, 10, pending_connections.WHOLE + 100_000):
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
         for _ in range(2):  # the second one by the same connection
             connection.request("POST", "/", b"a" * length)
@@ -452,7 +452,7 @@ def test_bodies_reach_the_page(serving, monkeypatch):
 
 def test_who_holds_a_thread_for_too_long_is_sent_away(monkeypatch):
     """One who may ask, and sends the rest of a long body a byte at a time."""
-    monkeypatch.setattr(lobby, "LONGEST", 0.5)
+    monkeypatch.setattr(pending_connections, "LONGEST", 0.5)
 
     def read(environ, start):
         got.append(len(environ["wsgi.input"].read()))
@@ -462,9 +462,9 @@ def test_who_holds_a_thread_for_too_long_is_sent_away(monkeypatch):
     got: list[int] = []
     server = Server(read, Address())
     one = socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE)
-    length = lobby.WHOLE + 1000
+    length = pending_connections.WHOLE + 1000
     head = f"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n\r\n"
-    one.sendall(head.encode() + b"a" * (lobby.WHOLE + 10))
+    one.sendall(head.encode() + b"a" * (pending_connections.WHOLE + 10))
     assert b"200" not in one.recv(1000)
     one.close()
     server.close()
@@ -472,7 +472,7 @@ def test_who_holds_a_thread_for_too_long_is_sent_away(monkeypatch):
 
 @pytest.mark.slow
 def test_more_visitors_than_there_is_room_for(serving, monkeypatch):
-    monkeypatch.setattr(lobby, "ROOM", 5)
+    monkeypatch.setattr(pending_connections, "ROOM", 5)
     server = serving()
     waiting = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(20)]
     for one in waiting:

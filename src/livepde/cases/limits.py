@@ -53,7 +53,7 @@ def check_text(text: str, where: str) -> None:
     if DOTTED.search(NAME.sub("a", text)):
         raise CaseError(f"{where}: a key has more than {DEPTH} parts; a case needs few.")
     if DIGITS.search(text):
-        raise CaseError(f"{where}: a number has 400 digits or more; write it as 1e400 is written.")
+        raise CaseError(f"{where}: a number has 400 digits or more; write it shorter, as 2.5e9.")
 
 
 def check_document(document: Mapping[str, Any], where: str) -> None:

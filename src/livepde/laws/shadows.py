@@ -56,7 +56,9 @@ class Shadows:
     estimate itself, and the filter, stay as they are.
 
     The first 16 steps are shadowed, later one of eight, from 256 on one of sixteen, which stands
-    for those around it: an error that changes much faster is found on average only.
+    for those around it: an error of step or input lines that changes much faster is found on
+    average only. The mesh is followed by one step in the place of several: where the process is
+    driven by something that turns within them, its shift is overstated.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from livepde.errors import RunError
-from livepde.runs.lobby import LONGEST_BODY, LONGEST_HEADER, Lobby
+from livepde.runs.pending_connections import LONGEST_BODY, LONGEST_HEADER, PendingConnections
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -123,7 +123,9 @@ class Server:
         place = (address.host, address.port)
         server: Callable[..., Any] = Cheroot
         self._server = server(place, _headed(application, address), numthreads=THREADS)
-        self._lobby = Lobby(self._server.process_conn, lambda e: _why_not(e, address), TIMEOUT)
+        self._pending = PendingConnections(
+            self._server.process_conn, lambda e: _why_not(e, address), TIMEOUT
+        )
         self._server.process_conn = self._receive
         self._server.timeout = TIMEOUT
         self._server.max_request_header_size = LONGEST_HEADER
@@ -162,7 +164,7 @@ class Server:
         if connection.rfile.has_data():
             connection.close()
         else:
-            self._lobby.admit(connection)
+            self._pending.admit(connection)
 
     def wait(self) -> None:
         """Serve until it is closed."""
@@ -170,7 +172,7 @@ class Server:
 
     def close(self) -> None:
         """Stop listening."""
-        self._lobby.close()
+        self._pending.close()
         self._server.stop()
         self._thread.join()
 
@@ -179,7 +181,7 @@ def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
     """Return an application with our headers, and with a cookie for who knows the token."""
 
     def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
-        if why := _why_not(environ, address):  # should the lobby have read the header otherwise
+        if why := _why_not(environ, address):  # should the header have been read otherwise before
             begin("403 Forbidden", [("Content-Type", "text/plain"), ("Connection", "close")])
             return [f"{why}\n".encode()]
         given = _given(environ)

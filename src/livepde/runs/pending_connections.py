@@ -1,4 +1,4 @@
-"""Where visitors wait until they have asked: none of them holds a thread of a server meanwhile."""
+"""Connections of a web server whose request has not arrived as a whole: they hold no thread."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
-__all__ = ["Lobby", "environ_of"]
+__all__ = ["PendingConnections", "environ_of"]
 
 LONGEST_HEADER = 16_384  # bytes
 LONGEST_BODY = 1_000_000  # bytes; of a longer one the server says so
 WHOLE = 65_536  # bytes of what follows the header that are waited for here
 END = b"\r\n\r\n"
-ROOM = 256  # visitors that may wait at a time; of more the first ones are sent away
+ROOM = 256  # connections that may wait at a time; of more the oldest are closed
 DEADLINE = 10.0  # seconds within which a request has to be there as a whole
 LONGEST = 30.0  # seconds within which it has to be answered
 TICK = 0.02  # seconds between two looks at who waits
 
 
-class Lobby:
-    """Takes connections as they come, and hands them on when their request is there as a whole.
+class PendingConnections:
+    """Connections that wait until their request has arrived; then a thread serves them.
 
-    A visitor who sends a byte now and then waits here, and is sent away at a deadline. So is at
-    once, with an answer, who may not ask.
+    A connection that sends a byte now and then is closed at a deadline. One without permission is
+    answered and closed at once.
 
     Parameters
     ----------
