@@ -34,14 +34,14 @@ from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
 from livepde.stepping import Advance, Interval, Scheme
-from livepde.verdict import Verdict, WithheldLedger
+from livepde.verdict import InputLedger, Verdict, WithheldLedger
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 5  # of the checkpoint
+FORMAT = 6  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -147,6 +147,7 @@ class Identifier:
         self._inputs: Inputs = Inputs({})
         self._samples = 0
         self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
+        self._gaps = InputLedger.start(len(self.inputs))
         if not self.inputs:
             self._begin(self._inputs)
 
@@ -282,12 +283,14 @@ class Identifier:
             self._begun_by(values, t)
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         start = self._inputs if t > self._t else values
-        interval = Interval(
-            self._t, t, start, values, self._z if t > self._t else used, used, noise
-        )
+        missing = np.array([name in held for name in self.inputs], dtype=float)
+        gaps = self._gaps.gaps(self.inputs, missing) if self._gaps.held.any() else {}
+        z0 = self._z if t > self._t else used
+        interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
         self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
+            self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held, scored=True)
 
@@ -401,7 +404,7 @@ class Identifier:
             notes=report.notes,
             held=held,
             space=self.model.parameter_space,
-            judge=self._judge(self._state),
+            judge=self._judge(self._state, report.notes),
         )
 
     def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
@@ -415,13 +418,19 @@ class Identifier:
         found: Array = (rows * rows).sum(axis=1)
         return found
 
-    def _judge(self, state: Any) -> Callable[[], Verdict]:
-        """Return a function that gives the verdict on the run so far."""
-        judge, ledger = self.law.judge(self._work, state), self._withheld
-        if self.withheld is None:
+    def _judge(self, state: Any, notes: Mapping[str, float]) -> Callable[[], Verdict]:
+        """Return a function that gives the verdict on the run so far, which has these notes."""
+        judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
+        names = self.withheld.names if self.withheld is not None else ()
+        inputs, labels = self.inputs, tuple(self.model.parameter_space.labels)
+        if not names and not gaps.counts[1:].any():
             return judge
-        names = self.withheld.names
-        return lambda: judge().with_findings(ledger.findings(names))
+
+        def found() -> Verdict:
+            held = gaps.findings(inputs, notes, labels)
+            return judge().with_findings([*withheld.findings(names), *held])
+
+        return found
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last accepted sample.
@@ -452,7 +461,7 @@ class Identifier:
         if state is self._state:
             return estimate
         belief = self.problem.physical(self.law.belief(self._work, state))
-        return replace(estimate, belief=belief, judge=self._judge(state))
+        return replace(estimate, belief=belief, judge=self._judge(state, estimate.notes))
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return what the sensors will show if nothing more is measured; nothing is learned.
@@ -632,6 +641,8 @@ class Identifier:
             "inputs": np.array([self._inputs[c] for c in self._inputs]),
             "withheld": self._withheld.sums,
             "withheld_last": self._withheld.last,
+            "held_counts": self._gaps.counts,
+            "held": self._gaps.held,
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
@@ -666,6 +677,7 @@ class Identifier:
         try:
             t, samples, z = float(leaves["t"]), int(leaves["samples"]), leaves["z"]
             withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
+            gaps = InputLedger(leaves["held_counts"].astype(np.int64), leaves["held"])
             names = self.inputs if len(leaves["inputs"]) else ()
             inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
             if header["begun"]:
@@ -677,7 +689,7 @@ class Identifier:
                 "as they were when it was saved."
             ) from error
         self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
-        self._state, self._withheld = state, withheld
+        self._state, self._withheld, self._gaps = state, withheld, gaps
         if state is None and not self.inputs:
             self._begin(inputs)
 

@@ -18,7 +18,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
-from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat
+from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat, held_inputs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -134,7 +134,8 @@ class Estimate:
 
         It is found when it is first read, and takes about a millisecond.
         """
-        shifted = discretised(self.notes, self.space.labels)
+        labels = self.space.labels
+        shifted = [*discretised(self.notes, labels), *held_inputs(self.notes, labels)]
         return self.judge().with_findings([*known_badly(self.belief, self.space), *shifted])
 
     @property

@@ -157,7 +157,12 @@ def _absorbed(
     largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
     e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
     refused, count, newest = x.refused, np.zeros(len(x)), None
-    far = _far(x, e, used, options.gate)
+    shadows = filter_.shadows
+    off = None if shadows is None else shadows.seen(x, span.end)
+    known = np.zeros_like(d)  # what the discretisation is known to do to the innovations
+    if shadows is not None and off is not None:
+        known = off[:, shadows.counted].sum(axis=1) / noise
+    far = _far(x, d / np.sqrt(1.0 + (Y * Y).sum(axis=1) + known * known), used, options.gate)
     if far is not None:
         refused = np.where(far, refused + 1, np.where(used, 0, refused))
         kept = used & ~(far & (refused <= options.patience))
@@ -169,7 +174,8 @@ def _absorbed(
     if not whole:  # zeros tell nothing: what is missing takes part as such
         Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
     if filter_.judge is not None:
-        x = _judged(filter_.judge, filter_, x, Y, d, used, noise, predicted, span)
+        told = d + used * known  # the discretisation has a finding of its own
+        x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     new, made = filter_.update(x, Y, d)
     parts: dict[str, Any] = {
         "innovations": x.innovations.add(e, measured, newest),
@@ -177,9 +183,8 @@ def _absorbed(
     }
     if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
-    if filter_.shadows is not None:
-        weights = used / noise
-        parts["shadows"] = filter_.shadows.updated(x, new, made, weights, span.end)
+    if shadows is not None and off is not None:
+        parts["shadows"] = shadows.updated(x, new, made, used / noise, off)
     # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
     # overflows would leave statistics that are not finite.
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
@@ -205,7 +210,10 @@ def _judged(
         return filter_.estimate(x)
 
     def a() -> Array:
-        return filter_.reduction.reduced(q() - prior)
+        found: Array = filter_.reduction.reduced(q() - prior)
+        if filter_.shadows is not None:
+            found = found - x.shadows.a[:, filter_.shadows.counted].sum(axis=1)
+        return found
 
     u = x.u + x.du
     seen = Seen(x.C, x.causes, a, q, u, Y, d, used, span.z1, predicted, noise, span.end)

@@ -89,8 +89,17 @@ class FollowedErrors(Protocol):
         """Return the state after a span, from those before and after, with the errors in it."""
         ...
 
+    def seen(self, x: FilterState, at: Moments) -> Array:
+        """Return by how much predictions are off, (members, errors, sensors)."""
+        ...
+
+    @property
+    def counted(self) -> Mask:
+        """Which of them are errors, (errors,): others are followed for the verdict alone."""
+        ...
+
     def updated(
-        self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array
     ) -> ShadowState:
         """Return what is known after a sample; weights: one over noise, (members, sensors)."""
         ...

@@ -112,6 +112,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
         unit=problem.observed.observation.unit,
         time_unit=problem.model.time_unit,
         unknowns=names,
+        moving=reduction.moves,
     )
 
 

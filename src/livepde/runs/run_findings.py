@@ -31,7 +31,6 @@ LEAVES = 1.0  # squared distance from the prior over what model and prior allow
 REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
-HELD = 0.02  # share of the samples in which the last value of an input was held
 INPUT_KINDS = {
     "spike": "values far off those before and after were refused as spikes",
     "interpolated": "gaps were interpolated between the values before and after",
@@ -82,7 +81,7 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
 def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
     """Return gaps and spikes of the channels that drive the model, if any.
 
-    A value that was held is worth a caution where more than 2 % of the samples have one.
+    Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
     """
     found = []
     for name in channels:
@@ -91,9 +90,8 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         if not parts:
             continue
         held = counts.get("missing", 0) / max(len(journal), 1)
-        severity: Severity = "caution" if held > HELD else "note"
         text = f"Channel {name}: {'; '.join(parts)}."
-        found.append(Finding("input", severity, text, name, held))
+        found.append(Finding("input", "note", text, name, held))
     return found
 
 

@@ -15,7 +15,9 @@ from livepde.verdict.findings import (
     at_bound,
     discretised,
     flat,
+    held_inputs,
 )
+from livepde.verdict.inputs import InputLedger
 from livepde.verdict.judge import Judge, Seen
 from livepde.verdict.ledger import WINDOWS, Ledger
 from livepde.verdict.withheld import WithheldLedger
@@ -31,6 +33,7 @@ __all__ = [
     "Dictionary",
     "Direction",
     "Finding",
+    "InputLedger",
     "Judge",
     "Ledger",
     "Position",
@@ -42,4 +45,5 @@ __all__ = [
     "at_bound",
     "discretised",
     "flat",
+    "held_inputs",
 ]

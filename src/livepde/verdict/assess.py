@@ -20,6 +20,7 @@ from livepde.verdict.evidence import (
     disagreement,
     following,
     levels,
+    mean_squares,
     quiet,
 )
 from livepde.verdict.findings import Cause, Finding, Severity, Verdict
@@ -63,6 +64,10 @@ class Position:
         Standard deviation of each, as stated.
     unit, time_unit
         Of the sensors and of the time.
+    unknowns
+        Label of each reduced unknown that stays.
+    moving
+        Whether unknowns move.
     """
 
     ledger: Ledger
@@ -74,6 +79,7 @@ class Position:
     unit: str
     time_unit: str
     unknowns: Sequence[str]
+    moving: bool
 
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
@@ -295,6 +301,15 @@ def _following(at: Position, window: int) -> Iterator[Finding]:
     if found is None:
         return
     name = at.sensors[found.sensor]
+    size = float(mean_squares(at.ledger, at.member)[window, found.sensor])
+    if at.moving and size < 1.0:
+        text = (
+            f"Successive errors of sensor {name} follow each other (correlation "
+            f"{found.correlation:.2f}) and are smaller than expected: with a noise that is stated "
+            "too large unknowns that move are followed late. The intervals are wide enough for it."
+        )
+        yield Finding("following", "note", text, name, found.p_value, "p-value")
+        return
     text = (
         f"Successive errors of sensor {name} follow each other (correlation "
         f"{found.correlation:.2f}): something slow is not in the model, or the noise is not white. "

@@ -30,6 +30,7 @@ __all__ = [
     "disagreement",
     "following",
     "levels",
+    "mean_squares",
     "quiet",
 ]
 
@@ -81,6 +82,13 @@ def levels(ledger: Ledger, member: int = 0) -> Array:
     differences = np.maximum(squares - products, 0.0)
     whole = (differences[0] + NU) / (pairs[0] + NU)
     found: Array = (differences + TRUSTED_LEVEL * whole) / (pairs + TRUSTED_LEVEL)
+    return found
+
+
+def mean_squares(ledger: Ledger, member: int = 0) -> Array:
+    """Return mean squares of the whitened innovations, 1 if as stated, (windows, sensors)."""
+    count, _, squares, *_ = ledger.noise[member]
+    found: Array = squares / np.maximum(count, 1.0)
     return found
 
 

@@ -21,6 +21,7 @@ __all__ = [
     "at_bound",
     "discretised",
     "flat",
+    "held_inputs",
 ]
 
 Level: TypeAlias = Literal["trusted", "caution", "do not trust"]
@@ -33,6 +34,8 @@ FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly a
 TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
 MOST = 5  # findings that are said unasked
 SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+DECIDES = 5.0  # the same, from which the interval is little else
+SETTING = 1.0  # the same if inputs are readings: no interval holds that
 REFINE = {
     "step": (
         "the time step",
@@ -204,7 +207,31 @@ def discretised(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[F
         f"The discretisation has shifted the unknowns by {total:.1f} standard deviations, and most "
         f"of it is {what}{by}. The intervals were widened by that."
     )
-    yield Finding("discretisation", "caution", text, evidence=total, remedy=remedy)
+    severity: Severity = "caution" if total > DECIDES else "note"  # the interval holds it
+    yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
+
+
+def held_inputs(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[Finding]:
+    """Return whether inputs that are held as settings would matter if they were readings.
+
+    Parameters
+    ----------
+    notes
+        Of an estimate: `hold_shift`, and `k_hold_shift`.
+    """
+    total = abs(notes.get("hold_shift", math.nan))
+    if not total > SETTING:
+        return
+    moved = {label: -notes.get(f"{label}_hold_shift", math.nan) for label in labels}
+    parts = [f"{label} by {size:+.2g}" for label, size in moved.items() if math.isfinite(size)]
+    by = f" ({', '.join(parts[:MOST])})" if parts else ""
+    text = (
+        "Inputs are held from sample to sample (hold), but change as smoothly as readings do: as "
+        f"straight lines they would move the unknowns by {total:.1f} standard deviations{by}. The "
+        "intervals do not hold that."
+    )
+    remedy = "Leave out hold, unless these inputs are settings that change in steps."
+    yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
 
 
 @dataclass(frozen=True)

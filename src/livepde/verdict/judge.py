@@ -60,7 +60,8 @@ class Seen:
     u
         The state, as it is estimated.
     Y, d, used
-        Observed square root, (members, r, sensors), innovations and which values are used.
+        Observed square root, (members, r, sensors), innovations less what the discretisation is
+        known to do to them, and which values are used.
     z, predicted, noise
         Readings, what was expected of them, and the noise, (members or 1, sensors).
     at
