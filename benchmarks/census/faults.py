@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,8 @@ class Scene:
         What livepde is told.
     subject
         What is wrong, by name; empty for the process.
+    told
+        Problem whose process livepde is told; None for that of the truth.
     """
 
     problem: Problem
@@ -59,6 +61,7 @@ class Scene:
     scheme: Any = None
     hold: bool = False
     subject: str = ""
+    told: Problem | None = None
 
     @property
     def name(self) -> str:
@@ -92,6 +95,10 @@ class Fault:
         Whether it needs a channel.
     late
         Whether it begins in the middle of the run.
+    own_state
+        Whether it needs an initial state that is told.
+    traced
+        Whether it is one of readings, channels or process: not of noise, start or settings.
     """
 
     text: str
@@ -100,7 +107,8 @@ class Fault:
     only: tuple[str, ...] = ()
     channels: bool = False
     late: bool = False
-    own_state: bool = field(default=False)
+    own_state: bool = False
+    traced: bool = True
 
 
 def _sensor(change: Callable[[Scene, Array], Array]) -> Change:
@@ -230,7 +238,9 @@ def _layers(scene: Scene) -> Scene:
 def _bent(scene: Scene) -> Scene:
     theta = scene.theta.copy()
     theta[1] = 1.5
-    return replace(scene, z=scene.problem.predict(theta), theta=theta, model=PROBLEMS["rod"].model)
+    rod = PROBLEMS["rod"]
+    z = scene.problem.predict(theta)
+    return replace(scene, z=z, theta=theta, model=rod.model, told=rod)
 
 
 def _with_u0(scene: Scene) -> Scene:
@@ -274,15 +284,19 @@ FAULTS: Mapping[str, Fault] = {
     "position": Fault("a sensor sits 5 % of the length away", _moved, ("position",)),
     "swapped": Fault("two sensors are swapped", _swapped, ("position", "gain", "offset", "lag")),
     "stands": Fault("a sensor stands still", _stands, ("stuck", "offset", "gain"), late=True),
-    "noisy": Fault("a sensor is four times as noisy", _errors(lambda s, e: 4.0 * e)),
+    "noisy": Fault("a sensor is four times as noisy", _errors(lambda s, e: 4.0 * e), traced=False),
     "burst": Fault(
         "a sensor is five times as noisy for a tenth of the run",
         _errors(lambda s, e: np.where(np.abs(np.linspace(-1, 1, len(e))) < 0.1, 5.0 * e, e)),
+        traced=False,
     ),
-    "following": Fault("errors of a sensor that follow each other, 0.95", _errors(_following)),
+    "following": Fault(
+        "errors of a sensor that follow each other, 0.95", _errors(_following), traced=False
+    ),
     "heavy tails": Fault(
         "Student errors with 3 degrees of freedom",
         lambda s: replace(s, errors=s.rng.standard_t(3, s.errors.shape) / np.sqrt(3.0)),
+        traced=False,
     ),
     "channel offset": Fault(
         "a channel reads 6 sigma too much",
@@ -310,7 +324,9 @@ FAULTS: Mapping[str, Fault] = {
         only=("rod", "wall", "profile"),
         channels=True,
     ),
-    "start": Fault("the initial state is 15 sigma off", _with_u0, ("initial",), own_state=True),
+    "start": Fault(
+        "the initial state is 15 sigma off", _with_u0, ("initial",), own_state=True, traced=False
+    ),
     "jump": Fault("the first unknown jumps", _jump, ("jump",), late=True),
     "ramp": Fault("the first unknown moves all along", _ramp, ("jump",)),
     "loss": Fault(
@@ -332,9 +348,14 @@ FAULTS: Mapping[str, Fault] = {
         only=("warm-rod",),
     ),
     "steps": Fault(
-        "implicit Euler, one step a sample", lambda s: replace(s, scheme=lp.ImplicitEuler())
+        "implicit Euler, one step a sample",
+        lambda s: replace(s, scheme=lp.ImplicitEuler()),
+        traced=False,
     ),
     "held": Fault(
-        "channels are held, not straight", lambda s: replace(s, hold=True), channels=True
+        "channels are held, not straight",
+        lambda s: replace(s, hold=True),
+        channels=True,
+        traced=False,
     ),
 }

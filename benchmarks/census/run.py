@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 import livepde as lp
 from benchmarks.census.faults import FAULTS, HALF, Scene
 from benchmarks.census.report import outcome
+from benchmarks.census.trace import trace
 from benchmarks.honest.problem import Problem
 from benchmarks.honest.problems import PROBLEMS as TRUTHS
 from livepde.progress import watched
@@ -54,6 +55,9 @@ class Score:
         Whether such a run was doubted before its fault began.
     said
         The first sentence.
+    trace
+        What the fault leaves of the readings that no unknowns explain, over the noise; NaN where
+        the truth's code cannot tell: of noise, initial states and settings.
     failure
         What ended the run, if anything did.
     """
@@ -69,6 +73,7 @@ class Score:
     delay: int | None = None
     early: bool = False
     said: str = ""
+    trace: float = np.nan
     failure: str = ""
 
 
@@ -194,6 +199,7 @@ def _judged(scene: Scene, score: Score) -> Score:
         delay if late else None,
         early,
         verdict.sentences[0] if verdict.sentences else "",
+        trace(scene) if about and about.traced else np.nan,
     )
 
 
