@@ -262,8 +262,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             samples=GUESS * one,
             evidence=0.0 * one,
             kept=filter_.stage.kept(1),
-            causes=np.zeros((1, k, filter_.judge.columns if filter_.judge else 0)),
-            ledger=filter_.judge.start() if filter_.judge else Ledger.start(0, 0, 0, 0, 0, 0, 0, 0),
+            causes=np.zeros((1, k, filter_.judge.rank if filter_.judge else 0)),
+            ledger=filter_.judge.start()
+            if filter_.judge
+            else Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0),
             shadows=ShadowState.none(1, n, k),
         )
         if filter_.shadows is not None:

@@ -13,11 +13,10 @@ of the noise, an update is
 
     w <- W^T (w - Y f),    since  [U C] <- W^T [U C]  and  K = [U C]^T W W^T Y N^-1.
 
-Several samples are summed together. Until then `FilterState.causes` holds [T Z_1 Z_2 ...]: the
-identity and Y of each sample that waits, moved on as rows of w are. Then w = T w_0 - sum_j Z_j f_j,
-and with A_k = Y_k^T [T Z_1 ...] at the time of sample k
+Several samples are summed together. `FilterState.causes` holds M, by which updates and predictions
+have moved rows since the last sample; each sample that waits keeps its M and Y. Then
 
-    g_k = f_k + A_k [w_0; -f_1; -f_2; ...].
+    w_k = M_k (w_(k-1) - Y_(k-1) f_(k-1)),    g_k = f_k + Y_k^T w_k.
 
 So w costs no solve: it is exact for a linear filter, whatever moves, and C^T w says by how much the
 estimate of the unknowns is off for each unit of the cause.
@@ -40,7 +39,6 @@ from livepde.verdict.process import Now, stride
 
 __all__ = ["Judge", "Seen"]
 
-MOST_WHITENED = 64  # sensors whose innovations are whitened together
 MOST_MEMBERS = 16  # of a bank that are judged; a fleet of more is not
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
 SAME = 1e-12  # relative difference of readings that are the same
@@ -53,8 +51,7 @@ class Seen:
     Attributes
     ----------
     C, causes
-        Square root of the covariance of the unknowns, (members, r, k), and [T Z_1 ...], (members,
-        r, columns).
+        Square root of the covariance of the unknowns, (members, r, k), and M, (members, r, rank).
     a, q
         Return reduced and latent unknowns, as they are estimated: not every judge asks.
     u
@@ -103,12 +100,11 @@ class Judge:
         self.dictionary = dictionary
         self.sensors, self.unknowns, self.n, self.rank = sensors, unknowns, n, rank
         self.recorded = still and 0 < sensors * unknowns**2 <= MOST_RECORDED
-        self.windows, self.batch = len(WINDOWS), batch_of(sensors)
+        self.windows = len(WINDOWS)
         self.terms = len(dictionary.process.terms) if dictionary.process else 0
         self._drift = dictionary.parts.get("drift", slice(0, 0))
         self._jump, self._process = dictionary.parts["jump"], dictionary.parts["process"]
         # What stands in a row that waits, in this order.
-        wide = sensors > MOST_WHITENED
         sizes = {
             "t": 1,
             "used": sensors,
@@ -116,13 +112,12 @@ class Judge:
             "noise": sensors,
             "z": sensors,
             "predicted": sensors,
-            "spread": sensors if wide else sensors**2,
-            "A": sensors * self.columns,
+            "Y": rank * sensors,
+            "M": rank**2,
             "moved": sensors * (dictionary.shifts.axes if dictionary.shifts else 0),
             "answers": self.terms * sensors,
             "a": unknowns if self.recorded else 0,
             "C": unknowns**2 if self.recorded else 0,
-            "Y": unknowns * sensors if self.recorded else 0,
         }
         ends = np.cumsum(list(sizes.values())).tolist()
         self._at = {
@@ -130,6 +125,8 @@ class Judge:
             for (name, size), end in zip(sizes.items(), ends, strict=True)
         }
         self.numbers = int(ends[-1])
+        self.batch = batch_of(self.numbers)
+        self._fresh = np.eye(rank)
 
     def widened(self, more: int) -> Judge:
         """Return the judge of a filter whose square root has more rows."""
@@ -141,29 +138,22 @@ class Judge:
         followed = self.unknowns if self.recorded else 0
         n = self.n if self.terms else 0
         counts = len(self.dictionary), followed, self.terms, n, self.windows, self.rank
-        return Ledger.start(self.sensors, *counts, self.numbers)
-
-    @property
-    def columns(self) -> int:
-        """Number of columns of [T Z_1 ...]."""
-        return self.rank + self.batch * self.sensors
+        return Ledger.start(self.sensors, *counts, self.batch, self.numbers)
 
     def heard(self, ledger: Ledger, seen: Seen) -> tuple[Array, Ledger]:
-        """Return [T Z_1 ...] with what a sample brings, before its update, and the ledger."""
-        members, sensors = seen.d.shape
-        causes, full = seen.causes, ledger.waiting == self.batch
+        """Return M of a sample, the identity before its update, and the ledger."""
+        M, full = seen.causes, ledger.waiting == self.batch
+        members, r, _ = M.shape
         if full.any() or not ledger.seen.all():
-            causes, ledger = self._begun(ledger, seen, full)
-        Yt = seen.Y.transpose(0, 2, 1)
-        wide = sensors > MOST_WHITENED
+            M, ledger = self._begun(ledger, seen, full)
         each: dict[str, Array | Mask] = {
             "used": seen.used,
             "d": seen.d,
             "noise": seen.noise,
             "z": seen.z,
             "predicted": seen.predicted,
-            "spread": (seen.Y * seen.Y).sum(axis=1) if wide else Yt @ seen.Y,
-            "A": Yt @ causes,
+            "Y": seen.Y,
+            "M": M,
         }
         parts: dict[str, Any] = {}
         if self.dictionary.shifts is not None:
@@ -172,18 +162,18 @@ class Judge:
             parts = self._answered(ledger, seen)
             each["answers"] = _between(parts, seen.at.t)
         if self.recorded and seen.C.shape[1] == self.unknowns:
-            each |= {"a": seen.a(), "C": seen.C, "Y": seen.Y}
-        rows, causes = ledger.rows.copy(), causes.copy()
-        for k, filled in enumerate(ledger.waiting.tolist()):
-            row = rows[k, filled]
-            row[:] = 0.0
-            row[0] = seen.at.t
-            for name, part in each.items():
-                row[self._at[name]] = part[k if len(part) > 1 else 0].ravel()
-            begin = self.rank + filled * sensors
-            causes[k, :, begin : begin + sensors] = seen.Y[k]
+            each |= {"a": seen.a(), "C": seen.C}
+        row = np.zeros((members, self.numbers))
+        row[:, 0] = seen.at.t
+        for name, part in each.items():  # those of rows that a square root lacks stay zero
+            flat = part.reshape(len(part), -1)
+            begin = self._at[name].start
+            row[:, begin : begin + flat.shape[1]] = flat
+        rows = ledger.rows.copy()
+        rows[np.arange(members), ledger.waiting] = row
         more = {"seen": ledger.seen + 1, "waiting": ledger.waiting + 1, "rows": rows}
-        return causes, _changed(ledger, more | parts)
+        fresh = np.broadcast_to(self._fresh[:r], (members, r, self.rank))
+        return fresh, _changed(ledger, more | parts)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # counted as nothing
     def settled(self, ledger: Ledger, causes: Array) -> tuple[Array, Ledger]:
@@ -192,7 +182,7 @@ class Judge:
         Parameters
         ----------
         causes
-            [T Z_1 ...] now, (members, r, columns).
+            M now, (members, r, rank).
 
         Returns
         -------
@@ -205,25 +195,16 @@ class Judge:
         used = rows[:, :, at["used"]] * there[:, :, None]
         due, ledger = ledger.due, self._timed(ledger, there)
         f = self._effects(ledger, due) * used[:, :, None]
-        count = f.shape[2]
-        known = f.transpose(0, 1, 3, 2).reshape(members, batch * sensors, count)
-        whole = np.concatenate([ledger.w, -known], axis=1)
-        A = rows[:, :, at["A"]].reshape(members, batch * sensors, self.columns)
-        g = (known + A @ whole).reshape(members, batch, sensors, count).transpose(0, 1, 3, 2)
-        r = rows[:, :, at["d"]]
-        spread = rows[:, :, at["spread"]]
-        if sensors <= MOST_WHITENED:
-            T = _whitening(spread.reshape(members, batch, sensors, sensors))
-            r, g = (r[:, :, None] @ T)[:, :, 0], g @ T
-        else:
-            T = 1.0 / np.sqrt(1.0 + spread)
-            r, g = r * T, g * T[:, :, None]
-        r = ledger.clipped(r) * there[:, :, None]
+        Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, sensors)
+        before, w = self._followed(ledger, Y, f)
+        g = f + before @ Y
+        r, g = _whitened(Y, rows[:, :, None, at["d"]], g)
+        r = ledger.clipped(r[:, :, 0]) * there[:, :, None]
         g = g.reshape(members, batch, self.windows, -1, sensors) * there[:, :, None, None, None]
         names = ("sums", "noise", "before", "present")
         parts: dict[str, Any] = dict(zip(names, summed(ledger, due, r, g, used), strict=True))
         if self.recorded:
-            Y, told = self._record(rows)
+            Y, told = self._record(rows, Y[:, :, : self.unknowns])
             Y, told = Y * used[:, :, None], told * used
             new = blocked(ledger, ledger.seen - ledger.waiting, Y, told)
             parts |= dict(zip(("score", "information", "length"), new, strict=True))
@@ -241,18 +222,33 @@ class Judge:
             "last": np.where(waited > 0, last[:, at["predicted"]], ledger.last),
             "times": np.where(waited > 0, _replaced(ledger.times, last[:, at["t"]]), ledger.times),
         }
-        return causes @ whole, replace(ledger, **parts)
+        return causes @ w, replace(ledger, **parts)
 
-    def _record(self, rows: Array) -> tuple[Array, Array]:
+    def _followed(self, ledger: Ledger, Y: Array, f: Array) -> tuple[Array, Array]:
+        """Return w^T before the update of each sample that waits, and w - Y f of the last one.
+
+        Shapes (members, batch, columns, rank) and (members, rank, columns). Where none is there w
+        stays.
+        """
+        members, batch, count, _ = f.shape
+        rank = self.rank
+        M = ledger.rows[:, :, self._at["M"]].reshape(members, batch, rank, rank)
+        Mt, effect = M.transpose(0, 1, 3, 2), f @ Y.transpose(0, 1, 3, 2)
+        before, w = np.zeros((members, batch, count, rank)), ledger.w.transpose(0, 2, 1)
+        for k in range(int(ledger.waiting.max(initial=0))):
+            there = (ledger.waiting > k)[:, None, None]
+            before[:, k] = w @ Mt[:, k]
+            w = np.where(there, before[:, k] - effect[:, k], w)
+        return before, w.transpose(0, 2, 1)
+
+    def _record(self, rows: Array, Y: Array) -> tuple[Array, Array]:
         """Return sensitivities to the unknowns, and residuals at the prior mean, of the record.
 
         Shapes (members, batch, k, sensors) and (members, batch, sensors).
         """
         members, batch, _ = rows.shape
         k, at = self.unknowns, self._at
-        C = rows[:, :, at["C"]].reshape(members, batch, k, k)
-        Y = rows[:, :, at["Y"]].reshape(members, batch, k, self.sensors)
-        Y = _sensitivity(C, Y)
+        Y = _sensitivity(rows[:, :, at["C"]].reshape(members, batch, k, k), Y)
         told: Array = rows[:, :, at["d"]] + (rows[:, :, None, at["a"]] @ Y)[:, :, 0]
         return Y, told
 
@@ -289,7 +285,7 @@ class Judge:
         return {"stuck": stuck, "value": value[:, -1]}
 
     def _begun(self, ledger: Ledger, seen: Seen, full: Mask) -> tuple[Array, Ledger]:
-        """Return [T Z_1 ...] and the ledger of members whose batch is full, or the first one."""
+        """Return M and the ledger of members whose batch is full, or the first one."""
         begins = full | (ledger.seen == 0)
         members, r, _ = seen.causes.shape
         w = np.zeros((members, r, ledger.w.shape[2]))
@@ -301,10 +297,8 @@ class Judge:
         kept = np.zeros_like(ledger.w)
         kept[:, :r] = w[:, : self.rank]
         chosen = begins[:, None, None]
-        fresh = np.zeros_like(seen.causes)
-        fresh[:, np.arange(r), np.arange(r)] = 1.0
-        causes = np.where(chosen, fresh, seen.causes)
-        return causes, replace(ledger, w=np.where(chosen, kept, ledger.w))
+        M = np.where(chosen, self._fresh[:r], seen.causes)
+        return M, replace(ledger, w=np.where(chosen, kept, ledger.w))
 
     def _opened(self, ledger: Ledger, seen: Seen, due: Mask, w: Array) -> Array:
         """Return w with that of windows that begin: nothing but jumps of the unknowns."""
@@ -397,13 +391,23 @@ def _between(parts: dict[str, Any], t: float) -> Array:
     return np.stack(found) if len(found) > 1 else found[0][None]
 
 
-def _whitening(spread: Array) -> Array:
-    """Return (1 + Y^T Y)^(-1/2) of matrices Y^T Y, (..., sensors, sensors)."""
-    finite = np.isfinite(spread).all(axis=(-2, -1), keepdims=True)
-    values, axes = np.linalg.eigh(np.where(finite, spread, 0.0))
-    scale = 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0))
-    found: Array = (axes * scale[..., None, :]) @ axes.swapaxes(-1, -2)
-    return found
+def _whitened(Y: Array, *rows: Array) -> list[Array]:
+    """Return rows (1 + Y^T Y)^(-1/2) of some rows, (..., sensors), with Y (..., rank, sensors).
+
+    From the smaller one of Y Y^T = V L V^T and Y^T Y: with X = Y^T V L^(-1/2) it is
+    rows + rows X ((1 + L)^(-1/2) - 1) X^T.
+    """
+    rank, sensors = Y.shape[-2:]
+    Y = np.where(np.isfinite(Y).all(axis=(-2, -1), keepdims=True), Y, 0.0)
+    small = rank < sensors
+    Yt = Y.swapaxes(-1, -2)
+    values, axes = np.linalg.eigh(Y @ Yt if small else Yt @ Y)
+    values = np.maximum(values, 0.0)
+    scale = 1.0 / np.sqrt(1.0 + values) - 1.0
+    if small:
+        scale /= np.where(values > 0.0, values, 1.0)
+        axes = Yt @ axes
+    return [row + ((row @ axes) * scale[..., None, :]) @ axes.swapaxes(-1, -2) for row in rows]
 
 
 def _replaced(times: Array, last: Array) -> Array:

@@ -21,7 +21,7 @@ WINDOWS = (0, 64, 512)
 begin with it, so that an old, sound record does not hide a fault that is new."""
 
 BATCH = 16  # samples at most that wait until they are summed together
-ROOM = 64  # columns at most that they take while they wait
+ROOM = 2**16  # numbers at most that they take while they wait
 BLOCKS = 16  # of the record of an unknown that stays; they double in length, and pairs merge
 CLIP = 4.0  # times the usual size: no whitened innovation counts for more (Huber)
 
@@ -38,7 +38,7 @@ class Ledger:
         Samples that wait, (members, batch, numbers); see `livepde.verdict.judge`.
     w
         Coordinates of all directions in all windows on the rows of the square root as they were
-        when the first of these came, (members, columns, windows times directions).
+        when the first of these came, (members, rank, windows times directions).
     times
         Time of the last sample that was summed, and the usual interval, (members, 2).
     first, last
@@ -110,7 +110,8 @@ class Ledger:
         terms: int,
         n: int,
         windows: int,
-        columns: int,
+        rank: int,
+        batch: int,
         numbers: int,
     ) -> Ledger:
         """Return the value of one member before any sample.
@@ -121,15 +122,15 @@ class Ledger:
             Number k of unknown coordinates of which the record is kept.
         terms, n
             Number of missing terms, and of coefficients of the state.
-        columns, numbers
-            Of `w` and of a row that waits.
+        rank, batch, numbers
+            Rows of the square root, samples that are summed together, and numbers of each.
         """
         never, zero = np.full((1, sensors), np.nan), np.zeros(1, dtype=np.int64)
         return cls(
             seen=zero,
             waiting=zero,
-            rows=np.zeros((1, batch_of(sensors), numbers)),
-            w=np.zeros((1, columns, windows * directions)),
+            rows=np.zeros((1, batch, numbers)),
+            w=np.zeros((1, rank, windows * directions)),
             times=np.full((1, 2), np.nan),
             first=never,
             last=never,
@@ -141,7 +142,7 @@ class Ledger:
             present=np.zeros((1, sensors)),
             score=np.zeros((1, BLOCKS, sensors, followed)),
             information=np.zeros((1, BLOCKS, sensors, followed, followed)),
-            length=zero + batch_of(sensors),
+            length=zero + batch,
             process=np.zeros((1, terms, n)),
             readings=np.zeros((1, 2, terms, sensors)),
             reached=np.full((1, 2), np.nan),
@@ -166,10 +167,10 @@ class Ledger:
         return np.minimum(np.maximum(r, -limit), limit)
 
 
-def batch_of(sensors: int) -> int:
-    """Return how many samples wait until they are summed together: a power of two."""
+def batch_of(numbers: int) -> int:
+    """Return how many samples of so many numbers are summed together: a power of two."""
     batch = BATCH
-    while batch > 1 and batch * sensors > ROOM:
+    while batch > 1 and batch * numbers > ROOM:
         batch //= 2
     return batch
 
