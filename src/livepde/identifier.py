@@ -343,11 +343,13 @@ class Identifier:
     @property
     def place(self) -> tuple[Any, ...]:
         """Where it stands, for `return_to`; holds what a step does not change."""
-        return self._state, self._t, self._z, self._inputs, self._samples
+        ledgers = self._withheld, self._gaps
+        return self._state, self._t, self._z, self._inputs, self._samples, ledgers
 
     def return_to(self, place: tuple[Any, ...]) -> None:
         """Stand again where it stood, as if nothing had been taken since then."""
-        self._state, self._t, self._z, self._inputs, self._samples = place
+        self._state, self._t, self._z, self._inputs, self._samples, ledgers = place
+        self._withheld, self._gaps = ledgers
 
     def check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""

@@ -70,8 +70,8 @@ class FilterState:
     samples: Array
     evidence: Array
     kept: KeptFactors
-    causes: Array = field(metadata={"grows": 1})
-    ledger: Ledger
+    causes: Array = field(metadata={"grows": 1, "begins_anew": True})
+    ledger: Ledger = field(metadata={"begins_anew": True})
     shadows: ShadowState
 
     def __len__(self) -> int:

@@ -61,6 +61,7 @@ __all__ = ["SensitivityLaw", "without_factors"]
 
 GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
+NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 GUESS = 2.0  # samples that the first guess of the noise counts for
 
 
@@ -263,9 +264,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             evidence=0.0 * one,
             kept=filter_.stage.kept(1),
             causes=np.zeros((1, k, filter_.judge.rank if filter_.judge else 0)),
-            ledger=filter_.judge.start()
-            if filter_.judge
-            else Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0),
+            ledger=filter_.judge.start() if filter_.judge else NO_LEDGER,
             shadows=ShadowState.none(1, n, k),
         )
         if filter_.shadows is not None:
@@ -478,7 +477,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return self.member_belief(work, state.now, 0)
 
     def reader(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Belief]:
-        now = without_factors(state.now)
+        now = without_ledger(without_factors(state.now))
         return lambda: self.member_belief(work, now, 0)
 
     def judge(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Verdict]:
@@ -507,6 +506,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
     """Return one member at the start with another filter."""
     return changed(state, start=x, now=x, older=x, newer=x, replay=ReplayState.none(x))
+
+
+def without_ledger(x: FilterState) -> FilterState:
+    """Return a filter without what only its verdict needs."""
+    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
 
 
 def without_factors(x: FilterState) -> FilterState:

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from livepde.linalg import Array
 from livepde.verdict.directions import DRIFT, LAG, OFFSET, Dictionary, Direction
@@ -16,6 +15,7 @@ from livepde.verdict.evidence import (
     RECORD,
     CauseEvidence,
     causes_of,
+    chance,
     constancy,
     disagreement,
     following,
@@ -376,7 +376,7 @@ def _refused(at: Position) -> Iterator[Finding]:
 
 def _prior(at: Position) -> Iterator[Finding]:
     squared, freedom = at.distance
-    p = float(chi2.sf(squared, freedom)) if freedom else 1.0
+    p = chance(squared, freedom) if freedom else 1.0
     if p < PRIOR:
         text = (
             f"The unknowns lie {math.sqrt(squared):.1f} prior standard deviations from their prior "

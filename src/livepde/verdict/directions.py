@@ -158,7 +158,7 @@ class Dictionary:
         start = len(self.directions)
         self.directions += [Direction(term.kind, term.subject) for term in terms]
         self.parts["process"] = slice(start, len(self.directions))
-        self._own: IntArray = np.array(self.owner, dtype=np.int64)
+        self.own: IntArray = np.array(self.owner, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.directions)
@@ -172,9 +172,9 @@ class Dictionary:
     def signals(
         self, noise: Array, h: Array, first: Array, last: Array, share: Array, moved: Array
     ) -> Array:
-        """Return what each direction does to its own sensor, (samples, directions, sensors).
+        """Return what each direction of a sensor does to it, (samples, directions of sensors).
 
-        In units of the noise; of the process and of jumps zero. That of a drift is its slope.
+        In units of the noise. That of a drift is its slope.
 
         Parameters
         ----------
@@ -201,11 +201,9 @@ class Dictionary:
                 parts[kind] = LAG * np.where(np.isfinite(rate), rate, 0.0) / noise
             else:
                 parts[kind] = moved / np.tile(noise, moved.shape[1] // sensors)
-        f = np.zeros((samples, len(self.directions), sensors))
-        if parts:
-            own = np.concatenate([parts[kind] for kind in self.kinds], axis=1)
-            f[:, np.arange(len(self._own)), self._own] = own
-        return f
+        if not parts:
+            return np.zeros((samples, 0))
+        return np.concatenate([parts[kind] for kind in self.kinds], axis=1)
 
 
 def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float] | None:
@@ -232,6 +230,8 @@ def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], fl
             except Exception:  # noqa: BLE001  outside of a mesh that is no box
                 moved = at.copy()
                 rows = sp.csr_array(block.probe(moved.T, "sensor"))
+            if rows.shape[0] != len(at):  # sensors of vectors, each with several readings
+                return None
             ends.append(observed.state.widen(rows, observation.of))
             width += sign * moved[:, axis]
         scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))

@@ -8,12 +8,12 @@ martingale that begins at one, and so is a mean of several: the probability that
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
-from scipy.stats import chi2, norm
+import scipy
 
 from livepde.linalg import Array
 from livepde.verdict.ledger import BLOCKS, Ledger
@@ -26,6 +26,7 @@ __all__ = [
     "Constancy",
     "Following",
     "causes_of",
+    "chance",
     "constancy",
     "disagreement",
     "following",
@@ -85,6 +86,11 @@ def levels(ledger: Ledger, member: int = 0) -> Array:
     return found
 
 
+def chance(statistic: float, freedom: int) -> float:
+    """Return the probability of a larger value of the chi-square distribution."""
+    return float(scipy.special.gammaincc(0.5 * freedom, 0.5 * statistic))
+
+
 def mean_squares(ledger: Ledger, member: int = 0) -> Array:
     """Return mean squares of the whitened innovations, 1 if as stated, (windows, sensors)."""
     count, _, squares, *_ = ledger.noise[member]
@@ -98,10 +104,10 @@ def causes_of(ledger: Ledger, member: int = 0) -> CauseEvidence:
     spread = levels(ledger, member)
     log_e, size, share = _tested(sums, noise, spread, np.zeros_like(spread))
     weights = _weights(ledger, member, log_e.shape[1])
-    total = float(logsumexp(log_e + weights)) if log_e.size else 0.0
+    total = float(scipy.special.logsumexp(log_e + weights)) if log_e.size else 0.0
     rho, left = _left(sums, noise, log_e, size)
     white, _, _ = _tested(sums, noise, left, rho)
-    whitened = float(logsumexp(white + weights)) if white.size else 0.0
+    whitened = float(scipy.special.logsumexp(white + weights)) if white.size else 0.0
     return CauseEvidence(log_e, size, share, total, min(total, whitened), rho[0])
 
 
@@ -119,7 +125,7 @@ def following(ledger: Ledger, member: int, window: int) -> Following | None:
     rho = products / np.maximum(squares, 1e-300)
     z = rho * np.sqrt(np.maximum(pairs, 1.0))
     worst = int(np.argmax(z))
-    p = min(1.0, float(norm.sf(z[worst])) * len(z))
+    p = min(1.0, 0.5 * math.erfc(float(z[worst]) / math.sqrt(2.0)) * len(z))
     if p > RECORD or rho[worst] < FOLLOWING:
         return None
     return Following(worst, float(rho[worst]), p)
@@ -134,7 +140,7 @@ def quiet(ledger: Ledger, member: int, log_e: Array) -> bool:
         Of all windows and directions.
     """
     if log_e.size:
-        each = logsumexp(log_e[1:], axis=1) - np.log(log_e.shape[1])
+        each = scipy.special.logsumexp(log_e[1:], axis=1) - np.log(log_e.shape[1])
         if not (each < -np.log(CAUSES)).all():
             return False
     return following(ledger, member, -1) is None
@@ -259,7 +265,7 @@ def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy 
             best, at, change = statistic, j, -A @ c
     if not looks:
         return None
-    p = min(1.0, looks * float(chi2.sf(best, rank)))
+    p = min(1.0, looks * chance(best, rank))
     after = (at + 1) * int(ledger.length[member]) / int(ledger.seen[member])
     return Constancy(p, min(after, 1.0), change)
 
@@ -284,4 +290,4 @@ def disagreement(ledger: Ledger, member: int = 0, wider: float = 1.0) -> tuple[f
     if freedom < 1:
         return None
     total = float(each.sum())
-    return float(chi2.sf(total, freedom)), each / max(total, 1e-300)
+    return chance(total, freedom), each / max(total, 1e-300)

@@ -189,18 +189,29 @@ class Judge:
         w
             Shape (members, r, windows times directions).
         """
-        members, sensors, batch = len(ledger.seen), self.sensors, self.batch
-        rows, at = ledger.rows, self._at
-        there = np.arange(batch) < ledger.waiting[:, None]  # (members, batch)
-        used = rows[:, :, at["used"]] * there[:, :, None]
-        due, ledger = ledger.due, self._timed(ledger, there)
-        f = self._effects(ledger, due) * used[:, :, None]
+        members, sensors = len(ledger.seen), self.sensors
+        at, due = self._at, ledger.due
+        there = np.arange(self.batch) < ledger.waiting[:, None]  # (members, batch)
+        ledger = self._timed(ledger, there)
+        batch = max(int(ledger.waiting.max(initial=0)), 1)
+        rows, some = ledger.rows[:, :batch], there[:, :batch, None]
+        used = rows[:, :, at["used"]] * some
         Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, sensors)
-        before, w = self._followed(ledger, Y, f)
-        g = f + before @ Y
-        r, g = _whitened(Y, rows[:, :, None, at["d"]], g)
-        r = ledger.clipped(r[:, :, 0]) * there[:, :, None]
-        g = g.reshape(members, batch, self.windows, -1, sensors) * there[:, :, None, None, None]
+        own, answers = self._effects(ledger, rows, used, due)
+        Yt, (X, scale) = Y.swapaxes(-1, -2), _whitening(Y)
+        before, w = self._followed(ledger, self._through(own, answers, Yt))
+        # With T = 1 + X scale X^T all of g T is f and a product of few columns.
+        scaled = (self._through(own, answers, X) + (X.swapaxes(-1, -2) @ Yt) @ before) * scale
+        g = np.concatenate([Yt, X], axis=-1) @ np.concatenate([before, scaled], axis=-2)
+        g = g.reshape(members, batch, sensors, self.windows, -1)
+        owner = self.dictionary.own
+        g[:, :, owner, :, np.arange(len(owner))] += own.transpose(3, 0, 1, 2)
+        g[..., self._process] += answers.swapaxes(-1, -2)[:, :, :, None]
+        d = rows[:, :, at["d"]]
+        r = d + (X @ (scale * (X.swapaxes(-1, -2) @ d[..., None])))[..., 0]
+        r = ledger.clipped(r) * some
+        if not some.all():
+            g *= some[..., None, None]
         names = ("sums", "noise", "before", "present")
         parts: dict[str, Any] = dict(zip(names, summed(ledger, due, r, g, used), strict=True))
         if self.recorded:
@@ -211,7 +222,7 @@ class Judge:
         waited = ledger.waiting[:, None]
         parts |= self._stuck(ledger, there)
         parts["sound"] = _sounded(ledger, due)
-        shown = np.isfinite(rows[:, :, at["z"]]) & there[:, :, None]
+        shown = np.isfinite(rows[:, :, at["z"]]) & some
         refused = shown & ~(used > 0.0)
         parts["shown"] = ledger.shown + np.stack([shown.sum(axis=1), refused.sum(axis=1)], axis=1)
         last = rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
@@ -224,22 +235,36 @@ class Judge:
         }
         return causes @ w, replace(ledger, **parts)
 
-    def _followed(self, ledger: Ledger, Y: Array, f: Array) -> tuple[Array, Array]:
-        """Return w^T before the update of each sample that waits, and w - Y f of the last one.
+    def _through(self, own: Array, answers: Array, X: Array) -> Array:
+        """Return X^T f of the effects of all directions, (members, batch, k, columns).
 
-        Shapes (members, batch, columns, rank) and (members, rank, columns). Where none is there w
+        Parameters
+        ----------
+        own, answers
+            As `_effects` returns them.
+        X
+            Shape (members, batch, sensors, k).
+        """
+        members, batch, _, k = X.shape
+        found = np.zeros((members, batch, k, self.windows, len(self.dictionary)))
+        Xt, owner = X.swapaxes(-1, -2), self.dictionary.own
+        found[..., : len(owner)] = Xt[:, :, :, None, owner] * own[:, :, None]
+        found[..., self._process] = (Xt @ answers.swapaxes(-1, -2))[:, :, :, None]
+        return found.reshape(members, batch, k, -1)
+
+    def _followed(self, ledger: Ledger, effect: Array) -> tuple[Array, Array]:
+        """Return w before the update of each sample that waits, and w - Y f of the last one.
+
+        Shapes (members, batch, rank, columns) and (members, rank, columns). Where none is there w
         stays.
         """
-        members, batch, count, _ = f.shape
-        rank = self.rank
-        M = ledger.rows[:, :, self._at["M"]].reshape(members, batch, rank, rank)
-        Mt, effect = M.transpose(0, 1, 3, 2), f @ Y.transpose(0, 1, 3, 2)
-        before, w = np.zeros((members, batch, count, rank)), ledger.w.transpose(0, 2, 1)
-        for k in range(int(ledger.waiting.max(initial=0))):
-            there = (ledger.waiting > k)[:, None, None]
-            before[:, k] = w @ Mt[:, k]
-            w = np.where(there, before[:, k] - effect[:, k], w)
-        return before, w.transpose(0, 2, 1)
+        members, batch, rank, _ = effect.shape
+        M = ledger.rows[:, :batch, self._at["M"]].reshape(members, batch, rank, rank)
+        before, w = np.zeros_like(effect), ledger.w
+        for k in range(batch):
+            before[:, k] = M[:, k] @ w
+            w = np.where((ledger.waiting > k)[:, None, None], before[:, k] - effect[:, k], w)
+        return before, w
 
     def _record(self, rows: Array, Y: Array) -> tuple[Array, Array]:
         """Return sensitivities to the unknowns, and residuals at the prior mean, of the record.
@@ -317,11 +342,14 @@ class Judge:
                     w[k, :, window, self._jump] = moved
         return w.reshape(members, r, -1)
 
-    def _effects(self, ledger: Ledger, due: Mask) -> Array:
-        """Return f of the samples that wait, (members, batch, windows * directions, sensors)."""
-        rows, at = ledger.rows, self._at
+    def _effects(self, ledger: Ledger, rows: Array, used: Array, due: Mask) -> tuple[Array, Array]:
+        """Return f of the samples that wait: of directions of sensors, and of terms of the process.
+
+        Shapes (members, batch, windows, directions of sensors) and (members, batch, terms,
+        sensors).
+        """
+        at = self._at
         members, batch, _ = rows.shape
-        sensors = self.sensors
         t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
         before = np.concatenate([ledger.times[:, :1], t[:, :-1]], axis=1)
         last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
@@ -335,15 +363,14 @@ class Judge:
             for part in (noise, h, first, last, rows[:, :, at["moved"]])
         )
         f = self.dictionary.signals(noise, h, first, last, share.ravel(), moved)
-        if self.terms:
-            answers = rows[:, :, at["answers"]].reshape(members * batch, self.terms, sensors)
-            f[:, self._process] = answers / noise[:, None]
-        f = f.reshape(members, batch, 1, -1, sensors)
-        f = np.repeat(f, self.windows, axis=2)
+        f = f.reshape(members, batch, -1) * used[:, :, self.dictionary.own]
+        own = np.repeat(np.where(np.isfinite(f), f, 0.0)[:, :, None], self.windows, axis=2)
         if self._drift.stop > self._drift.start:
             age = np.where(due, 0, ledger.age)[:, None] + np.arange(batch)[:, None]
-            f[:, :, :, self._drift] *= age[:, :, :, None, None]
-        return np.where(np.isfinite(f), f, 0.0).reshape(members, batch, -1, sensors)
+            own[..., self._drift] *= age[..., None]
+        answers = rows[:, :, at["answers"]].reshape(members, batch, self.terms, self.sensors)
+        answers = answers * (used / noise.reshape(members, batch, -1))[:, :, None]
+        return own, np.where(np.isfinite(answers), answers, 0.0)
 
     def _answered(self, ledger: Ledger, seen: Seen) -> dict[str, Any]:
         """Return responses of the process that reach this sample at least."""
@@ -391,11 +418,11 @@ def _between(parts: dict[str, Any], t: float) -> Array:
     return np.stack(found) if len(found) > 1 else found[0][None]
 
 
-def _whitened(Y: Array, *rows: Array) -> list[Array]:
-    """Return rows (1 + Y^T Y)^(-1/2) of some rows, (..., sensors), with Y (..., rank, sensors).
+def _whitening(Y: Array) -> tuple[Array, Array]:
+    """Return X and scale with (1 + Y^T Y)^(-1/2) = 1 + X scale X^T, for Y (..., rank, sensors).
 
-    From the smaller one of Y Y^T = V L V^T and Y^T Y: with X = Y^T V L^(-1/2) it is
-    rows + rows X ((1 + L)^(-1/2) - 1) X^T.
+    From the smaller one of Y Y^T = V L V^T, with X = Y^T V, and Y^T Y = X L X^T. Shapes (...,
+    sensors, k) and (..., k, 1).
     """
     rank, sensors = Y.shape[-2:]
     Y = np.where(np.isfinite(Y).all(axis=(-2, -1), keepdims=True), Y, 0.0)
@@ -407,7 +434,7 @@ def _whitened(Y: Array, *rows: Array) -> list[Array]:
     if small:
         scale /= np.where(values > 0.0, values, 1.0)
         axes = Yt @ axes
-    return [row + ((row @ axes) * scale[..., None, :]) @ axes.swapaxes(-1, -2) for row in rows]
+    return axes, scale[..., None]
 
 
 def _replaced(times: Array, last: Array) -> Array:

@@ -185,34 +185,42 @@ def summed(
     due
         Windows that begin with this batch, (members, windows).
     r, g
-        Whitened innovations, (members, batch, sensors), and responses, (members, batch, windows,
-        directions, sensors).
+        Whitened innovations, (members, batch, sensors), and responses, (members, batch, sensors,
+        windows, directions).
     used
         1 where there is a value, (members, batch, sensors).
     """
-    members, _, windows, directions, sensors = g.shape
+    members, batch, sensors, windows, directions = g.shape
     anew = due & (old.age > 0)
     kept = ~anew
-    before = old.before[:, 1:].reshape(members, 1, windows, directions, sensors)
-    before = before * kept[:, None, :, None, None]
     rs = np.concatenate([old.before[:, :1], r], axis=1)
-    gs = np.concatenate([before, g], axis=1)
     present = np.concatenate([old.present[:, None], used], axis=1)
     pair = present[:, 1:] * present[:, :-1]
-    r1, g1 = rs[:, :-1] * pair, gs[:, :-1] * pair[:, :, None, None]
-    parts = np.stack(
-        [
-            np.einsum("mbwds,mbs->mwds", g, r),
-            np.einsum("mbwds,mbwds->mwds", g, g),
-            np.einsum("mbwds,mbs->mwds", g, r1) + np.einsum("mbwds,mbs->mwds", g1, r),
-            np.einsum("mbwds,mbwds->mwds", g, g1),
-        ],
-        axis=1,
-    )
+    r1 = rs[:, :-1] * pair
+    beside = r1.copy()  # what g_k is multiplied with in g_k r_(k-1) + g_(k-1) r_k
+    beside[:, :-1] += r[:, 1:] * pair[:, 1:]
+    g = g.reshape(members, batch, sensors, -1)
+    weights = np.stack([r, beside], axis=1).transpose(0, 3, 1, 2)
+    first = weights @ g.transpose(0, 2, 1, 3)  # (members, sensors, 2, columns)
+    after = g[:, 1:] if pair.all() else g[:, 1:] * pair[:, 1:, :, None]
+    parts = [
+        first[:, :, 0],
+        np.einsum("mbsc,mbsc->msc", g, g),
+        first[:, :, 1],
+        np.einsum("mbsc,mbsc->msc", after, g[:, :-1]),
+    ]
+    found = np.stack(parts, axis=1).reshape(members, 4, sensors, windows, directions)
+    found = found.transpose(0, 1, 3, 4, 2)
+    # The pair of the last sample before and the first one.
+    before = old.before[:, 1:].reshape(members, windows, directions, sensors)
+    before = before * (kept[:, :, None] * pair[:, :1])[:, :, None]
+    begin = g[:, 0].reshape(members, sensors, windows, directions).transpose(0, 2, 3, 1)
+    found[:, 2] += before * r[:, 0, None, None]
+    found[:, 3] += before * begin
     told = np.stack([used, r, r * r, r * r1, pair], axis=1).sum(axis=2)[:, :, None]
-    sums = old.sums * kept[:, None, :, None, None] + parts
+    sums = old.sums * kept[:, None, :, None, None] + found
     noise = old.noise * kept[:, None, :, None] + told
-    last = np.concatenate([r[:, -1:], g[:, -1].reshape(members, -1, sensors)], axis=1)
+    last = np.concatenate([r[:, -1:], g[:, -1].transpose(0, 2, 1)], axis=1)
     return sums, noise, last, used[:, -1]
 
 

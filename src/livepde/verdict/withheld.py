@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
 
 from livepde.linalg import Array
+from livepde.verdict.evidence import chance
 from livepde.verdict.findings import Cause, Finding
 
 __all__ = ["WithheldLedger"]
@@ -92,7 +92,7 @@ class WithheldLedger:
             noise = differences / max(pairs, 1.0)
             expected = noise + variance / count
             ratio = squares / count / max(expected, 1e-300)
-            p = min(1.0, float(chi2.sf(ratio, 1)) * len(names))
+            p = min(1.0, chance(ratio, 1) * len(names))
             if p > CHANCE:
                 continue
             size, mean = math.sqrt(squares / count), errors / count
