@@ -43,7 +43,8 @@ def moved(given, by):
 
 
 def told(run: Live) -> list[str]:
-    return [event.kind for event in run.journal.events]
+    kinds = [event.kind for event in run.journal.events]
+    return [kind for kind in kinds if kind != "verdict"]
 
 
 def times(run: Live) -> list[float]:
@@ -96,7 +97,7 @@ def test_a_clock_that_was_set_back_is_told_and_time_goes_on(tmp_path):
     assert len(run.journal) == 200
     np.testing.assert_allclose(np.diff(times(run)), 0.1, atol=1e-9)
     assert told(run) == ["clock"]
-    assert "set back" in run.journal.events[0].message
+    assert any("set back" in event.message for event in run.journal.events)
     assert run.health["ok"]
 
 
