@@ -638,6 +638,48 @@ def journal(
     _report(context, benchmark(repetitions=1 if quick else None), as_json)
 
 
+FAULTY, SOUND = Count(4, 1), Count(40, 6)
+
+
+@app.command()
+def census(
+    context: typer.Context,
+    only: ProblemsOption = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="Only this fault. Repeat it for more.")
+    ] = None,
+    seeds: Annotated[int, FAULTY.option("Runs of each fault and problem.")] = FAULTY.usual,
+    sound: Annotated[int, SOUND.option("Runs of each problem with nothing wrong.")] = SOUND.usual,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes, default one for each processor.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Five problems, few runs: one false alarm is too many.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Count how often runs that are wrong say so, name the cause, and sound ones keep quiet.
+
+    Example:  python -m benchmarks census --only rod --seeds 2 --sound 3
+    """
+    from benchmarks.census import FAULTS, PROBLEMS, QUICK
+    from benchmarks.census import census as benchmark
+
+    for name in only or ():
+        named(name, dict.fromkeys(PROBLEMS), "problem")
+    for name in fault or ():
+        named(name, FAULTS, "fault")
+    outcome = benchmark(
+        only or (QUICK if quick else PROBLEMS),
+        fault or (),
+        FAULTY.of(context, "seeds"),
+        SOUND.of(context, "sound"),
+        workers=workers,
+        progress=True,
+    )
+    _report(context, outcome, as_json)
+
+
 STEPS = Count(1_000_000, 20_000)
 
 

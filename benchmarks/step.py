@@ -37,6 +37,14 @@ GAINS = ((1.0, 0.1), (1e2, 0.1), (1e4, 0.1), (1e4, 1.0))  # gain and c_1 of the 
 FIRST = 100  # samples over which steps of the gradient law are timed, the first one included
 MEDIAN, MEAN = 2.5, 4.0  # forward steps that one of them may cost on a square
 SENSORS = 25
+BESIDE: tuple[tuple[str, Shadows | None, bool | str], ...] = (
+    ("", Shadows(), True),
+    (", no shadows", None, True),
+    (", no shadows, verdict 'cheap'", None, "cheap"),
+    (", no shadows, no verdict", None, False),
+)
+"""What the sensitivity law follows beside its estimates."""
+
 SETTLED = 24  # steps after which one of some is shadowed
 
 
@@ -153,9 +161,11 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
         for count in modes:
             if count > given.model.Q.free.sum():
                 continue
-            for beside, shadows in (("", Shadows()), (", no shadows", None)):
+            for beside, shadows, verdict in BESIDE:
                 name, bound = f"sensitivity, modes {count}{beside}", 2.0 + count / 3.0
-                law = SensitivityLaw(modes=count, noise=1e-3, start_window=0, shadows=shadows)
+                law = SensitivityLaw(
+                    modes=count, noise=1e-3, start_window=0, shadows=shadows, verdict=verdict
+                )
                 ratios = np.array(_ratios(given, given.points, law))
                 low, middle, high = np.quantile(ratios, (0.0, 0.5, 1.0)).tolist()
                 mean = float(ratios.mean())
@@ -169,8 +179,8 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
         "Ratios of processor times taken in one process; the forward step is livepde.simulate with "
         f"the factor kept. Gradient law: the first {FIRST} samples, each step over the median "
         f"forward step; sensitivity law: stretches of steps after the first {SETTLED}, no iterated "
-        "start, with and without its shadows of the discretisation error. A forward step is one of "
-        "the law's own scheme."
+        "start, with and without its shadows of the discretisation error and its verdict. A "
+        "forward step is one of the law's own scheme."
     )
     return Outcome(tables=[table], checks=checks, notes=[note])
 

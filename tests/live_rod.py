@@ -22,7 +22,7 @@ CLOCK = Clock("t")
 OPENED: list = []  # sources, closed after each test of the module that opened them
 
 
-def identifier() -> lp.Identifier:
+def identifier(*, verdict: bool = True) -> lp.Identifier:
     mesh = lp.interval(0.0, 1.0, 10)
     model = lp.Model(
         state=lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("left"), "right": 0.0}),
@@ -30,7 +30,8 @@ def identifier() -> lp.Identifier:
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
     sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
-    return lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=8)))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8), verdict=verdict)
+    return lp.Identifier(model, sensors, law)
 
 
 def rows(count: int):
@@ -48,14 +49,16 @@ def journal(path: Path) -> Journal:
     return Journal.create(path, ("a", "b", "left"), layout)
 
 
-def live(folder: Path, source=None, **options) -> Live:
+def live(folder: Path, source=None, *, verdict: bool = True, **options) -> Live:
     path = folder / "journal.sqlite"
     kept = Journal.open(path, write=True) if path.exists() else journal(path)
     if source is None:
         source = Follow(folder / "data.csv", position=kept.position)
     OPENED.append(source)
     intake = Intake(COLUMNS, CLOCK, origin=0.0, last=kept.last)
-    return Live(identifier(), Gathered(source, intake), kept, fields_every=10, **options)
+    return Live(
+        identifier(verdict=verdict), Gathered(source, intake), kept, fields_every=10, **options
+    )
 
 
 def write(folder: Path, count: int) -> None:

@@ -261,7 +261,7 @@ def lines(count: int) -> str:
 def test_standard_input(rod):
     code, output = call("run", rod, "--data", "-", "--json", "--out", "out", stdin=lines(12))
     assert code in (0, 1)
-    assert json.loads(output)["tables"][1]["rows"][0][4] == 12
+    assert json.loads(output)["tables"][2]["rows"][0][4] == 12
 
 
 @pytest.mark.slow

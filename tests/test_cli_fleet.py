@@ -184,6 +184,9 @@ def alike(here):
             changed.append(",".join([t, "" if k == 7 else left, *inner, right]))
         Path(f"rod/{name}.csv").write_text("\n".join(changed) + "\n")
     Path("rods.csv").write_text(ALIKE)
+    case = Path("rod/case.toml")
+    unjudged = case.read_text().replace("[law]\n", "[law]\nverdict = false\n")  # as in a fleet
+    case.write_text(unjudged)
     return here
 
 

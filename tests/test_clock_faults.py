@@ -28,7 +28,7 @@ def closed():
 
 def run_of(folder, given, policy=None) -> Live:
     """Return a run of rows whose intake knows what was taken."""
-    run = live(folder, Rows(given))
+    run = live(folder, Rows(given), verdict=False)  # of rows that are no rod's
     run.feed.intake.policy = policy or Policy(leap=30 * DAY)
     run.feed.intake.past = run.journal
     return run
@@ -43,7 +43,8 @@ def moved(given, by):
 
 
 def told(run: Live) -> list[str]:
-    return [event.kind for event in run.journal.events]
+    kinds = [event.kind for event in run.journal.events]
+    return [kind for kind in kinds if kind != "verdict"]
 
 
 def times(run: Live) -> list[float]:
@@ -70,7 +71,7 @@ def test_rows_far_ahead_that_agree_are_taken_back(tmp_path, wrong, step):
     ahead = [{**row, "t": row["t"] + step * k} for k, row in enumerate(ahead)]
     run = run_of(tmp_path, [*given[:30], *ahead, *given[30:]])
     run.run()
-    expected = live(tmp_path / "whole", Rows(given)) if (tmp_path / "whole").mkdir() is None else 0
+    expected = run_of(tmp_path / "whole", given) if (tmp_path / "whole").mkdir() is None else 0
     expected.run()
     assert times(run) == times(expected)
     for one, other in zip(run.journal, expected.journal, strict=True):
@@ -96,7 +97,7 @@ def test_a_clock_that_was_set_back_is_told_and_time_goes_on(tmp_path):
     assert len(run.journal) == 200
     np.testing.assert_allclose(np.diff(times(run)), 0.1, atol=1e-9)
     assert told(run) == ["clock"]
-    assert "set back" in run.journal.events[0].message
+    assert any("set back" in event.message for event in run.journal.events)
     assert run.health["ok"]
 
 
@@ -138,7 +139,7 @@ def test_a_shift_survives_a_restart(tmp_path):
 
     def gone_on(count: int) -> Live:
         path.write_text("\n".join(lines[:count]) + "\n")
-        run = live(tmp_path, Rows(()))
+        run = live(tmp_path, Rows(()), verdict=False)
         shift, place = shifted(run.journal.position)
         source = Follow(path, position=place)
         OPENED.append(source)

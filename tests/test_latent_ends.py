@@ -11,7 +11,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
-from livepde.runs.doubts import doubts
+from livepde.runs.judgement import doubts
 
 MESH = lp.interval(0.0, 1.0, 8)
 NOISE = 0.01

@@ -54,7 +54,8 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     assert found.sizes["snapshot"] == 6
     run.journal.close()
     with Journal.open(tmp_path / "journal.sqlite") as reader:
-        xr.testing.assert_identical(reader.layout.dataset(list(reader)), found)
+        kept = reader.layout.dataset(list(reader))
+    xr.testing.assert_identical(kept.assign_attrs(verdict=found.attrs["verdict"]), found)
 
 
 @pytest.mark.slow
@@ -238,7 +239,11 @@ def test_broken_rows_are_counted_and_the_rest_arrives(tmp_path):
     run.run()
     assert len(run.journal) == 200
     assert run.journal.counts == {("malformed", ""): 150, ("malformed", "a"): 50}
-    assert [event.kind for event in run.journal.events] == ["malformed", "malformed"]
+    kinds = [event.kind for event in run.journal.events]
+    assert [kind for kind in kinds if kind not in ("verdict", "unwell", "well")] == [
+        "malformed",
+        "malformed",
+    ]
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "nan", "1" * 2_000_000, "[" * 100_000])
@@ -417,7 +422,7 @@ def health_of(run: Live) -> list[tuple[str, str]]:
 
 
 def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
-    now, right = [0.0], [*rows(60)]
+    now, right = [0.0], [*rows(45)]  # so few that no verdict is looked at
     old = [{**right[0], "t": -1.0 - k} for k in range(10)]
     source = Sequence_([*right[:5], *old, *right[5:]], now)
     run = live(tmp_path, source, silence=5.0, clock=lambda: now[0])
@@ -430,6 +435,18 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
     assert [kind for kind, _ in rest] == ["well"]
     assert run.health["ok"]
     assert run.journal.health == ""
+
+
+def test_a_verdict_of_no_trust_is_no_health_and_is_told(tmp_path):
+    run = live(tmp_path, Rows(rows(101)))
+    run.run()
+    levels = [e.message.partition(":")[0] for e in run.journal.events if e.kind == "verdict"]
+    assert levels[:1] == ["do not trust"]
+    grave = levels[-1] == "do not trust"
+    assert run.health["ok"] == (not grave)
+    assert health_of(run)[0] == ("unwell", "the verdict on the estimates is 'do not trust'")
+    kinds = [kind for kind, _ in health_of(run)]
+    assert kinds[-1] == ("unwell" if grave else "well")
 
 
 def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):
@@ -535,12 +552,15 @@ def test_health_and_metrics(tmp_path):
         "silent": False,
         "status": "ok",
         "counts": [["late", "a", 1], ["late", "b", 1], ["late", "left", 1]],
+        "verdict": "caution",
+        "findings": ["There are 4 samples: too few to judge by."],
     }
     value = run.result.last.parameters["k"][0]
     assert f'livepde_estimate{{unknown="k"}} {value!r}' in ask("/metrics")
     told = ask("/metrics")
     assert 'livepde_remarks_total{channel="a",kind="late"} 1.0' in told
     assert "livepde_waiting_samples 0.0" in told
+    assert "livepde_verdict 1.0" in told
     assert "livepde_silent 0.0" in told
     assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
     run.silent = True

@@ -17,7 +17,17 @@ import livepde as lp
 from livepde import runs
 from livepde.models import heat
 from livepde.result import Result
-from livepde.runs import Check, Outcome, RunWriter, Table, checks_of, drive, measures, tables
+from livepde.runs import (
+    Check,
+    Outcome,
+    RunWriter,
+    Table,
+    checks_of,
+    drive,
+    measures,
+    tables,
+    verdict,
+)
 from livepde.runs.directory import markdown, plain
 from livepde.runs.outcome import attempted
 from livepde.runs.summary import digits
@@ -150,7 +160,9 @@ def test_a_run_comes_back_as_it_was(tmp_path, driven):
         assert repr(run.dataset[name].values.tolist()) == repr(data[name].values.tolist())
     assert run.dataset.attrs["scalars"] == data.attrs["scalars"]
     assert run.dataset.alpha.attrs["units"] == "m^2/s"
-    assert [table.to_dict() for table in run.summary()] == [t.to_dict() for t in tables(data)]
+    first, *others = run.summary()
+    assert first.title == f"Verdict: {verdict(data).level}"
+    assert [table.to_dict() for table in others] == [t.to_dict() for t in tables(data)]
     assert "| alpha |" in (tmp_path / "run" / "report.md").read_text()
 
 

@@ -127,7 +127,9 @@ def test_a_square_root_of_fewer_rows_is_as_good():
 @pytest.mark.study
 def test_error_and_coverage_of_a_nonlinear_problem_whose_truth_comes_from_another_code():
     """Against the most probable path of all data, whose model is the code of the truth."""
-    checks = {check.name: check for check in honest(["warm-flux"], ["white"], 12, workers=1).checks}
+    checks = {
+        check.name: check for check in honest(["warm-flux"], ["white"], seeds=12, workers=1).checks
+    }
     assert checks["warm-flux, white: smoother, error of J / batch fit"].value <= 1.1
     assert 0.90 <= checks["warm-flux, white: smoother, coverage of J"].value <= 0.98
 

@@ -7,7 +7,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,9 @@ def rebuild(
     """Return a value shaped like `template` with the leaves given.
 
     The first axis of an array may have another length (stored samples, members that are awake), and
-    what the metadata of its dataclass field say, as in field(metadata={"grows": 1}).
+    what the metadata of its dataclass field say, as in field(metadata={"grows": 1}). A field with
+    the metadata "begins_anew" is as in the template, with the length that may differ, where it was
+    stored by something else: a verdict by a run that has kept none.
     """
     if isinstance(template, tuple):
         return tuple(
@@ -63,12 +65,7 @@ def rebuild(
         )
     if is_dataclass(template) and not isinstance(template, type):
         parts = {
-            item.name: rebuild(
-                getattr(template, item.name),
-                leaves,
-                f"{prefix}.{item.name}",
-                item.metadata.get("grows", 0),
-            )
+            item.name: _part(item, getattr(template, item.name), leaves, f"{prefix}.{item.name}")
             for item in fields(template)
         }
         return type(template)(**parts)
@@ -78,6 +75,20 @@ def rebuild(
     if _others(array, grows) != _others(template, grows):
         raise ValueError(f"{prefix} has shape {array.shape}, needs {template.shape}")
     return array
+
+
+def _part(item: Field[Any], template: Any, leaves: Mapping[str, Array], prefix: str) -> Any:
+    grows = item.metadata.get("grows", 0)
+    if not item.metadata.get("begins_anew"):
+        return rebuild(template, leaves, prefix, grows)
+    try:
+        return rebuild(template, leaves, prefix, grows)
+    except ValueError:
+        if not isinstance(template, np.ndarray):
+            return template
+        shape = list(template.shape)
+        shape[grows] = leaves[prefix].shape[grows]
+        return np.zeros(shape)
 
 
 def _others(array: Array, axis: int) -> list[int]:

@@ -34,13 +34,14 @@ from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
 from livepde.stepping import Advance, Interval, Scheme
+from livepde.verdict import InputLedger, Verdict, WithheldLedger
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 5  # of the checkpoint
+FORMAT = 6  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -145,6 +146,8 @@ class Identifier:
         self._z = np.full(self.observed.size, np.nan)
         self._inputs: Inputs = Inputs({})
         self._samples = 0
+        self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
+        self._gaps = InputLedger.start(len(self.inputs))
         if not self.inputs:
             self._begin(self._inputs)
 
@@ -280,14 +283,16 @@ class Identifier:
             self._begun_by(values, t)
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         start = self._inputs if t > self._t else values
-        interval = Interval(
-            self._t, t, start, values, self._z if t > self._t else used, used, noise
-        )
+        missing = np.array([name in held for name in self.inputs], dtype=float)
+        gaps = self._gaps.gaps(self.inputs, missing) if self._gaps.held.any() else {}
+        z0 = self._z if t > self._t else used
+        interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
         self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
+            self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
-        return self._estimate(t, measured, withheld, values, report, held)
+        return self._estimate(t, measured, withheld, values, report, held, scored=True)
 
     def _begun_by(self, inputs: Inputs, t: float) -> None:
         """Begin with the inputs of the first sample, unless no finite state comes of them."""
@@ -338,11 +343,13 @@ class Identifier:
     @property
     def place(self) -> tuple[Any, ...]:
         """Where it stands, for `return_to`; holds what a step does not change."""
-        return self._state, self._t, self._z, self._inputs, self._samples
+        ledgers = self._withheld, self._gaps
+        return self._state, self._t, self._z, self._inputs, self._samples, ledgers
 
     def return_to(self, place: tuple[Any, ...]) -> None:
         """Stand again where it stood, as if nothing had been taken since then."""
-        self._state, self._t, self._z, self._inputs, self._samples = place
+        self._state, self._t, self._z, self._inputs, self._samples, ledgers = place
+        self._withheld, self._gaps = ledgers
 
     def check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""
@@ -377,12 +384,18 @@ class Identifier:
         inputs: Inputs,
         report: Report,
         held: tuple[str, ...],
+        *,
+        scored: bool = False,
     ) -> Estimate:
         read, error = self._reader(), withheld
         if self.withheld is not None:
             belief = read()
             read = lambda: belief  # noqa: E731
-            error = withheld - self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
+            predicted = self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
+            error = withheld - predicted
+            if scored and t >= self.assimilate_from:
+                variance = self._predicted_variance(belief, Moment(t, inputs))
+                self._withheld = self._withheld.add(withheld, predicted, variance)
         return Estimate.deferred(
             read,
             t=t,
@@ -393,7 +406,33 @@ class Identifier:
             notes=report.notes,
             held=held,
             space=self.model.parameter_space,
+            judge=self._judge(self._state, report.notes),
         )
+
+    def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
+        """Return the variance of what withheld sensors are predicted to show, without noise."""
+        if self.withheld is None or belief.u_factor is None or belief.q_factor is None:
+            return np.zeros(self._withheld.last.shape)
+        H_u, H_q = self.withheld.jacobian(belief.u, belief.q, moment)
+        rows = np.asarray(H_u @ belief.u_factor)
+        if H_q is not None:
+            rows = rows + H_q @ belief.q_factor
+        found: Array = (rows * rows).sum(axis=1)
+        return found
+
+    def _judge(self, state: Any, notes: Mapping[str, float]) -> Callable[[], Verdict]:
+        """Return a function that gives the verdict on the run so far, which has these notes."""
+        judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
+        names = self.withheld.names if self.withheld is not None else ()
+        inputs, labels = self.inputs, tuple(self.model.parameter_space.labels)
+        if not names and not gaps.counts[1:].any():
+            return judge
+
+        def found() -> Verdict:
+            held = gaps.findings(inputs, notes, labels)
+            return judge().with_findings([*withheld.findings(names), *held])
+
+        return found
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last accepted sample.
@@ -423,7 +462,8 @@ class Identifier:
         state = self.law.settled(self._work, self._state)
         if state is self._state:
             return estimate
-        return replace(estimate, belief=self.problem.physical(self.law.belief(self._work, state)))
+        belief = self.problem.physical(self.law.belief(self._work, state))
+        return replace(estimate, belief=belief, judge=self._judge(state, estimate.notes))
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return what the sensors will show if nothing more is measured; nothing is learned.
@@ -601,6 +641,10 @@ class Identifier:
             "z": self._z,
             "samples": self._samples,
             "inputs": np.array([self._inputs[c] for c in self._inputs]),
+            "withheld": self._withheld.sums,
+            "withheld_last": self._withheld.last,
+            "held_counts": self._gaps.counts,
+            "held": self._gaps.held,
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
@@ -634,6 +678,8 @@ class Identifier:
         state = None
         try:
             t, samples, z = float(leaves["t"]), int(leaves["samples"]), leaves["z"]
+            withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
+            gaps = InputLedger(leaves["held_counts"].astype(np.int64), leaves["held"])
             names = self.inputs if len(leaves["inputs"]) else ()
             inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
             if header["begun"]:
@@ -645,7 +691,7 @@ class Identifier:
                 "as they were when it was saved."
             ) from error
         self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
-        self._state = state
+        self._state, self._withheld, self._gaps = state, withheld, gaps
         if state is None and not self.inputs:
             self._begin(inputs)
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
+from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat, held_inputs
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -56,6 +59,8 @@ class Estimate:
         Input channels whose last value was held because the sample had none.
     space
         The unknowns.
+    judge
+        Gives what the law says of the run so far; see `verdict`.
     """
 
     t: float
@@ -67,6 +72,7 @@ class Estimate:
     notes: Mapping[str, float]
     held: tuple[str, ...]
     space: FunctionSpace
+    judge: Callable[[], Verdict] = Verdict.unjudged
 
     @classmethod
     def deferred(
@@ -81,6 +87,7 @@ class Estimate:
         notes: Mapping[str, float],
         held: tuple[str, ...],
         space: FunctionSpace,
+        judge: Callable[[], Verdict],
     ) -> Estimate:
         """Return an estimate whose belief is computed when it is first read, and kept then.
 
@@ -100,6 +107,7 @@ class Estimate:
             notes=notes,
             held=held,
             space=space,
+            judge=judge,
         )
         return estimate
 
@@ -117,7 +125,18 @@ class Estimate:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: the belief itself."""
-        return {"belief": self.belief} | {k: v for k, v in vars(self).items() if k != "_read"}
+        own = {"belief": self.belief, "verdict": self.verdict}
+        return own | {k: v for k, v in vars(self).items() if k not in ("_read", "judge")}
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Whether the estimates are to be believed, by all samples so far.
+
+        It is found when it is first read, and takes about a millisecond.
+        """
+        labels = self.space.labels
+        shifted = [*discretised(self.notes, labels), *held_inputs(self.notes, labels)]
+        return self.judge().with_findings([*known_badly(self.belief, self.space), *shifted])
 
     @property
     def q(self) -> Array:
@@ -151,8 +170,8 @@ class Estimate:
     def to_dict(self) -> dict[str, Any]:
         """Return time, status, unknown numbers and innovations as JSON can hold them.
 
-        {"t", "status", "unknowns": {label: {"value", "std"}}, "innovation": [...]}; None stands
-        where there is no number.
+        {"t", "status", "unknowns": {label: {"value", "std"}}, "innovation": [...], "verdict"}; None
+        stands where there is no number.
         """
         unknowns = {
             label: {"value": _number(value), "std": _number(std)}
@@ -163,6 +182,7 @@ class Estimate:
             "status": self.status.code,
             "unknowns": unknowns,
             "innovation": [_number(value) for value in self.innovation.tolist()],
+            "verdict": self.verdict.level,
         }
 
     def interval(self, name: str, level: float = 0.95) -> tuple[Any, Any]:
@@ -196,6 +216,18 @@ class Estimate:
         part = space.part(name)
         ends: tuple[Array, Array] = unknown_of(space, name).interval(self.q[part], std[part], level)
         return ends
+
+
+def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
+    """Return which scalar unknowns the data have hardly told of, or end at a bound."""
+    for label, row in space.labels.items():
+        unknown, value = unknown_of(space, label), float(belief.q[row])
+        lower, upper = map(float, unknown.bounds)
+        if value in (lower, upper):
+            yield at_bound(label, value)
+        left = float(belief.left([row])[0])
+        if left > FLAT and not unknown.evolution.moves:
+            yield flat(label, left)
 
 
 class Result:
@@ -238,6 +270,11 @@ class Result:
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on the run so far: that of the last estimate."""
+        return Verdict.unjudged() if self.last is None else self.last.verdict
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
@@ -308,7 +345,8 @@ class Result:
         law with covariance also `_left`, the share of the prior deviation of a number that is left;
         `_modes`, of how many modes of a field the data have told, and `_left_out`, the share of the
         modes that the law leaves out in its mean variance, over `snapshot`; and `correlation` of
-        the last numbers, over (`unknown`, `other`).
+        the last numbers, over (`unknown`, `other`). The attribute `verdict` is what
+        `Verdict.to_dict` gives, as JSON.
         """
         records, last = RecordArrays.of(self.records), None
         if self.last is not None and self._settled is not None:
@@ -318,7 +356,10 @@ class Result:
             records = records.with_last(np.array(self._readout(self._settled)), snapshot)
         if self.last is not None and records.last_snapshot < len(records) - 1:
             last = self.snapshot(self.last)
-        return self.layout.dataset(records, last)
+        data = self.layout.dataset(records, last)
+        if self.last is not None:
+            data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
+        return data
 
     def smoothed(self) -> xr.Dataset:
         """Return a dataset of what unknowns and state were, given all samples of the run.

@@ -63,6 +63,7 @@ def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
         "jumps": _jumps(frame, spec),
         "guards": _chosen(Guards, spec.guards),
         "shadows": _chosen(Shadows, spec.shadows),
+        "verdict": spec.verdict,
     }
     replay = _chosen(Replay, spec.replay)
     return SensitivityLaw(spec.modes, _noise(frame, spec), drift, memory, replay, **more)

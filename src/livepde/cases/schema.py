@@ -370,6 +370,7 @@ class SensitivitySpec(Spec):
     jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | JumpsSpec = False
     guards: StrictBool | GuardsSpec = True
     shadows: StrictBool | ShadowsSpec = True
+    verdict: StrictBool | Literal["cheap"] = True
 
 
 class AutoSpec(Spec):

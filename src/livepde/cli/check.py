@@ -91,7 +91,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     """Print what the sensors can tell; return sentences on it."""
     from livepde.cases.preview import preview
     from livepde.runs import Table
-    from livepde.runs.doubts import TELLING
+    from livepde.verdict import TELLING
 
     found = preview(prepared, prepared.stream)
     rows = [
@@ -110,7 +110,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
         title = f"What {found.samples} samples can tell, at best"
         print_table(console, Table(title, columns, rows))
     hardly = [
-        f"{item.name}: these data can tell hardly anything; {TELLING}"
+        f"{item.name}: these data can tell hardly anything. {TELLING}"
         for item in found.unknowns
         if item.hardly
     ]

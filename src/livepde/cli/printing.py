@@ -90,13 +90,14 @@ def print_json(
     **more: Any,
 ) -> None:
     """Print one JSON object; `dataset`: with the measures of a run."""
-    from livepde.runs import measures
+    from livepde.runs import measures, verdict
     from livepde.runs.directory import plain
 
     content: dict[str, Any] = {"livepde": __version__, **more}
     content["checks"] = [item.to_dict() for item in checks]
     if dataset is not None:
         content["measures"] = measures(dataset)
+        content["verdict"] = verdict(dataset).to_dict()
     content["tables"] = [item.to_dict() for item in shown]
     content["notes"] = list(notes)
     sys.stdout.write(json.dumps(plain(content), ensure_ascii=False) + "\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -272,23 +273,30 @@ def concluded(
         With figures.
     """
     from livepde.linalg import in_use
-    from livepde.runs import arrivals, checks_of, doubts, input_notes, tables
+    from livepde.runs import arrivals, checks_of, input_findings, tables, verdict, verdict_table
     from livepde.runs.outcome import attempted
+    from livepde.verdict import Verdict
 
     loaded = prepared.case
     notes: list[str] = []
     nothing: list[Any] = []
-    found = attempted("The estimate of the end", driven.result.to_xarray, None, notes)
-    dataset = driven.journal.dataset() if found is None else found
+    ended = attempted("The estimate of the end", driven.result.to_xarray, None, notes)
+    dataset = driven.journal.dataset() if ended is None else ended
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
+    driving = loaded.frame.roles("boundary", "input")
+
+    def judged() -> Verdict:
+        return verdict(dataset).with_findings(input_findings(driven.journal, driving))
+
+    found = attempted("The verdict", judged, Verdict.unjudged(), notes)
+    dataset.attrs["verdict"] = json.dumps(found.to_dict())
     shown = [
+        *([verdict_table(found)] if len(driven.result) else []),
         *attempted("The tables", lambda: tables(dataset), nothing, notes),
         *attempted("The table of irregular rows", lambda: arrivals(driven.journal), nothing, notes),
     ]
     checks = attempted("The checks", lambda: checks_of(loaded.expected, dataset), nothing, notes)
-    driving = loaded.frame.roles("boundary", "input")
-    notes[:0] = [*loaded.notes, *attempted("The doubts", lambda: doubts(dataset), nothing, notes)]
-    notes += input_notes(driven.journal, driving)
+    notes[:0] = [*loaded.notes, *found.sentences]
     if (engine := in_use()) is not None:
         notes.append(f"Large systems were solved by {engine.reason}.")
         if "resumed" in writer.record:

@@ -20,9 +20,10 @@ from livepde.dashboard.view import Seen
 from livepde.diagnostics.identifiability import Known
 from livepde.plots.dataset import groups, interval_95, labelled, scalars
 from livepde.records import STATUS_CODES
-from livepde.runs import unexplained
+from livepde.runs import severities
 from livepde.runs.directory import bound_text
 from livepde.runs.summary import digits, scored
+from livepde.verdict import Severity
 
 __all__ = ["cards", "chip", "facts", "pretty", "summary", "tables", "verdict"]
 
@@ -33,6 +34,7 @@ MOST_CARDS = 12
 MOST_ROWS = 100  # of a table
 LONG = 12  # rows from which a table is closed at first
 RAISED = str.maketrans("+-0123456789", "⁺⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SEVERITY: dict[Severity, Level] = {"note": "info", "caution": "warn", "do not trust": "bad"}
 SIGNS: dict[Level, str] = {"good": "✓", "info": "i", "warn": "!", "bad": "✕"}
 STATUS: dict[str, tuple[Level, str]] = {
     "waiting": ("info", "waiting for the first sample"),
@@ -135,9 +137,8 @@ def verdict(seen: Seen) -> list[Any]:
             found.append(("bad", f"{text}: the estimate is that of the last good step."))
     found += [("bad", f"Expected {c.name} {c.sense} {bound_text(c)}, but it is {c.value:.4g}.")
               for c in seen.checks if not c.ok]  # fmt: skip
-    grave = data is not None and unexplained(data)
-    for k, sentence in enumerate(seen.doubts):
-        found.append(("bad" if grave and k == 0 else "warn", sentence))
+    graves = {} if data is None else severities(data)
+    found += [(SEVERITY[graves.get(sentence, "caution")], sentence) for sentence in seen.doubts]
     if seen.counts:
         reasons: Counter[str] = Counter()
         for (kind, _), number in seen.counts.items():

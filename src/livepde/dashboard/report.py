@@ -101,14 +101,17 @@ def page_of(run: Run) -> str:
 
 def _verdict(run: Run) -> list[tuple[str, str]]:
     """Return sentences with how grave they are, the gravest first."""
+    from livepde.dashboard.cards import SEVERITY
+
     doubts = runs.doubts(run.dataset)
     found = [
         ("bad", f"Expected {name} {bound}, but it is {value}.")
         for name, value, bound, result in map(_checked, run.checks)
         if result != "ok"
     ]
-    found += [("warn", doubt) for doubt in doubts]
-    if not found:
+    graves = runs.severities(run.dataset)
+    found += [(SEVERITY[graves.get(doubt, "caution")], doubt) for doubt in doubts]
+    if not any(level in ("bad", "warn") for level, _ in found):
         found.append(("good", "Nothing speaks against the estimates."))
     return found + [("info", note) for note in run.notes if note not in doubts]
 

@@ -229,6 +229,7 @@ class View:
             new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]
             layout, count = journal.layout, journal.estimated
             events, counts, unwell = journal.events, journal.counts, journal.health
+            verdict = journal.verdict
         for number, record in new:
             self._add(number, record)
         status = seen.status
@@ -241,7 +242,7 @@ class View:
         return replace(
             seen,
             status=status,
-            dataset=self._dataset(layout),
+            dataset=self._dataset(layout, verdict),
             samples=count,
             gap=self._rows.gap,
             reading=len(new) == AT_ONCE,
@@ -261,11 +262,14 @@ class View:
             self._notable.add(number, plain)
         self._rows.add(number, plain)
 
-    def _dataset(self, layout: Layout) -> xr.Dataset | None:
+    def _dataset(self, layout: Layout, verdict: str) -> xr.Dataset | None:
         kept = {**dict(self._rows), **dict(self._notable), **dict(self._fields)}
         if not kept:
             return None
-        return layout.dataset([kept[number] for number in sorted(kept)])
+        data = layout.dataset([kept[number] for number in sorted(kept)])
+        if verdict:
+            data.attrs["verdict"] = verdict
+        return data
 
     def _status(self, run: runs.Run, journal: Path | None, latest: float) -> str:
         if run.status != "running":

@@ -16,11 +16,11 @@ from livepde.errors import ConfigurationError
 from livepde.laws import Belief
 from livepde.linalg import Array
 from livepde.model import Model
+from livepde.verdict import FLAT
 
 __all__ = ["FLAT", "Direction", "Identifiability", "Known", "identifiability"]
 
 PINNED = 0.1  # of the prior deviation left, at most
-FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly anything
 TRADED = 0.9  # correlation from which two unknowns are one
 WEIGHT = 0.3  # least weight in a combination of length one that is named
 

@@ -25,7 +25,7 @@ from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.fleet.separately import Separately
 from livepde.fleet.together import Together
 from livepde.identifier import MOST_SUBSTEPS, Identifier
-from livepde.laws import AnyLaw, Belief, MemberReports, Status
+from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
@@ -96,6 +96,8 @@ class Fleet:
             raise ConfigurationError("a fleet needs at least one member.")
         if len(set(names)) < len(names):
             raise ConfigurationError("the names of the members of a fleet must differ.")
+        if isinstance(law, SensitivityLaw):  # the sums of each member would cost more than its step
+            law = replace(law, verdict=False)
         self.members = tuple(names)
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
         made_of = [one or {} for one in self._each("u0_from", u0_from)]

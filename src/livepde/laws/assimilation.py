@@ -15,6 +15,7 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.members import changed
 from livepde.linalg import Array, Mask
 from livepde.stepping import Span
+from livepde.verdict import Judge, Seen
 
 __all__ = ["OK", "Assimilation", "MemberReports", "assimilate", "assimilate_at_once"]
 
@@ -156,7 +157,12 @@ def _absorbed(
     largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
     e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
     refused, count, newest = x.refused, np.zeros(len(x)), None
-    far = _far(x, e, used, options.gate)
+    shadows = filter_.shadows
+    off = None if shadows is None else shadows.seen(x, span.end)
+    known = np.zeros_like(d)  # what the discretisation is known to do to the innovations
+    if shadows is not None and off is not None:
+        known = off[:, shadows.counted].sum(axis=1) / noise
+    far = _far(x, d / np.sqrt(1.0 + (Y * Y).sum(axis=1) + known * known), used, options.gate)
     if far is not None:
         refused = np.where(far, refused + 1, np.where(used, 0, refused))
         kept = used & ~(far & (refused <= options.patience))
@@ -167,6 +173,9 @@ def _absorbed(
         e = np.where(used, e, np.nan)
     if not whole:  # zeros tell nothing: what is missing takes part as such
         Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
+    if filter_.judge is not None:
+        told = d + used * known  # the discretisation has a finding of its own
+        x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     new, made = filter_.update(x, Y, d)
     parts: dict[str, Any] = {
         "innovations": x.innovations.add(e, measured, newest),
@@ -174,14 +183,42 @@ def _absorbed(
     }
     if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
-    if filter_.shadows is not None:
-        weights = used / noise
-        parts["shadows"] = filter_.shadows.updated(x, new, made, weights, span.end)
+    if shadows is not None and off is not None:
+        parts["shadows"] = shadows.updated(x, new, made, used / noise, off, span.t1)
     # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
     # overflows would leave statistics that are not finite.
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
     finite = np.isfinite(sums + largest * largest)
     return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
+
+
+def _judged(
+    judge: Judge,
+    filter_: Filter,
+    x: FilterState,
+    Y: Array,
+    d: Array,
+    used: Mask,
+    noise: Array,
+    predicted: Array,
+    span: Span,
+) -> FilterState:
+    """Return the state before an update with what the verdict keeps of the sample."""
+    prior = filter_.problem.model.latent.prior
+
+    def q() -> Array:
+        return filter_.estimate(x)
+
+    def a() -> Array:
+        found: Array = filter_.reduction.reduced(q() - prior)
+        if filter_.shadows is not None:
+            found = found - x.shadows.a[:, filter_.shadows.counted].sum(axis=1)
+        return found
+
+    u = x.u + x.du
+    seen = Seen(x.C, x.causes, a, q, u, Y, d, used, span.z1, predicted, noise, span.end)
+    causes, ledger = judge.heard(x.ledger, seen)
+    return changed(x, causes=causes, ledger=ledger)
 
 
 def _far(x: FilterState, e: Array, used: Mask, gate: float) -> Mask | None:

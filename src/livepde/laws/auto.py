@@ -45,8 +45,10 @@ from livepde.laws.sensitivity_state import (
 )
 from livepde.laws.shadows import Shadows
 from livepde.laws.smoother import evidence, smoothed
+from livepde.laws.verdict import judged
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Alexander2, Interval, Scheme
+from livepde.verdict import Verdict
 
 __all__ = ["AutoLaw"]
 
@@ -149,9 +151,12 @@ class AutoLaw(Law[Bank, AutoState]):
         # What moves far has no use for a reference that stays.
         walks = reduction.moving(0.0) > 0
         replays = np.array([not (walks or c.drift) for c in candidates])
+        judge = work.filter.judge
+        wider = None if judge is None else judge.widened(rank - work.filter.rank)
+        drift = np.zeros(len(candidates))
         work = replace(
             work,
-            filter=replace(work.filter, rank=rank, drift=np.zeros(len(candidates))),
+            filter=replace(work.filter, rank=rank, drift=drift, judge=wider),
             options=replace(work.options, adaptive=True),
             start_window=self.member.start_window if walks else 0,
         )
@@ -427,6 +432,12 @@ class AutoLaw(Law[Bank, AutoState]):
         tick, now = state.tick, without_factors(state.members.now)
         weights = np.exp(state.weights[now.member])
         return lambda: self._mixture(work.filters(tick, noise), now, weights)
+
+    def judge(self, work: Bank, state: AutoState) -> Callable[[], Verdict]:
+        if not state.known:
+            return super().judge(work, state)
+        filters = work.filters(state.tick, state.noise)
+        return judged(filters.filter, state.members.now, state.at(state.leader))
 
     def _mixture(self, filters: SensitivityWork, now: FilterState, weights: Array) -> Belief:
         """Return the mean and covariance of all members."""

@@ -16,6 +16,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
+from livepde.verdict import Verdict
 
 __all__ = [
     "Belief",
@@ -458,6 +459,14 @@ class Law(ABC, Generic[Work, State]):
         """
         belief = self.belief(work, state)
         return lambda: belief
+
+    def judge(self, work: Work, state: State) -> Callable[[], Verdict]:
+        """Return a function that gives the verdict on a run so far; it never changes afterwards.
+
+        Here that of a law whose innovations are not judged.
+        """
+        name = type(self).__name__
+        return lambda: Verdict.of((), (f"innovations: {name} says nothing of their size",))
 
 
 AnyLaw = Law[Any, Any]

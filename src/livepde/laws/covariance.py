@@ -8,7 +8,7 @@ from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.linalg import Array
 
-__all__ = ["robust_factors"]
+__all__ = ["reported_factors", "robust_factors"]
 
 
 def robust_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
@@ -37,3 +37,15 @@ def robust_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
     widths[~finite] = 1.0
     rows = widths[:, :, None] * rotation.transpose(0, 2, 1)
     return rows @ x.U, rows @ x.C
+
+
+def reported_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
+    """Return a square root [U C] of the covariance that is reported, as `robust_factors` does.
+
+    It has one row more for the discretisation error, where shadows follow it.
+    """
+    U, C = robust_factors(filter_, x)
+    if filter_.shadows is None:
+        return U, C
+    u, a = filter_.shadows.widening(x)
+    return np.concatenate([U, u], axis=1), np.concatenate([C, a], axis=1)

@@ -41,6 +41,7 @@ from livepde.stepping import (
     StepFailed,
     advance,
 )
+from livepde.verdict import Judge
 
 __all__ = ["Filter", "FollowedErrors", "MeanFilter", "Update"]
 
@@ -88,8 +89,17 @@ class FollowedErrors(Protocol):
         """Return the state after a span, from those before and after, with the errors in it."""
         ...
 
+    def seen(self, x: FilterState, at: Moments) -> Array:
+        """Return by how much predictions are off, (members, errors, sensors)."""
+        ...
+
+    @property
+    def counted(self) -> Mask:
+        """Which of them are errors, (errors,): others are followed for the verdict alone."""
+        ...
+
     def updated(
-        self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array, t: float
     ) -> ShadowState:
         """Return what is known after a sample; weights: one over noise, (members, sensors)."""
         ...
@@ -123,6 +133,8 @@ class Filter:
         number, shape (numbers,), or (1,) for all.
     fading
         Time after which what the state knows of the unknowns has faded to 1/e.
+    judge
+        Keeps the sums that a verdict is drawn from; None: there is none.
     shadows
         What follows the discretisation error; None: nothing does.
     """
@@ -136,6 +148,7 @@ class Filter:
     scale: Array
     drift: Array
     fading: float = np.inf
+    judge: Judge | None = None
     shadows: FollowedErrors | None = None
 
     def drifts(self, member: IntArray) -> Array:
@@ -190,6 +203,7 @@ class Filter:
             U=_extended(x.U, len(grows)),
             C=np.concatenate([x.C @ F.T, new], axis=1),
             past=_extended(x.past, len(grows)),
+            causes=_extended(x.causes, len(grows)),
             age=x.age + h,
             shadows=changed(x.shadows, a=x.shadows.a @ F.T),
         )
@@ -289,6 +303,8 @@ class Filter:
         if x.past.shape[2]:
             past = Wt @ x.past
             new = changed(new, past=past, dpast=x.dpast + (row @ past)[:, 0])
+        if x.causes.shape[2]:
+            new = changed(new, causes=Wt @ x.causes)
         return new, Update(W, Y, half, misfit)
 
     def remembered(self, x: FilterState) -> FilterState:
@@ -332,7 +348,8 @@ class Filter:
         members, _, k = x.C.shape
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
         C = np.concatenate([x.C, np.broadcast_to(rows, (members, *rows.shape))], axis=1)
-        new = changed(x, U=_extended(x.U, len(rows)), C=C, past=_extended(x.past, len(rows)))
+        U, past, causes = (_extended(part, len(rows)) for part in (x.U, x.past, x.causes))
+        new = changed(x, U=U, C=C, past=past, causes=causes)
         return self._compressed(new) if C.shape[1] > self.rank else new
 
     def with_prior(self, x: FilterState) -> FilterState:
@@ -342,8 +359,9 @@ class Filter:
         C = np.broadcast_to(np.eye(k), (members, k, k))
         U, du, da = np.zeros((members, k, x.u.shape[1])), np.zeros_like(x.du), np.zeros_like(x.da)
         past = np.zeros((members, k, x.past.shape[2]))
+        causes = np.zeros((members, k, x.causes.shape[2]))
         shadows = changed(x.shadows, a=np.zeros_like(x.shadows.a))
-        new = changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past)
+        new = changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past, causes=causes)
         return changed(new, shadows=shadows)
 
     def _compressed(self, x: FilterState) -> FilterState:
@@ -366,7 +384,9 @@ class Filter:
         U = np.concatenate([rotated[:, :k], leading @ alone], axis=1)
         past = rotation.transpose(0, 2, 1) @ x.past
         past = np.concatenate([past[:, :k], leading @ past[:, k:]], axis=1)
-        return changed(x, U=U, C=C, past=past)
+        causes = rotation.transpose(0, 2, 1) @ x.causes
+        causes = np.concatenate([causes[:, :k], leading @ causes[:, k:]], axis=1)
+        return changed(x, U=U, C=C, past=past, causes=causes)
 
 
 class MeanFilter(Filter):
@@ -374,9 +394,9 @@ class MeanFilter(Filter):
 
     @classmethod
     def of(cls, filter_: Filter) -> MeanFilter:
-        """Return the same filter without covariance, noise of inputs and shadows."""
+        """Return the same filter without covariance, noise of inputs, judge and shadows."""
         parts = {item.name: getattr(filter_, item.name) for item in fields(filter_)}
-        return cls(**(parts | {"shadows": None}))
+        return cls(**(parts | {"judge": None, "shadows": None}))
 
     def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
         """Return the state whose unknowns have moved for a time h as they are expected to."""

@@ -10,6 +10,7 @@ from livepde.laws.innovations import Innovations
 from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import KeptFactors
+from livepde.verdict import Ledger
 
 __all__ = ["FilterState", "along"]
 
@@ -45,6 +46,10 @@ class FilterState:
         Logarithm of the likelihood of all samples so far, each given those before, (members,).
     kept
         What the last stage has left to the next.
+    causes, ledger
+        What the verdict is drawn from: by how much possible causes of misfit have moved the
+        estimate, as coordinates on the rows of the square root, (members, r, columns), and running
+        sums; see `livepde.verdict`. The filter itself never reads them.
     shadows
         What is known of the discretisation error.
     """
@@ -65,6 +70,8 @@ class FilterState:
     samples: Array
     evidence: Array
     kept: KeptFactors
+    causes: Array = field(metadata={"grows": 1, "begins_anew": True})
+    ledger: Ledger = field(metadata={"begins_anew": True})
     shadows: ShadowState
 
     def __len__(self) -> int:

@@ -57,6 +57,7 @@ def with_input_noise(
         U=np.zeros((members, 0, n)),
         C=np.zeros((members, 0, k)),
         past=x.past[:, :0],
+        causes=x.causes[:, :0],
     )
     rows = []
     for name, std in problem.input_noise.items():
@@ -67,7 +68,9 @@ def with_input_noise(
     U = np.concatenate([end.U, np.stack(rows, axis=1)], axis=1)
     C = np.concatenate([end.C, np.zeros((members, len(rows), k))], axis=1)
     past = np.concatenate([end.past, np.zeros((members, len(rows), end.past.shape[2]))], axis=1)
-    return changed(end, U=U, C=C, past=past), None
+    more = np.zeros((members, len(rows), end.causes.shape[2]))
+    causes = np.concatenate([end.causes, more], axis=1)
+    return changed(end, U=U, C=C, past=past, causes=causes), None
 
 
 def _moved(span: Span, name: str, change: float) -> Span:
@@ -125,4 +128,5 @@ def with_initial_rows(
     if not problem.initial_readings:
         return x
     U, C = initial_rows(problem, reduction, noise, x.q[0], x.u[0], moment)
-    return changed(x, U=U[None], C=C[None], past=np.zeros((1, len(C), 0)))
+    causes = np.zeros((1, len(C), x.causes.shape[2]))
+    return changed(x, U=U[None], C=C[None], past=np.zeros((1, len(C), 0)), causes=causes)

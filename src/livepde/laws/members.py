@@ -33,8 +33,20 @@ def _each(function: Callable[..., Any], first: Any, *others: Any) -> Any:
     return changed(first, **parts)
 
 
+def _members(state: Any) -> int:
+    """Return the number of members of a state."""
+    while not isinstance(state, np.ndarray):
+        state = next(iter(vars(state).values()))
+    return len(state)
+
+
 def take(state: State, which: Any) -> State:
-    """Return the state of some members, by an index array; of one for a number, as one member."""
+    """Return the state of some members, by an index array; of one for a number, as one member.
+
+    The only member is the state itself: no step writes into the arrays of a state.
+    """
+    if isinstance(which, int) and _members(state) == 1:
+        return state
     index = [which] if isinstance(which, int) else which
     taken: State = _each(lambda array: array[index], state)
     return taken

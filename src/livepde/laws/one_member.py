@@ -89,7 +89,8 @@ def _assimilated(
         state = stored(work, state, work.filter.relinearised(x), span, one)
         if state.assimilated[0] >= state.start_due[0]:
             state, notes = _smoothed(work, state)
-            report = replace(report, notes={**report.notes, **_noted(work, state.now), **notes})
+            if notes:
+                report = replace(report, notes={**report.notes, **_noted(work, state.now), **notes})
         return state, report
     state = stored(work, state, x, span, one)
     if state.log.shape[1] - state.window[0] > work.most and not state.replay.active[0]:

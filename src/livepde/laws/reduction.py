@@ -115,6 +115,25 @@ class Reduction:
             still[evolution.part] = not evolution.model.moves
         return still
 
+    @property
+    def stay(self) -> list[tuple[str, int]]:
+        """Coordinates of unknowns that stay, with what they are called: numbers before fields."""
+        space = self.problem.model.parameter_space
+        numbers, modes = [], []
+        for (name, item), evolution in zip(
+            self.problem.model.latent.parts.items(), self.evolutions, strict=True
+        ):
+            if evolution.model.moves:
+                continue
+            first, count = evolution.part.start, evolution.part.stop - evolution.part.start
+            if isinstance(item.block, FieldBlock):
+                modes += [(f"{name}, mode {k + 1}", first + k) for k in range(count)]
+                continue
+            labels = [label for label in space.labels if label.split("[")[0] == name]
+            named = labels if len(labels) == count else [f"{name}, {k + 1}" for k in range(count)]
+            numbers += [(label, first + k) for k, label in enumerate(named)]
+        return numbers + modes
+
     def named(self, names: Sequence[str] | None, who: str) -> Mask:
         """Return which coordinates belong to some unknowns, shape (k,); None stands for all.
 

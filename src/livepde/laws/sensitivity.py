@@ -18,7 +18,7 @@ from livepde.laws.assimilation import (
     assimilate_at_once,
 )
 from livepde.laws.base import Belief, FixedInterval, Law, Problem, Report, finite
-from livepde.laws.covariance import robust_factors
+from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter, MeanFilter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
@@ -44,6 +44,7 @@ from livepde.laws.sensors import MemberSensors
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
+from livepde.laws.verdict import judge_of, judged
 from livepde.linalg import Array, Mask
 from livepde.stepping import (
     Alexander2,
@@ -54,11 +55,13 @@ from livepde.stepping import (
     Span,
     member_stage,
 )
+from livepde.verdict import Ledger, Verdict
 
 __all__ = ["SensitivityLaw", "without_factors"]
 
 GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
+NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 GUESS = 2.0  # samples that the first guess of the noise counts for
 
 
@@ -119,6 +122,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         What to do when a linearisation is overconfident or the estimate runs away; None: nothing.
     shadows
         Which discretisation errors widen what is reported; None: none does.
+    verdict
+        Judge the run as it goes on (`Estimate.verdict`): True; "cheap", without the directions that
+        cost solves, those of terms that the process may lack; False: not at all.
     """
 
     modes: int | str | dict[str, int] = "auto"
@@ -133,6 +139,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     start_window: int = 64
     guards: Guards | None = field(default_factory=Guards)
     shadows: Shadows | None = field(default_factory=Shadows)
+    verdict: bool | str = True
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
 
@@ -151,6 +158,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
             )
         self._check_parts()
+        if self.verdict not in (True, False, "cheap"):
+            raise LawError(
+                f"SensitivityLaw: verdict must be True, 'cheap' or False; got {self.verdict!r}."
+            )
 
     def _check_parts(self) -> None:
         """Refuse parts that are of another kind, and gates that let nothing through."""
@@ -209,6 +220,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             np.sqrt(mass / mass.sum()),
             np.array([self.drift]),
             self.memory,
+            judge_of(
+                problem,
+                reduction,
+                noise,
+                self.verdict,
+                rank,
+                kept=not (self.drift or self.memory < np.inf),
+            ),
         )
         if self.shadows is not None:
             followed = ShadowSet.of(filter_, MeanFilter.of(filter_), self.shadows)
@@ -244,6 +263,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             samples=GUESS * one,
             evidence=0.0 * one,
             kept=filter_.stage.kept(1),
+            causes=np.zeros((1, k, filter_.judge.rank if filter_.judge else 0)),
+            ledger=filter_.judge.start() if filter_.judge else NO_LEDGER,
             shadows=ShadowState.none(1, n, k),
         )
         if filter_.shadows is not None:
@@ -456,16 +477,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return self.member_belief(work, state.now, 0)
 
     def reader(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Belief]:
-        now = without_factors(state.now)
+        now = without_ledger(without_factors(state.now))
         return lambda: self.member_belief(work, now, 0)
+
+    def judge(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Verdict]:
+        return judged(work.filter, without_factors(state.now), 0)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""
-        U, C = robust_factors(work.filter, x)
-        if work.filter.shadows is None:
-            return U, C
-        u, a = work.filter.shadows.widening(x)
-        return np.concatenate([U, u], axis=1), np.concatenate([C, a], axis=1)
+        return reported_factors(work.filter, x)
 
     def member_belief(self, work: SensitivityWork, now: FilterState, k: int) -> Belief:
         """Return what is believed of one member, in latent coefficients."""
@@ -486,6 +506,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
     """Return one member at the start with another filter."""
     return changed(state, start=x, now=x, older=x, newer=x, replay=ReplayState.none(x))
+
+
+def without_ledger(x: FilterState) -> FilterState:
+    """Return a filter without what only its verdict needs."""
+    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
 
 
 def without_factors(x: FilterState) -> FilterState:

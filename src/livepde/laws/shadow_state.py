@@ -38,6 +38,9 @@ class ShadowState:
     bend, missed
         Integral of what straight lines have missed of the inputs in the last interval, and of all
         that no shadow has stepped with yet, shapes (members, channels).
+    held
+        Of inputs that are held: last value, last change, and sums of the squares of changes and of
+        their differences, shape (members, 4, channels).
     halves, blocks
         What the last stages of halved steps, and of a block of steps, have left.
     fine, fine_stage
@@ -68,6 +71,7 @@ class ShadowState:
     slope: Array
     bend: Array
     missed: Array
+    held: Array
     halves: KeptFactors
     blocks: KeptFactors
     fine: Array
@@ -102,6 +106,7 @@ class ShadowState:
             slope=nothing,
             bend=nothing,
             missed=nothing,
+            held=np.zeros((members, 4, 0)),
             halves=kept,
             blocks=kept,
             fine=nothing,

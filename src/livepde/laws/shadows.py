@@ -44,6 +44,8 @@ ALIKE = 3.0  # ratio of the errors of two steps that others between them have, t
 LATER = np.array([5, 11, 7, 9])
 MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
 KINDS = ("step", "mesh", "input")
+HELD = "hold"  # kind of the shift by inputs that are held: no error if they are what is stated
+SMOOTH = 0.5  # differences of changes over changes, squared: below, an input changes smoothly
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,10 @@ class Shadows:
         The mesh, by the halved mesh: for states and unknown fields of first order and sensors that
         mean the same on every mesh.
     inputs
-        The straight line between readings of a channel, by the curvature of three readings; not
-        where inputs are held.
+        The straight line between readings of a channel, by the curvature of three readings, and
+        values that were held in gaps, once the next one is known. Where all inputs are held as
+        those of an actuator, by how much straight lines would shift the estimates is followed for
+        the verdict alone.
     largest
         Coefficients of the state on the halved mesh beyond which it is not followed, because that
         would cost more than the filter.
@@ -150,6 +154,10 @@ class Shadow(ABC):
     def found(self, s: ShadowState, steps: Steps) -> Found:
         """Return what the shadow has found about some steps."""
 
+    def read(self, s: ShadowState, span: Span) -> ShadowState:
+        """Return what is known after one more interval was read, before any shadow is taken."""
+        return s
+
     def seen(self, s: ShadowState) -> Array | None:
         """Return what sensors see of an error beside that in `ShadowState.u`; None if nothing."""
         return None
@@ -226,9 +234,8 @@ class InputShadow(Shadow):
         nothing = np.zeros((1, len(self.mean.problem.channels)))
         return changed(s, slope=nothing, bend=nothing, missed=nothing)
 
-    @staticmethod
-    def read(s: ShadowState, span: Span) -> ShadowState:
-        """Return what straight lines have missed after one more interval."""
+    def read(self, s: ShadowState, span: Span) -> ShadowState:
+        """Return what straight lines, and values held in a gap, have missed by now."""
         length, slope = span.t1 - span.t0, span.inputs1 - span.inputs0
         if len(length) < len(s):  # the members of a bank have their samples in common
             length = np.repeat(length, len(s))
@@ -237,7 +244,10 @@ class InputShadow(Shadow):
         h = length[:, None]
         slope = slope / h
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
-        return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
+        missed = s.missed + bend
+        if span.gaps is not None:  # what was held is off the line across the gap, on average half
+            missed = missed - 0.5 * span.gaps * (span.inputs1 - span.inputs0)
+        return changed(s, slope=slope, length=length, bend=bend, missed=missed)
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
         ahead = (0.5 * (steps.next - 1))[:, None] * s.bend  # of half of the steps until the next
@@ -252,6 +262,35 @@ class InputShadow(Shadow):
         moved = replace(span, inputs0=first, inputs1=last, interval=None)
         u, _, failed = _followed(self.mean, steps.x, steps.x.u, steps.x.kept, moved)
         return Found(u - steps.end.u, left, failed)
+
+
+class HeldInputShadow(InputShadow):
+    """How estimates would shift if inputs that are held changed along straight lines instead.
+
+    Only inputs that change smoothly are looked at: successive changes of readings are alike, those
+    of settings that are made anew now and then are not.
+    """
+
+    kind = HELD
+
+    def begun(
+        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
+    ) -> ShadowState:
+        channels = len(self.mean.problem.channels)
+        s = super().begun(s, x, moment, given)
+        return changed(s, held=np.full((1, 4, channels), np.nan))
+
+    def read(self, s: ShadowState, span: Span) -> ShadowState:
+        """Return what held values have missed of straight lines by now."""
+        last, before, changes, differences = s.held.transpose(1, 0, 2)
+        change = np.where(np.isfinite(last), span.inputs1 - last, 0.0)
+        changes = np.nan_to_num(changes) + change**2
+        differences = np.nan_to_num(differences) + (change - np.nan_to_num(before)) ** 2
+        smooth = differences < SMOOTH * changes
+        missed = 0.5 * (span.t1 - span.t0)[:, None] * np.where(smooth, change, 0.0)
+        values = np.broadcast_to(span.inputs1, change.shape)
+        held = np.stack([values, change, changes, differences], axis=1)
+        return changed(s, held=held, bend=missed, missed=s.missed + missed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,9 +425,14 @@ class ShadowSet:
                 found.append(MeshShadow.of(mean))
             except LivepdeError as error:
                 refused = f"on the halved mesh: {error}"
-        if options.inputs and problem.model.channels and not problem.control.hold:
-            found.append(InputShadow(mean))
+        if options.inputs and problem.model.channels:
+            found.append((HeldInputShadow if problem.control.hold else InputShadow)(mean))
         return cls(filter_, tuple(found), refused)
+
+    @cached_property
+    def counted(self) -> Mask:
+        """Which shadows tell an error, shape (shadows,)."""
+        return np.array([kind != HELD for kind in self.kinds], dtype=bool)
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
@@ -422,8 +466,8 @@ class ShadowSet:
         fresh = s.count == s.last
         if fresh.any():
             s = _opened(s, fresh, x, span, "mesh" in self.kinds)
-        if "input" in self.kinds:
-            s = InputShadow.read(s, span)
+        for shadow in self.shadows:
+            s = shadow.read(s, span)
         s, jumps = _watched(s, x, end, span)
         due = (s.count >= s.due) | jumps
         for t in np.unique(s.begun[due]) if due.any() else ():
@@ -458,8 +502,18 @@ class ShadowSet:
         begun = np.full(len(s), span.t1)
         return changed(s, u=u, a=a, begun=begun, last=s.count, due=s.count + wait)
 
+    def seen(self, x: FilterState, at: Moments) -> Array:
+        """Return by how much predictions are off, (members, shadows, sensors)."""
+        s = x.shadows
+        seen = self.filter.sensors.rows(x, s.u, s.a, at)
+        for row, shadow in enumerate(self.shadows):
+            more = shadow.seen(s)
+            if more is not None:
+                seen[:, row] += more
+        return seen
+
     def updated(
-        self, x: FilterState, new: FilterState, made: Update, weights: Array, at: Moments
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array, t: float
     ) -> ShadowState:
         """Return the shadows after a sample.
 
@@ -469,15 +523,14 @@ class ShadowSet:
             The filter before and after it.
         weights
             One over the noise of each value that was used, zero for others, (members, sensors).
+        seen
+            By how much predictions were off, as `seen` says.
+        t
+            Time of the sample.
         """
         s = x.shadows
-        seen = self.filter.sensors.rows(x, s.u, s.a, at)
-        for row, shadow in enumerate(self.shadows):
-            more = shadow.seen(s)
-            if more is not None:
-                seen[:, row] += more
         if s.gains.size:
-            s = _recalled(s, x, new, made, weights, at.t)
+            s = _recalled(s, x, new, made, weights, t)
         used = (weights > 0.0)[:, None]
         half = (np.where(used, seen, 0.0) * weights[:, None]) @ made.left.transpose(0, 2, 1)
         return changed(s, u=s.u - half @ new.U, a=s.a - half @ new.C)
@@ -506,11 +559,12 @@ class ShadowSet:
             each = latent.tangent(q, reduction.Phi @ a.T)  # (m, shadows)
             std = np.linalg.norm(latent.tangent(q, reduction.Phi @ C[k].T), axis=1)
             shift = each / np.where(std > 0.0, std, np.inf)[:, None]
-            total = np.abs(shift.sum(axis=1))
+            total = np.abs(shift[:, self.counted].sum(axis=1))
             worst = int(np.argmax(np.where(np.isfinite(total), total, -1.0)))
             numbers = {"discretisation_shift": float(total[worst])}
             for row, kind in enumerate(self.kinds):
-                numbers[f"{kind}_shift"] = float(shift[worst, row])
+                at_worst = worst if kind != HELD else int(np.argmax(np.abs(shift[:, row])))
+                numbers[f"{kind}_shift"] = float(shift[at_worst, row])
                 for label, at in latent.space.labels.items():
                     numbers[f"{label}_{kind}_shift"] = float(each[at, row])
             for name, value in numbers.items():
@@ -529,7 +583,7 @@ class ShadowSet:
         deviation: what the data tell wrongly is known as well as before, and the linear filter is
         nothing to count more.
         """
-        u, a = (rows.sum(axis=1, keepdims=True) for rows in self.shifts(x))
+        u, a = (rows[:, self.counted].sum(axis=1, keepdims=True) for rows in self.shifts(x))
         size = np.linalg.norm(self.filter.reduction.in_prior_units(a, x.age), axis=2)
         good = np.isfinite(size) & np.isfinite(u).all(axis=2)
         factor = np.where(good, 1.0 / np.maximum(size, 1.0), 0.0)[:, :, None]
@@ -556,14 +610,16 @@ def _watched(
 ) -> tuple[ShadowState, Mask]:
     """Return members after one more step, and of whom something jumped in it."""
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
-    differs = np.linalg.norm(rate - s.rate, axis=1)
-    jumps = (differs > JUMP * s.usual) & (s.count > CALM)
-    # Before the second step nothing is known; a jump does not count as usual.
-    told = np.where(s.count > CALM, np.minimum(differs, JUMP * s.usual), differs)
-    usual = np.where(
-        s.count > 1, s.usual + (told - s.usual) / np.minimum(s.count + 1.0, USUAL), differs
-    )
-    count = s.count + 1
+    more = rate - s.rate
+    differs, most = np.sqrt((more * more).sum(axis=1)), JUMP * s.usual
+    count, settled = s.count + 1, s.count > CALM
+    jumps = settled & (differs > most)
+    # A jump does not count as usual.
+    told = np.minimum(differs, most)
+    if not settled.all():  # before the second step nothing is known
+        told = np.where(settled, told, differs)
+    weight = 1.0 / np.minimum(count, USUAL)
+    usual = s.usual + (told - s.usual) * np.where(count > 2, weight, 1.0)
     jumped = np.where(jumps, count, s.jumped)
     return changed(s, rate=rate, usual=usual, count=count, jumped=jumped), jumps
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from livepde.runs.directory import JOURNAL, RECORD, Run, RunWriter, free_path, refuse_taken
 from livepde.runs.directory import open_run as open
-from livepde.runs.doubts import doubts, unexplained
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
+from livepde.runs.judgement import doubts, severities, unexplained, verdict, verdict_table
 from livepde.runs.live import Backlog, Live, Retention, Sink
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.runs.summary import Jump, arrivals, checks_of, input_notes, jumps, measures, tables
+from livepde.runs.run_findings import input_findings
+from livepde.runs.summary import Jump, arrivals, checks_of, jumps, measures, tables
 
 __all__ = [
     "JOURNAL",
@@ -32,13 +33,16 @@ __all__ = [
     "doubts",
     "drive",
     "free_path",
-    "input_notes",
+    "input_findings",
     "journal_of",
     "jumps",
     "measures",
     "open",
     "refuse_taken",
+    "severities",
     "stopped_by_signals",
     "tables",
     "unexplained",
+    "verdict",
+    "verdict_table",
 ]

@@ -30,6 +30,7 @@ from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
+from livepde.runs.judgement import verdict, verdict_table
 from livepde.runs.outcome import Check, FigureFactory, Table, attempted
 from livepde.runs.salvage import Salvage
 from livepde.runs.summary import arrivals, tables
@@ -363,8 +364,10 @@ class Run:
             return arrivals(kept)
 
     def summary(self) -> list[Table]:
-        """Return its tables: estimates ± deviation, errors of each channel."""
-        return tables(self.dataset)
+        """Return its tables: verdict, estimates ± standard deviation, errors of each channel."""
+        data = self.dataset
+        judged = [verdict_table(verdict(data))] if data.sizes["time"] else []
+        return [*judged, *tables(data)]
 
 
 def open_run(path: str | os.PathLike[str]) -> Run:

@@ -84,6 +84,7 @@ SCHEMA = (
     "UNIQUE (t, kind, channel, message))",
     "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, crc INTEGER NOT NULL, "
     "PRIMARY KEY (kind, channel)) WITHOUT ROWID",
+    "CREATE TABLE verdicts (id INTEGER PRIMARY KEY, said TEXT NOT NULL, crc INTEGER NOT NULL)",
     "CREATE TABLE withdrawn (id INTEGER PRIMARY KEY)",
     "CREATE TABLE tries (id INTEGER PRIMARY KEY, number INTEGER NOT NULL)",
 )
@@ -374,6 +375,17 @@ class Journal:
         self._say("health", why[:LONGEST].encode(errors="replace").decode())
         self._write(self._db.commit)
 
+    def judge(self, verdict: Mapping[str, Any]) -> None:
+        """Keep the verdict on the run so far, as `Verdict.to_dict` gives it."""
+        conflict = "ON CONFLICT (id) DO UPDATE SET said = excluded.said, crc = excluded.crc"
+        self._insert("verdicts", 1, json.dumps(verdict), conflict=conflict)
+
+    @property
+    def verdict(self) -> str:
+        """The verdict that was kept last, as JSON; empty before any."""
+        rows = self._sound("verdicts", self._read("SELECT * FROM verdicts"))
+        return str(rows[0][1]) if rows else ""
+
     def note(self, event: Event) -> None:
         """Keep an event; one that was kept before a crash is not kept twice."""
         message = event.message[:LONGEST].encode(errors="replace").decode()
@@ -632,7 +644,10 @@ class Journal:
         """Return the estimates as a dataset; see `Result.to_xarray`."""
         records = RecordArrays.of(self)
         with sound(self.path):
-            return self.layout.dataset(records)
+            data = self.layout.dataset(records)
+        if verdict := self.verdict:
+            data.attrs["verdict"] = verdict
+        return data
 
     @property
     def events(self) -> list[Event]:

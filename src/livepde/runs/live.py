@@ -22,10 +22,12 @@ from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.runs.outcome import attempted
 from livepde.streams.intake import Ready, Remark
+from livepde.verdict import LEVELS
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
 CHECKPOINT = 256  # samples between two checkpoints
+JUDGED = 50  # samples between two looks at the verdict, of which a change is an event
 LOOK = 0.5  # seconds between two looks at whether to stop
 LONGEST = 500  # characters of an event
 TRIES = 2  # times that a sample in whose step the process has ended is tried again
@@ -145,7 +147,8 @@ class Live:
     ----------
     ailments
         Each returns why the run is not well, in one sentence, or nothing; the first that does is
-        what /health, the metrics, the log and the page say. A verdict on the estimate joins here.
+        what /health, the metrics, the log and the page say. The last is a verdict of "do not
+        trust", which is looked at every 50 samples.
     """
 
     def __init__(
@@ -183,17 +186,20 @@ class Live:
         self._heard = self._taken = clock()
         self._refused = self._failed = 0  # in a row
         self._refusal = self._failure = ""
-        self._unwell, self._told = "", (-1, "well")
+        self._unwell, self._told, self._doubt = "", (-1, "well"), ""
         self.ailments: list[Callable[[], str]] = [
             self._unlinked,
             self._silence,
             self._refusing,
             self._failing,
+            self._doubted,
         ]
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._remarked = set(self._counts)
         self._steps = 0
+        told = [event for event in journal.events if event.kind == "verdict"]
+        self._level = told[-1].message.partition(":")[0] if told else LEVELS[0]
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
@@ -263,6 +269,7 @@ class Live:
         last = self.result.last
         if last is not None:
             self.result.settle(last := self.identifier.settled(last))
+            self.journal.judge(last.verdict.to_dict())
         if self.journal.estimated:
             self.journal.keep(self.result.snapshot(last or self.identifier.estimate()))
 
@@ -322,7 +329,7 @@ class Live:
         """What a watchdog should know: ok, or why not, in one sentence."""
         last = self.result.last
         counts = self._counts.copy()  # who asks does so from another thread
-        why = self.why
+        why, verdict = self.why, None if last is None else last.verdict
         return {
             "ok": not why,
             "why": why,
@@ -332,6 +339,8 @@ class Live:
             "silent": self.silent,
             "status": "" if last is None else last.status.code,
             "seconds": self._seconds,
+            "verdict": "" if verdict is None else verdict.level,
+            "findings": [] if verdict is None else verdict.sentences,
             "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
 
@@ -375,6 +384,9 @@ class Live:
         if self._failed > 1:
             return f"the last steps have failed; the last one: {self._failure}"
         return "" if last is None or last.status.ok else f"the last step: {last.status}"
+
+    def _doubted(self) -> str:
+        return self._doubt
 
     def _look(self) -> None:
         """Say in the log, and to who reads the journal, what has changed of the run's health."""
@@ -464,10 +476,23 @@ class Live:
             self._failure = str(estimate.status)
             self._tell(estimate.status.code, self._failure)
         self._steps += 1
+        if len(self.result) % JUDGED == 0:
+            self._judge(estimate)
         if self._steps % CHECKPOINT == 0:
             self.journal.checkpoint(self.identifier.dump())
             if math.isfinite(self.retention.span):
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
+
+    def _judge(self, estimate: Estimate) -> None:
+        """Tell of a verdict that is another one than before."""
+        verdict = estimate.verdict
+        self.journal.judge(verdict.to_dict())
+        grave = verdict.level == LEVELS[-1]
+        self._doubt = f"the verdict on the estimates is {verdict.level!r}" if grave else ""
+        if verdict.level != self._level:
+            self._level = verdict.level
+            said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
+            self._tell("verdict", f"{verdict.level}: {said}")
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; one that fails is given up, the run goes on."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from livepde.errors import RunError
 from livepde.result import Estimate
 from livepde.runs.web import Address, Server
+from livepde.verdict import LEVELS
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIEnvironment
@@ -24,7 +25,8 @@ class Metrics:
     `livepde_estimate{unknown}`, `livepde_deviation{unknown}`, `livepde_innovation{sensor}`,
     `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`. A `Monitor` adds what its
     run's health says: `livepde_ok`, `livepde_unwell{why}`, `livepde_silent`,
-    `livepde_waiting_samples`, `livepde_step_seconds_total`, `livepde_remarks_total{kind, channel}`.
+    `livepde_waiting_samples`, `livepde_verdict`, `livepde_step_seconds_total`,
+    `livepde_remarks_total{kind, channel}`.
 
     Parameters
     ----------
@@ -99,6 +101,10 @@ class _Health:
         ):
             if key in found:
                 yield GaugeMetricFamily(f"livepde_{name}", text, float(found[key]))
+        if found.get("verdict") in LEVELS:
+            text = "0 trusted, 1 caution, 2 do not trust"
+            level = float(LEVELS.index(found["verdict"]))
+            yield GaugeMetricFamily("livepde_verdict", text, level)
         unwell = GaugeMetricFamily("livepde_unwell", "1 with the reason, if any", labels=["why"])
         if why := str(found.get("why", "")):
             unwell.add_metric([why], 1.0)

@@ -69,6 +69,14 @@ class Salvage(Journal):
             raise RunError(damaged(self.path, f"no {' and no '.join(sorted(missing))}"))
         return found
 
+    @property
+    def verdict(self) -> str:
+        """The verdict that was kept last, as JSON; empty if there is none or it is damaged."""
+        try:
+            return super().verdict
+        except RunError:
+            return ""
+
     def after(self, number: int) -> Iterator[tuple[int, Record]]:
         """Iterate over the whole estimates after one, with their numbers."""
         end, every = self._thinning()

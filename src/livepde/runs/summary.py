@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -213,7 +213,8 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run.
 
-    Estimates with references, errors of each channel, what the data have told, and jumps.
+    Estimates with references, errors of each channel, what the data have told, jumps, and the
+    verdict.
     """
     result: list[Table] = []
     labels = scalars(data) if data.sizes["time"] else []
@@ -322,27 +323,9 @@ def _jumped(data: xr.Dataset) -> Table:
     return Table("Jumps", ("when", "unknown", "before", "since then"), rows)
 
 
-INPUT_KINDS = {
-    "spike": "values far off those before and after were refused as spikes",
-    "interpolated": "gaps were interpolated between the values before and after",
-    "missing": "missing values were not between known ones: the last value was held",
-}
-
-
 def arrivals(journal: Journal) -> list[Table]:
     """Return the table of rows and values that were refused, missing or out of order, if any."""
     rows = [(kind, channel or "(row)", n) for (kind, channel), n in journal.counts.items()]
     if not rows:
         return []
     return [Table("Irregular rows and values", ("what", "channel", "number"), rows)]
-
-
-def input_notes(journal: Journal, channels: Iterable[str]) -> list[str]:
-    """Return sentences on gaps and spikes of the channels that drive the model, if any."""
-    found = []
-    for name in channels:
-        counts = {kind: n for (kind, channel), n in journal.counts.items() if channel == name}
-        parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
-        if parts:
-            found.append(f"Channel {name}: {'; '.join(parts)}.")
-    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -37,6 +37,8 @@ class Interval:
     noise
         Standard deviation of each value of z1, shape (sensors,), NaN where it is that of the
         sensor; None if all are.
+    gaps
+        Channel -> time at the end of which it has a value again; it was held for so long.
     """
 
     t0: float
@@ -46,6 +48,7 @@ class Interval:
     z0: Array
     z1: Array
     noise: Array | None = None
+    gaps: Mapping[str, float] = field(default_factory=dict)
 
     def _weight(self, t: float) -> float:
         return (t - self.t0) / (self.t1 - self.t0)

@@ -62,6 +62,9 @@ class Span:
     noise
         Standard deviation of each value of z1, of its shape, NaN where it is that of the sensor;
         None if all are.
+    gaps
+        Time for which each channel that has a value again was held before this interval, shape
+        (1, channels); None if there was no gap.
     """
 
     t0: Array
@@ -73,6 +76,7 @@ class Span:
     z1: Array
     interval: Interval | None = None
     noise: Array | None = None
+    gaps: Array | None = None
 
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
@@ -85,7 +89,10 @@ class Span:
                 first = np.array([[interval.inputs0[name] for name in channels]])
         t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
         noise = None if interval.noise is None else interval.noise[None]
-        return cls(t0, interval.t1, channels, first, last, z0, z1, interval, noise)
+        gaps = None
+        if interval.gaps:
+            gaps = np.array([[interval.gaps.get(name, 0.0) for name in channels]])
+        return cls(t0, interval.t1, channels, first, last, z0, z1, interval, noise, gaps)
 
     def __len__(self) -> int:
         return len(self.t0)

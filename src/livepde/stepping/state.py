@@ -263,6 +263,18 @@ class ForwardStage:
             return self.factor(q, h, moment)
         return self.jacobian(u, q, h, moment)
 
+    def linearised(
+        self, u: Array, q: Array, h: float, moment: Moment
+    ) -> tuple[Factor, sp.csr_array | Array]:
+        """Return the factorised S = M/h + B'(u) + d(A(u) q)/du, and its rows as a matrix.
+
+        The factor is that on the free coefficients, the matrix has all columns.
+        """
+        if self.keeps:
+            return self.factor(q, h, moment), self._system(q, h, moment).matrix
+        data = self._data(u, self.model.latent.value(q), h, moment)
+        return self._factorise(data), self._rows[0].matrix(data)
+
     def advance(
         self,
         c: Array,

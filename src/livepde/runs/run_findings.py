@@ -1,122 +1,117 @@
-"""What a run's numbers say against its estimates, in plain sentences."""
+"""What the dataset and the journal of a run say against its estimates, as findings."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from livepde.diagnostics.identifiability import FLAT
 from livepde.plots.dataset import note, scalars
 from livepde.runs.dates import when
-from livepde.runs.summary import digits, jumps, scored
+from livepde.runs.summary import digits, jumps
+from livepde.verdict import FLAT, REFINE, Finding, Severity, at_bound, discretised, flat
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["doubts", "unexplained"]
+    from livepde.runs.journal import Journal
+
+__all__ = ["findings_of", "input_findings"]
 
 MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: twice as large
-OFFSET = 0.7  # mean of a sensor's innovations over their root mean square: always the same side
-SETTLED = 0.25  # share of a run after which means are taken
 LEFT = 1.0  # deviations between estimate and reference after the last replay
 BELIEVED = 0.5  # weight of the members of a bank that drift
 DRIFTING = 0.03  # share of the samples in which they are believed
-MOST_SENSORS = 6  # that are named
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
-TELLING = "longer data, with larger changes nearer to the sensors, would tell more."
 LEAVES = 1.0  # squared distance from the prior over what model and prior allow
 REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
-SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
-REMEDIES = {
-    "step": ("the time step", "take a smaller dt_max (steps.dt_max), or a scheme of second order"),
-    "mesh": ("the mesh", "take more elements, where the state bends most"),
-    "input": (
-        "the straight lines between readings of the input channels",
-        "read these channels more often",
-    ),
-}
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
+INPUT_KINDS = {
+    "spike": "values far off those before and after were refused as spikes",
+    "interpolated": "gaps were interpolated between the values before and after",
+    "missing": "missing values were not between known ones: the last value was held",
+}
 
 
-def doubts(data: xr.Dataset) -> list[str]:
-    """Return what a user should know before he believes the estimates.
+def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
+    """Return what the dataset of a run says against its estimates.
 
-    The model does not explain the data if at the end the mean square of the innovations, over the
-    last 500 samples, is more than four times what noise and uncertainty allow. An unknown ends at a
-    bound, or keeps more than 0.9 of its prior deviation: the data did not tell. The gate has
-    refused more than 2 % of the readings. The last replay ended more than one deviation away from
-    where it has to end. Guards had to give up samples or to restart, or to hold unknowns that
-    nothing excited. With gain='auto' the unknowns ended farther from their prior than, with a right
-    model, they do in one of a million cases. With a fixed gain an estimate wanders, in the last
-    half of a run, by more than 0.3 of what it has learned. In more than 0.03 of the samples a bank
-    believes that unknowns drift. Latent values were held where they would have left their
-    prior. Of the mean variance of a field more than a quarter is that of modes that the law leaves
-    out. Something jumped. Time step, mesh and straight lines between readings of inputs have
-    together shifted an unknown by more than two standard deviations.
+    An unknown ends at a bound, or keeps more than 0.9 of its prior standard deviation: the data did
+    not tell. The gate has refused more than 2 % of the readings. The last replay ended more than
+    one standard deviation away from where it has to end. Guards had to give up samples or to
+    restart, or to hold unknowns that nothing excited. With gain='auto' the unknowns ended farther
+    from their prior than, with a right model, they do in one of a million cases. With a fixed gain
+    an estimate wanders, in the last half of a run, by more than 0.3 of what it has learned. In more
+    than 0.03 of the samples a bank believes that unknowns drift. Latent values were held where they
+    would have left their prior. Of the mean variance of a field more than a quarter is that of
+    modes that the law leaves out. Time step, mesh and straight lines between readings of inputs
+    have together shifted an unknown by more than two standard deviations. Something jumped. Where
+    no law has judged the innovations: their mean square, over the last 500 samples, is more than
+    four times what was expected.
+
+    Parameters
+    ----------
+    judged
+        Whether the law has judged innovations and refused readings itself.
     """
-    if not data.sizes["time"]:
-        return []
+    gradient = note(data, "residual") is not None
+    own = [] if judged else [*_model_error(data), *_said("refused", "caution", _refused(data))]
     return [
-        *_model_error(data),
-        *_replays(data),
-        *_refused(data),
+        *own,
+        *_said("replay", "do not trust", _replays(data)),
         *_unknowns(data),
-        *_held(data),
-        *_left_out(data),
-        *([*_rests(data), *_lost(data)] if note(data, "residual") is not None else _guards(data)),
-        *_drifts(data),
-        *_departure(data),
-        *_gain(data),
-        *_jumps(data),
+        *_said("held", "do not trust", _held(data)),
+        *_said("left out", "note", _left_out(data)),
         *_discretised(data),
+        *_said("rest", "note", _rests(data) if gradient else []),
+        *_said("lost", "caution", _lost(data) if gradient else []),
+        *_said("guards", "caution", [] if gradient else _guards(data)),
+        *_said("drift", "caution", _drifts(data)),
+        *_said("departure", "do not trust", _departure(data)),
+        *_said("gain", "caution", _gain(data)),
+        *_said("jump", "caution", _jumps(data)),
     ]
 
 
-def unexplained(data: xr.Dataset) -> bool:
-    """Return whether a run says that its model does not explain the data: see `doubts`."""
-    ratio = note(data, "innovation_ratio")
-    return ratio is not None and len(ratio) > 0 and bool(ratio[-1] > MODEL_ERROR)
+def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
+    """Return gaps and spikes of the channels that drive the model, if any.
+
+    Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
+    """
+    found = []
+    for name in channels:
+        counts = {kind: n for (kind, channel), n in journal.counts.items() if channel == name}
+        parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
+        if not parts:
+            continue
+        held = counts.get("missing", 0) / max(len(journal), 1)
+        text = f"Channel {name}: {'; '.join(parts)}."
+        found.append(Finding("input", "note", text, name, held))
+    return found
 
 
-def _model_error(data: xr.Dataset) -> list[str]:
+def _said(what: str, severity: Severity, sentences: Iterable[str]) -> list[Finding]:
+    return [Finding(what, severity, sentence) for sentence in sentences]
+
+
+def _model_error(data: xr.Dataset) -> list[Finding]:
+    """Return whether innovations are too large, for runs whose law has not judged them itself."""
     ratios = note(data, "innovation_ratio")
-    if ratios is None or not unexplained(data):
+    if ratios is None or not len(ratios) or ratios[-1] <= MODEL_ERROR:
         return []
     ratio = float(ratios[-1])
-    found = [
+    text = (
         "The model does not explain the data: the sensors miss what is expected of them by "
         f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
-        f"{ratio:.1f}, bound {MODEL_ERROR:g}). The deviations are widened, and yet do not trust "
-        "them."
-    ]
-    unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
-    off = []
-    for name, (role, errors) in scored(data).items():
-        late = errors[int(SETTLED * len(errors)) :]
-        if role != "assimilated" or not len(late):
-            continue
-        mean = float(late.mean())
-        if abs(mean) > OFFSET * float(np.sqrt((late**2).mean())):
-            side = "above" if mean > 0 else "below"
-            off.append(f"{name} reads {abs(mean):.2g} {unit}".rstrip() + f" {side} it")
-    if len(off) > MOST_SENSORS:
-        off = [*off[:MOST_SENSORS], f"{len(off) - MOST_SENSORS} more read too much or too little"]
-    if off:
-        found.append(
-            f"{'; '.join(off)} nearly all the time: give these sensors an unknown offset, or a "
-            "process is missing in the model."
-        )
-    else:
-        found.append(
-            "What is left changes with time: layers, a source, or an unknown that moves "
-            "(evolution) may be missing in the model; or the noise is larger than stated."
-        )
-    return found
+        f"{ratio:.1f}, bound {MODEL_ERROR:g}). The intervals were widened but should still not be "
+        "trusted."
+    )
+    return [Finding("misfit", "do not trust", text, evidence=ratio)]
 
 
 def _replays(data: xr.Dataset) -> list[str]:
@@ -127,9 +122,9 @@ def _replays(data: xr.Dataset) -> list[str]:
     if not len(left) or left[-1] <= LEFT:
         return []
     return [
-        f"The last replay has not converged: estimate and reference are {left[-1]:.1f} deviations "
-        "apart, so that the deviations do not hold. Give law.replay more iterations, let it begin "
-        "later (first), or start from a better prior."
+        f"The last replay has not converged: estimate and reference are {left[-1]:.1f} standard "
+        "deviations apart, so that the intervals do not hold. Give law.replay more iterations, let "
+        "it begin later (first), or start from a better prior."
     ]
 
 
@@ -148,22 +143,16 @@ def _refused(data: xr.Dataset) -> list[str]:
     ]
 
 
-def _unknowns(data: xr.Dataset) -> list[str]:
+def _unknowns(data: xr.Dataset) -> list[Finding]:
     found = []
     for label in scalars(data):
         attrs: dict[Any, Any] = data[label].attrs
-        value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
-        for bound in ("lower_bound", "upper_bound"):
-            if value == attrs.get(bound):
-                found.append(
-                    f"{label} ends at its bound {value:g}: the bound decides, not the data."
-                )
-        prior = float(attrs.get("prior_std", math.nan))
-        if std > FLAT * prior:
-            found.append(
-                f"{label}: the data have told hardly anything, its deviation is still about "
-                f"that of the prior; {TELLING}"
-            )
+        value = float(data[label][-1])
+        if value in (attrs.get("lower_bound"), attrs.get("upper_bound")):
+            found.append(at_bound(label, value))
+        left = float(data[f"{label}_left"][-1]) if f"{label}_left" in data else math.nan
+        if left > FLAT and "prior_std" in attrs:
+            found.append(flat(label, left))
     return found
 
 
@@ -326,25 +315,14 @@ def _departure(data: xr.Dataset) -> list[str]:
     ]
 
 
-def _discretised(data: xr.Dataset) -> list[str]:
+def _discretised(data: xr.Dataset) -> list[Finding]:
     """Return whether the discretisation has shifted the unknowns at the end, and by what."""
-    total = note(data, "discretisation_shift")
-    if total is None or not total[-1] > SHIFTED:
-        return []
-    notes = {kind: note(data, f"{kind}_shift") for kind in REMEDIES}
-    sizes = {kind: abs(float(values[-1])) for kind, values in notes.items() if values is not None}
-    kind = max(sizes, key=lambda kind: sizes[kind])
-    what, remedy = REMEDIES[kind]
-    parts = []
-    for label in scalars(data):
-        shift = note(data, f"{label}_{kind}_shift")
-        if shift is not None and np.isfinite(shift[-1]):
-            parts.append(f"{label} by {shift[-1]:+.2g}")
-    moved = f" ({', '.join(parts[:MOST_SENSORS])})" if parts else ""
-    return [
-        f"The discretisation has shifted the unknowns by {total[-1]:.1f} standard deviations, and "
-        f"most of it is {what}{moved}. The intervals were widened by that: {remedy}."
-    ]
+    labels = scalars(data)
+    kinds = [f"{kind}_shift" for kind in ("discretisation", *REFINE)]
+    names = [*kinds, *(f"{label}_{kind}" for label in labels for kind in kinds[1:])]
+    noted = {name: note(data, name) for name in names}
+    last = {name: float(values[-1]) for name, values in noted.items() if values is not None}
+    return list(discretised(last, labels))
 
 
 def _gain(data: xr.Dataset) -> list[str]:

@@ -1,0 +1,361 @@
+"""What can be wrong with sensors, channels, process, model and settings of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import livepde as lp
+from benchmarks.honest.problem import Problem
+from benchmarks.honest.problems import PROBLEMS
+
+__all__ = ["FAULTS", "Fault", "Scene"]
+
+Array = NDArray[Any]
+HALF = 0.5  # of the run, when what is sudden begins
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The data of a run, and what livepde is told.
+
+    Attributes
+    ----------
+    problem, theta
+        The process, and the coordinates of its truth.
+    z
+        Readings without noise, shape (samples, sensors).
+    errors
+        What noise does to them, of the same shape, in units of the noise.
+    inputs
+        Channels as livepde reads them, shape (samples, channels).
+    noise
+        True standard deviation of the sensors.
+    sensor
+        Which sensor is the faulty one.
+    rng
+        For what is drawn.
+    points, model, u0, scheme, hold
+        What livepde is told.
+    subject
+        What is wrong, by name; empty for the process.
+    told
+        Problem whose process livepde is told; None for that of the truth.
+    """
+
+    problem: Problem
+    theta: Array
+    z: Array
+    errors: Array
+    inputs: Array
+    noise: float
+    sensor: int
+    rng: np.random.Generator
+    points: Mapping[str, Any]
+    model: Callable[[], lp.Model]
+    u0: float
+    scheme: Any = None
+    hold: bool = False
+    subject: str = ""
+    told: Problem | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the faulty sensor."""
+        return list(self.points)[self.sensor]
+
+    @property
+    def length(self) -> int:
+        """Number of samples."""
+        return len(self.z)
+
+
+Change = Callable[[Scene], Scene]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that is wrong.
+
+    Attributes
+    ----------
+    text
+        What it is.
+    change
+        Makes it so.
+    kinds
+        Causes of a verdict that name it; empty where none can.
+    only
+        Problems that it is for; empty for all that have what it needs.
+    channels
+        Whether it needs a channel.
+    late
+        Whether it begins in the middle of the run.
+    own_state
+        Whether it needs an initial state that is told.
+    traced
+        Whether it is one of readings, channels or process: not of noise, start or settings.
+    """
+
+    text: str
+    change: Change
+    kinds: tuple[str, ...] = ()
+    only: tuple[str, ...] = ()
+    channels: bool = False
+    late: bool = False
+    own_state: bool = False
+    traced: bool = True
+
+
+def _sensor(change: Callable[[Scene, Array], Array]) -> Change:
+    """Return the change of the readings of one sensor."""
+
+    def changed(scene: Scene) -> Scene:
+        z = scene.z.copy()
+        z[:, scene.sensor] = change(scene, z[:, scene.sensor].copy())
+        return replace(scene, z=z, subject=scene.name)
+
+    return changed
+
+
+def _late(scene: Scene, values: Array, fault: Array) -> Array:
+    half = int(HALF * scene.length)
+    return np.concatenate([values[:half], fault[half:]])
+
+
+def _shifted(values: Array, samples: float) -> Array:
+    at = np.arange(len(values))
+    return np.asarray(np.interp(at - samples, at, values))
+
+
+def _scaled(values: Array, factor: float) -> Array:
+    return np.asarray(values[0] + factor * (values - values[0]))
+
+
+def _errors(change: Callable[[Scene, Array], Array]) -> Change:
+    """Return the change of the errors of one sensor."""
+
+    def changed(scene: Scene) -> Scene:
+        errors = scene.errors.copy()
+        errors[:, scene.sensor] = change(scene, errors[:, scene.sensor].copy())
+        return replace(scene, errors=errors, subject=scene.name)
+
+    return changed
+
+
+def _following(scene: Scene, errors: Array) -> Array:
+    rho, found = 0.95, errors.copy()
+    for k in range(1, len(errors)):
+        found[k] = rho * found[k - 1] + np.sqrt(1.0 - rho**2) * errors[k]
+    return found
+
+
+def _stands(scene: Scene) -> Scene:
+    z, errors, half = scene.z.copy(), scene.errors.copy(), int(HALF * scene.length)
+    z[half:, scene.sensor], errors[half:, scene.sensor] = z[half, scene.sensor], 0.0
+    return replace(scene, z=z, errors=errors, subject=scene.name)
+
+
+def _swapped(scene: Scene) -> Scene:
+    other = (scene.sensor + 1) % scene.z.shape[1]
+    z = scene.z.copy()
+    z[:, [scene.sensor, other]] = z[:, [other, scene.sensor]]
+    return replace(scene, z=z, subject=scene.name)
+
+
+def _moved(scene: Scene) -> Scene:
+    at = np.atleast_1d(np.asarray(scene.points[scene.name], dtype=float)).copy()
+    at[0] += 0.05
+    place = float(at[0]) if len(at) == 1 else tuple(at.tolist())
+    return replace(scene, points={**scene.points, scene.name: place}, subject=scene.name)
+
+
+def _channel(change: Callable[[Scene, Array], Array]) -> Change:
+    def changed(scene: Scene) -> Scene:
+        inputs = scene.inputs.copy()
+        inputs[:, 0] = change(scene, inputs[:, 0].copy())
+        return replace(scene, inputs=inputs, subject=next(iter(scene.problem.channels)))
+
+    return changed
+
+
+def _gaps(scene: Scene, values: Array) -> Array:
+    gone = scene.rng.random(len(values)) < 0.3
+    gone[0] = False
+    return np.where(gone, np.nan, values)
+
+
+def _channels_swapped(scene: Scene) -> Scene:
+    return replace(scene, inputs=scene.inputs[:, ::-1].copy())
+
+
+def _other(scene: Scene, share: Array) -> Scene:
+    """Return the scene whose first coordinate moves by 1.5 prior deviations, as share says."""
+    theta = scene.theta.copy()
+    theta[0] += 1.5 if theta[0] < 0.0 else -1.5
+    z = scene.problem.predict(theta)
+    mixed = (1.0 - share[:, None]) * scene.z + share[:, None] * z
+    return replace(scene, z=mixed, subject=next(iter(scene.problem.latents)))
+
+
+def _jump(scene: Scene) -> Scene:
+    return _other(scene, (np.arange(scene.length) >= int(HALF * scene.length)).astype(float))
+
+
+def _ramp(scene: Scene) -> Scene:
+    return _other(scene, np.linspace(0.0, 1.0, scene.length))
+
+
+def _lacks(of: str, **other: float) -> Change:
+    """Return the change by which the truth is that of another problem with the same sensors."""
+
+    def changed(scene: Scene) -> Scene:
+        truth = PROBLEMS[of]
+        theta = np.zeros(truth.coordinates)
+        for place, value in other.items():
+            theta[int(place[1:])] = value
+        theta[0] = scene.theta[0]
+        return replace(scene, z=truth.predict(theta))
+
+    return changed
+
+
+def _layers(scene: Scene) -> Scene:
+    wall = PROBLEMS["wall"]
+    theta = np.array([1.5, -1.5, 1.5, -1.5])
+    names = list(wall.points)
+    z = wall.predict(theta)
+    keep = {name: wall.points[name] for name in names}
+    errors = scene.rng.standard_normal(z.shape)
+    inputs = wall.inputs(wall.times)
+    return replace(scene, z=z, points=keep, errors=errors, inputs=inputs, sensor=0)
+
+
+def _bent(scene: Scene) -> Scene:
+    theta = scene.theta.copy()
+    theta[1] = 1.5
+    rod = PROBLEMS["rod"]
+    z = scene.problem.predict(theta)
+    return replace(scene, z=z, theta=theta, model=rod.model, told=rod)
+
+
+def _with_u0(scene: Scene) -> Scene:
+    return replace(scene, u0=scene.u0 + 15.0 * scene.noise)
+
+
+FAULTS: Mapping[str, Fault] = {
+    "offset": Fault(
+        "a sensor reads 4 sigma too much",
+        _sensor(lambda s, v: v + 4.0 * s.noise),
+        ("offset", "drift"),
+    ),
+    "offset, late": Fault(
+        "the same from the middle on",
+        _sensor(lambda s, v: _late(s, v, v + 4.0 * s.noise)),
+        ("offset", "drift"),
+        late=True,
+    ),
+    "drift": Fault(
+        "a sensor drifts by 8 sigma in all",
+        _sensor(lambda s, v: v + 8.0 * s.noise * np.linspace(0.0, 1.0, len(v))),
+        ("drift", "offset"),
+    ),
+    "scale": Fault(
+        "a sensor's scale is off by 20 %", _sensor(lambda s, v: _scaled(v, 1.2)), ("gain",)
+    ),
+    "unit": Fault(
+        "a sensor in degrees Fahrenheit",
+        _sensor(lambda s, v: 32.0 * s.noise + 1.8 * v),
+        ("gain", "offset", "drift"),
+    ),
+    "sign": Fault("a sensor with the wrong sign", _sensor(lambda s, v: -v), ("gain",)),
+    "lag": Fault("a sensor is 4 samples late", _sensor(lambda s, v: _shifted(v, 4.0)), ("lag",)),
+    "lag, late": Fault(
+        "the same from the middle on",
+        _sensor(lambda s, v: _late(s, v, _shifted(v, 4.0))),
+        ("lag",),
+        late=True,
+    ),
+    "lead": Fault("a sensor is 4 samples early", _sensor(lambda s, v: _shifted(v, -4.0)), ("lag",)),
+    "position": Fault("a sensor sits 5 % of the length away", _moved, ("position",)),
+    "swapped": Fault("two sensors are swapped", _swapped, ("position", "gain", "offset", "lag")),
+    "stands": Fault("a sensor stands still", _stands, ("stuck", "offset", "gain"), late=True),
+    "noisy": Fault("a sensor is four times as noisy", _errors(lambda s, e: 4.0 * e), traced=False),
+    "burst": Fault(
+        "a sensor is five times as noisy for a tenth of the run",
+        _errors(lambda s, e: np.where(np.abs(np.linspace(-1, 1, len(e))) < 0.1, 5.0 * e, e)),
+        traced=False,
+    ),
+    "following": Fault(
+        "errors of a sensor that follow each other, 0.95", _errors(_following), traced=False
+    ),
+    "heavy tails": Fault(
+        "Student errors with 3 degrees of freedom",
+        lambda s: replace(s, errors=s.rng.standard_t(3, s.errors.shape) / np.sqrt(3.0)),
+        traced=False,
+    ),
+    "channel offset": Fault(
+        "a channel reads 6 sigma too much",
+        _channel(lambda s, v: v + 6.0 * s.noise),
+        ("boundary", "channel", "source", "flux"),
+        channels=True,
+    ),
+    "channel scale": Fault(
+        "a channel's scale is off by 20 %",
+        _channel(lambda s, v: 1.2 * v),
+        ("boundary", "channel"),
+        channels=True,
+    ),
+    "channel lag": Fault(
+        "a channel is 4 samples late",
+        _channel(lambda s, v: _shifted(v, 4.0)),
+        ("boundary", "channel"),
+        channels=True,
+    ),
+    "channel gaps": Fault("30 % of a channel missing", _channel(_gaps), channels=True),
+    "channels swapped": Fault(
+        "two channels are swapped",
+        _channels_swapped,
+        ("boundary", "channel"),
+        only=("rod", "wall", "profile"),
+        channels=True,
+    ),
+    "start": Fault(
+        "the initial state is 15 sigma off", _with_u0, ("initial",), own_state=True, traced=False
+    ),
+    "jump": Fault("the first unknown jumps", _jump, ("jump",), late=True),
+    "ramp": Fault("the first unknown moves all along", _ramp, ("jump",)),
+    "loss": Fault(
+        "a loss is missing in the model",
+        _lacks("lossy-rod", t1=1.0, t2=-0.67),
+        ("loss",),
+        only=("rod",),
+    ),
+    "source": Fault(
+        "a source is missing in the model",
+        _lacks("lossy-rod", t1=-8.0, t2=1.0),
+        ("source",),
+        only=("rod",),
+    ),
+    "layers": Fault("layers are missing in the model", _layers, only=("rod",)),
+    "bend": Fault(
+        "the conductivity depends on the temperature, in the model it does not",
+        _bent,
+        only=("warm-rod",),
+    ),
+    "steps": Fault(
+        "implicit Euler, one step a sample",
+        lambda s: replace(s, scheme=lp.ImplicitEuler()),
+        traced=False,
+    ),
+    "held": Fault(
+        "channels are held, not straight",
+        lambda s: replace(s, hold=True),
+        channels=True,
+        traced=False,
+    ),
+}

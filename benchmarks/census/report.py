@@ -1,0 +1,126 @@
+"""Tables and checks of the census."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.census.faults import FAULTS
+from benchmarks.census.trace import VISIBLE
+from livepde.runs.outcome import Check, Outcome, Table
+
+if TYPE_CHECKING:
+    from benchmarks.census.run import Score
+
+__all__ = ["outcome"]
+
+WRONG = 3.0  # standard deviations
+SILENT = 0.01  # share of all runs that are wrong and trusted, at most
+FALSE = 0.02  # share of sound runs that are doubted, at most
+NAMED = 0.70  # share of doubted runs with a cause that can be named in which it is, at least
+
+
+def outcome(scores: Sequence[Score]) -> Outcome:
+    """Return tables and checks."""
+    whole = [score for score in scores if not score.failure]
+    sound = [score for score in whole if not score.fault]
+    silent = [s for s in whole if s.verdict == "trusted" and s.off > WRONG]
+    shown_silent = [s for s in silent if not s.trace < VISIBLE]
+    false = [s for s in sound if s.verdict != "trusted"]
+    hidden = [s for s in whole if s.trace < VISIBLE]
+    shown = [s for s in whole if not s.trace < VISIBLE]
+    told = [s for s in shown if s.named is not None and s.verdict != "trusted"]
+    delays = [s.delay for s in whole if s.delay is not None and s.delay >= 0 and not s.early]
+    checks = [
+        Check("wrong by three deviations and trusted", _share(silent, whole), SILENT, "<="),
+        Check("the same of those with a trace", _share(shown_silent, shown), SILENT, "<="),
+        Check("nothing wrong and doubted", _share(false, sound), FALSE, "<="),
+        Check("cause among the first two", _share([s for s in told if s.named], told), NAMED, ">="),
+        Check("runs that ended early", len(scores) - len(whole), 0, "<="),
+    ]
+    rows = []
+    for fault in dict.fromkeys(score.fault for score in scores):
+        some = [score for score in whole if score.fault == fault]
+        if some:
+            rows.append(_row(fault, some))
+    columns = [
+        "wrong",
+        "runs",
+        "trace",
+        "hidden",
+        "off",
+        "told",
+        "silent",
+        "named",
+        "delay",
+        "90 %",
+    ]
+    tables = [Table("What runs say of themselves", columns, rows)]
+    told_of = [*silent, *false]
+    tables.append(
+        Table(
+            "Silent wrong answers and false alarms",
+            ["wrong", "problem", "seed", "stated", "level", "trace", "off", "verdict", "said"],
+            [
+                [
+                    s.fault or "nothing",
+                    s.problem,
+                    s.seed,
+                    s.stated,
+                    s.level,
+                    round(s.trace, 1) if np.isfinite(s.trace) else None,
+                    round(s.off, 1),
+                    s.verdict,
+                    s.said[:160],
+                ]
+                for s in told_of
+            ],
+        )
+    )
+    notes = [
+        "off: runs with an unknown more than three reported standard deviations off; told: share "
+        "with a verdict of caution or do not trust; silent: off and trusted; named: share of those "
+        "told whose cause is among the first two; delay: median and 90 % quantile of the samples "
+        "from a fault in the middle of the run to the verdict.",
+        "trace: norm of what is left of readings without noise after the best fit of the truth's "
+        "own code, over the noise, median (none for noise, start and settings); hidden: runs in "
+        f"which it is below {VISIBLE:g}, so that the unknowns take the fault up and no test of the "
+        f"readings can tell ({len(hidden)} runs in all).",
+        f"{len(whole)} runs, {len(sound)} with nothing wrong; delays of all late faults: median "
+        f"{_quantile(delays, 0.5)}, 90 % {_quantile(delays, 0.9)}.",
+    ]
+    return Outcome(
+        tables,
+        checks,
+        notes + [f"{s.problem}, {s.fault}: {s.failure}" for s in scores if s.failure],
+    )
+
+
+def _share(some: Sequence[Score], of: Sequence[Score]) -> float:
+    return len(some) / len(of) if of else float("nan")
+
+
+def _quantile(values: Sequence[int], share: float) -> str:
+    return f"{np.quantile(values, share):.0f}" if values else "–"
+
+
+def _row(fault: str, some: Sequence[Score]) -> list[object]:
+    off = [s for s in some if s.off > WRONG]
+    traces = [s.trace for s in some if np.isfinite(s.trace)]
+    told = [s for s in some if s.verdict != "trusted"]
+    known = [s.named for s in told if s.named is not None]
+    delays = [s.delay for s in some if s.delay is not None and s.delay >= 0 and not s.early]
+    return [
+        FAULTS[fault].text if fault else "nothing",
+        len(some),
+        round(float(np.median(traces)), 1) if traces else None,
+        sum(s.trace < VISIBLE for s in some),
+        len(off),
+        round(len(told) / len(some), 2),
+        sum(s.verdict == "trusted" for s in off),
+        round(float(np.mean(known)), 2) if known else None,
+        _quantile(delays, 0.5),
+        _quantile(delays, 0.9),
+    ]

@@ -1,0 +1,238 @@
+"""Runs of the census, in several processes."""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import livepde as lp
+from benchmarks.census.faults import FAULTS, HALF, Scene
+from benchmarks.census.report import outcome
+from benchmarks.census.trace import trace
+from benchmarks.honest.problem import Problem
+from benchmarks.honest.problems import PROBLEMS as TRUTHS
+from livepde.progress import watched
+from livepde.runs.outcome import Outcome
+from livepde.verdict import Finding, Verdict
+
+__all__ = ["PROBLEMS", "QUICK", "Score", "census"]
+
+PROBLEMS = ("rod", "column", "wall", "profile", "plate", "flux", "warm-rod", "borehole")
+QUICK = ("rod", "column", "profile", "plate", "warm-rod")
+STATED = (1.0, 3.0, 1.0 / 3.0)
+"""Stated over true noise."""
+LEVELS = (0.25, 1.0, 4.0)
+"""True noise over that of the problem, about 2 % of the signal."""
+LOOKED = 10  # samples between two looks at the verdict after a fault
+NAMED = 2  # causes among which the right one has to be
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one run said of itself.
+
+    Attributes
+    ----------
+    problem, fault, stated, level, seed
+        Which run; no fault: nothing is wrong.
+    verdict
+        At the end.
+    off
+        Largest error of an unknown in its reported standard deviations.
+    named
+        Whether the cause is among the first two; None where none is expected.
+    delay
+        Samples from a fault that begins late to the first verdict that is not "trusted"; -1: never,
+        None: does not apply.
+    early
+        Whether such a run was doubted before its fault began.
+    said
+        The first sentence.
+    trace
+        What the fault leaves of the readings that no unknowns explain, over the noise; NaN where
+        the truth's code cannot tell: of noise, initial states and settings.
+    failure
+        What ended the run, if anything did.
+    """
+
+    problem: str
+    fault: str
+    stated: float
+    level: float
+    seed: int
+    verdict: str
+    off: float
+    named: bool | None = None
+    delay: int | None = None
+    early: bool = False
+    said: str = ""
+    trace: float = np.nan
+    failure: str = ""
+
+
+def census(
+    only: Sequence[str] = (),
+    faults: Sequence[str] = (),
+    seeds: int = 4,
+    sound: int = 40,
+    *,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Outcome:
+    """Run all faults of problems, and sound runs.
+
+    Parameters
+    ----------
+    faults
+        Some of `FAULTS`; default all.
+    seeds
+        Runs of each fault and problem; statements of the noise and its level take turns.
+    sound
+        Runs of each problem with nothing wrong.
+    """
+    todo = [
+        (name, fault, seed)
+        for name in only or PROBLEMS
+        for fault in ["", *(faults or FAULTS)]
+        if not fault or _fits(name, fault)
+        for seed in range(seeds if fault else sound)
+    ]
+    stream = _all(todo, workers or os.cpu_count() or 1)
+    scores = list(watched(stream, len(todo), "runs") if progress else stream)
+    return outcome(sorted(scores, key=lambda s: (s.fault, s.problem, s.seed)))
+
+
+def _fits(name: str, fault: str) -> bool:
+    about, problem = FAULTS[fault], TRUTHS[name]
+    if about.only:
+        return name in about.only
+    single = len(problem.points) == 1
+    moved = about.text.startswith("two sensors") and single
+    own = about.own_state and problem.model().form_initial is not None
+    return not (about.channels and not problem.channels) and not moved and not own
+
+
+def _all(todo: Sequence[tuple[str, str, int]], workers: int) -> Iterator[Score]:
+    if workers == 1:
+        yield from (scored(*item) for item in todo)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(scored, *item) for item in todo]):
+            yield future.result()
+
+
+def scored(name: str, fault: str, seed: int) -> Score:
+    """Return the score of one run; the same arguments give the same numbers."""
+    problem = TRUTHS[name]
+    rng = np.random.default_rng([zlib.crc32(f"{name} {fault}".encode()), seed])
+    stated, level = STATED[seed % 3], LEVELS[(seed // 3 + 1) % 3]
+    with threadpool_limits(1):
+        theta, shown = problem.draw(rng)
+        scene = _scene(problem, theta, shown, problem.noise * level, rng)
+        if fault:
+            scene = FAULTS[fault].change(scene)
+        score = Score(name, fault, stated, level, seed, "", np.nan)
+        try:
+            return _judged(scene, score)
+        except (lp.errors.LivepdeError, ArithmeticError, np.linalg.LinAlgError) as error:
+            return Score(name, fault, stated, level, seed, "", np.nan, failure=repr(error))
+
+
+def _scene(
+    problem: Problem, theta: np.ndarray, shown: np.ndarray, noise: float, rng: np.random.Generator
+) -> Scene:
+    return Scene(
+        problem=problem,
+        theta=theta,
+        z=shown,
+        errors=rng.standard_normal(shown.shape),
+        inputs=problem.inputs(problem.times),
+        noise=noise,
+        sensor=int(rng.integers(shown.shape[1])),
+        rng=rng,
+        points=dict(problem.points),
+        model=problem.model,
+        u0=problem.u0,
+    )
+
+
+def _judged(scene: Scene, score: Score) -> Score:
+    problem = scene.problem
+    model = scene.model()
+    direct = {k: v for k, v in problem.direct.items() if k in scene.points}
+    sensors = lp.Points(scene.points, noise=scene.noise * score.stated, direct=direct)
+    u0 = None if model.form_initial is not None else scene.u0
+    law = lp.SensitivityLaw()
+    identifier = lp.Identifier(model, sensors, law, scheme=scene.scheme, hold=scene.hold, u0=u0)
+    z = scene.z + scene.noise * scene.errors
+    names, half = tuple(problem.channels), int(HALF * scene.length)
+    about = FAULTS.get(score.fault)
+    late, delay, early = about is not None and about.late, -1, False
+    estimate: lp.Estimate | None = None
+    for k, t in enumerate(problem.times.tolist()):
+        inputs = dict(zip(names, scene.inputs[k].tolist(), strict=True))
+        estimate = identifier.step(t, z[k], inputs)
+        if late and k == half - 1:
+            early = estimate.verdict.level != "trusted"
+        if late and k > half and (k - half) % LOOKED == 0 and delay < 0:
+            delay = k - half if estimate.verdict.level != "trusted" else -1
+    if estimate is None:
+        raise ValueError("a run of the census has no samples.")
+    verdict = estimate.verdict
+    kinds = about.kinds if about else ()
+    return Score(
+        score.problem,
+        score.fault,
+        score.stated,
+        score.level,
+        score.seed,
+        verdict.level,
+        _off(problem, scene, estimate),
+        _names(verdict, kinds, scene.subject) if kinds else None,
+        delay if late else None,
+        early,
+        verdict.sentences[0] if verdict.sentences else "",
+        trace(scene) if about and about.traced else np.nan,
+    )
+
+
+def _off(problem: Problem, scene: Scene, estimate: lp.Estimate) -> float:
+    """Return the largest error of an unknown in its standard deviations; of a field its mean."""
+    last, found = scene.length - 1, [0.0]
+    for label, latent in problem.latents.items():
+        space = estimate.space
+        if label not in space.labels and label not in space.fields:
+            continue
+        part = space.labels[label] if label in space.labels else space.part(label)
+        centre, low, high = (
+            latent.inverse(item) for item in (estimate.q[part], *estimate.interval(label))
+        )
+        half = 0.5 * (high - low) / 1.96
+        with np.errstate(invalid="ignore", divide="ignore"):
+            score = (centre - latent.value(scene.theta, last)) / half
+        found.append(float(np.sqrt(np.mean(score**2))))
+    return max(np.inf if np.isnan(score) else score for score in found)
+
+
+def _names(verdict: Verdict, kinds: Sequence[str], subject: str) -> bool:
+    """Return whether the right cause is among the first two of a finding."""
+
+    def right(finding: Finding) -> bool:
+        return any(
+            cause.kind in kinds and _same(cause.subject, subject)
+            for cause in finding.causes[:NAMED]
+        )
+
+    return any(right(finding) for finding in verdict.findings)
+
+
+def _same(named: str, subject: str) -> bool:
+    """Return whether a cause is of the subject; one of the whole process has none."""
+    return not subject or not named or named.split(",")[0].split("[")[0] == subject.split("[")[0]

@@ -1,0 +1,131 @@
+"""Which causes the verdict on a filter looks for, and by how much they have moved its estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from livepde.laws.base import Problem
+from livepde.laws.covariance import reported_factors
+from livepde.laws.filter import Filter
+from livepde.laws.filter_state import FilterState
+from livepde.laws.input_noise import input_rank
+from livepde.laws.members import changed, take
+from livepde.laws.reduction import Reduction
+from livepde.linalg import Array
+from livepde.verdict import WINDOWS, Dictionary, Finding, Judge, Position, Verdict, assess
+
+__all__ = ["judge_of", "judged"]
+
+
+def judge_of(
+    problem: Problem,
+    reduction: Reduction,
+    noise: Array,
+    verdict: bool | str,
+    rank: int,
+    *,
+    kept: bool,
+) -> Judge | None:
+    """Return the judge of a filter; None if there is to be none.
+
+    Parameters
+    ----------
+    verdict
+        As for `SensitivityLaw`.
+    rank
+        Rows of the square root at most.
+    kept
+        Whether the filter forgets nothing, so that a record of unknowns that stay makes sense.
+    """
+    if not verdict:
+        return None
+    still = kept and not (reduction.moves or problem.input_noise)
+    model = problem.model
+    dictionary = Dictionary(
+        model,
+        problem.observed,
+        noise,
+        reduction.stay,
+        dearer=verdict is True,
+        windows=len(WINDOWS),
+    )
+    sizes = problem.observed.size, reduction.size, model.X.dim
+    # Noise of inputs, and of the readings of the start, adds rows before they are compressed.
+    rows = rank + input_rank(problem) + len(problem.initial_readings)
+    return Judge(dictionary, *sizes, rows, still=still)
+
+
+def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict]:
+    """Return a function that gives the verdict on a member, and holds no more than that needs."""
+    judge = filter_.judge
+    if judge is None:
+        return lambda: Verdict.of((), ("innovations: verdict = False",))
+    if not x.ledger.seen[member]:
+        return lambda: Verdict.of([_unseen()])
+    x = changed(x, ledger=changed(x.ledger, process=x.ledger.process[:, :0]))
+
+    def found() -> Verdict:
+        one = take(x, member)
+        w, settled = judge.settled(one.ledger, one.causes)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            at = _position(filter_, replace(one, causes=w, ledger=settled))
+            return assess(judge.dictionary, at)
+
+    return found
+
+
+def _unseen() -> Finding:
+    return Finding("samples", "caution", "There are no samples: nothing to judge by.")
+
+
+def _position(filter_: Filter, x: FilterState) -> Position:
+    """Return where the estimates of one member stand."""
+    problem, reduction = filter_.problem, filter_.reduction
+    space, latent = problem.model.parameter_space, problem.model.latent
+    _, C = reported_factors(filter_, x)
+    std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
+    std = np.where(std > 0.0, std, np.inf)
+    moved = (reduction.Phi @ (x.C[0].T @ x.causes[0])) / std[:, None]  # (m, columns)
+    shape = (len(x.ledger.age[0]), -1)
+    found: dict[str, Array] = {}
+    for name, item in latent.parts.items():
+        rows = moved[item.part.start : item.part.start + item.size]
+        labels = [label for label in space.labels if label.split("[")[0] == name]
+        if len(labels) == len(rows):
+            found |= {label: row.reshape(shape) for label, row in zip(labels, rows, strict=True)}
+        else:
+            found[name] = np.sqrt((rows**2).mean(axis=0)).reshape(shape)
+    a = reduction.reduced(filter_.estimate(x) - latent.prior)[0]
+    names = [""] * reduction.size
+    for label, place in reduction.stay:
+        names[place] = label
+    return Position(
+        ledger=x.ledger,
+        member=0,
+        moved=found,
+        distance=_distance(reduction, x, a),
+        sensors=problem.observed.names,
+        noise=np.sqrt(x.level[0]) * filter_.noise,
+        unit=problem.observed.observation.unit,
+        time_unit=problem.model.time_unit,
+        unknowns=names,
+        moving=reduction.moves,
+    )
+
+
+def _distance(reduction: Reduction, x: FilterState, a: Array) -> tuple[float, int]:
+    """Return the squared distance of an estimate from its prior, and its degrees of freedom.
+
+    Over the directions that the data have told: there the estimate is distributed as the prior
+    less what is left of it, N(0, 1 - P).
+    """
+    if reduction.moves:
+        return 0.0, 0
+    left, axes = np.linalg.eigh(x.C[0].T @ x.C[0])
+    told = left < 0.5
+    along = axes.T @ a
+    squared = float((along[told] ** 2 / (1.0 - left[told])).sum())
+    return squared, int(told.sum())

@@ -1,0 +1,49 @@
+"""Verdict of a run on itself: trusted, caution or do not trust, with what speaks against it."""
+
+from livepde.verdict.assess import Position, assess
+from livepde.verdict.directions import Dictionary, Direction
+from livepde.verdict.findings import (
+    FLAT,
+    LEVELS,
+    MOST,
+    REFINE,
+    TELLING,
+    Cause,
+    Finding,
+    Severity,
+    Verdict,
+    at_bound,
+    discretised,
+    flat,
+    held_inputs,
+)
+from livepde.verdict.inputs import InputLedger
+from livepde.verdict.judge import Judge, Seen
+from livepde.verdict.ledger import WINDOWS, Ledger
+from livepde.verdict.withheld import WithheldLedger
+
+__all__ = [
+    "FLAT",
+    "LEVELS",
+    "MOST",
+    "REFINE",
+    "TELLING",
+    "WINDOWS",
+    "Cause",
+    "Dictionary",
+    "Direction",
+    "Finding",
+    "InputLedger",
+    "Judge",
+    "Ledger",
+    "Position",
+    "Seen",
+    "Severity",
+    "Verdict",
+    "WithheldLedger",
+    "assess",
+    "at_bound",
+    "discretised",
+    "flat",
+    "held_inputs",
+]

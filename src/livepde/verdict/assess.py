@@ -1,0 +1,386 @@
+"""From the ledger of one member to its verdict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.linalg import Array
+from livepde.verdict.directions import DRIFT, LAG, OFFSET, Dictionary, Direction
+from livepde.verdict.evidence import (
+    CAUSES,
+    RECORD,
+    CauseEvidence,
+    causes_of,
+    chance,
+    constancy,
+    disagreement,
+    following,
+    levels,
+    mean_squares,
+    quiet,
+)
+from livepde.verdict.findings import Cause, Finding, Severity, Verdict
+from livepde.verdict.ledger import Ledger
+
+__all__ = ["Position", "assess"]
+
+PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
+FEWEST = 20  # samples before which there is nothing to judge by
+LARGER = 1.5  # times the stated noise that is worth a note
+SMALLER = 0.5
+FAR = 3.0  # standard deviations between a sensor that stands still and its prediction
+REFUSED = 0.02  # share of the readings that a gate refuses
+MENDED = 128  # samples of a new window after which a fault may count as mended
+STANDS = 10  # equal readings in a row
+MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
+EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
+SEEN = 4.0  # standard errors of an amplitude from which it shows
+BEYOND = 2.0  # standard deviations of a shift beyond an interval
+UNSEEN = 3  # sentences on what is not seen
+NAMED = 4  # causes that are kept
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """Where the estimates of one member stand.
+
+    Attributes
+    ----------
+    ledger, member
+        The ledger, and which of its members.
+    moved
+        By how much each direction of each window has moved the estimate away from the truth, in
+        standard deviations that are reported: unknown -> (windows, directions).
+    distance
+        Squared distance of the estimate from the prior mean over what the prior and the data allow,
+        and its degrees of freedom.
+    sensors
+        Names of the sensors.
+    noise
+        Standard deviation of each, as stated.
+    unit, time_unit
+        Of the sensors and of the time.
+    unknowns
+        Label of each reduced unknown that stays.
+    moving
+        Whether unknowns move.
+    """
+
+    ledger: Ledger
+    member: int
+    moved: dict[str, Array]
+    distance: tuple[float, int]
+    sensors: Sequence[str]
+    noise: Array
+    unit: str
+    time_unit: str
+    unknowns: Sequence[str]
+    moving: bool
+
+
+def assess(dictionary: Dictionary, at: Position) -> Verdict:
+    """Return the verdict on one member."""
+    seen = int(at.ledger.seen[at.member])
+    if seen < FEWEST:
+        text = f"There are {seen} samples: too few to judge by."
+        few = Finding("samples", "caution", text, evidence=float(seen))
+        return Verdict.of([few], dictionary.left_out)
+    evidence = causes_of(at.ledger, at.member)
+    findings = list(_misfit(dictionary, at, evidence))
+    if not findings:
+        findings += _records(at, evidence)
+    findings += [*_noise(at), *_stuck(at), *_refused(at), *_prior(at)]
+    return Verdict.of(findings, dictionary.left_out, _unseen(dictionary, at))
+
+
+def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
+    """Return which errors of sensors would not show, and move an estimate beyond its interval.
+
+    One of less than `SEEN` standard errors is not seen, and none is larger than the amplitude of
+    its direction: what is usual.
+    """
+    den = at.ledger.sums[at.member, 1, 0].sum(axis=1)
+    hidden = np.minimum(SEEN / np.sqrt(np.maximum(den, 1e-300)), 1.0)
+    found = []
+    for d, direction in enumerate(dictionary.directions):
+        if direction.kind not in ("offset", "gain", "lag", "position"):
+            continue
+        for name, moved in at.moved.items():
+            shift = float(hidden[d] * abs(moved[0, d]))
+            if shift > BEYOND:
+                found.append((shift, d, name))
+    said = []
+    for shift, d, name in sorted(found, reverse=True)[:UNSEEN]:
+        text, remedy = _words(dictionary.directions[d], float(hidden[d]), at)
+        said.append(
+            f"If {text}, that is not seen, and moves {name} by {shift:.1f} standard "
+            f"deviations. {remedy}"
+        )
+    return said
+
+
+def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
+    """Return whether innovations go with a cause more than chance allows."""
+    limit = -math.log(CAUSES)
+    recent = _mended(at, evidence)
+    if evidence.total < limit:
+        yield from _following(at, -1 if recent else 0)
+        return
+    order = _ranked(evidence)
+    if recent and _recovered(at, evidence, order):
+        yield _past(at)
+        return
+    if evidence.whitened < limit:
+        worst = float(evidence.correlation.max(initial=0.0))
+        text = (
+            f"Successive errors follow each other (correlation up to {worst:.2f}), by which what "
+            "looks like a cause may be chance: the intervals are widened for it."
+        )
+        e = math.exp(min(evidence.total, 700.0))
+        yield Finding("following", "caution", text, evidence=e, measure="e-value")
+        return
+    causes = tuple(_cause(dictionary.directions[d], w, evidence, at, d) for w, d in order[:NAMED])
+    w, d = order[0]
+    shift = {name: float(moved[w, d] * evidence.size[w, d]) for name, moved in at.moved.items()}
+    grave = max((abs(size) for size in shift.values()), default=math.inf) >= MOVES
+    understood = evidence.share[w, d] >= EXPLAINED
+    text = (
+        "The model does not explain the data: what is left of the readings is not noise (one such "
+        f"run in {_many(evidence.whitened)} would look so by chance)."
+    )
+    yield Finding(
+        "misfit",
+        "do not trust" if grave or not understood else "caution",
+        text,
+        subject=causes[0].subject,
+        evidence=math.exp(min(evidence.whitened, 700.0)),
+        measure="e-value",
+        causes=causes,
+        shift=shift,
+    )
+
+
+def _mended(at: Position, evidence: CauseEvidence) -> bool:
+    """Return whether what speaks against the model is long past.
+
+    Nothing does in the windows that begin anew, neither in those of now nor, as long as the longest
+    of them is young, in the one before it.
+    """
+    ledger, k = at.ledger, at.member
+    if not ledger.epoch[k, -1] or not (ledger.sound[k] or ledger.age[k, -1] >= MENDED):
+        return False
+    return quiet(ledger, k, evidence.log_e)
+
+
+def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int, int]]) -> bool:
+    """Return whether no likely cause has left the estimate off by a standard deviation."""
+    limit = -math.log(CAUSES)
+    likely = [(w, d) for w, d in order if evidence.log_e[w, d] > limit] or list(order[:NAMED])
+    return all(
+        abs(float(moved[w, d] * evidence.size[w, d])) < MOVES
+        for w, d in likely
+        for moved in at.moved.values()
+    )
+
+
+def _past(at: Position) -> Finding:
+    count = int(at.ledger.age[at.member, -1])
+    text = (
+        f"The data did not fit the model earlier; in the last {count} samples nothing speaks "
+        "against it, and what was wrong moves no unknown by a standard deviation any more."
+    )
+    return Finding("past", "note", text, evidence=float(count))
+
+
+def _many(log_e: float) -> str:
+    return f"{math.exp(log_e):.0f}" if log_e < math.log(1e6) else "more than a million"
+
+
+def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
+    """Return window and number of the directions that tell something, the best first, each once.
+
+    Windows of different length are compared by the share of the whole run's evidence.
+    """
+    windows, directions = evidence.log_e.shape
+    best: dict[int, tuple[float, int]] = {}
+    for w in range(windows):
+        for d in range(directions):
+            value = float(evidence.log_e[w, d])
+            if value > best.get(d, (0.0, 0))[0]:
+                best[d] = value, w
+    order = sorted(best, key=lambda d: -best[d][0])
+    return [(best[d][1], d) for d in order] or [(0, 0)]
+
+
+def _cause(
+    direction: Direction, window: int, evidence: CauseEvidence, at: Position, number: int
+) -> Cause:
+    size, share = evidence.size[window, number], evidence.share[window, number]
+    text, remedy = _words(direction, float(size), at)
+    if window and direction.kind not in ("jump", "initial"):
+        text += f" in the last {int(at.ledger.age[at.member, window])} samples"
+    share = float(min(max(share, 0.0), 1.0))
+    return Cause(direction.kind, direction.subject, text, share, remedy)
+
+
+def _words(direction: Direction, size: float, at: Position) -> tuple[str, str]:
+    """Return a cause of a size, and its remedy, in words."""
+    name, amount = direction.subject, size * direction.size
+    if direction.kind in ("offset", "drift"):  # by the noise that was found, where that is so
+        amount = size * OFFSET * float(at.noise[list(at.sensors).index(name)])
+    unit = f" {direction.unit}" if direction.unit else ""
+    interval = float(at.ledger.times[at.member, 1])
+    time = f" {at.time_unit}" if at.time_unit else ""
+    typical, of = float(np.median(at.noise)), f" {at.unit}" if at.unit else ""
+    side = "above" if size > 0 else "below"
+    low = "high" if size < 0 else "low"
+    words = {
+        "offset": (
+            f"sensor {name} reads {abs(amount):.2g}{unit} too {'much' if size > 0 else 'little'}",
+            f"Free it: channels.{name}.offset.",
+        ),
+        "drift": (
+            f"sensor {name} drifts, by {amount / DRIFT:+.2g}{unit} a sample",
+            f"Calibrate {name}, or leave it out.",
+        ),
+        "gain": (
+            f"the scale of sensor {name} is {abs(100 * amount):.2g} % too "
+            f"{'large' if size > 0 else 'small'}",
+            f"Free it: channels.{name}.gain; and check its unit.",
+        ),
+        "lag": (
+            f"sensor {name} is {abs(size) * LAG * interval:.2g}{time} "
+            f"{'late' if size > 0 else 'early'}",
+            f"Check the clock, the averaging and the response time of {name}.",
+        ),
+        "position": (
+            f"sensor {name} sits {abs(amount):.2g} away from where it is said to be, towards "
+            f"{'larger' if size > 0 else 'smaller'} {'xyz'[direction.axis]}",
+            f"Free it: channels.{name}.at_std.",
+        ),
+        "jump": (
+            f"{name} has changed during the run",
+            "Let it: law.jumps = true, or an evolution of the unknown.",
+        ),
+        "boundary": (
+            f"boundary value {name} is {low} by {abs(size) * OFFSET * typical:.2g}{of}",
+            f"Check {name}: its unit, its place, its offset, and gaps in it.",
+        ),
+        "source": (
+            f"a {'source' if size > 0 else 'sink'} is missing in the model",
+            "Add a source to the process, or free one.",
+        ),
+        "loss": (
+            f"a loss to the surroundings is {'missing' if size > 0 else 'too large'} in the model",
+            "Add a loss term, or free it.",
+        ),
+        "flux": (
+            f"a flux {'into' if size > 0 else 'out of'} the process at boundary {name} is missing",
+            f"Check the boundary condition at {name}.",
+        ),
+        "channel": (
+            f"channel {name} is {abs(10 * size):.2g} % {'larger' if size > 0 else 'smaller'} than "
+            "the data say",
+            f"Check the scale and unit of {name}.",
+        ),
+        "initial": (
+            f"the initial state lies {side} the one that is stated",
+            'Let the first readings make it: initial = "interpolate".',
+        ),
+    }
+    return words[direction.kind]
+
+
+def _following(at: Position, window: int) -> Iterator[Finding]:
+    """Return whether successive errors of a sensor are correlated though no cause explains it."""
+    found = following(at.ledger, at.member, window)
+    if found is None:
+        return
+    name = at.sensors[found.sensor]
+    size = float(mean_squares(at.ledger, at.member)[window, found.sensor])
+    if at.moving and size < 1.0:
+        text = (
+            f"Successive errors of sensor {name} follow each other (correlation "
+            f"{found.correlation:.2f}) and are smaller than expected: with a noise that is stated "
+            "too large unknowns that move are followed late. The intervals are wide enough for it."
+        )
+        yield Finding("following", "note", text, name, found.p_value, "p-value")
+        return
+    text = (
+        f"Successive errors of sensor {name} follow each other (correlation "
+        f"{found.correlation:.2f}): something slow is not in the model, or the noise is not white. "
+        "The intervals are widened for it."
+    )
+    yield Finding("following", "caution", text, name, found.p_value, "p-value")
+
+
+def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
+    """Return whether the unknowns changed, and whether sensors disagree on them."""
+    rho = float(evidence.correlation.max(initial=0.0))
+    wider = (1.0 + rho) / (1.0 - rho)
+    severity: Severity = "caution" if _mended(at, evidence) else "do not trust"
+    change = constancy(at.ledger, at.member, wider)
+    if change is not None and change.p_value < RECORD:
+        name = at.unknowns[int(np.argmax(np.abs(change.change)))]
+        text = f"{name} has changed after {change.after:.0%} of the samples."
+        remedy = "Let it: law.jumps = true, or an evolution of the unknown."
+        cause = Cause("jump", name, f"{name} has changed during the run", remedy=remedy)
+        p = change.p_value
+        yield Finding("constancy", severity, text, name, p, "p-value", (cause,))
+    found = disagreement(at.ledger, at.member, wider)
+    if found is not None and found[0] < RECORD:
+        name = at.sensors[int(np.argmax(found[1]))]
+        text = f"The sensors disagree on the unknowns, {name} the most."
+        cause = Cause("position", name, f"sensor {name} is not where, or what, the case says")
+        yield Finding("disagreement", severity, text, name, found[0], "p-value", (cause,))
+
+
+def _noise(at: Position) -> Iterator[Finding]:
+    """Return notes on noise that is not as stated: intervals and tests do not depend on it."""
+    ratio = np.sqrt(levels(at.ledger, at.member)[0])
+    typical = float(np.median(ratio))
+    if typical > LARGER or typical < SMALLER:
+        text = f"The readings scatter by {typical:.2g} times the stated noise."
+        yield Finding("noise", "note", text, evidence=typical)
+
+
+def _stuck(at: Position) -> Iterator[Finding]:
+    ledger, k = at.ledger, at.member
+    off = np.abs(ledger.value[k] - ledger.last[k]) / at.noise
+    for i in np.flatnonzero((ledger.stuck[k] >= STANDS - 1) & (off > FAR)):
+        name, count = at.sensors[int(i)], int(ledger.stuck[k, i]) + 1
+        text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
+        cause = Cause("stuck", name, f"sensor {name} stands still", remedy=f"Look at {name}.")
+        yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
+
+
+def _refused(at: Position) -> Iterator[Finding]:
+    """Return whether the gate refuses more readings than a mishap now and then."""
+    shown, refused = at.ledger.shown[at.member]
+    share = refused.sum() / max(int(shown.sum()), 1)
+    if share <= REFUSED:
+        return
+    worst = int(np.argmax(refused / np.maximum(shown, 1)))
+    name = at.sensors[worst]
+    text = (
+        f"{share:.1%} of the readings were not used ({refused.sum()}, most of them of {name}): "
+        "they lie more than law.gate standard deviations from what was expected."
+    )
+    remedy = f"Look at {name}, state a larger noise, or open the gate."
+    yield Finding("refused", "caution", text, name, float(share), remedy=remedy)
+
+
+def _prior(at: Position) -> Iterator[Finding]:
+    squared, freedom = at.distance
+    p = chance(squared, freedom) if freedom else 1.0
+    if p < PRIOR:
+        text = (
+            f"The unknowns lie {math.sqrt(squared):.1f} prior standard deviations from their prior "
+            "mean, farther than it allows: the prior is too narrow, or a unit, a sensor or the "
+            "model is wrong."
+        )
+        yield Finding("prior", "caution", text, evidence=p, measure="p-value")

@@ -1,0 +1,239 @@
+"""Dictionary of causes: what a sensor or a process may do that the model does not know of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from livepde.linalg import Array, IntArray
+from livepde.model import Model
+from livepde.observation import Observed, Points
+from livepde.verdict.process import Process
+
+__all__ = ["Dictionary", "Direction"]
+
+OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
+DRIFT = 64.0  # ... a drift in so many samples
+GAIN = 0.1  # of the change of a sensor since the start
+LAG = 3.0  # samples
+SHIFT = 0.02  # of the length of the domain
+JUMP = 0.3  # prior standard deviations of an unknown
+MOST_JUMPS = 8  # coordinates of unknowns that may jump
+MOST_SUMS = 12_000  # numbers in one kind of sum
+MOST_DENSE = 10_000  # entries of a matrix that is cheaper when dense
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A possible cause with an amplitude of one.
+
+    Attributes
+    ----------
+    kind
+        "offset", "drift", "gain", "lag", "position", "jump", or that of a `Term`.
+    subject
+        Name of the sensor, channel, boundary or unknown.
+    size
+        The amplitude in its unit; NaN where that is not known beforehand.
+    unit
+        Of the size.
+    axis
+        Coordinate of a position.
+    """
+
+    kind: str
+    subject: str = ""
+    size: float = np.nan
+    unit: str = ""
+    axis: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Shifts:
+    """How readings change if sensors are shifted, as a matrix on the coefficients that matter.
+
+    Attributes
+    ----------
+    axes
+        Number of axes.
+    used, rows
+        Coefficients of the state, (m,), and the matrix of all axes one after the other, (axes *
+        sensors, m): dense where it has few columns.
+    """
+
+    axes: int
+    used: IntArray
+    rows: Any
+
+    @classmethod
+    def of(cls, shifts: Sequence[sp.csr_array]) -> Shifts:
+        """Return the value of the matrices of all axes, each (sensors, n)."""
+        rows = sp.csc_array(sp.vstack(shifts))
+        used = np.flatnonzero(np.diff(rows.indptr))
+        rows = rows[:, used]
+        dense = rows.shape[0] * rows.shape[1] <= MOST_DENSE
+        return cls(len(shifts), used, rows.toarray() if dense else sp.csr_array(rows))
+
+    def of_readings(self, u: Array) -> Array:
+        """Return the changes of readings with states u, (members, axes * sensors)."""
+        return np.asarray((self.rows @ u[:, self.used].T).T)
+
+
+class Dictionary:
+    """All directions of a model and its sensors.
+
+    Those of the sensors come first, each seen by its own sensor only; then jumps of unknowns, and
+    missing terms of the process.
+
+    Parameters
+    ----------
+    noise
+        Standard deviation of each sensor.
+    unknowns
+        Labels of the coordinates that may jump, each with its place.
+    dearer
+        With the directions that cost solves: terms that the process may lack.
+    windows
+        In how many windows sums are kept.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        observed: Observed,
+        noise: Array,
+        unknowns: list[tuple[str, int]],
+        *,
+        dearer: bool,
+        windows: int,
+    ) -> None:
+        sensors = observed.size
+        self.left_out: list[str] = []
+        self.process = Process(model, observed, float(np.median(noise))) if dearer else None
+        refused = Process.refused(model)
+        if not dearer:
+            self.left_out.append("missing sources, losses, boundary values (verdict = 'cheap')")
+        elif refused:
+            self.left_out.append(f"missing sources, losses, boundary values: {refused}")
+        terms = self.process.terms if self.process else []
+        position = _positions(model, observed)
+        jumps = unknowns[:MOST_JUMPS]
+        kinds = ["offset", "lag", *([] if position is None else ["position"]), "gain", "drift"]
+        fixed = len(jumps) + len(terms)
+        room = MOST_SUMS // (windows * sensors) - fixed
+        axes = 1 if position is None else len(position[0])
+        wide = {kind: sensors * (axes if kind == "position" else 1) for kind in kinds}
+        while kinds and sum(wide[kind] for kind in kinds) > room:
+            self.left_out.append(f"{kinds.pop()} of single sensors: there are {sensors}")
+        self.kinds = kinds
+        self.directions: list[Direction] = []
+        self.owner: list[int] = []  # sensor of each of the first directions
+        unit = observed.observation.unit
+        self.parts: dict[str, slice] = {}
+        for kind in kinds:
+            start = len(self.directions)
+            for axis in range(axes if kind == "position" else 1):
+                for k, name in enumerate(observed.names):
+                    size, of = np.nan, ""
+                    if kind in ("offset", "drift"):
+                        size, of = OFFSET * float(noise[k]), unit
+                    elif kind == "gain":
+                        size = GAIN
+                    elif kind == "position" and position is not None:
+                        size = position[1]
+                    self.directions.append(Direction(kind, name, size, of, axis))
+                    self.owner.append(k)
+            self.parts[kind] = slice(start, len(self.directions))
+        self.shifts: Shifts | None = None
+        if position is not None and "position" in kinds:
+            self.shifts = Shifts.of(position[0])
+        start = len(self.directions)
+        self.jumps = [place for _, place in jumps]
+        self.directions += [Direction("jump", label, JUMP) for label, _ in jumps]
+        self.parts["jump"] = slice(start, len(self.directions))
+        start = len(self.directions)
+        self.directions += [Direction(term.kind, term.subject) for term in terms]
+        self.parts["process"] = slice(start, len(self.directions))
+        self.own: IntArray = np.array(self.owner, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def moved(self, u: Array) -> Array:
+        """Return how readings change with shifts of their sensors, (members, axes * sensors)."""
+        if self.shifts is None:
+            return np.zeros((len(u), 0))
+        return self.shifts.of_readings(u)
+
+    def signals(
+        self, noise: Array, h: Array, first: Array, last: Array, share: Array, moved: Array
+    ) -> Array:
+        """Return what each direction of a sensor does to it, (samples, directions of sensors).
+
+        In units of the noise. That of a drift is its slope.
+
+        Parameters
+        ----------
+        noise
+            Shape (samples, sensors).
+        h, first, last
+            Predictions now, at the start and of the sample before, (samples, sensors).
+        share
+            Usual interval between samples over this one, (samples,).
+        moved
+            Shape (samples, axes * sensors).
+        """
+        samples, sensors = h.shape
+        parts: dict[str, Any] = {}
+        for kind in self.kinds:
+            if kind == "offset":
+                parts[kind] = np.full((samples, sensors), OFFSET)
+            elif kind == "drift":
+                parts[kind] = np.full((samples, sensors), OFFSET / DRIFT)
+            elif kind == "gain":
+                parts[kind] = GAIN * (h - first) / noise
+            elif kind == "lag":
+                rate = (last - h) * share[:, None]
+                parts[kind] = LAG * np.where(np.isfinite(rate), rate, 0.0) / noise
+            else:
+                parts[kind] = moved / np.tile(noise, moved.shape[1] // sensors)
+        if not parts:
+            return np.zeros((samples, 0))
+        return np.concatenate([parts[kind] for kind in self.kinds], axis=1)
+
+
+def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float] | None:
+    """Return how readings change if sensors are shifted along each axis, and by how much.
+
+    None for sensors that have no position, or an uncertain one that is estimated anyway.
+    """
+    observation = observed.observation
+    if not isinstance(observation, Points) or observation.position_std is not None:
+        return None
+    at = observation.positions
+    vertices = np.asarray(model.mesh.p)
+    low, high = vertices.min(axis=1), vertices.max(axis=1)
+    step = SHIFT * float((high - low).max())
+    block, _ = observed.state.component(observation.of)
+    found = []
+    for axis in range(at.shape[1]):
+        ends, width = [], np.zeros(len(at))
+        for sign in (-1.0, 1.0):
+            moved = at.copy()
+            moved[:, axis] = np.clip(moved[:, axis] + sign * step, low[axis], high[axis])
+            try:
+                rows = sp.csr_array(block.probe(moved.T, "sensor"))
+            except Exception:  # noqa: BLE001  outside of a mesh that is no box
+                moved = at.copy()
+                rows = sp.csr_array(block.probe(moved.T, "sensor"))
+            if rows.shape[0] != len(at):  # sensors of vectors, each with several readings
+                return None
+            ends.append(observed.state.widen(rows, observation.of))
+            width += sign * moved[:, axis]
+        scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))
+        found.append(sp.csr_array(scale @ (ends[1] - ends[0])))
+    return found, step

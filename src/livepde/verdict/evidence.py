@@ -1,0 +1,293 @@
+"""Evidence in a ledger: e-values of causes, and tests whose statistics are chi-square.
+
+The e-value of a direction is the Bayes factor of its amplitude, free with a normal prior of size
+one, against zero, with the noise level integrated out. Under white errors of any size it is a
+martingale that begins at one, and so is a mean of several: the probability that it ever exceeds
+1/alpha is at most alpha, for any number of looks (Ville 1939; Robbins 1970; Vovk and Wang 2021).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from livepde.linalg import Array
+from livepde.verdict.ledger import BLOCKS, Ledger
+
+__all__ = [
+    "ALPHA",
+    "CAUSES",
+    "RECORD",
+    "CauseEvidence",
+    "Constancy",
+    "Following",
+    "causes_of",
+    "chance",
+    "constancy",
+    "disagreement",
+    "following",
+    "levels",
+    "mean_squares",
+    "quiet",
+]
+
+ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
+CAUSES = 0.5 * ALPHA  # for the e-value of all directions
+RECORD = 0.05 * ALPHA  # for each test of the record of the unknowns, and of following errors
+FOLLOWING = 0.2  # correlation of successive errors that is worth a word
+
+NU = 10.0  # degrees of freedom of the prior of the noise level
+TRUSTED_LEVEL = 20.0  # samples for which the level of all of the run counts in a window
+MOST_CORRELATED = 0.98
+LEAST = 0.05  # share of the information on each side of a change that is looked for
+LEAST_SHARE = 1e-6  # of the information in the largest direction, below which nothing is told
+
+
+@dataclass(frozen=True, eq=False)
+class CauseEvidence:
+    """Evidence of every direction in every window, shapes (windows, directions).
+
+    Attributes
+    ----------
+    log_e, size
+        Logarithm of the e-value, and the amplitude that fits best.
+    share
+        Part of the misfit beyond the noise that the direction explains.
+    total, whitened
+        Logarithm of the mean e-value, as it is, and with errors that follow each other taken out.
+    correlation
+        Of successive errors of each sensor, once the largest direction is free, (sensors,).
+    """
+
+    log_e: Array
+    size: Array
+    share: Array
+    total: float
+    whitened: float
+    correlation: Array
+
+
+def levels(ledger: Ledger, member: int = 0) -> Array:
+    """Return the variance of each sensor's noise in each window, in units of the stated one.
+
+    From successive differences of the whitened innovations (von Neumann 1941), so that slow misfit
+    does not count: shape (windows, sensors).
+    """
+    count, _, squares, products, pairs = ledger.noise[member]
+    del count
+    # Half of the squared differences: the ends of a window hardly count.
+    differences = np.maximum(squares - products, 0.0)
+    whole = (differences[0] + NU) / (pairs[0] + NU)
+    found: Array = (differences + TRUSTED_LEVEL * whole) / (pairs + TRUSTED_LEVEL)
+    return found
+
+
+def chance(statistic: float, freedom: int) -> float:
+    """Return the probability of a larger value of the chi-square distribution."""
+    return float(scipy.special.gammaincc(0.5 * freedom, 0.5 * statistic))
+
+
+def mean_squares(ledger: Ledger, member: int = 0) -> Array:
+    """Return mean squares of the whitened innovations, 1 if as stated, (windows, sensors)."""
+    count, _, squares, *_ = ledger.noise[member]
+    found: Array = squares / np.maximum(count, 1.0)
+    return found
+
+
+def causes_of(ledger: Ledger, member: int = 0) -> CauseEvidence:
+    """Return the evidence of all directions of one member."""
+    sums, noise = ledger.sums[member], ledger.noise[member]
+    spread = levels(ledger, member)
+    log_e, size, share = _tested(sums, noise, spread, np.zeros_like(spread))
+    weights = _weights(ledger, member, log_e.shape[1])
+    total = float(scipy.special.logsumexp(log_e + weights)) if log_e.size else 0.0
+    rho, left = _left(sums, noise, log_e, size)
+    white, _, _ = _tested(sums, noise, left, rho)
+    whitened = float(scipy.special.logsumexp(white + weights)) if white.size else 0.0
+    return CauseEvidence(log_e, size, share, total, min(total, whitened), rho[0])
+
+
+class Following(NamedTuple):
+    """Sensor whose successive errors follow each other: its number, their correlation, p-value."""
+
+    sensor: int
+    correlation: float
+    p_value: float
+
+
+def following(ledger: Ledger, member: int, window: int) -> Following | None:
+    """Return the sensor whose successive errors are correlated most, None if by chance."""
+    _, _, squares, products, pairs = ledger.noise[member][:, window]
+    rho = products / np.maximum(squares, 1e-300)
+    z = rho * np.sqrt(np.maximum(pairs, 1.0))
+    worst = int(np.argmax(z))
+    p = min(1.0, 0.5 * math.erfc(float(z[worst]) / math.sqrt(2.0)) * len(z))
+    if p > RECORD or rho[worst] < FOLLOWING:
+        return None
+    return Following(worst, float(rho[worst]), p)
+
+
+def quiet(ledger: Ledger, member: int, log_e: Array) -> bool:
+    """Return whether nothing speaks against the model in the windows that begin anew.
+
+    Parameters
+    ----------
+    log_e
+        Of all windows and directions.
+    """
+    if log_e.size:
+        each = scipy.special.logsumexp(log_e[1:], axis=1) - np.log(log_e.shape[1])
+        if not (each < -np.log(CAUSES)).all():
+            return False
+    return following(ledger, member, -1) is None
+
+
+def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array, Array, Array]:
+    """Return log e-values, sizes and shares of misfit of all directions.
+
+    Parameters
+    ----------
+    spread, rho
+        Variance and correlation of successive errors, (windows, sensors).
+    """
+    num, den, cross, lagged = sums
+    count, _, squares, products, _ = noise
+    now = ((1.0 + rho**2) / spread)[:, None]
+    before = (rho / spread)[:, None]
+    num = (num * now - cross * before).sum(axis=2)
+    den = np.maximum((den * now - 2.0 * lagged * before).sum(axis=2), 0.0)
+    rss = ((squares * (1.0 + rho**2) - 2.0 * rho * products) / spread).sum(axis=1)
+    rss = np.maximum(rss, 0.0)[:, None]
+    total = count.sum(axis=1)[:, None]
+    k = 1.0 / (1.0 + den)
+    gained = np.minimum(num**2 * k / (NU + rss), 1.0 - 1e-12)
+    log_e = 0.5 * np.log(k) - 0.5 * (NU + total) * np.log1p(-gained)
+    log_e = np.where(np.isfinite(log_e), log_e, 0.0)
+    size = num / np.where(den > 0.0, den, np.inf)
+    excess = np.maximum(rss - total, num * size)
+    share = num * size / np.where(excess > 0.0, excess, np.inf)
+    return log_e, size, share
+
+
+def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, Array]:
+    """Return correlation and variance of what the largest direction of each window leaves."""
+    _, _, squares, products, pairs = noise
+    count = noise[0]
+    if log_e.size:
+        rows, best = np.arange(len(log_e)), log_e.argmax(axis=1)
+        theta = size[rows, best][:, None]
+        num, den, cross, lagged = (part[rows, best] for part in sums)
+        squares = np.maximum(squares - 2.0 * theta * num + theta**2 * den, 0.0)
+        products = products - theta * cross + theta**2 * lagged
+    rho = (products / np.maximum(squares, 1e-300)) * pairs / (pairs + NU)
+    rho = np.clip(rho, 0.0, MOST_CORRELATED)
+    white = (1.0 + rho**2) * squares - 2.0 * rho * products
+    return rho, (np.maximum(white, 0.0) + NU) / (count + NU)
+
+
+def _weights(ledger: Ledger, member: int, directions: int) -> Array:
+    """Return logarithms of the prior weights of all directions, (windows, directions).
+
+    Half for the window of all samples; the other windows share the rest, and each spends of it the
+    less the more often it has begun anew, 1/((n + 1)(n + 2)), so that the sum is one at most.
+    """
+    epoch = ledger.epoch[member].astype(float)
+    windows = len(epoch)
+    share = np.full(windows, 0.5 / max(windows - 1, 1)) / ((epoch + 1.0) * (epoch + 2.0))
+    share[0] = 0.5
+    found: Array = np.log(share)[:, None] - np.log(max(directions, 1)) + np.zeros((1, directions))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Constancy:
+    """Test of whether the unknowns stayed: sup-LM on the cumulated scores (Andrews 1993).
+
+    Attributes
+    ----------
+    p_value
+        At most that, by the union bound over the places of the change.
+    after
+        Share of the samples before the most likely change.
+    change
+        How far the unknowns are apart on both sides of it, in prior standard deviations, (k,).
+    """
+
+    p_value: float
+    after: float
+    change: Array
+
+
+def _record(ledger: Ledger, member: int, wider: float) -> tuple[Array, Array]:
+    """Return score, (blocks, sensors, k), and information in units of the noise that was found."""
+    spread = levels(ledger, member)[0] * wider
+    score = ledger.score[member] / spread[:, None]
+    return score, ledger.information[member] / spread[:, None, None]
+
+
+def _inverse(F: Array) -> tuple[Array, int]:
+    """Return the pseudo-inverse of an information, and in how many directions it tells at all."""
+    values, axes = np.linalg.eigh(F)
+    told = values > LEAST_SHARE * max(float(values[-1]), 1.0)
+    inverse = (axes[:, told] / values[told]) @ axes[:, told].T
+    return inverse, int(told.sum())
+
+
+def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy | None:
+    """Return the test of whether the unknowns stayed; None without a record.
+
+    `wider` is by how much a mean of correlated errors varies more than one of independent errors.
+    """
+    score, information = (part.sum(axis=1) for part in _record(ledger, member, wider))
+    k = score.shape[1]
+    used = int(ledger.seen[member] - 1) // int(ledger.length[member]) + 1
+    if not k or used < 4:
+        return None
+    F, B = information.cumsum(axis=0), score.cumsum(axis=0)
+    inverse, rank = _inverse(F[-1])
+    if not rank:
+        return None
+    best, at, change, looks = -1.0, 0, np.zeros(k), 0
+    for j in range(min(used, BLOCKS) - 1):
+        before = float(np.trace(inverse @ F[j])) / rank
+        if not LEAST < before < 1.0 - LEAST:
+            continue
+        looks += 1
+        c = B[j] - F[j] @ inverse @ B[-1]
+        A, _ = _inverse(F[j] - F[j] @ inverse @ F[j])
+        statistic = float(c @ A @ c)
+        if statistic > best:
+            # A step d after the change leaves the score c = -(F_j - F_j F^-1 F_j) d.
+            best, at, change = statistic, j, -A @ c
+    if not looks:
+        return None
+    p = min(1.0, looks * chance(best, rank))
+    after = (at + 1) * int(ledger.length[member]) / int(ledger.seen[member])
+    return Constancy(p, min(after, 1.0), change)
+
+
+def disagreement(ledger: Ledger, member: int = 0, wider: float = 1.0) -> tuple[float, Array] | None:
+    """Return p-value and share of each sensor of the test of whether sensors agree; None without.
+
+    Q = sum_i Bp_i^T F_i^+ Bp_i, Bp_i = B_i - F_i F^-1 sum B: the heterogeneity of what each sensor
+    alone says of the unknowns (Cochran 1954), chi-square under the model.
+    """
+    score, information = (part.sum(axis=0) for part in _record(ledger, member, wider))
+    sensors, k = score.shape
+    if sensors < 2 or not k:
+        return None
+    inverse, rank = _inverse(information.sum(axis=0))
+    each, freedom = np.zeros(sensors), -rank
+    for i in range(sensors):
+        own, told = _inverse(information[i])
+        left = score[i] - information[i] @ inverse @ score.sum(axis=0)
+        each[i] = left @ own @ left
+        freedom += told
+    if freedom < 1:
+        return None
+    total = float(each.sum())
+    return chance(total, freedom), each / max(total, 1e-300)

@@ -1,0 +1,304 @@
+"""What a verdict says: its level, and findings with evidence, causes, remedy and consequence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+__all__ = [
+    "FLAT",
+    "LEVELS",
+    "MOST",
+    "REFINE",
+    "TELLING",
+    "Cause",
+    "Finding",
+    "Level",
+    "Severity",
+    "Verdict",
+    "at_bound",
+    "discretised",
+    "flat",
+    "held_inputs",
+]
+
+Level: TypeAlias = Literal["trusted", "caution", "do not trust"]
+Severity: TypeAlias = Literal["note", "caution", "do not trust"]
+Measure: TypeAlias = Literal["e-value", "p-value", "number"]
+
+LEVELS: tuple[Level, ...] = ("trusted", "caution", "do not trust")
+RANK = {"note": 0, "trusted": 0, "caution": 1, "do not trust": 2}
+FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly anything
+TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
+MOST = 5  # findings that are said unasked
+SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+DECIDES = 5.0  # the same, from which the interval is little else
+SETTING = 1.0  # the same if inputs are readings: no interval holds that
+REFINE = {
+    "step": (
+        "the time step",
+        "Take a smaller dt_max (steps.dt_max), or a scheme of second order.",
+    ),
+    "mesh": ("the mesh", "Take more elements, where the state bends most."),
+    "input": (
+        "the straight lines between readings of the input channels",
+        "Read these channels more often.",
+    ),
+}
+"""Kind of a discretisation error -> its name, and the remedy."""
+LARGEST = 1e99  # evidence beyond is written as that
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause that would explain a finding.
+
+    Attributes
+    ----------
+    kind, subject
+        What is wrong ("offset", "lag", "position", "gain", "drift", "jump", "boundary", "source",
+        "loss", "flux", "initial"), and of which sensor, channel, boundary or unknown.
+    text
+        The same in words, with its size.
+    share
+        Part of the misfit beyond the noise that it explains, 0 to 1; NaN if not known.
+    remedy
+        What to do, with the line of the case that would test it.
+    """
+
+    kind: str
+    subject: str
+    text: str
+    share: float = math.nan
+    remedy: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the cause as JSON can hold it."""
+        share = None if math.isnan(self.share) else self.share
+        return {
+            "kind": self.kind,
+            "subject": self.subject,
+            "text": self.text,
+            "share": share,
+            "remedy": self.remedy,
+        }
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that speaks against the estimates.
+
+    Attributes
+    ----------
+    what
+        Name of the test, such as "misfit", "constancy", "withheld", "prior" or "stuck".
+    severity
+        "note" (worth knowing), "caution" or "do not trust".
+    text
+        What was found, as a sentence.
+    subject
+        The unknown or sensor concerned; empty for the whole run.
+    evidence, measure
+        A number, and whether it is an e-value, a p-value or the number itself.
+    causes
+        Likely causes, the likeliest first.
+    remedy
+        What to do.
+    shift
+        Unknown -> by how many of its standard deviations the estimate would move if the first
+        cause were taken into account.
+    """
+
+    what: str
+    severity: Severity
+    text: str
+    subject: str = ""
+    evidence: float = math.nan
+    measure: Measure = "number"
+    causes: tuple[Cause, ...] = ()
+    remedy: str = ""
+    shift: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def sentence(self) -> str:
+        """The finding with its causes, consequence and remedy, in plain English."""
+        parts = [self.text]
+        if self.causes:
+            first, *others = self.causes
+            share = "" if math.isnan(first.share) else f" (explains {first.share:.0%} of it)"
+            parts.append(f"Most likely {first.text}{share}.")
+            if others:
+                share = "" if math.isnan(others[0].share) else f" ({others[0].share:.0%})"
+                parts.append(f"Else {others[0].text}{share}.")
+        moved = [(name, size) for name, size in self.shift.items() if abs(size) >= 0.5]
+        if moved:
+            each = [f"{name} by {size:+.1f}" for name, size in moved[:3]]
+            parts.append(f"That would move {', '.join(each)} standard deviations.")
+        remedy = self.remedy or (self.causes[0].remedy if self.causes else "")
+        if remedy:
+            parts.append(remedy)
+        return " ".join(parts)
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
+        """Return the finding that `to_dict` has written."""
+        own = {name: value for name, value in stored.items() if name != "sentence"}
+        causes = tuple(Cause(**{**item, "share": _number(item["share"])}) for item in own["causes"])
+        return cls(**{**own, "causes": causes, "evidence": _number(own["evidence"])})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as JSON can hold it."""
+        evidence = None if math.isnan(self.evidence) else min(self.evidence, LARGEST)
+        return {
+            "what": self.what,
+            "severity": self.severity,
+            "subject": self.subject,
+            "text": self.text,
+            "evidence": evidence,
+            "measure": self.measure,
+            "causes": [cause.to_dict() for cause in self.causes],
+            "remedy": self.remedy,
+            "shift": {name: float(size) for name, size in self.shift.items()},
+            "sentence": self.sentence,
+        }
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def at_bound(label: str, value: float) -> Finding:
+    """Return the finding of an unknown that ends at a bound."""
+    text = f"{label} ends at its bound {value:g}: the bound decides, not the data."
+    return Finding("bound", "caution", text, label, value)
+
+
+def flat(label: str, left: float) -> Finding:
+    """Return the finding of an unknown of which the data have told hardly anything."""
+    text = (
+        f"{label}: the data have told hardly anything, {left:.0%} of its prior standard deviation "
+        "is left."
+    )
+    return Finding("flat", "caution", text, label, left, remedy=TELLING)
+
+
+def discretised(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[Finding]:
+    """Return whether the discretisation has shifted the unknowns, and by what.
+
+    Parameters
+    ----------
+    notes
+        Of an estimate: `discretisation_shift`, and for each kind `step_shift` and `k_step_shift`.
+    labels
+        Of the unknown numbers.
+    """
+    total = notes.get("discretisation_shift", math.nan)
+    sizes = {kind: abs(notes[f"{kind}_shift"]) for kind in REFINE if f"{kind}_shift" in notes}
+    if not total > SHIFTED or not sizes:
+        return
+    kind = max(sizes, key=lambda kind: sizes[kind])
+    what, remedy = REFINE[kind]
+    moved = {label: notes.get(f"{label}_{kind}_shift", math.nan) for label in labels}
+    parts = [f"{label} by {size:+.2g}" for label, size in moved.items() if math.isfinite(size)]
+    by = f" ({', '.join(parts[:MOST])})" if parts else ""
+    text = (
+        f"The discretisation has shifted the unknowns by {total:.1f} standard deviations, and most "
+        f"of it is {what}{by}. The intervals were widened by that."
+    )
+    severity: Severity = "caution" if total > DECIDES else "note"  # the interval holds it
+    yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
+
+
+def held_inputs(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[Finding]:
+    """Return whether inputs that are held as settings would matter if they were readings.
+
+    Parameters
+    ----------
+    notes
+        Of an estimate: `hold_shift`, and `k_hold_shift`.
+    """
+    total = abs(notes.get("hold_shift", math.nan))
+    if not total > SETTING:
+        return
+    moved = {label: -notes.get(f"{label}_hold_shift", math.nan) for label in labels}
+    parts = [f"{label} by {size:+.2g}" for label, size in moved.items() if math.isfinite(size)]
+    by = f" ({', '.join(parts[:MOST])})" if parts else ""
+    text = (
+        "Inputs are held from sample to sample (hold), but change as smoothly as readings do: as "
+        f"straight lines they would move the unknowns by {total:.1f} standard deviations{by}. The "
+        "intervals do not hold that."
+    )
+    remedy = "Leave out hold, unless these inputs are settings that change in steps."
+    yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the estimates of a run are to be believed.
+
+    Attributes
+    ----------
+    level
+        "trusted", "caution" or "do not trust".
+    findings
+        What speaks against them, the worst first, and notes.
+    untested
+        What was not tested, and why.
+    unseen
+        Errors that the data would not show and that would yet move an estimate by more than its
+        interval, as sentences, the worst first.
+    """
+
+    level: Level
+    findings: tuple[Finding, ...] = ()
+    untested: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        findings: Iterable[Finding],
+        untested: Iterable[str] = (),
+        unseen: Iterable[str] = (),
+    ) -> Verdict:
+        """Return the verdict of some findings: the worst of them counts."""
+        ordered = sorted(findings, key=lambda finding: -RANK[finding.severity])
+        worst = max((RANK[finding.severity] for finding in ordered), default=0)
+        untested = tuple(dict.fromkeys(untested))
+        return cls(LEVELS[worst], tuple(ordered), untested, tuple(unseen))
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Verdict:
+        """Return the verdict that `to_dict` has written."""
+        findings = [Finding.from_dict(item) for item in stored["findings"]]
+        return cls.of(findings, stored["untested"], stored["unseen"])
+
+    @classmethod
+    def unjudged(cls) -> Verdict:
+        """Return the verdict where nothing was looked at."""
+        return cls.of((), ("everything: no law has judged the run",))
+
+    def with_findings(self, more: Iterable[Finding]) -> Verdict:
+        """Return the verdict with more findings; one that says the same is not said twice."""
+        said = {finding.text for finding in self.findings}
+        new = [finding for finding in more if finding.text not in said]
+        return Verdict.of([*self.findings, *new], self.untested, self.unseen)
+
+    @property
+    def sentences(self) -> list[str]:
+        """At most five sentences, the worst first, each once."""
+        return list(dict.fromkeys(finding.sentence for finding in self.findings))[:MOST]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as JSON can hold it."""
+        return {
+            "level": self.level,
+            "findings": [finding.to_dict() for finding in self.findings],
+            "untested": list(self.untested),
+            "unseen": list(self.unseen),
+        }
+
+    def __str__(self) -> str:
+        return "\n".join([self.level, *(f"- {text}" for text in self.sentences)])

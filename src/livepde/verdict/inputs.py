@@ -1,0 +1,84 @@
+"""Count of input values that were held because a sample had none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.linalg import Array, IntArray
+from livepde.verdict.findings import Finding
+
+__all__ = ["InputLedger"]
+
+HELD = 0.02  # share of the samples in which the last value of an input was held
+
+
+@dataclass(frozen=True, eq=False)
+class InputLedger:
+    """Gaps of the input channels so far.
+
+    Attributes
+    ----------
+    counts
+        Number of samples, and of those in which each channel was held, shape (1 + channels,).
+    held
+        Time for which each channel has been held by now, shape (channels,); 0 if it has a value.
+    """
+
+    counts: IntArray
+    held: Array
+
+    @classmethod
+    def start(cls, channels: int) -> InputLedger:
+        """Return the value before any sample."""
+        return cls(np.zeros(1 + channels, dtype=np.int64), np.zeros(channels))
+
+    def add(self, length: float, missing: Array) -> InputLedger:
+        """Return the value after an interval; `missing`: 1 for channels that are held at its end.
+
+        The interval in which a channel has a value again is no gap: there the value changes.
+        """
+        counts = self.counts + np.append(1, missing).astype(np.int64)
+        return InputLedger(counts, (self.held + length) * missing)
+
+    def gaps(self, names: Sequence[str], missing: Array) -> dict[str, float]:
+        """Return the channels that have a value again, and for how long they were held."""
+        ended = (self.held > 0.0) & (missing == 0.0)
+        return {names[k]: float(self.held[k]) for k in np.flatnonzero(ended).tolist()}
+
+    def findings(
+        self, names: Sequence[str], notes: Mapping[str, float], labels: Sequence[str]
+    ) -> Iterator[Finding]:
+        """Return which channels were held in more than 2 % of the samples.
+
+        Parameters
+        ----------
+        notes
+            Of the estimate, with the shift of each unknown by its inputs: `k_input_shift`.
+        labels
+            Of the unknown numbers.
+        """
+        samples = max(int(self.counts[0]), 1)
+        shifts = {
+            label: notes[f"{label}_input_shift"]
+            for label in labels
+            if f"{label}_input_shift" in notes
+        }
+        by = ", ".join(f"{label} by {-size:+.2g}" for label, size in shifts.items())
+        moved = (
+            f" With straight lines across the gaps the estimates would move: {by}."
+            if by
+            else " By how much that moves the estimates is not known."
+        )
+        for name, count in zip(names, self.counts[1:].tolist(), strict=True):
+            share = count / samples
+            if share <= HELD:
+                continue
+            text = (
+                f"Channel {name} had no value in {count} of {samples} samples, and its last one "
+                f"was held.{moved}"
+            )
+            remedy = f"Interpolate {name} where the next value is known, or read it more often."
+            yield Finding("input", "caution", text, name, share, remedy=remedy)

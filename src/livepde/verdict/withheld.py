@@ -1,0 +1,125 @@
+"""Running sums of sensors that are never assimilated, against what is predicted of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from livepde.linalg import Array
+from livepde.verdict.evidence import chance
+from livepde.verdict.findings import Cause, Finding
+
+__all__ = ["WithheldLedger"]
+
+FEWEST = 20  # values before which there is nothing to judge by
+CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
+SIMILAR = 0.05  # relative difference of a slope to that of a unit
+UNITS = (
+    ("degF", "degC", 1.8, 32.0),
+    ("degC", "degF", 1.0 / 1.8, -32.0 / 1.8),
+    ("K", "degC", 1.0, 273.15),
+    ("degC", "K", 1.0, -273.15),
+)
+"""Unit that a sensor may have, the one that it is taken for, slope and intercept of that."""
+
+
+@dataclass(frozen=True, eq=False)
+class WithheldLedger:
+    """Sums over the values of each withheld sensor, in constant memory.
+
+    Attributes
+    ----------
+    sums
+        Shape (9, sensors): number of values and of successive pairs; sums of half the squared
+        difference of those, of squared errors, errors, predictions p, p p, p z, and of the variance
+        that is predicted.
+    last
+        Last error of each sensor, shape (sensors,); NaN before.
+    """
+
+    sums: Array
+    last: Array
+
+    @classmethod
+    def start(cls, sensors: int) -> WithheldLedger:
+        """Return the value before any sample."""
+        return cls(np.zeros((9, sensors)), np.full(sensors, np.nan))
+
+    def add(self, z: Array, predicted: Array, variance: Array) -> WithheldLedger:
+        """Return the value after a sample; z is NaN where missing.
+
+        Parameters
+        ----------
+        variance
+            Of the prediction, without noise, shape (sensors,).
+        """
+        error = z - predicted
+        seen = np.isfinite(error)
+        if not seen.any():
+            return replace(self, last=np.full_like(self.last, np.nan))
+        step = error - self.last
+        pair = np.isfinite(step)
+        rows = np.array(
+            [
+                np.ones_like(z),
+                pair,
+                np.where(pair, 0.5 * step**2, 0.0),
+                error**2,
+                error,
+                predicted,
+                predicted**2,
+                predicted * z,
+                variance,
+            ],
+            dtype=float,
+        )
+        return WithheldLedger(self.sums + np.where(seen, rows, 0.0), np.where(seen, error, np.nan))
+
+    def findings(self, names: Sequence[str]) -> Iterator[Finding]:
+        """Return which sensors are missed by more than prediction and noise allow.
+
+        The errors of one sensor go together as far as they come from the unknowns: so their mean
+        square over what is predicted counts as one draw of chi-square. The noise is what successive
+        differences show.
+        """
+        for k, name in enumerate(names):
+            count, pairs, differences, squares, errors, *_, variance = self.sums[:, k]
+            if count < FEWEST:
+                continue
+            noise = differences / max(pairs, 1.0)
+            expected = noise + variance / count
+            ratio = squares / count / max(expected, 1e-300)
+            p = min(1.0, chance(ratio, 1) * len(names))
+            if p > CHANCE:
+                continue
+            size, mean = math.sqrt(squares / count), errors / count
+            text = (
+                f"Withheld sensor {name} is missed by {size:.2g} (mean {mean:+.2g}), "
+                f"{math.sqrt(ratio):.1f} times what prediction and noise allow."
+            )
+            cause = self._unit(k, name) or Cause(
+                "withheld",
+                name,
+                f"the model does not hold at {name}, or its place or calibration is wrong",
+                remedy=f"Look at {name}, or assimilate it: role = 'sensor'.",
+            )
+            yield Finding("withheld", "do not trust", text, name, p, "p-value", (cause,))
+
+    def _unit(self, k: int, name: str) -> Cause | None:
+        """Return the cause that a sensor has another unit, if its values say so."""
+        count, _, _, _, errors, p, pp, pz, _ = self.sums[:, k]
+        mean_p, mean_z = p / count, (errors + p) / count
+        spread = pp / count - mean_p**2
+        if not spread > 0.0:
+            return None
+        slope = (pz / count - mean_p * mean_z) / spread
+        rest = max(math.sqrt(spread), 1e-300)
+        for unit, taken, scale, origin in UNITS:
+            off = abs(mean_z - (scale * mean_p + origin))
+            if abs(slope / scale - 1.0) < 4.0 * SIMILAR and off < rest:
+                text = f"{name} is in {unit} and taken for {taken}"
+                return Cause("unit", name, text, remedy=f'Say so: channels.{name}.unit = "{unit}".')
+        return None

@@ -1,0 +1,343 @@
+"""A run judges itself: what speaks against it is found, named, and said no louder than it is."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.errors import LawError
+from livepde.runs import doubts, verdict
+from livepde.verdict import LEVELS, Finding, Verdict, WithheldLedger, discretised
+
+TIMES = np.linspace(0.0, 8.0, 161)
+NOISE = 0.02
+PLACES = {"A": 0.25, "B": 0.5, "C": 0.75}
+ENDS = {"left": lp.Channel("T_left"), "right": 0.0}
+
+
+def rod(loss: float = 0.0) -> lp.Model:
+    """Return heat conduction between a measured end and one at zero, with an unknown k."""
+    mesh = lp.interval(0.0, 1.0, 24)
+    return lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet=ENDS),
+        {"k": lp.Scalar(0.1, std=0.03, transform="log")},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: loss * u * v,
+    )
+
+
+def driven(t: Any) -> Any:
+    return np.sin(2.1 * t) + 0.3 * np.sin(7.0 * t)
+
+
+@cache
+def shown(
+    k: float = 0.13,
+    loss: float = 0.0,
+    places: tuple[float, ...] = (0.25, 0.5, 0.75),
+    count: int = len(TIMES),
+) -> Any:
+    """Return what sensors show: method of lines on a finer grid, steps by the matrix exponential.
+
+    A code of its own: central differences on 160 cells, and the input as a staircase of 20 steps
+    for each sample.
+    """
+    from scipy.linalg import expm
+
+    cells, parts = 160, 20
+    h, dt = 1.0 / cells, (TIMES[1] - TIMES[0]) / parts
+    n = cells - 1
+    D = k / h**2 * (np.diag(np.ones(n - 1), -1) - 2 * np.eye(n) + np.diag(np.ones(n - 1), 1))
+    D -= loss * np.eye(n)
+    source = np.zeros(n)
+    source[0] = k / h**2
+    E = expm(D * dt)
+    once = np.linalg.solve(D, E @ source - source)
+    u, rows = np.zeros(n), []
+    at = [round(p * cells) - 1 for p in places]
+    for t in (TIMES[1] * np.arange(count)).tolist():
+        rows.append(u[at])
+        for part in range(parts):
+            u = E @ u + once * driven(t + (part + 0.5) * dt)
+    return np.array(rows)
+
+
+def errors(seed: int = 1) -> Any:
+    return NOISE * np.random.default_rng(seed).standard_normal((len(TIMES), len(PLACES)))
+
+
+def run(
+    z: Any, *, stated: float = 1.0, law: Any = None, places: Any = None, withheld: Any = None
+) -> tuple[lp.Identifier, lp.Estimate]:
+    """Return identifier and last estimate of a run with some readings."""
+    sensors = lp.Points(places or PLACES, noise=NOISE * stated, unit="degC")
+    law = law or lp.SensitivityLaw()
+    identifier = lp.Identifier(rod(), sensors, law, u0=0.0, withheld=withheld)
+    estimate: Any = None
+    for k, t in enumerate(TIMES.tolist()):
+        readings = z[k] if not isinstance(z, dict) else {name: z[name][k] for name in z}
+        estimate = identifier.step(t, readings, {"T_left": driven(t)})
+    return identifier, estimate
+
+
+def named(found: Verdict) -> list[tuple[str, str]]:
+    """Return kinds and subjects of the first two causes."""
+    return [(c.kind, c.subject) for f in found.findings for c in f.causes[:2]]
+
+
+@pytest.mark.parametrize("stated", [1.0, 3.0, 1 / 3])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_right_model_is_trusted_whatever_noise_is_stated(stated: float, seed: int):
+    _, estimate = run(shown() + errors(seed), stated=stated)
+    assert estimate.verdict.level == "trusted"
+    said = [finding.what for finding in estimate.verdict.findings]
+    assert said == ([] if stated == 1.0 else ["noise"])
+
+
+def test_the_filter_gives_the_same_numbers_to_the_last_bit():
+    z = shown() + errors()
+    _, judged = run(z)
+    _, cheap = run(z, law=lp.SensitivityLaw(verdict="cheap"))
+    _, bare = run(z, law=lp.SensitivityLaw(verdict=False))
+    for other in (cheap, bare):
+        assert np.array_equal(judged.q, other.q)
+        assert np.array_equal(judged.q_std, other.q_std)
+        assert np.array_equal(judged.u, other.u)
+
+
+def test_an_offset_is_named_with_its_size():
+    z = shown() + errors()
+    z[:, 1] += 0.08
+    found = run(z)[1].verdict
+    assert found.level != "trusted"
+    assert named(found)[0] == ("offset", "B")
+    text = found.findings[0].causes[0].text
+    assert float(text.split("reads ")[1].split()[0]) == pytest.approx(0.08, rel=0.15)
+    assert "channels.B.offset" in found.findings[0].sentence
+
+
+def test_a_lag_is_named_with_its_size_and_what_it_does_to_the_estimate():
+    z = shown().copy()
+    lag = 4 * (TIMES[1] - TIMES[0])
+    z[:, 2] = np.interp(TIMES - lag, TIMES, z[:, 2])
+    z += errors()
+    estimate = run(z)[1]
+    found = estimate.verdict
+    assert named(found)[0] == ("lag", "C")
+    size = float(found.findings[0].causes[0].text.split("is ")[1].split()[0])
+    assert size == pytest.approx(lag, rel=0.25)
+    off = (estimate.parameters["k"][0] - 0.13) / estimate.parameters["k"][1]
+    assert found.findings[0].shift["k"] == pytest.approx(-off, abs=2.0)
+    assert abs(off) > 3.0
+    assert found.level == "do not trust"
+
+
+def test_a_sensor_elsewhere_is_named():
+    found = run(shown() + errors(), places={**PLACES, "B": 0.56})[1].verdict
+    assert ("position", "B") in named(found)
+    assert "smaller x" in found.findings[0].sentence
+
+
+def test_a_missing_loss_is_named():
+    found = run(shown(loss=0.6) + errors())[1].verdict
+    assert ("loss", "") in named(found)
+
+
+def test_a_jump_is_named_and_turns_the_verdict_soon():
+    half = len(TIMES) // 2
+    z = np.concatenate([shown()[:half], shown(k=0.2)[half:]]) + errors()
+    sensors = lp.Points(PLACES, noise=NOISE)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    turned = None
+    for k, t in enumerate(TIMES.tolist()):
+        estimate = identifier.step(t, z[k], {"T_left": driven(t)})
+        level = estimate.verdict.level if k >= 20 else "trusted"
+        assert k >= half or level == "trusted"
+        turned = k if turned is None and level != "trusted" else turned
+    assert turned is not None
+    assert turned - half <= 30
+    assert ("jump", "k") in named(estimate.verdict)
+
+
+def test_the_verdict_turns_back_when_a_fault_is_mended():
+    count, begin, end = 700, 150, 300
+    rng = np.random.default_rng(1)
+    z = shown(count=count) + NOISE * rng.standard_normal((count, len(PLACES)))
+    z[begin:end, 1] += 0.08
+    sensors = lp.Points(PLACES, noise=NOISE)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    levels = []
+    for k in range(count):
+        t = float(TIMES[1] * k)
+        estimate = identifier.step(t, z[k], {"T_left": driven(t)})
+        levels.append(estimate.verdict.level if k % 10 == 0 or k == count - 1 else "")
+    assert "trusted" not in levels[begin + 40 : end]
+    assert levels[-1] == "trusted"
+    assert estimate.verdict.findings[0].what == "past"
+    assert "in the last" in estimate.verdict.sentences[0]
+
+
+def test_readings_that_the_gate_refuses_are_a_finding():
+    z = shown() + errors()
+    z[40::12, 0] += 50.0
+    found = [f for f in run(z)[1].verdict.findings if f.what == "refused"]
+    assert [finding.subject for finding in found] == ["A"]
+    assert "were not used" in found[0].text
+    quiet = run(shown() + errors())[1].verdict
+    assert not [f for f in quiet.findings if f.what == "refused"]
+
+
+def test_a_shift_by_the_discretisation_is_a_finding_of_the_estimate():
+    notes = {
+        "discretisation_shift": 2.5,
+        "step_shift": -0.5,
+        "mesh_shift": 3.0,
+        "k_mesh_shift": 0.2,
+    }
+    (found,) = discretised(notes, ["k"])
+    assert "2.5 standard deviations" in found.text
+    assert "the mesh (k by +0.2)" in found.text
+    assert "more elements" in found.sentence
+    assert list(discretised({**notes, "discretisation_shift": 1.9}, ["k"])) == []
+    assert list(discretised({}, ["k"])) == []
+
+
+def test_a_sensor_that_stands_still_is_named():
+    z = shown() + errors()
+    z[100:, 0] = z[100, 0]
+    found = run(z)[1].verdict
+    assert ("stuck", "A") in named(found) or ("offset", "A") in named(found)
+    assert found.level == "do not trust"
+
+
+def test_errors_that_follow_each_other_are_no_cause():
+    rng = np.random.default_rng(3)
+    e = rng.standard_normal((len(TIMES), 3))
+    for k in range(1, len(e)):
+        e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.81) * e[k]
+    found = run(shown() + NOISE * e)[1].verdict
+    assert [finding.what for finding in found.findings if finding.severity != "note"] == [
+        "following"
+    ]
+    assert found.level == "caution"
+
+
+def test_directions_move_the_estimate_by_what_they_say():
+    """For an unknown source model and filter are linear: the shift by an offset is exact."""
+    mesh = lp.interval(0.0, 1.0, 20)
+
+    def estimated(offset: float) -> tuple[lp.Identifier, lp.Estimate]:
+        model = lp.Model(
+            lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
+            {"s": lp.Scalar(0.0, std=1.0)},
+            A=lambda q, u, v, x: -q.s * v,
+            B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
+        )
+        sensors = lp.Points(PLACES, noise=NOISE)
+        law = lp.SensitivityLaw(start_window=0)
+        identifier = lp.Identifier(model, sensors, law, u0=0.0)
+        for k, t in enumerate(TIMES[1:71].tolist()):
+            estimate = identifier.step(t, errors()[k] + np.array([0.0, offset, 0.0]))
+        return identifier, estimate
+
+    identifier, plain = estimated(0.0)
+    judge, x = identifier._work.filter.judge, identifier._state.now
+    w, _ = judge.settled(x.ledger, x.causes)
+    kinds = [(d.kind, d.subject) for d in judge.dictionary.directions]
+    moved = float(x.C[0].T[0] @ w[0][:, kinds.index(("offset", "B"))])
+    _, off = estimated(3.0 * NOISE)
+    # An offset moves the estimate away from the truth by minus what would mend it.
+    assert off.q[0] - plain.q[0] == pytest.approx(-moved, rel=1e-6)
+
+
+def test_a_checkpoint_carries_the_ledger():
+    z = shown() + errors()
+    z[:, 1] += 0.08
+    sensors = lp.Points(PLACES, noise=NOISE)
+
+    def identifier() -> lp.Identifier:
+        return lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+
+    one, other = identifier(), identifier()
+    for k, t in enumerate(TIMES[:101].tolist()):
+        whole = one.step(t, z[k], {"T_left": driven(t)})
+        if k == 70:
+            other.restore(one.dump())
+        if k > 70:
+            resumed = other.step(t, z[k], {"T_left": driven(t)})
+    assert resumed.verdict.to_dict() == whole.verdict.to_dict()
+
+
+def test_withheld_sensors_are_judged_against_what_is_predicted():
+    clean = shown(places=(0.25, 0.75, 0.5)) + errors()
+    z = {"A": clean[:, 0], "C": clean[:, 1], "W": clean[:, 2]}
+    places = {"A": 0.25, "C": 0.75}
+    withheld = lp.Points({"W": 0.5}, noise=NOISE)
+    assert run(z, places=places, withheld=withheld)[1].verdict.level == "trusted"
+    fahrenheit = {**z, "W": 32.0 + 1.8 * z["W"]}
+    found = run(fahrenheit, places=places, withheld=withheld)[1].verdict
+    assert ("unit", "W") in named(found)
+    assert "W is in degF" in found.sentences[0]
+
+
+def test_a_withheld_sensor_with_few_values_is_not_judged():
+    ledger = WithheldLedger.start(1)
+    for _ in range(10):
+        ledger = ledger.add(np.array([9.0]), np.zeros(1), np.zeros(1))
+    assert list(ledger.findings(["W"])) == []
+
+
+def test_few_samples_are_too_few():
+    sensors = lp.Points(PLACES, noise=NOISE)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    estimate = identifier.step(0.1, np.zeros(3), {"T_left": 0.0})
+    assert estimate.verdict.level == "caution"
+    assert "too few to judge by" in estimate.verdict.sentences[0]
+
+
+def test_a_bank_judges_by_its_leader():
+    z = shown() + errors()
+    z[:, 1] += 0.1
+    found = run(z, law=lp.AutoLaw())[1].verdict
+    assert found.level != "trusted"
+
+
+def test_what_is_left_out_is_said():
+    found = run(shown() + errors(), law=lp.SensitivityLaw(verdict="cheap"))[1].verdict
+    assert any("missing sources" in text for text in found.untested)
+    bare = run(shown() + errors(), law=lp.SensitivityLaw(verdict=False))[1].verdict
+    assert bare.untested == ("innovations: verdict = False",)
+    with pytest.raises(LawError, match="verdict must be"):
+        lp.SensitivityLaw(verdict="dear")
+
+
+def test_a_verdict_survives_json_and_stands_in_the_dataset():
+    z = shown() + errors()
+    z[:, 1] += 0.08
+    sensors = lp.Points(PLACES, noise=NOISE)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    stream = [(t, z[k], {"T_left": driven(t)}) for k, t in enumerate(TIMES.tolist())]
+    result = identifier.run(stream)
+    found = result.verdict
+    stored = json.loads(json.dumps(found.to_dict()))
+    assert Verdict.from_dict(stored).to_dict() == found.to_dict()
+    data = result.to_xarray()
+    assert verdict(data).level == found.level
+    assert doubts(data)[0] == found.sentences[0]
+
+
+def test_the_worst_finding_decides_and_none_is_said_twice():
+    notes = [Finding("noise", "note", f"n{k}") for k in range(6)]
+    grave = Finding("misfit", "do not trust", "grave")
+    found = Verdict.of([*notes, grave, grave])
+    assert found.level == LEVELS[2]
+    assert len(found.sentences) == 5
+    assert found.sentences[0] == "grave"
+    assert len(set(found.sentences)) == len(found.sentences)
+    assert Verdict.of(notes).level == "trusted"
+    assert found.with_findings([grave]).findings == found.findings
