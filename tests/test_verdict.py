@@ -255,6 +255,77 @@ def test_directions_move_the_estimate_by_what_they_say():
     assert off.q[0] - plain.q[0] == pytest.approx(-moved, rel=1e-6)
 
 
+def fed(inputs: Any, *, hold: bool = False) -> lp.Estimate:
+    """Return the last estimate of a run whose channel reads some values."""
+    sensors = lp.Points(PLACES, noise=NOISE)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0, hold=hold)
+    z = shown() + errors()
+    for k, t in enumerate(TIMES.tolist()):
+        estimate = identifier.step(t, z[k], {"T_left": inputs[k]})
+    return estimate
+
+
+def test_readings_that_are_held_as_settings_are_told():
+    straight, held = fed(driven(TIMES)), fed(driven(TIMES), hold=True)
+    (found,) = [f for f in held.verdict.findings if f.what == "hold"]
+    assert found.severity == "caution"
+    shift = held.q[0] - straight.q[0]
+    assert held.notes["k_hold_shift"] == pytest.approx(shift, rel=0.3)
+    assert found.evidence == pytest.approx(abs(shift) / held.q_std[0], rel=0.4)
+    assert "hold_shift" not in straight.notes
+    steps = np.repeat(driven(TIMES[::10]), 10)[: len(TIMES)]  # what an actuator does
+    assert fed(steps, hold=True).notes["hold_shift"] == 0.0
+
+
+def test_gaps_of_a_channel_are_told_and_in_the_interval():
+    whole, off, shifts = fed(driven(TIMES)), [], []
+    for seed in range(5, 9):
+        values = driven(TIMES)
+        values[1:][np.random.default_rng(seed).random(len(TIMES) - 1) < 0.3] = np.nan
+        gaps = fed(values)
+        (found,) = [f for f in gaps.verdict.findings if f.what == "input"]
+        assert (found.severity, found.subject) == ("caution", "T_left")
+        assert found.evidence == pytest.approx(np.isnan(values).mean())
+        off.append(gaps.q[0] - whole.q[0])
+        shifts.append(gaps.notes["k_input_shift"])
+        assert abs(off[-1]) > 3.0 * whole.q_std[0]
+        assert abs(off[-1]) < 3.0 * gaps.q_std[0]
+    assert abs(np.mean(off) - np.mean(shifts)) < 0.5 * abs(np.mean(off))
+
+
+def test_what_was_not_judged_is_judged_from_where_it_is_taken_up():
+    def identifier(judged: bool) -> lp.Identifier:
+        sensors = lp.Points(PLACES, noise=NOISE)
+        return lp.Identifier(rod(), sensors, lp.SensitivityLaw(verdict=judged), u0=0.0)
+
+    one, z = identifier(False), shown() + errors()
+    for k, t in enumerate(TIMES[:60].tolist()):
+        before = one.step(t, z[k], {"T_left": driven(t)})
+    other = identifier(True)
+    other.restore(one.dump())
+    z[60:, 1] += 6.0 * NOISE
+    for k, t in enumerate(TIMES[60:120].tolist(), 60):
+        after = other.step(t, z[k], {"T_left": driven(t)})
+    assert before.verdict.untested == ("innovations: verdict = False",)
+    assert ("offset", "B") in named(after.verdict)
+    one.restore(other.dump())
+    assert one.estimate().q[0] == after.q[0]
+
+
+def test_a_census_knows_what_the_unknowns_take_up():
+    from benchmarks.census import FAULTS
+    from benchmarks.census.run import TRUTHS, scene_of
+    from benchmarks.census.trace import VISIBLE, trace
+
+    traces = {}
+    for name in ("rod", "borehole"):
+        problem, rng = TRUTHS[name], np.random.default_rng(0)
+        sound = scene_of(problem, *problem.draw(rng), problem.noise, rng)
+        traces[name] = trace(sound), trace(FAULTS["offset"].change(sound))
+    assert max(sound for sound, _ in traces.values()) < 1.0
+    assert traces["borehole"][1] < VISIBLE < traces["rod"][1]
+
+
 def test_a_checkpoint_carries_the_ledger():
     z = shown() + errors()
     z[:, 1] += 0.08

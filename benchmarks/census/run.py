@@ -22,7 +22,7 @@ from livepde.progress import watched
 from livepde.runs.outcome import Outcome
 from livepde.verdict import Finding, Verdict
 
-__all__ = ["PROBLEMS", "QUICK", "Score", "census"]
+__all__ = ["PROBLEMS", "QUICK", "Score", "census", "scene_of"]
 
 PROBLEMS = ("rod", "column", "wall", "profile", "plate", "flux", "warm-rod", "borehole")
 QUICK = ("rod", "column", "profile", "plate", "warm-rod")
@@ -135,7 +135,7 @@ def scored(name: str, fault: str, seed: int) -> Score:
     stated, level = STATED[seed % 3], LEVELS[(seed // 3 + 1) % 3]
     with threadpool_limits(1):
         theta, shown = problem.draw(rng)
-        scene = _scene(problem, theta, shown, problem.noise * level, rng)
+        scene = scene_of(problem, theta, shown, problem.noise * level, rng)
         if fault:
             scene = FAULTS[fault].change(scene)
         score = Score(name, fault, stated, level, seed, "", np.nan)
@@ -145,9 +145,10 @@ def scored(name: str, fault: str, seed: int) -> Score:
             return Score(name, fault, stated, level, seed, "", np.nan, failure=repr(error))
 
 
-def _scene(
+def scene_of(
     problem: Problem, theta: np.ndarray, shown: np.ndarray, noise: float, rng: np.random.Generator
 ) -> Scene:
+    """Return the data of a run in which nothing is wrong."""
     return Scene(
         problem=problem,
         theta=theta,

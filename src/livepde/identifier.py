@@ -284,7 +284,7 @@ class Identifier:
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         start = self._inputs if t > self._t else values
         missing = np.array([name in held for name in self.inputs], dtype=float)
-        gaps = self._gaps.gaps(self.inputs, missing) if self._gaps.held.any() else {}
+        gaps = self._gaps.gaps(self.inputs, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
         self._state, report = self._stepped(interval)

@@ -242,11 +242,28 @@ class InputShadow(Shadow):
         if len(slope) < len(s):
             slope = np.repeat(slope, len(s), axis=0)
         h = length[:, None]
+        if span.gaps is not None:
+            return self._read_gaps(s, h, slope, span.gaps)
         slope = slope / h
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
-        missed = s.missed + bend
-        if span.gaps is not None:  # what was held is off the line across the gap, on average half
-            missed = missed - 0.5 * span.gaps * (span.inputs1 - span.inputs0)
+        return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
+
+    @staticmethod
+    def _read_gaps(s: ShadowState, h: Array, change: Array, gaps: Array) -> ShadowState:
+        """Return the same where channels are held.
+
+        In a gap a channel is expected to go on as before; once it has a value again the line across
+        the gap is known.
+        """
+        held, missing = gaps[0], gaps[1] > 0.0
+        whole = held + h
+        slope = np.where(missing, s.slope, change / whole)
+        bend = (slope - s.slope) * whole**3 / (6.0 * (whole + s.length[:, None]))
+        expected = s.slope * (held + 0.5 * h) * h
+        line = 0.5 * held * (change - s.slope * held)
+        missed = s.missed + np.where(missing, -expected, bend - line)
+        bend = np.zeros_like(missed)  # of the next steps nothing is expected
+        length = np.where(missing.all(), s.length, whole.max(axis=1))
         return changed(s, slope=slope, length=length, bend=bend, missed=missed)
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
@@ -469,7 +486,8 @@ class ShadowSet:
         for shadow in self.shadows:
             s = shadow.read(s, span)
         s, jumps = _watched(s, x, end, span)
-        due = (s.count >= s.due) | jumps
+        # What gaps miss counts at once: later it might cancel with that of the next one.
+        due = (s.count >= s.due) | jumps | (span.gaps is not None)
         for t in np.unique(s.begun[due]) if due.any() else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):

@@ -38,7 +38,8 @@ class Interval:
         Standard deviation of each value of z1, shape (sensors,), NaN where it is that of the
         sensor; None if all are.
     gaps
-        Channel -> time at the end of which it has a value again; it was held for so long.
+        Channel that is held at either end -> for how long it was held before, and whether it is at
+        the end.
     """
 
     t0: float
@@ -48,7 +49,7 @@ class Interval:
     z0: Array
     z1: Array
     noise: Array | None = None
-    gaps: Mapping[str, float] = field(default_factory=dict)
+    gaps: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
 
     def _weight(self, t: float) -> float:
         return (t - self.t0) / (self.t1 - self.t0)

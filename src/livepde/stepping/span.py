@@ -63,8 +63,8 @@ class Span:
         Standard deviation of each value of z1, of its shape, NaN where it is that of the sensor;
         None if all are.
     gaps
-        Time for which each channel that has a value again was held before this interval, shape
-        (1, channels); None if there was no gap.
+        Time for which each channel was held before this interval, and 1 if it is held at its end,
+        shape (2, channels); None if there is no gap.
     """
 
     t0: Array
@@ -91,7 +91,7 @@ class Span:
         noise = None if interval.noise is None else interval.noise[None]
         gaps = None
         if interval.gaps:
-            gaps = np.array([[interval.gaps.get(name, 0.0) for name in channels]])
+            gaps = np.array([interval.gaps.get(name, (0.0, False)) for name in channels]).T
         return cls(t0, interval.t1, channels, first, last, z0, z1, interval, noise, gaps)
 
     def __len__(self) -> int:

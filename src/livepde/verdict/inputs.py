@@ -43,10 +43,10 @@ class InputLedger:
         counts = self.counts + np.append(1, missing).astype(np.int64)
         return InputLedger(counts, (self.held + length) * missing)
 
-    def gaps(self, names: Sequence[str], missing: Array) -> dict[str, float]:
-        """Return the channels that have a value again, and for how long they were held."""
-        ended = (self.held > 0.0) & (missing == 0.0)
-        return {names[k]: float(self.held[k]) for k in np.flatnonzero(ended).tolist()}
+    def gaps(self, names: Sequence[str], missing: Array) -> dict[str, tuple[float, bool]]:
+        """Return for how long channels were held by now, and whether they are once more."""
+        each = zip(names, self.held.tolist(), (missing > 0.0).tolist(), strict=True)
+        return {name: (held, again) for name, held, again in each if held or again}
 
     def findings(
         self, names: Sequence[str], notes: Mapping[str, float], labels: Sequence[str]
@@ -68,7 +68,7 @@ class InputLedger:
         }
         by = ", ".join(f"{label} by {-size:+.2g}" for label, size in shifts.items())
         moved = (
-            f" With straight lines across the gaps the estimates would move: {by}."
+            f" Straight lines across the gaps would move the estimates roughly so: {by}."
             if by
             else " By how much that moves the estimates is not known."
         )
