@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.measured import measured
 from livepde.cases.template import write_template
 from livepde.cli import app
 from livepde.models import EQUATIONS
@@ -58,7 +59,7 @@ def test_a_table_of_a_german_excel(here, encoding):
         },
         "Fühler": {"role": "sensor", "column": "Fühler (0,2 m)", "at": "0.2 m"},
     }
-    assert found["steps"]["dt_max"] == "900 s"
+    assert "steps" not in found
     text = Path("mine/case.toml").read_text()
     assert (
         "# 3 rows from 2025-04-01 12:00:00 to 2025-04-01 12:30:00 UTC, 900 s apart (median)" in text
@@ -77,7 +78,7 @@ def test_a_table_of_a_german_excel(here, encoding):
     ],
 )
 def test_numbers_as_times(here, header, time, unit, step):
-    found = begun(f"{header}\n0,20,20\n10,21,\n20,20,21\n")
+    found = begun(f"{header}\n0,20,20\n10,21,\n20,20,21\n60,20,21\n")
     assert found["data"] == {"file": "../my.csv", "time": time, "time_unit": unit}
     assert found["steps"]["dt_max"] == step
     assert found["channels"]["T_0_05"]["at"] == "? m"
@@ -102,7 +103,7 @@ def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
         ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column holds times: expected dates, or numbers"),
         (",T\n2025-04-01,20\n2025-04-02,20\n", "Column 1 has no name: give it one."),
         ("time_s,note\n0,a\n1,b\n", "beside the times, 'time_s', no column holds numbers"),
-        ("day,at,T\n2025-04-01,12:00,20\n2025-04-01,12:10,20\n", "join them in one column"),
+        ("at,T\n12:00,20\n12:10,20\n", "'at' has times of day: add a column of days."),
         ("time_s,T\n0,20\n20,20\n10,20\n", "row 4, column 'time_s': the time is earlier"),
         ("time_s,T\n0,20\n20,ERR\n40,20\n", "row 3, column 'T': got 'ERR'"),
         ("time_s,T,T\n0,20,20\n20,20,20\n", "two columns are called 'T'"),
@@ -134,9 +135,151 @@ def test_what_loggers_write_for_no_value_is_missing(here):
     assert "20 to 20, 3 missing" in Path("mine/case.toml").read_text()
 
 
-def test_a_day_and_a_month_that_may_be_swapped_are_asked_for(here):
-    begun("time,T\n03/02/2026 08:00,20\n03/02/2026 08:10,20\n")
-    assert "the day first, or the month?" in Path("mine/case.toml").read_text()
+@pytest.mark.parametrize(
+    ("first", "second", "told"),
+    [
+        ("03/02/2026 08:00", "03/02/2026 08:10", "'%d/%m/%Y %H:%M' (2026-02-03 08:00:00) or "),
+        ("16/06/28 06:45", "16/06/28 07:00", "'%y/%m/%d %H:%M' (2016-06-28 06:45:00)"),
+    ],
+)
+def test_an_order_of_day_and_month_that_cannot_be_known_is_asked_for(here, first, second, told):
+    with pytest.raises(lp.DataError, match=re.escape(told)) as error:
+        begun(f"time,T\n{first},20\n{second},20\n")
+    assert f"the order of day, month and year in '{first}' cannot be known" in str(error.value)
+    table = measured(Path("my.csv"), "s", choose=lambda column, cell, formats: formats[-1])
+    assert table.time_format in told or "%m/%d/%Y" in table.time_format
+    given = measured(Path("my.csv"), "s", time_format=table.time_format)
+    assert given.samples.origin == table.samples.origin
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "form", "origin"),
+    [
+        ("16/06/28 23:45", "16/06/29 00:00", "%y/%m/%d %H:%M", "2016-06-28 23:45:00"),
+        ("6/28/2016 11:45 PM", "6/29/2016 12:00 AM", "%m/%d/%Y %I:%M %p", "2016-06-28 23:45:00"),
+        ("28-Jun-2016 23:45", "29-Jun-2016 00:00", "%d-%b-%Y %H:%M", "2016-06-28 23:45:00"),
+    ],
+)
+def test_dates_whose_order_the_rows_tell(here, first, second, form, origin):
+    third = second.replace("00:00", "00:15").replace("12:00", "12:15")
+    text = f"id,time,T\n1,{first},20\n2,{second},20\n3,{third},21\n"
+    found = begun(text)
+    assert found["data"] == {"file": "../my.csv", "time": "time", "time_format": form}
+    assert set(found["channels"]) == {"T"}
+    assert "# numbers of rows: id" in Path("mine/case.toml").read_text()
+    read = measured(Path("my.csv"), "s").samples
+    assert str(read.origin) == origin
+    assert np.allclose(read.t, [0.0, 900.0, 1800.0])
+
+
+def test_the_number_of_a_row_is_no_time(here):
+    found = begun("id,t,T\n1,0.5,20\n2,1.0,20\n3,1.7,20\n")
+    assert found["data"]["time"] == "t"
+    assert set(found["channels"]) == {"T"}
+
+
+@pytest.mark.parametrize(
+    ("day", "hour", "form"),
+    [
+        ("2025-04-01", "12:00", ""),
+        ("2025-04-01", "9:00", "%Y-%m-%d %H:%M"),
+        ("01.04.2025", "12:00:00", "%d.%m.%Y %H:%M:%S"),
+    ],
+)
+def test_days_and_times_of_day_in_two_columns(here, day, hour, form):
+    later = hour.replace(":00", ":10", 1)
+    found = begun(f"date,hour,T_5cm,T_10cm\n{day},{hour},20,20\n{day},{later},21,20\n")
+    assert found["data"]["time"] == ["date", "hour"]
+    assert found["data"].get("time_format", "") == form
+    filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
+    filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
+    stream = cases.load("mine/case.toml", settings=filled).prepare().stream
+    assert np.allclose(stream.t, [0.0, 600.0])
+    with pytest.raises(lp.CaseError, match="skip and a time in two columns belong to a file"):
+        cases.load("mine/case.toml", settings={**filled, "data.follow": True})
+    with pytest.raises(lp.CaseError, match="times in two columns are read from CSV files only"):
+        cases.load("mine/case.toml", settings=filled).prepare("rows.parquet")
+
+
+def test_title_lines_before_the_header(here):
+    title = "Logger 17, made by A\n\nbench 3;\n"
+    table = "time_s;T_5cm;T_10cm\n0;20,5;20,5\n10;21,5;20,5\n"
+    found = begun(title + table)
+    assert found["data"] == {
+        "file": "../my.csv",
+        "skip": 3,
+        "time": "time_s",
+        "time_unit": "s",
+        "separator": ";",
+        "decimal": ",",
+    }
+    filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
+    filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
+    case = cases.load("mine/case.toml", settings=filled)
+    assert len(case.prepare().stream) == 2
+    Path("my.csv").write_text(title + table.replace("21,5", "ERR"))
+    with pytest.raises(lp.DataError, match="row 6, column 'T_5cm': got 'ERR'"):
+        case.prepare()
+    with pytest.raises(lp.DataError, match="line 1 is no header, but a title: say skip = 3"):
+        cases.load("mine/case.toml", settings={**filled, "data.skip": 0}).prepare()
+
+
+def test_numbered_columns_are_one_line(here):
+    names = [f"u_{k}" for k in range(12)]
+    row = ",".join("1" for _ in names)
+    found = begun(f"time_s,{','.join(names)}\n0,{row}\n1,{row}\n")
+    assert found["channels"] == {
+        "u": {"role": "sensor", "column": "u_{}", "each": ["? m", "? m", 12]},
+    }
+
+
+def test_numbered_columns_with_a_table_of_places(here):
+    names = [f"T {k}" for k in range(1, 10)]
+    row = ",".join("1" for _ in names)
+    found = begun(f"time_s,{','.join(names)}\n0,{row}\n1,{row}\n")
+    assert found["channels"] == {"T": {"role": "sensor", "positions": "places.csv"}}
+    places = Path("mine/places.csv")
+    assert places.read_text().splitlines()[:2] == ["name,x", "T 1,?"]
+    filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
+    filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
+    with pytest.raises(lp.CaseError, match=r"places\.csv, row 2: still to be filled in"):
+        cases.load("mine/case.toml", settings=filled)
+    rows = [f"{name},{0.02 * k}" for k, name in enumerate(names)]
+    places.write_text("\n".join(["name,x", *rows]) + "\n")
+    assert len(cases.load("mine/case.toml", settings=filled).sensors) == 9
+
+
+@pytest.mark.parametrize("name", ["dH", "dH_m", "dH [m]", "dH_cm"])
+def test_a_column_named_like_an_input_is_that_input(here, name):
+    found = begun(f"time_s,{name},T_5cm\n0,1,20\n1,1,20\n", equation="advection_diffusion")
+    unit = {"unit": "cm"} if "cm" in name else {}
+    assert found["channels"]["dH"] == {"role": "input", "column": name, **unit}
+    assert set(found["unknowns"]) == {"kappa", "K"}
+    assert found["options"] == {"L": "? m", "ratio": "?"}
+
+
+def test_without_that_input_another_unknown_is_taken(here):
+    found = begun("time_s,T_5cm\n0,20\n1,20\n", equation="advection_diffusion")
+    assert set(found["unknowns"]) == {"kappa", "v"}
+    assert "transform" not in found["unknowns"]["v"]  # a flux may have any sign
+    assert found["options"] == {"ratio": "?"}
+    assert set(found["channels"]) == {"T_5cm"}
+
+
+@pytest.mark.parametrize("name", ["borehole", "grouted_borehole", "pumping_test"])
+def test_graded_meshes_where_the_equation_wants_them(here, name):
+    found = begun("time_s,a\n0,1\n1,1\n", equation=name)
+    assert found["mesh"]["spacing"] == "geometric"
+    if name != "pumping_test":
+        return
+    filled = {"mesh.from": "0.1 m", "mesh.to": "900 m", "options.b": "10 m", "law.noise": "1 cm"}
+    filled |= {f"unknowns.k.{key}": "1e-4 m/s" for key in ("prior", "std")}
+    filled |= {f"unknowns.Ss.{key}": "1e-5 1/m" for key in ("prior", "std")}
+    filled |= {"channels.a.at": "9 m", "channels.Q.column": "a"}
+    told = "where 'pumping_test' changes most: mesh.spacing = 'geometric'"
+    for spacing, expected in (("geometric", False), ("uniform", True)):
+        case = cases.load("mine/case.toml", settings={**filled, "mesh.spacing": spacing})
+        assert any(told in note for note in case.notes) is expected
 
 
 def test_names_that_are_alike_without_signs_and_units(here):
@@ -187,13 +330,17 @@ def test_a_case_of_every_equation_has_what_it_needs(here, name):
     def needed(known):
         return {key for key, item in known.items() if not item.optional}
 
+    chosen = {*list(equation.alternatives)[-1:]}
     assert found["equation"] == name
-    assert set(found["unknowns"]) == needed(equation.unknowns)
+    assert set(found["unknowns"]) == needed(equation.unknowns) | chosen
     assert set(found["channels"]) == {"a", *needed(equation.inputs)}
     assert set(found.get("options", ())) == {
-        key for key, option in equation.options.items() if option.default is None
+        key
+        for key, option in equation.options.items()
+        if option.default is None or any(key in equation.alternatives[one] for one in chosen)
     }
-    with pytest.raises(lp.CaseError, match=r"still to be filled in, .* mesh\.from, mesh\.to,"):
+    sides = r"mesh\.x, mesh\.y," if equation.dimension > 1 else r"mesh\.from, mesh\.to,"
+    with pytest.raises(lp.CaseError, match=rf"still to be filled in, .* {sides}"):
         cases.load("mine/case.toml")
 
 

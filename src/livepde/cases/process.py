@@ -275,7 +275,13 @@ def _ends(mesh: Any) -> tuple[Any, Any]:
 def process_notes(frame: Frame, mesh: Any) -> list[str]:
     """Return what is allowed and yet deserves a word."""
     found = []
-    nodes = mesh.p[0]
+    nodes, spec = mesh.p[0], frame.spec.mesh
+    if frame.equation.spacing == "geometric" and spec.start is not None:
+        if spec.spacing == "uniform":
+            found.append(
+                "The mesh is uniform, with cells too large at the left end, where "
+                f"'{frame.equation.name}' changes most: mesh.spacing = 'geometric'."
+            )
     for name, unknown in frame.spec.unknowns.items():
         for layer, given in (unknown.regions or {}).items():
             if isinstance(given, str) or len(given) != 2:

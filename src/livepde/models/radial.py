@@ -81,4 +81,5 @@ BOREHOLE = Equation(
     },
     build=closed(borehole, "is heated by the input Q, with T0 far away"),
     element=linear,
+    spacing="geometric",
 )
