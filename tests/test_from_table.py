@@ -358,6 +358,40 @@ def test_an_equation_belongs_to_a_table(here):
     assert not Path("mine").exists()
 
 
+WALL = {
+    "mesh.from": 0,
+    "mesh.to": "20 mm",
+    "options.C": "3.6e6 J/(m^3 K)",
+    "unknowns.k.prior": "20 W/(m K)",
+    "unknowns.k.std": "10 W/(m K)",
+    "law.noise": "0.1 K",
+}
+
+
+@pytest.mark.parametrize(
+    ("more", "driven"),
+    [
+        ({}, False),
+        ({"channels.T_5mm.at": "left", "channels.T_5mm.role": "boundary"}, True),
+        ({"boundary.left": "20 degC"}, True),
+        ({"boundary.left": {"flux": "1 W/m^2"}}, True),
+        ({"boundary.left": {"transfer": "5 W/(m^2 K)", "ambient": "20 degC"}}, True),
+        ({"sources.all": {"value": "1 W/m^3"}}, True),
+        ({"unknowns.source.std": "1 W/m^3"}, True),
+        ({"mesh.cells": 400, "mesh.to": "20 m"}, False),
+        ({"mesh.cells": 400, "mesh.to": "20 m", "unknowns.source.std": 1}, True),
+    ],
+)
+def test_a_process_that_nothing_drives_is_noted(here, more, driven):
+    begun("time_s,T_5mm,T_10mm\n0,20,20\n10,21,21\n", equation="conduction")
+    case = Path("mine/case.toml")
+    if "unknowns.source.std" in more:
+        case.write_text(case.read_text() + "[unknowns.source]\nprior = 0\nstd = 1\n")
+    case = cases.load(case, settings={**WALL, **more})
+    told = "nothing drives the process"
+    assert any(told in note for note in case.notes) is not driven
+
+
 @pytest.mark.slow
 def test_from_a_table_to_estimates(here):
     rod, _ = write_template(Path("rod"))

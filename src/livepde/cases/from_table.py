@@ -34,8 +34,8 @@ HEAD = """\
 # '?' stands for what the table does not tell: fill it in; 'livepde check' names what is left.
 """
 VALUES = """\
-# A value given at an end: role = "boundary", at = "left" or "right"; an end without one is closed,
-# or has a [boundary]: left = { flux = "5 W/m^2" }, right = { transfer = "h", ambient = "T_room" }."""
+# A value given at an end: role = "boundary", at = "left" or "right". An end without one is closed,
+# or has a flux or an exchange: [boundary], as left = {{ flux = "1 {flux}" }}."""
 ENDS = """\
 # A value given at a boundary: role = "boundary", at = its name, as "left"; others are closed."""
 
@@ -220,7 +220,8 @@ def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
     for name, quantity in equation.quantities.items():
         yield f'# In place of at = ...: quantity = "{name}", the {quantity.text}.'
     if equation.takes_values:
-        yield VALUES if equation.fluxes is not None else ENDS
+        units = equation.fluxes
+        yield ENDS if units is None else VALUES.format(flux=units.flux)
     for item in found:
         yield _told(toml_line(item.name, item.given), item.told)
 
