@@ -344,6 +344,114 @@ def test_a_case_of_every_equation_has_what_it_needs(here, name):
         cases.load("mine/case.toml")
 
 
+def test_a_preview_of_what_was_read(here):
+    Path("my.csv").write_text(
+        "Logger 17\nid;when;T_5cm [degF];Q;note;T_b\n"
+        "1;01.04.2025 12:00;68;1;a;20\n2;01.04.2025 12:10;;1;b;20\n3;01.04.2025 13:00;70;1;c;21\n"
+    )
+    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"])
+    assert done.exit_code == 0
+    shown = [" ".join(line.split()) for line in done.output.splitlines()]
+    span = "3 rows from 2025-04-01 12:00:00 to 2025-04-01 13:00:00 UTC, 1800 s apart (median)"
+    assert f"my.csv: {span}, 600 to 3000." in shown
+    assert "Times in when" in shown
+    assert "T_5cm [degF] sensor T_5cm degF 68 70 1" in shown
+    assert "T_b sensor T_b degC 20 21 0" in shown
+    assert "id number of the row" in shown
+    assert "note text, not used" in shown
+    assert tomllib.loads(Path("mine/case.toml").read_text())["steps"] == {"dt_max": "1800 s"}
+
+
+def test_options_for_what_the_table_does_not_tell(here):
+    Path("my.csv").write_text("a;b\ntime;T\n03/02/2026 08:00;20\n03/02/2026 08:10;20\n")
+    runner = CliRunner()
+    begin = ["init", "mine", "--data", "my.csv"]
+    error = runner.invoke(app, begin).exception
+    assert "'a'" in str(error)  # a line as wide as the others may be the header
+    error = runner.invoke(app, [*begin, "--skip", "1"]).exception
+    assert "cannot be known: say --time-format, '%d/%m/%Y %H:%M' (2026-02-03" in str(error)
+    begin += ["--skip", "1", "--time-format", "%m/%d/%Y %H:%M"]
+    for key, told in {"law.nose": "cannot be set", "channels.X.at": "has no 'channels.X'"}.items():
+        error = runner.invoke(app, [*begin, "--set", f"{key}=1"]).exception
+        assert error is None or told in str(error)
+    known = ["channels.T.at=left", "channels.T.role=boundary", "law.noise=0.1 K", "title=Two"]
+    sets = [part for item in known for part in ("--set", item)]
+    assert runner.invoke(app, [*begin[:1], "own", *begin[2:], *sets]).exit_code == 0
+    text = Path("own/case.toml").read_text()
+    found = tomllib.loads(text)
+    assert found["data"]["time_format"] == "%m/%d/%Y %H:%M"
+    assert found["data"]["skip"] == 1
+    assert found["channels"]["T"] == {"role": "boundary", "column": "T", "at": "left"}
+    assert (found["title"], found["law"]) == ("Two", {"noise": "0.1 K"})
+    assert "# standard deviation of a single reading" in text
+    for option in (["--skip", "0"], ["--time-format", "%d"], ["--set", "title=x"]):
+        error = runner.invoke(app, ["init", "other", *option]).exception
+        assert f"{option[0]} belongs to a table of your own" in str(error)
+
+
+def test_questions_on_a_terminal(here, monkeypatch):
+    monkeypatch.setattr("livepde.cli.questions.asks", lambda: True)
+    rows = "03/02/2026 08:00,20,20,20,20\n03/02/2026 08:10,20,20,20,21\n"
+    Path("my.csv").write_text(f"time,T_l,T_1,T_2,T_3\n{rows}")
+    answers = [
+        "3",  # of two orders of day and month: asked again
+        "1",
+        "0",  # mesh.from
+        "40 s",  # mesh.to: no length, asked again
+        "40 cm",
+        "5e-5",  # prior
+        "",  # std: skipped
+        "left",
+        "0.1",
+        "-",
+        "",
+        "0.05",
+    ]
+    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"], "\n".join(answers) + "\n")
+    assert done.exit_code == 0, done.output
+    assert "1  %d/%m/%Y %H:%M" in done.output
+    assert "'s' cannot be converted to 'm'" in done.output
+    assert "fill in what it says '?' for (2)" in done.output
+    found = tomllib.loads(Path("mine/case.toml").read_text())
+    assert found["data"]["time_format"] == "%d/%m/%Y %H:%M"
+    assert found["mesh"] == {"from": "0 m", "to": "40 cm", "cells": 40}
+    alpha = {"prior": "5e-05 m^2/s", "std": "? m^2/s", "transform": "log"}
+    assert found["unknowns"] == {"alpha": alpha}
+    assert found["channels"] == {
+        "T_l": {"role": "boundary", "column": "T_l", "at": "left"},
+        "T_1": {"role": "sensor", "column": "T_1", "at": "0.1 m"},
+        "T_3": {"role": "sensor", "column": "T_3", "at": "? m"},
+    }
+    assert found["law"] == {"noise": "0.05 K"}
+
+
+def test_without_a_terminal_nothing_is_asked(here):
+    Path("my.csv").write_text("time_s,T\n0,20\n1,20\n")
+    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"], "0\n1\n")
+    assert done.exit_code == 0
+    assert "Press Enter" not in done.output
+    assert tomllib.loads(Path("mine/case.toml").read_text())["mesh"]["from"] == "? m"
+
+
+def test_questions_on_rows_of_sensors_and_on_columns(here, monkeypatch):
+    monkeypatch.setattr("livepde.cli.questions.asks", lambda: True)
+    names = [f"s_{k}" for k in range(9)]
+    row = ",".join("0" for _ in names)
+    Path("my.csv").write_text(f"time_s,rate,{','.join(names)}\n0,1,{row}\n60,1,{row}\n")
+    answers = ["8 m", "0.1", "900", "", "", "", "", "-", "1", "1, 9 m", "flow", "rate", ""]
+    begin = ["init", "mine", "--data", "my.csv", "--equation", "pumping_test"]
+    done = CliRunner().invoke(app, begin, "\n".join(answers) + "\n")
+    assert done.exit_code == 0, done.output
+    assert "There is no column 'flow' among rate, s_0" in done.output
+    assert "Got 1 values; expected 2" in done.output
+    found = tomllib.loads(Path("mine/case.toml").read_text())
+    assert found["options"] == {"b": "8 m"}
+    assert found["channels"] == {
+        "s": {"role": "sensor", "column": "s_{}", "each": ["1 m", "9 m", 9]},
+        "Q": {"role": "input", "column": "rate"},
+    }
+
+
 def test_an_equation_belongs_to_a_table(here):
     Path("my.csv").write_text("time_s,T\n0,20\n")
     runner = CliRunner()
@@ -398,7 +506,10 @@ def test_from_a_table_to_estimates(here):
     runner = CliRunner()
     done = runner.invoke(app, ["init", "mine", "--data", "rod/rod.csv"])
     assert done.exit_code == 0
-    assert "Wrote mine/case.toml for rod/rod.csv: fill in" in done.stdout
+    assert (
+        "Wrote mine/case.toml for rod/rod.csv: fill in what it says '?' for (10). Next:"
+        in done.stdout
+    )
     case = Path("mine/case.toml")
     with pytest.raises(lp.CaseError) as error:
         cases.load(case)

@@ -252,18 +252,22 @@ def test_the_case_runs_as_written(here, name):
         assert measured(Path("my.csv"), "").time_unit == ""
     write(simulated(case, filled, given), equation.time_unit)
     runner = CliRunner()
-    done = runner.invoke(app, ["init", "mine", "--data", "my.csv", "--equation", name])
-    assert done.exit_code == 0
+    begin = ["init", "--data", "my.csv", "--equation", name]
+    assert runner.invoke(app, [*begin, "open"]).exit_code == 0
     with pytest.raises(lp.CaseError) as error:
-        cases.load("mine/case.toml")
+        cases.load("open/case.toml")
     told = str(error.value).split("'?': ")[1].rstrip(".").split(", ")
     assert set(told) <= set(given)  # nothing else is open
     sets = [part for key, value in given.items() for part in ("--set", f"{key}={text(value)}")]
-    done = runner.invoke(app, ["run", "mine/case.toml", "--out", "out", "--json", *sets])
+    done = runner.invoke(app, [*begin, "mine", *sets])
+    assert "mine/case.toml for my.csv: nothing is left open." in done.output
+    done = runner.invoke(app, ["run", "mine/case.toml", "--out", "out", "--json"])
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
+    assert found["status"] == "finished"
     for unknown in filled.truth:
         assert math.isfinite(found["measures"][unknown])
+        assert found["measures"][unknown] != 1.2 * filled.truth[unknown]  # the prior
 
 
 def text(value: Any) -> str:
