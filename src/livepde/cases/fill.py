@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from livepde.cases.read import is_blank, read_toml
+from livepde.cases.read import is_blank, read_toml, spec_of
 from livepde.cases.settings import apply, key_path, toml_line
 from livepde.errors import CaseError
 
@@ -86,6 +86,8 @@ def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
         text = _with(text, key_path(key, where), value)
         if read_toml(text, where) != expected:
             raise CaseError(f"{where}: {key}: cannot be set here; edit the file in its place.")
+    if settings:
+        spec_of(read_toml(text, where), where)
     return text
 
 

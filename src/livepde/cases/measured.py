@@ -180,7 +180,7 @@ def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
     if not any(of_cell(cell) in ("number", "date") for cell in rows[0]):
         raise SampleError(
             f"{table}, row {written.skip + 2}: holds no numbers; the header is one line: delete "
-            "the second."
+            "the second, or say --skip if the first are titles."
         )
     return {
         name: of_column([row[k].strip() for row in rows if k < len(row)])

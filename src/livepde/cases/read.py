@@ -43,6 +43,7 @@ __all__ = [
     "read_spec",
     "read_text",
     "read_toml",
+    "spec_of",
 ]
 
 BLANK = "?"  # how a value begins that is still to be filled in
@@ -145,6 +146,11 @@ def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
     """Return the checked content of a case's document; raises `CaseError`."""
     if blanks := list(blanks_in(raw)):
         raise CaseError(f"{where}: still to be filled in, where it says '?': {', '.join(blanks)}.")
+    return spec_of(raw, where)
+
+
+def spec_of(raw: Mapping[str, Any], where: str) -> CaseSpec:
+    """Return the same of a case that may still have something open."""
     try:
         return CaseSpec.model_validate(raw)
     except ValidationError as error:

@@ -158,8 +158,8 @@ def _show_read(console: Console, read: Measured, equation: Equation) -> None:
             columns += f" ... {item.columns[-1]}"
         gaps = "" if not item.columns else block.size - present.size
         rows.append((columns, role, item.name, given or state.unit, *ends, gaps))
-    rows += [(name, "number of the row", "", "", "", "", "") for name in read.row_numbers]
-    rows += [(name, "text, not used", "", "", "", "", "") for name in read.texts]
+    rows += [(name, "row number", "", "", "", "", "") for name in read.row_numbers]
+    rows += [(name, "text", "", "", "", "", "") for name in read.texts]
     headings = ("column", "role", "channel", "unit", "least", "largest", "missing")
     where = f"{read.path}: {read.span}"
     console.print(f"{escape(where)}.", soft_wrap=True)

@@ -28,17 +28,12 @@ def asks() -> bool:
 
 def date_order(column: str, cell: str, formats: Sequence[str]) -> str:
     """Ask for the order of day, month and year."""
-    shown = "\n".join(f"  {k}  {form}" for k, form in enumerate(formats, start=1))
+    known = {str(k): form for k, form in enumerate(formats, start=1)}
+    shown = "\n".join(f"  {k}  {form}" for k, form in known.items())
     typer.echo(f"How is '{cell}' in column '{column}' to be read?\n{shown}")
-    number: int = typer.prompt("Number", type=typer_range(len(formats)))
-    return formats[number - 1]
-
-
-def typer_range(count: int) -> Any:
-    """Return the type of an answer from 1 to `count`."""
-    from click import IntRange
-
-    return IntRange(1, count)
+    while (number := typer.prompt("Number").strip()) not in known:
+        typer.echo(f"Expected one of {', '.join(known)}.")
+    return known[number]
 
 
 def answered(text: str, equation: Equation, columns: Sequence[str], where: str) -> str:
