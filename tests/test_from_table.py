@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.measured import measured
 from livepde.cases.template import write_template
 from livepde.cli import app
 from livepde.models import EQUATIONS
@@ -58,7 +59,7 @@ def test_a_table_of_a_german_excel(here, encoding):
         },
         "Fühler": {"role": "sensor", "column": "Fühler (0,2 m)", "at": "0.2 m"},
     }
-    assert found["steps"]["dt_max"] == "900 s"
+    assert "steps" not in found
     text = Path("mine/case.toml").read_text()
     assert (
         "# 3 rows from 2025-04-01 12:00:00 to 2025-04-01 12:30:00 UTC, 900 s apart (median)" in text
@@ -77,7 +78,7 @@ def test_a_table_of_a_german_excel(here, encoding):
     ],
 )
 def test_numbers_as_times(here, header, time, unit, step):
-    found = begun(f"{header}\n0,20,20\n10,21,\n20,20,21\n")
+    found = begun(f"{header}\n0,20,20\n10,21,\n20,20,21\n60,20,21\n")
     assert found["data"] == {"file": "../my.csv", "time": time, "time_unit": unit}
     assert found["steps"]["dt_max"] == step
     assert found["channels"]["T_0_05"]["at"] == "? m"
@@ -102,7 +103,7 @@ def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
         ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column holds times: expected dates, or numbers"),
         (",T\n2025-04-01,20\n2025-04-02,20\n", "Column 1 has no name: give it one."),
         ("time_s,note\n0,a\n1,b\n", "beside the times, 'time_s', no column holds numbers"),
-        ("day,at,T\n2025-04-01,12:00,20\n2025-04-01,12:10,20\n", "join them in one column"),
+        ("at,T\n12:00,20\n12:10,20\n", "'at' has times of day: add a column of days."),
         ("time_s,T\n0,20\n20,20\n10,20\n", "row 4, column 'time_s': the time is earlier"),
         ("time_s,T\n0,20\n20,ERR\n40,20\n", "row 3, column 'T': got 'ERR'"),
         ("time_s,T,T\n0,20,20\n20,20,20\n", "two columns are called 'T'"),
@@ -134,9 +135,151 @@ def test_what_loggers_write_for_no_value_is_missing(here):
     assert "20 to 20, 3 missing" in Path("mine/case.toml").read_text()
 
 
-def test_a_day_and_a_month_that_may_be_swapped_are_asked_for(here):
-    begun("time,T\n03/02/2026 08:00,20\n03/02/2026 08:10,20\n")
-    assert "the day first, or the month?" in Path("mine/case.toml").read_text()
+@pytest.mark.parametrize(
+    ("first", "second", "told"),
+    [
+        ("03/02/2026 08:00", "03/02/2026 08:10", "'%d/%m/%Y %H:%M' (2026-02-03 08:00:00) or "),
+        ("16/06/28 06:45", "16/06/28 07:00", "'%y/%m/%d %H:%M' (2016-06-28 06:45:00)"),
+    ],
+)
+def test_an_order_of_day_and_month_that_cannot_be_known_is_asked_for(here, first, second, told):
+    with pytest.raises(lp.DataError, match=re.escape(told)) as error:
+        begun(f"time,T\n{first},20\n{second},20\n")
+    assert f"the order of day, month and year in '{first}' cannot be known" in str(error.value)
+    table = measured(Path("my.csv"), "s", choose=lambda column, cell, formats: formats[-1])
+    assert table.time_format in told or "%m/%d/%Y" in table.time_format
+    given = measured(Path("my.csv"), "s", time_format=table.time_format)
+    assert given.samples.origin == table.samples.origin
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "form", "origin"),
+    [
+        ("16/06/28 23:45", "16/06/29 00:00", "%y/%m/%d %H:%M", "2016-06-28 23:45:00"),
+        ("6/28/2016 11:45 PM", "6/29/2016 12:00 AM", "%m/%d/%Y %I:%M %p", "2016-06-28 23:45:00"),
+        ("28-Jun-2016 23:45", "29-Jun-2016 00:00", "%d-%b-%Y %H:%M", "2016-06-28 23:45:00"),
+    ],
+)
+def test_dates_whose_order_the_rows_tell(here, first, second, form, origin):
+    third = second.replace("00:00", "00:15").replace("12:00", "12:15")
+    text = f"id,time,T\n1,{first},20\n2,{second},20\n3,{third},21\n"
+    found = begun(text)
+    assert found["data"] == {"file": "../my.csv", "time": "time", "time_format": form}
+    assert set(found["channels"]) == {"T"}
+    assert "# numbers of rows: id" in Path("mine/case.toml").read_text()
+    read = measured(Path("my.csv"), "s").samples
+    assert str(read.origin) == origin
+    assert np.allclose(read.t, [0.0, 900.0, 1800.0])
+
+
+def test_the_number_of_a_row_is_no_time(here):
+    found = begun("id,t,T\n1,0.5,20\n2,1.0,20\n3,1.7,20\n")
+    assert found["data"]["time"] == "t"
+    assert set(found["channels"]) == {"T"}
+
+
+@pytest.mark.parametrize(
+    ("day", "hour", "form"),
+    [
+        ("2025-04-01", "12:00", ""),
+        ("2025-04-01", "9:00", "%Y-%m-%d %H:%M"),
+        ("01.04.2025", "12:00:00", "%d.%m.%Y %H:%M:%S"),
+    ],
+)
+def test_days_and_times_of_day_in_two_columns(here, day, hour, form):
+    later = hour.replace(":00", ":10", 1)
+    found = begun(f"date,hour,T_5cm,T_10cm\n{day},{hour},20,20\n{day},{later},21,20\n")
+    assert found["data"]["time"] == ["date", "hour"]
+    assert found["data"].get("time_format", "") == form
+    filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
+    filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
+    stream = cases.load("mine/case.toml", settings=filled).prepare().stream
+    assert np.allclose(stream.t, [0.0, 600.0])
+    with pytest.raises(lp.CaseError, match="skip and a time in two columns belong to a file"):
+        cases.load("mine/case.toml", settings={**filled, "data.follow": True})
+    with pytest.raises(lp.CaseError, match="times in two columns are read from CSV files only"):
+        cases.load("mine/case.toml", settings=filled).prepare("rows.parquet")
+
+
+def test_title_lines_before_the_header(here):
+    title = "Logger 17, made by A\n\nbench 3;\n"
+    table = "time_s;T_5cm;T_10cm\n0;20,5;20,5\n10;21,5;20,5\n"
+    found = begun(title + table)
+    assert found["data"] == {
+        "file": "../my.csv",
+        "skip": 3,
+        "time": "time_s",
+        "time_unit": "s",
+        "separator": ";",
+        "decimal": ",",
+    }
+    filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
+    filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
+    case = cases.load("mine/case.toml", settings=filled)
+    assert len(case.prepare().stream) == 2
+    Path("my.csv").write_text(title + table.replace("21,5", "ERR"))
+    with pytest.raises(lp.DataError, match="row 6, column 'T_5cm': got 'ERR'"):
+        case.prepare()
+    with pytest.raises(lp.DataError, match="line 1 is no header, but a title: say skip = 3"):
+        cases.load("mine/case.toml", settings={**filled, "data.skip": 0}).prepare()
+
+
+def test_numbered_columns_are_one_line(here):
+    names = [f"u_{k}" for k in range(12)]
+    row = ",".join("1" for _ in names)
+    found = begun(f"time_s,{','.join(names)}\n0,{row}\n1,{row}\n")
+    assert found["channels"] == {
+        "u": {"role": "sensor", "column": "u_{}", "each": ["? m", "? m", 12]},
+    }
+
+
+def test_numbered_columns_with_a_table_of_places(here):
+    names = [f"T {k}" for k in range(1, 10)]
+    row = ",".join("1" for _ in names)
+    found = begun(f"time_s,{','.join(names)}\n0,{row}\n1,{row}\n")
+    assert found["channels"] == {"T": {"role": "sensor", "positions": "places.csv"}}
+    places = Path("mine/places.csv")
+    assert places.read_text().splitlines()[:2] == ["name,x", "T 1,?"]
+    filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
+    filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
+    with pytest.raises(lp.CaseError, match=r"places\.csv, row 2: still to be filled in"):
+        cases.load("mine/case.toml", settings=filled)
+    rows = [f"{name},{0.02 * k}" for k, name in enumerate(names)]
+    places.write_text("\n".join(["name,x", *rows]) + "\n")
+    assert len(cases.load("mine/case.toml", settings=filled).sensors) == 9
+
+
+@pytest.mark.parametrize("name", ["dH", "dH_m", "dH [m]", "dH_cm"])
+def test_a_column_named_like_an_input_is_that_input(here, name):
+    found = begun(f"time_s,{name},T_5cm\n0,1,20\n1,1,20\n", equation="advection_diffusion")
+    unit = {"unit": "cm"} if "cm" in name else {}
+    assert found["channels"]["dH"] == {"role": "input", "column": name, **unit}
+    assert set(found["unknowns"]) == {"kappa", "K"}
+    assert found["options"] == {"L": "? m", "ratio": "?"}
+
+
+def test_without_that_input_another_unknown_is_taken(here):
+    found = begun("time_s,T_5cm\n0,20\n1,20\n", equation="advection_diffusion")
+    assert set(found["unknowns"]) == {"kappa", "v"}
+    assert "transform" not in found["unknowns"]["v"]  # a flux may have any sign
+    assert found["options"] == {"ratio": "?"}
+    assert set(found["channels"]) == {"T_5cm"}
+
+
+@pytest.mark.parametrize("name", ["borehole", "grouted_borehole", "pumping_test"])
+def test_graded_meshes_where_the_equation_wants_them(here, name):
+    found = begun("time_s,a\n0,1\n1,1\n", equation=name)
+    assert found["mesh"]["spacing"] == "geometric"
+    if name != "pumping_test":
+        return
+    filled = {"mesh.from": "0.1 m", "mesh.to": "900 m", "options.b": "10 m", "law.noise": "1 cm"}
+    filled |= {f"unknowns.k.{key}": "1e-4 m/s" for key in ("prior", "std")}
+    filled |= {f"unknowns.Ss.{key}": "1e-5 1/m" for key in ("prior", "std")}
+    filled |= {"channels.a.at": "9 m", "channels.Q.column": "a"}
+    told = "where 'pumping_test' changes most: mesh.spacing = 'geometric'"
+    for spacing, expected in (("geometric", False), ("uniform", True)):
+        case = cases.load("mine/case.toml", settings={**filled, "mesh.spacing": spacing})
+        assert any(told in note for note in case.notes) is expected
 
 
 def test_names_that_are_alike_without_signs_and_units(here):
@@ -187,14 +330,131 @@ def test_a_case_of_every_equation_has_what_it_needs(here, name):
     def needed(known):
         return {key for key, item in known.items() if not item.optional}
 
+    chosen = {*list(equation.alternatives)[-1:]}
     assert found["equation"] == name
-    assert set(found["unknowns"]) == needed(equation.unknowns)
+    assert set(found["unknowns"]) == needed(equation.unknowns) | chosen
     assert set(found["channels"]) == {"a", *needed(equation.inputs)}
     assert set(found.get("options", ())) == {
-        key for key, option in equation.options.items() if option.default is None
+        key
+        for key, option in equation.options.items()
+        if option.default is None or any(key in equation.alternatives[one] for one in chosen)
     }
-    with pytest.raises(lp.CaseError, match=r"still to be filled in, .* mesh\.from, mesh\.to,"):
+    sides = r"mesh\.x, mesh\.y," if equation.dimension > 1 else r"mesh\.from, mesh\.to,"
+    with pytest.raises(lp.CaseError, match=rf"still to be filled in, .* {sides}"):
         cases.load("mine/case.toml")
+
+
+def test_a_preview_of_what_was_read(here):
+    Path("my.csv").write_text(
+        "Logger 17\nid;when;T_5cm [degF];Q;note;T_b\n"
+        "1;01.04.2025 12:00;68;1;a;20\n2;01.04.2025 12:10;;1;b;20\n3;01.04.2025 13:00;70;1;c;21\n"
+    )
+    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"])
+    assert done.exit_code == 0
+    shown = [" ".join(line.split()) for line in done.output.splitlines()]
+    span = "3 rows from 2025-04-01 12:00:00 to 2025-04-01 13:00:00 UTC, 1800 s apart (median)"
+    assert f"my.csv: {span}, 600 to 3000." in shown
+    assert "Times in when" in shown
+    assert "T_5cm [degF] sensor T_5cm degF 68 70 1" in shown
+    assert "T_b sensor T_b degC 20 21 0" in shown
+    assert "id row number" in shown
+    assert "note text" in shown
+    assert tomllib.loads(Path("mine/case.toml").read_text())["steps"] == {"dt_max": "1800 s"}
+
+
+def test_options_for_what_the_table_does_not_tell(here):
+    Path("my.csv").write_text("a;b\ntime;T\n03/02/2026 08:00;20\n03/02/2026 08:10;20\n")
+    runner = CliRunner()
+    begin = ["init", "mine", "--data", "my.csv"]
+    error = runner.invoke(app, begin).exception
+    assert "delete the second, or say --skip if the first are titles" in str(error)
+    error = runner.invoke(app, [*begin, "--skip", "1"]).exception
+    assert "cannot be known: say --time-format, '%d/%m/%Y %H:%M' (2026-02-03" in str(error)
+    begin += ["--skip", "1", "--time-format", "%m/%d/%Y %H:%M"]
+    for key, told in {
+        "law.nose": "there is no key 'law.nose'; did you mean 'noise'?",
+        "channels.X.at": "the case has no 'channels.X'",
+        "a b": "'a b' is no key",
+    }.items():
+        error = runner.invoke(app, [*begin, "--set", f"{key}=1"]).exception
+        assert told in str(error)
+    assert not Path("mine").exists()
+    known = ["channels.T.at=left", "channels.T.role=boundary", "law.noise=0.1 K", "title=Two"]
+    sets = [part for item in known for part in ("--set", item)]
+    assert runner.invoke(app, [*begin[:1], "own", *begin[2:], *sets]).exit_code == 0
+    text = Path("own/case.toml").read_text()
+    found = tomllib.loads(text)
+    assert found["data"]["time_format"] == "%m/%d/%Y %H:%M"
+    assert found["data"]["skip"] == 1
+    assert found["channels"]["T"] == {"role": "boundary", "column": "T", "at": "left"}
+    assert (found["title"], found["law"]) == ("Two", {"noise": "0.1 K"})
+    assert "# standard deviation of a single reading" in text
+    for option in (["--skip", "0"], ["--time-format", "%d"], ["--set", "title=x"]):
+        error = runner.invoke(app, ["init", "other", *option]).exception
+        assert f"{option[0]} belongs to a table of your own" in str(error)
+
+
+def test_questions_on_a_terminal(here, monkeypatch):
+    monkeypatch.setattr("livepde.cli.questions.asks", lambda: True)
+    rows = "03/02/2026 08:00,20,20,20,20\n03/02/2026 08:10,20,20,20,21\n"
+    Path("my.csv").write_text(f"time,T_l,T_1,T_2,T_3\n{rows}")
+    answers = [
+        "3",  # of two orders of day and month: asked again
+        "1",
+        "0",  # mesh.from
+        "40 s",  # mesh.to: no length, asked again
+        "40 cm",
+        "5e-5",  # prior
+        "",  # std: skipped
+        "left",
+        "0.1",
+        "-",
+        "",
+        "0.05",
+    ]
+    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"], "\n".join(answers) + "\n")
+    assert done.exit_code == 0, done.output
+    assert "1  %d/%m/%Y %H:%M" in done.output
+    assert "'s' cannot be converted to 'm'" in done.output
+    assert "fill in what it says '?' for (2)" in done.output
+    found = tomllib.loads(Path("mine/case.toml").read_text())
+    assert found["data"]["time_format"] == "%d/%m/%Y %H:%M"
+    assert found["mesh"] == {"from": "0 m", "to": "40 cm", "cells": 40}
+    alpha = {"prior": "5e-05 m^2/s", "std": "? m^2/s", "transform": "log"}
+    assert found["unknowns"] == {"alpha": alpha}
+    assert found["channels"] == {
+        "T_l": {"role": "boundary", "column": "T_l", "at": "left"},
+        "T_1": {"role": "sensor", "column": "T_1", "at": "0.1 m"},
+        "T_3": {"role": "sensor", "column": "T_3", "at": "? m"},
+    }
+    assert found["law"] == {"noise": "0.05 K"}
+
+
+def test_without_a_terminal_nothing_is_asked(here):
+    Path("my.csv").write_text("time_s,T\n0,20\n1,20\n")
+    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"], "0\n1\n")
+    assert done.exit_code == 0
+    assert "Press Enter" not in done.output
+    assert tomllib.loads(Path("mine/case.toml").read_text())["mesh"]["from"] == "? m"
+
+
+def test_questions_on_rows_of_sensors_and_on_columns(here, monkeypatch):
+    monkeypatch.setattr("livepde.cli.questions.asks", lambda: True)
+    names = [f"s_{k}" for k in range(9)]
+    row = ",".join("0" for _ in names)
+    Path("my.csv").write_text(f"time_s,rate,{','.join(names)}\n0,1,{row}\n60,1,{row}\n")
+    answers = ["8 m", "0.1", "900", "", "", "", "", "-", "1", "1, 9 m", "flow", "rate", ""]
+    begin = ["init", "mine", "--data", "my.csv", "--equation", "pumping_test"]
+    done = CliRunner().invoke(app, begin, "\n".join(answers) + "\n")
+    assert done.exit_code == 0, done.output
+    assert "There is no column 'flow' among rate, s_0" in done.output
+    assert "Got 1 values; expected 2" in done.output
+    found = tomllib.loads(Path("mine/case.toml").read_text())
+    assert found["options"] == {"b": "8 m"}
+    assert found["channels"] == {
+        "s": {"role": "sensor", "column": "s_{}", "each": ["1 m", "9 m", 9]},
+        "Q": {"role": "input", "column": "rate"},
+    }
 
 
 def test_an_equation_belongs_to_a_table(here):
@@ -211,13 +471,50 @@ def test_an_equation_belongs_to_a_table(here):
     assert not Path("mine").exists()
 
 
+WALL = {
+    "mesh.from": 0,
+    "mesh.to": "20 mm",
+    "options.C": "3.6e6 J/(m^3 K)",
+    "unknowns.k.prior": "20 W/(m K)",
+    "unknowns.k.std": "10 W/(m K)",
+    "law.noise": "0.1 K",
+}
+
+
+@pytest.mark.parametrize(
+    ("more", "driven"),
+    [
+        ({}, False),
+        ({"channels.T_5mm.at": "left", "channels.T_5mm.role": "boundary"}, True),
+        ({"boundary.left": "20 degC"}, True),
+        ({"boundary.left": {"flux": "1 W/m^2"}}, True),
+        ({"boundary.left": {"transfer": "5 W/(m^2 K)", "ambient": "20 degC"}}, True),
+        ({"sources.all": {"value": "1 W/m^3"}}, True),
+        ({"unknowns.source.std": "1 W/m^3"}, True),
+        ({"mesh.cells": 400, "mesh.to": "20 m"}, False),
+        ({"mesh.cells": 400, "mesh.to": "20 m", "unknowns.source.std": 1}, True),
+    ],
+)
+def test_a_process_that_nothing_drives_is_noted(here, more, driven):
+    begun("time_s,T_5mm,T_10mm\n0,20,20\n10,21,21\n", equation="conduction")
+    case = Path("mine/case.toml")
+    if "unknowns.source.std" in more:
+        case.write_text(case.read_text() + "[unknowns.source]\nprior = 0\nstd = 1\n")
+    case = cases.load(case, settings={**WALL, **more})
+    told = "nothing drives the process"
+    assert any(told in note for note in case.notes) is not driven
+
+
 @pytest.mark.slow
 def test_from_a_table_to_estimates(here):
     rod, _ = write_template(Path("rod"))
     runner = CliRunner()
     done = runner.invoke(app, ["init", "mine", "--data", "rod/rod.csv"])
     assert done.exit_code == 0
-    assert "Wrote mine/case.toml for rod/rod.csv: fill in" in done.stdout
+    assert (
+        "Wrote mine/case.toml for rod/rod.csv: fill in what it says '?' for (10). Next:"
+        in done.stdout
+    )
     case = Path("mine/case.toml")
     with pytest.raises(lp.CaseError) as error:
         cases.load(case)

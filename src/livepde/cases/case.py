@@ -19,7 +19,7 @@ from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import expanded
 from livepde.cases.laws import law_of
-from livepde.cases.process import mesh_of, model_of, options_of, process_notes
+from livepde.cases.process import drive_notes, mesh_of, model_of, options_of, process_notes
 from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import VariantSpec
 from livepde.cases.sensors import (
@@ -357,7 +357,11 @@ class Case:
     @property
     def notes(self) -> list[str]:
         """What is allowed and yet deserves a word."""
-        found = process_notes(self.frame, self.mesh) + sensor_notes(self.frame, self.mesh)
+        found = [
+            *drive_notes(self.frame, self.model),
+            *process_notes(self.frame, self.mesh),
+            *sensor_notes(self.frame, self.mesh),
+        ]
         if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
             found.append(
                 "The gradient law is made for observed subdomains and averages; a few noisy point "

@@ -43,7 +43,7 @@ def clock_of(frame: Frame) -> Clock:
     second = conversion("s", unit, frame.where("data.time")).factor if unit else 1.0
     start, stop = _instant(frame, data.start, "start"), _instant(frame, data.stop, "stop")
     return Clock(
-        data.time,
+        data.times[0],
         rule.factor,
         start,
         stop,
@@ -51,6 +51,7 @@ def clock_of(frame: Frame) -> Clock:
         zone=_zone(frame),
         format=data.time_format,
         decimal=data.decimal,
+        hour="".join(data.times[1:]),
     )
 
 
@@ -79,6 +80,14 @@ def read_data(
 ) -> Table | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
     spec = frame.spec.data
+    ending = (
+        ""
+        if source is not None and not isinstance(source, str)
+        else Path(source if source is not None else spec.file or "").suffix
+    )
+    if clock.hour and ending in ("", ".parquet", *JSON_LINES):
+        text = "times in two columns are read from CSV files only: join them in one column."
+        raise frame.error("data.time", text)
     if source is not None and not isinstance(source, str):
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
     if source is None and frame.reader is not None:
@@ -98,6 +107,7 @@ def read_data(
         missing=spec.missing,
         separator=spec.separator,
         encoding=spec.encoding,
+        skip=spec.skip,
     )
 
 

@@ -1,97 +1,98 @@
-"""What a table of measurements tells of its case; what it does not tell stays open, as '?'."""
+"""The case for a table of measurements; what the table does not tell stays open, as '?'."""
 
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from datetime import timedelta
-from itertools import pairwise
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from livepde.cases.measured import IN_BRACKETS, Measured, unit_in
 from livepde.cases.read import BLANK, beside
 from livepde.cases.settings import toml_line
-from livepde.cases.units import conversion
-from livepde.errors import CaseError, SampleError
 from livepde.linalg import Array
-from livepde.models import Equation
-from livepde.streams import Clock, Column, Table, read_csv
-from livepde.streams.clock import number_of
-from livepde.streams.csvfile import UTF_8, Written, how_written
-from livepde.streams.table import JSON_LINES, MISSING
+from livepde.models import Equation, Variable
+from livepde.streams.csvfile import UTF_8
 
-__all__ = ["parts_of"]
+__all__ = ["PLACES", "FoundChannel", "case_for", "channels_in", "places_for"]
 
-UNIT = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
-TIME = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 # T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05
-HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?")
-EITHER = re.compile(r"%[dm][/-]%[dm][/-]")  # day and month: a table does not always tell which
-FIRST = """\
-# '?' stands for what the table does not tell: fill it in; 'livepde check' names what is left."""
-CHANNELS = """\
-# Drop what is no {state}. A value given at an end: role = "boundary", at = "left" or
-# "right"; through an end without one nothing flows. One of role = "withheld" is only scored."""
+SUFFIX = re.compile(r"(?<=\w)_(?P<unit>[A-Za-z]\w*)$")  # Q_W, dH_mm
+NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
+PLACES = "places.csv"  # the table of positions that is written beside the case
+FAMILY = 8  # so many numbered columns become one line of [channels]
+HEAD = """\
+# A case of livepde: which process, what is unknown, which channel is what.
+#   livepde check {case}     what is in here, and what its sensors can tell
+#   livepde run {case}       identify; writes a run directory
+# '?' stands for what the table does not tell: fill it in; 'livepde check' names what is left.
+"""
+VALUES = """\
+# A value given at an end: role = "boundary", at = "left" or "right". An end without one is closed,
+# or has a flux or an exchange: [boundary], as left = {{ flux = "1 {flux}" }}."""
+ENDS = """\
+# A value given at a boundary: role = "boundary", at = its name, as "left"; others are closed."""
 
 
-def parts_of(table: Path, folder: Path, equation: Equation) -> dict[str, str]:
-    """Return the parts of a case in `folder` that equation and CSV file tell; others are open.
+@dataclass(frozen=True)
+class FoundChannel:
+    """A channel of the case, as the table suggests it.
 
-    Raises
-    ------
-    DataError
-        There is no such file, or it is no table of times and measurements; one sentence.
+    Attributes
+    ----------
+    name
+        In the case.
+    given
+        Its keys and values.
+    columns
+        Of the table; none for an input that the table lacks.
+    told
+        A comment.
     """
-    if table.suffix in (*JSON_LINES, ".parquet"):
-        raise SampleError(f"{table}: a case is begun from a CSV file, with a header.")
-    written = how_written(table)
-    kinds = _kinds(table, written)
-    time = _times(table, written, kinds)
-    names = [name for name, kind in kinds.items() if kind == "number" and name != time]
-    if not names:
-        raise SampleError(f"{table}: beside the times, '{time}', no column holds numbers.")
-    samples = read_csv(
-        table,
-        {name: Column((name,), decimal=written.decimal) for name in names},
-        Clock(time, format=written.time_format, decimal=written.decimal),
-        separator=written.separator,
-        encoding=written.encoding,
-    )
-    file = table if table.is_absolute() else beside(table, folder)
-    unit = equation.time_unit
-    if unit:
-        unit = "s" if samples.origin else _unit(time, unit, UNIT, TIME) or BLANK
-    data = [
-        toml_line("file", file.as_posix()),
-        toml_line("time", time),
-        *_written(written, samples, unit),
+
+    name: str
+    given: Mapping[str, Any]
+    columns: tuple[str, ...]
+    told: str
+
+    @property
+    def is_sensor(self) -> bool:
+        """Whether it is a sensor."""
+        return bool(self.given["role"] == "sensor")
+
+
+def case_for(table: Measured, folder: Path, equation: Equation) -> str:
+    """Return the text of a case in `folder` that equation and table tell; the rest is open."""
+    found = channels_in(table, equation)
+    blocks = [
+        _top(table, equation, {item.name for item in found if not item.is_sensor}),
+        _mesh(equation),
+        ["[data]", *_data(table, folder)],
+        *_unknowns(equation, found),
+        ["[channels]", *_channels(equation, found)],
+        ["[law]", _told(f"noise = {_noise(equation)}", "standard deviation of a single reading")],
+        *_steps(table, equation),
     ]
-    if unused := [name for name in kinds if name not in (time, *names)]:
-        data.append(f"# without numbers: {', '.join(unused)}")
-    steps = np.diff(samples.t)
-    step = BLANK if unit == BLANK or not len(steps) else f"{np.median(steps):g}"
-    state = equation.state
-    noise = f"noise = {_open(state.unit.replace('degC', 'K'))}"
-    return {
-        "first": FIRST,
-        "title": toml_line("title", table.stem),
-        "equation": "\n".join(_equation(equation)),
-        "start": _open(equation.length_unit),
-        "stop": _open(equation.length_unit),
-        "data": "\n".join(data),
-        "unknowns": "\n\n".join(_unknowns(equation)),
-        "channels": "\n".join(
-            [CHANNELS.format(state=state.text), *_channels(equation, names, samples)]
-        ),
-        "noise": f"{_told(noise, 'of a single value: its standard deviation')}\n",
-        "step": "dt_max = " + _quantity(step, unit if unit != BLANK else equation.time_unit),
-        "last": "",
-    }
+    text = "\n\n".join("\n".join(lines) for lines in blocks)
+    return f"{HEAD.format(case=folder / 'case.toml')}{text}\n"
+
+
+def places_for(found: list[FoundChannel], equation: Equation) -> str:
+    """Return the table of positions that is to be filled in; empty if no channel names one."""
+    columns = [c for item in found if item.given.get("positions") == PLACES for c in item.columns]
+    axes = "xyz"[: equation.dimension]
+    lines = [",".join(["name", *axes]), *(",".join([c, *BLANK * len(axes)]) for c in columns)]
+    return "\n".join(lines) + "\n" if columns else ""
+
+
+def _noise(equation: Equation) -> str:
+    return _open(equation.state.unit.replace("degC", "K"))
 
 
 def _quantity(number: str, unit: str) -> str:
@@ -104,167 +105,232 @@ def _open(unit: str) -> str:
     return _quantity(BLANK, unit)
 
 
+def _blank(unit: str) -> str:
+    """Return the same without quotes."""
+    return _open(unit).strip('"')
+
+
 def _told(line: str, text: str) -> str:
-    """Return a line with a comment, in the column of those of the template."""
-    return f"{line:<29}  # {text}"
+    """Return a line with a comment."""
+    return f"{line:<29}  # {text}" if text else line
 
 
-def _equation(equation: Equation) -> Iterator[str]:
-    """Yield the line of the equation, and of the options that it needs."""
+def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]:
+    """Yield the lines of title, equation, the options that it needs, and the initial state."""
+    yield toml_line("title", table.path.stem)
     yield _told(toml_line("equation", equation.name), equation.formula)
     yield f"# 'livepde equations {equation.name}' tells what it knows; 'livepde equations': others"
+    asked = equation.alternatives.get(_alternative(equation, inputs), ())
     for name, option in equation.options.items():
-        if option.default is None:
+        if option.default is None or name in asked:
             yield _told(f"options.{name} = {_open(option.unit)}", option.text)
-
-
-def _unknowns(equation: Equation) -> Iterator[str]:
-    """Yield the tables of the unknowns that have to be there."""
-    for name, variable in equation.unknowns.items():
-        if variable.optional:
-            continue
-        prior = _open(variable.unit)
-        lines = {
-            f"[unknowns.{name}]": variable.text,
-            f"prior = {prior}": "what you would have said without data ...",
-            f"std = {prior}": "... and how far off that may be",
-            'transform = "log"': "it is positive; if it need not be, drop this line",
-        }
-        yield "\n".join(_told(line, text) for line, text in lines.items())
-
-
-def _kinds(table: Path, written: Written) -> dict[str, str]:
-    """Return column -> what most of its cells are: "number", "date", "hour" or "text"."""
-    header, rows = written.header, written.rows
-    if not rows:
-        raise SampleError(f"{table}: holds no rows beside its header.")
-
-    def kind(cells: list[str]) -> str:
-        found = Counter(_kind(cell, written) for cell in cells if cell.lower() not in MISSING)
-        return found.most_common(1)[0][0] if found else "text"
-
-    if all(_kind(cell, written) in ("number", "date") for cell in header if cell):
-        raise SampleError(f"{table}: has no header: begin it with a line of names of its columns.")
-    if len(header) < 2:
-        raise SampleError(
-            f"{table}: has one column, '{header[0]}'; expected times and measurements, with a "
-            "comma, a semicolon or a tab between them."
-        )
-    if not any(_kind(cell, written) in ("number", "date") for cell in rows[0]):
-        raise SampleError(
-            f"{table}, row 2: holds no numbers; the header is one line: delete the second."
-        )
-    return {
-        name: kind([row[k].strip() for row in rows if k < len(row)])
-        for k, name in enumerate(header)
-        if name
-    }
-
-
-def _kind(cell: str, written: Written) -> str:
-    if number_of(cell, written.decimal) is not None:
-        return "number"
-    if Clock("").stamp(cell, written.time_format) is not None:
-        return "date"
-    return "hour" if HOUR.fullmatch(cell.strip()) else "text"
-
-
-def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> str:
-    """Return the column of times: dates, or numbers that increase, best with a unit of time."""
-    dates, hours, numbers = (
-        [n for n, k in kinds.items() if k == kind] for kind in ("date", "hour", "number")
-    )
-    if dates and hours:
-        raise SampleError(
-            f"{table}: the day is in '{dates[0]}' and the time in '{hours[0]}': join them in one "
-            "column, as 2025-04-01 12:00."
-        )
-    timed = [name for name in numbers if _unit(name, "s", UNIT, TIME)]
-    rising = [name for name in numbers if _rises(name, written)]
-    found = [*dates, *(name for name in timed if name in rising), *rising, *timed]
-    if not found:
-        nameless = ""
-        if "" in written.header:
-            nameless = f" Column {written.header.index('') + 1} has no name: give it one."
-        raise SampleError(
-            f"{table}: no column holds times: expected dates, or numbers that increase from row to "
-            f"row.{nameless}"
-        )
-    return found[0]
-
-
-def _rises(name: str, written: Written) -> bool:
-    k = written.header.index(name)
-    values = [number_of(row[k], written.decimal) for row in written.rows if k < len(row)]
-    return all(a is not None and b is not None and a < b for a, b in pairwise(values))
-
-
-def _written(written: Written, samples: Table, unit: str) -> Iterator[str]:
-    """Yield the lines of [data] that say how the file is written, and what is in it."""
-    if samples.origin is None:
-        if unit:
-            yield toml_line("time_unit", unit)
-        begin, end = (f"{t:g}" for t in samples.t[[0, -1]])
+    unit = equation.state.unit
+    if equation.components:
+        parts = ", ".join(f"{name} = {_open(unit)}" for name in equation.components)
+        yield _told(f"initial = {{ {parts} }}", equation.state.text)
+    elif equation.dimension > 1:
+        yield _told(f"initial = {_open(unit)}", f"{equation.state.text} at the start")
     else:
-        begin, end = (f"{samples.origin + timedelta(seconds=t)}" for t in samples.t[[0, -1]])
-    if written.time_format and samples.origin:
-        line = toml_line("time_format", written.time_format)
-        swapped = EITHER.search(written.time_format)
-        yield _told(line, "the day first, or the month?") if swapped else line
+        yield _told('initial = "interpolate"', "from the first sample; or a number")
+
+
+def _mesh(equation: Equation) -> list[str]:
+    """Return the lines of the mesh."""
+    side = _open(equation.length_unit)
+    if equation.dimension > 1:
+        return ["[mesh]", f"x = [{side}, {side}]", f"y = [{side}, {side}]", "cells = [20, 20]"]
+    lines = ["[mesh]", f"from = {side}", f"to = {side}", "cells = 40"]
+    if equation.spacing == "geometric":
+        lines[1] = _told(lines[1], "more than 0, where the cells are smallest")
+        lines.append('spacing = "geometric"')
+    return lines
+
+
+def _data(table: Measured, folder: Path) -> Iterator[str]:
+    """Yield the lines of [data]: how the file is written, and what is in it."""
+    written, path = table.written, table.path
+    file = path if path.is_absolute() else beside(path, folder)
+    yield toml_line("file", file.as_posix())
+    if written.skip:
+        yield _told(toml_line("skip", written.skip), "lines before the header")
+    yield toml_line("time", table.time[0] if len(table.time) == 1 else list(table.time))
+    if table.samples.origin is None and table.time_unit:
+        yield toml_line("time_unit", table.time_unit)
+    if table.time_format:
+        yield toml_line("time_format", table.time_format)
     if written.separator != ",":
         yield toml_line("separator", written.separator)
     if written.decimal != ".":
         yield toml_line("decimal", written.decimal)
     if written.encoding != UTF_8:
         yield toml_line("encoding", written.encoding)
-    told = f"# {len(samples)} rows from {begin} to {end}{' UTC' if samples.origin else ''}"
-    steps = np.diff(samples.t)
-    if len(steps):
-        told += f", {np.median(steps):g} {unit.replace(BLANK, '')}".rstrip() + " apart"
-    if len(steps) and steps.max() > 1.01 * steps.min():
-        told += f" (median), {steps.min():g} to {steps.max():g}"
-    yield told
+    yield f"# {table.span}"
+    if table.row_numbers:
+        yield f"# numbers of rows: {', '.join(table.row_numbers)}"
+    if table.texts:
+        yield f"# without numbers: {', '.join(table.texts)}"
 
 
-def _channels(equation: Equation, names: list[str], samples: Table) -> Iterator[str]:
-    """Yield the lines of the channels, those of inputs that no column is named after at the end."""
-    inputs = {name: item for name, item in equation.inputs.items() if not item.optional}
-    keys = [re.sub(r"\W+", "_", UNIT.sub("", name)).strip("_") for name in names]
-    for key, name, values in zip(keys, names, samples.values.T, strict=True):
+def _steps(table: Measured, equation: Equation) -> Iterator[list[str]]:
+    """Yield the table of time steps, where intervals between samples are uneven."""
+    steps = table.steps
+    if len(steps) and steps.max() > 1.5 * np.median(steps):
+        known = table.time_unit != BLANK
+        number = f"{np.median(steps):g}" if known else BLANK
+        step = _quantity(number, table.time_unit if known else equation.time_unit)
+        yield ["[steps]", _told(f"dt_max = {step}", "longer intervals are divided")]
+
+
+def _alternative(equation: Equation, inputs: set[str]) -> str:
+    """Return the unknown that a case begins with where it needs one of several.
+
+    The first whose inputs the table has, or else the last, which needs the least.
+    """
+    for name, belongs in equation.alternatives.items():
+        if inputs & set(belongs):
+            return name
+    return next(reversed(list(equation.alternatives)), "")
+
+
+def _unknowns(equation: Equation, found: list[FoundChannel]) -> Iterator[list[str]]:
+    """Yield the tables of the unknowns that have to be there."""
+    chosen = _alternative(equation, {item.name for item in found if not item.is_sensor})
+    for name, variable in equation.unknowns.items():
+        if name == chosen or not variable.optional:
+            others = [other for other in equation.alternatives if other != name]
+            more = f"; or {', '.join(others)}, or both" if name == chosen else ""
+            yield list(_unknown(name, variable, more))
+
+
+def _unknown(name: str, variable: Variable, more: str) -> Iterator[str]:
+    prior = _open(variable.unit)
+    yield _told(f"[unknowns.{name}]", variable.text + more)
+    yield _told(f"prior = {prior}", "what you would have said without data ...")
+    yield _told(f"std = {prior}", "... and how far off that may be")
+    if variable.transform == "log":
+        yield _told('transform = "log"', "it is positive; if it need not be, drop this line")
+    elif variable.transform == "logit":
+        yield "bounds = [0, 1]"
+        yield _told('transform = "logit"', "it stays between its bounds")
+
+
+def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
+    """Yield the lines of [channels], with what may be said in them."""
+    yield f'# Drop what is no {equation.state.text}. role = "withheld": only scored.'
+    for name, quantity in equation.quantities.items():
+        yield f'# In place of at = ...: quantity = "{name}", the {quantity.text}.'
+    if equation.takes_values:
+        units = equation.fluxes
+        yield ENDS if units is None else VALUES.format(flux=units.flux)
+    for item in found:
+        yield _told(toml_line(item.name, item.given), item.told)
+
+
+def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
+    """Return the channels of a table, and at the end the inputs that it lacks."""
+    samples = table.samples
+    columns = dict(zip(samples.names, samples.values.T, strict=True))
+    keys = [re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns]
+    found, inputs = [], dict(equation.inputs)
+    for key, (name, values) in zip(keys, columns.items(), strict=True):
         key = key if key and keys.count(key) == 1 else name
-        told, variable = [_range(values)], inputs.pop(key, None)
-        given = {"role": "input" if variable else "sensor", "column": name}
-        if variable is None:
-            variable = equation.state
-            place, fraction = PLACE.search(name), FRACTION.search(name)
-            given["at"] = _open(equation.length_unit).strip('"')
-            if place is not None and equation.length_unit:
-                given["at"] = f"{place[1].replace(',', '.')} {place[2]}"
-                told.append("place as its name says")
-            elif fraction is not None:
-                told.append(f'at = "{fraction[0]} {equation.length_unit}"?')
-        stated = UNIT.search(name)
-        if stated and not PLACE.fullmatch(stated[1].strip()):
-            unit = _unit(name, variable.unit, UNIT) or f"{BLANK} {stated[1]}"
-            given |= {"unit": unit} if unit != variable.unit else {}
-        yield _told(toml_line(key, given), ", ".join(told))
-    for key, variable in inputs.items():
-        yield _told(toml_line(key, {"role": "input", "column": BLANK}), variable.text)
+        entry = _input_of(name, inputs)
+        if entry:
+            unit = _stated(name, inputs[entry].unit)
+            del inputs[entry]
+            given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
+            found.append(FoundChannel(entry, given, (name,), _range(values)))
+        else:
+            found.append(_sensor(equation, key, name, values))
+    there = {item.name for item in found if not item.is_sensor}
+    chosen = equation.alternatives.get(_alternative(equation, there), ())
+    found = _in_families(equation, found)
+    for name, variable in inputs.items():
+        if not variable.optional or name in chosen:
+            given = {"role": "input", "column": BLANK}
+            found.append(FoundChannel(name, given, (), variable.text))
+    return found
+
+
+def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
+    """Return the input that a column is named after: Q, Q [W], Q_W; empty if there is none."""
+    plain = IN_BRACKETS.sub("", column).strip()
+    suffix = SUFFIX.search(plain)
+    for name, variable in inputs.items():
+        if plain == name or plain.casefold() == name.casefold():
+            return name
+        if suffix and plain[: suffix.start()] == name and unit_in(plain, variable.unit, SUFFIX):
+            return name
+    return ""
+
+
+def _stated(name: str, unit: str) -> str:
+    """Return the unit that the name of a column states; empty if it is the model's, or none."""
+    found = unit_in(name, unit, IN_BRACKETS) or unit_in(IN_BRACKETS.sub("", name), unit, SUFFIX)
+    stated = IN_BRACKETS.search(name)
+    if not found and stated:
+        found = f"{BLANK} {stated[1]}"
+    return "" if found == unit else found
+
+
+def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChannel:
+    """Return a sensor with the place and the unit that the name of its column states."""
+    told, given = [_range(values)], {"role": "sensor", "column": name}
+    place, fraction = PLACE.search(name), FRACTION.search(name)
+    at: Any = _blank(equation.length_unit)
+    if equation.dimension > 1:
+        at = [at] * equation.dimension
+    elif place is not None and equation.length_unit:
+        at = f"{place[1].replace(',', '.')} {place[2]}"
+        told.append("place as its name says")
+    elif fraction is not None:
+        told.append(f'at = "{fraction[0]} {equation.length_unit}"?')
+    given["at"] = at
+    if equation.components:
+        given["of"] = equation.components[0]
+        told.append(f"of {' or '.join(equation.components)}")
+    stated = IN_BRACKETS.search(name)
+    if stated and not PLACE.fullmatch(stated[1].strip()):
+        unit = unit_in(name, equation.state.unit, IN_BRACKETS) or f"{BLANK} {stated[1]}"
+        given |= {"unit": unit} if unit != equation.state.unit else {}
+    return FoundChannel(key, given, (name,), ", ".join(told))
+
+
+def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundChannel]:
+    """Return the channels with numbered sensors whose places are open, u_0 to u_37, as one."""
+
+    def stem(item: FoundChannel) -> tuple[str, bool]:
+        numbered = NUMBERED.fullmatch(item.columns[0])
+        open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
+        return (numbered[1], True) if numbered and open_ else (item.name, False)
+
+    result: list[FoundChannel] = []
+    for (name, numbered), items in groupby(found, stem):
+        members = list(items)
+        columns = tuple(item.columns[0] for item in members)
+        count = len(members)
+        if numbered and count >= FAMILY:
+            given = {k: v for k, v in members[0].given.items() if k not in ("column", "at")}
+            evenly = columns == tuple(f"{name}{k}" for k in range(count))
+            if evenly and equation.dimension == 1:
+                at = members[0].given["at"]
+                given |= {"column": f"{name}{{}}", "each": [at, at, count]}
+                told = f'evenly from ... to ...; else positions = "{PLACES}" (name, x)'
+            else:
+                given |= {"positions": PLACES}
+                told = "fill in the places there"
+            label = re.sub(r"\W+", "_", name).strip("_") or "sensor"
+            result.append(FoundChannel(label, given, columns, told))
+        else:
+            result += members
+    return result
 
 
 def _range(values: Array) -> str:
     """Return in words what a column holds."""
     present = values[np.isfinite(values)]
     missing = len(values) - len(present)
+    if not len(present):
+        return "nothing"
     told = f"{present.min():.4g} to {present.max():.4g}"
     return f"{told}, {missing} missing" if missing else told
-
-
-def _unit(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
-    """Return the unit in the name of a column; empty if none can be converted to `unit`."""
-    for given in filter(None, (pattern.search(name) for pattern in patterns)):
-        for text in (given[1], re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])):  # m3/h, m^3/h
-            with suppress(CaseError):
-                conversion(text, unit, name)
-                return text
-    return ""

@@ -10,7 +10,9 @@ import pandas as pd
 
 from livepde.cases.frame import Frame
 from livepde.cases.limits import MEMBERS
+from livepde.cases.read import is_blank
 from livepde.cases.schema import CaseSpec, ChannelSpec
+from livepde.errors import CaseError
 from livepde.fem import MeanReverting, Scalars, Unknown
 from livepde.observation import Calibrated, Observation
 from livepde.observation.placed import POSITION, shift_names
@@ -77,6 +79,8 @@ def _listed(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[An
 
 
 def _coordinate(frame: Frame, cell: str, where: str) -> float:
+    if is_blank(cell):
+        raise CaseError(f"{where}: still to be filled in, where it says '?'.")
     try:
         value: float | str = float(cell)
     except ValueError:

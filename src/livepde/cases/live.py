@@ -218,7 +218,8 @@ class Wiring:
         if spec.every > 1 and not (file or reader):
             text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
             raise case.frame.error("data.every", text)
-        if reader or file.endswith(".parquet") or spec.every > 1:
+        whole = spec.every > 1 or spec.skip or len(spec.times) > 1
+        if reader or file.endswith(".parquet") or whole:
             table = read_data(case.frame, case.columns, case.clock, named)
             self._origin = table.origin
             return Samples(table, after=last)

@@ -36,7 +36,7 @@ from livepde.fem import (
 from livepde.model import Model
 from livepde.models import Option
 
-__all__ = ["mesh_of", "model_of", "options_of", "process_notes"]
+__all__ = ["drive_notes", "mesh_of", "model_of", "options_of", "process_notes"]
 
 
 def mesh_of(frame: Frame) -> Any:
@@ -272,10 +272,43 @@ def _ends(mesh: Any) -> tuple[Any, Any]:
     return mesh.p.min(axis=1), mesh.p.max(axis=1)
 
 
+def drive_notes(frame: Frame, model: Model) -> list[str]:
+    """Return a note where nothing drives the process but its initial state.
+
+    Without values on boundaries and without inputs, a state that is the same everywhere neither
+    changes nor depends on the unknowns if A'(q), B and F vanish there. Then the unknowns are only
+    in the decay of the differences of the initial state. Periodic states carry waves and are left
+    out, and equations of the user's own, which need not be defined for any state.
+    """
+    if ":" in frame.spec.equation:
+        return []
+    fields = [block.field for block in model.state_space.fields.values()]
+    held = any(field.boundary_values or field.periodic for field in fields)
+    if held or model.channels or model.form_initial is not None:
+        return []
+    level = model.state_space.interpolate(1.0)
+    uneven = level * (1.0 + np.arange(len(level)) % 3)  # for the size of each term
+    flat, steep = (abs(model.A(u).matrix).max(axis=0).toarray() for u in (level, uneven))
+    known = np.abs(model.B(level)).max() > 1e-9 * np.abs(model.B(uneven)).max()
+    if known or model.F().any() or (flat > 1e-9 * steep).any():
+        return []
+    return [
+        "No boundary value, flux, exchange, source or input: nothing drives the process, and only "
+        "the decay of its initial state tells of the unknowns. Give a channel role = 'boundary', "
+        "or [boundary] a value or a flux."
+    ]
+
+
 def process_notes(frame: Frame, mesh: Any) -> list[str]:
     """Return what is allowed and yet deserves a word."""
     found = []
-    nodes = mesh.p[0]
+    nodes, spec = mesh.p[0], frame.spec.mesh
+    graded = frame.equation.spacing == "geometric"
+    if graded and spec.start is not None and spec.spacing == "uniform":
+        found.append(
+            "The mesh is uniform, with cells too large at the left end, where "
+            f"'{frame.equation.name}' changes most: mesh.spacing = 'geometric'."
+        )
     for name, unknown in frame.spec.unknowns.items():
         for layer, given in (unknown.regions or {}).items():
             if isinstance(given, str) or len(given) != 2:

@@ -34,7 +34,17 @@ from livepde.cases.schema import (
 )
 from livepde.errors import CaseError
 
-__all__ = ["BLANK", "beside", "did_you_mean", "read_spec", "read_text", "read_toml"]
+__all__ = [
+    "BLANK",
+    "beside",
+    "blanks_in",
+    "did_you_mean",
+    "is_blank",
+    "read_spec",
+    "read_text",
+    "read_toml",
+    "spec_of",
+]
 
 BLANK = "?"  # how a value begins that is still to be filled in
 LONGEST = 1_000_000  # bytes of a case file
@@ -134,20 +144,32 @@ def _line(text: str, reason: str) -> str:
 
 def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
     """Return the checked content of a case's document; raises `CaseError`."""
-    if blanks := list(_blanks(raw)):
+    if blanks := list(blanks_in(raw)):
         raise CaseError(f"{where}: still to be filled in, where it says '?': {', '.join(blanks)}.")
+    return spec_of(raw, where)
+
+
+def spec_of(raw: Mapping[str, Any], where: str) -> CaseSpec:
+    """Return the same of a case that may still have something open."""
     try:
         return CaseSpec.model_validate(raw)
     except ValidationError as error:
         raise CaseError(f"{where}: {_sentence(error, raw)}") from None
 
 
-def _blanks(value: Any, key: str = "") -> Iterator[str]:
+def is_blank(value: Any) -> bool:
+    """Return whether a value is still to be filled in: '?', '? m', or a list that holds one."""
+    if isinstance(value, list):
+        return any(map(is_blank, value))
+    return isinstance(value, str) and value.split(" ")[0] == BLANK
+
+
+def blanks_in(value: Any, key: str = "") -> Iterator[str]:
     """Yield the keys whose values `livepde init --data` has left open: '?', '? m'."""
     if isinstance(value, Mapping):
         for name, item in value.items():
-            yield from _blanks(item, f"{key}.{name}" if key else name)
-    elif isinstance(value, str) and value.split(" ")[0] == BLANK:
+            yield from blanks_in(item, f"{key}.{name}" if key else name)
+    elif is_blank(value):
         yield key
 
 

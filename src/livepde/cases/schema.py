@@ -143,7 +143,8 @@ class DataSpec(Spec):
     encoding: Encoding = UTF_8
     reader: Name | None = None
     options: dict[Identifier, Any] = Field(default_factory=dict)
-    time: Name = "time"
+    skip: NonNegativeInt = 0
+    time: Name | tuple[Name, Name] = "time"
     time_unit: str | None = None
     time_format: TimeFormat = ""
     zone: Name = "UTC"
@@ -164,9 +165,16 @@ class DataSpec(Spec):
             raise ValueError(f"{sources[0]} and {sources[1]} are two sources: keep one")
         if self.follow and self.file is None:
             raise ValueError("follow belongs to a file that grows")
+        if self.live and (self.skip or not isinstance(self.time, str)):
+            raise ValueError("skip and a time in two columns belong to a file that is complete")
         if self.live and self.every > 1:
             raise ValueError("every belongs to data that are there, not to a source that goes on")
         return self
+
+    @property
+    def times(self) -> tuple[str, ...]:
+        """The columns of times: one, or days and times of day."""
+        return (self.time,) if isinstance(self.time, str) else self.time
 
     @property
     def live(self) -> bool:

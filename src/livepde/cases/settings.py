@@ -12,7 +12,7 @@ from typing import Any
 from livepde.cases.read import did_you_mean
 from livepde.errors import CaseError
 
-__all__ = ["apply", "parse", "to_toml", "toml_line"]
+__all__ = ["apply", "key_path", "parse", "to_toml", "toml_line"]
 
 NAMED = ("unknowns", "channels")  # tables whose members are the case's own
 BARE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
@@ -59,7 +59,7 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
     """
     changed = copy.deepcopy(dict(document))
     for key, given in settings.items():
-        for path, value in _leaves(_path(key, where), given):
+        for path, value in _leaves(key_path(key, where), given):
             here = changed
             for k, part in enumerate(path[:-1]):
                 if k == 1 and path[0] in NAMED and part not in here:
@@ -80,7 +80,8 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
     return changed
 
 
-def _path(key: str, where: str) -> tuple[str, ...]:
+def key_path(key: str, where: str) -> tuple[str, ...]:
+    """Return the keys of 'law.noise' as `--set` takes them; raises `CaseError`."""
     try:
         here: Any = tomllib.loads(f"{key} = 0")
     except tomllib.TOMLDecodeError:

@@ -38,14 +38,14 @@ def source_of(frame: Frame, data: Data, position: str) -> Source:
         from livepde.streams.mqtt import MqttSource
 
         topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
-        return MqttSource(_broker(frame, spec.mqtt, "data.mqtt"), topics, spec.time)
+        return MqttSource(_broker(frame, spec.mqtt, "data.mqtt"), topics, spec.times[0])
     if data is None and spec.opcua is not None:
         from livepde.streams.opcua import OpcuaSource
 
         return OpcuaSource(
             spec.opcua.url,
             spec.opcua.columns,
-            spec.time,
+            spec.times[0],
             interval=frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
             username=spec.opcua.username,
             password=_password(frame, spec.opcua.password_env, "data.opcua"),

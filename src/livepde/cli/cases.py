@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.markup import escape
 
 from livepde.cli.options import names_in
@@ -15,6 +17,10 @@ from livepde.cli.printing import (
     terminal,
 )
 from livepde.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from livepde.cases.measured import Measured
+    from livepde.models import Equation
 
 __all__ = ["equations", "init"]
 
@@ -37,32 +43,127 @@ def init(
             show_default=False,
         ),
     ] = None,
+    time_format: Annotated[
+        str,
+        typer.Option(
+            metavar="FORMAT",
+            help="With --data: of its dates, as '%d.%m.%Y %H:%M'. Default: found from the rows.",
+            show_default=False,
+        ),
+    ] = "",
+    skip: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="With --data: lines before the header. Default: found from the lines.",
+            show_default=False,
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="With --data: what you know beside the table, as mesh.to='40 cm'; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Write a commented case to start from, with made-up data that it runs on, or for your own.
+
+    On a terminal it asks for what your table does not tell; each question may be skipped.
 
     Example:  livepde init mycase
     Your own: livepde init mycase --data measured.csv --equation groundwater
     """
-    from livepde.cases.template import write_template
+    from livepde.cases.template import check_free, files_for, write_files, write_template
     from livepde.models import EQUATIONS
 
-    if equation is not None and data is None:
-        raise ConfigurationError("--equation belongs to a table of your own: add --data FILE.csv.")
-    if equation is not None and ":" in equation:
-        raise ConfigurationError(
-            f"--equation takes a ready-made one: begin with any, and write '{equation}' into the "
-            "case."
-        )
-    found = named(equation or "heat", EQUATIONS, "equation")
-    case, table = write_template(folder, data, found)
     console = terminal()
     if data is None:
+        given = {"--equation": equation, "--time-format": time_format, "--set": settings}
+        given |= {"--skip": None if skip is None else "given"}
+        for option in (name for name, value in given.items() if value):
+            raise ConfigurationError(
+                f"{option} belongs to a table of your own: add --data FILE.csv."
+            )
+        case, table = write_template(folder)
         console.print(f"Wrote {case} and {table}. Next:", soft_wrap=True)
     else:
-        console.print(
-            f"Wrote {case} for {data}: fill in what it says '?' for. Next:", soft_wrap=True
-        )
+        if equation is not None and ":" in equation:
+            raise ConfigurationError(
+                f"--equation takes a ready-made one: begin with any, and write '{equation}' into "
+                "the case."
+            )
+        check_free(folder, ["case.toml"])
+        found = named(equation or "heat", EQUATIONS, "equation")
+        case = folder / "case.toml"
+        read = _read(data, found, time_format, skip)
+        files = files_for(read, folder, found)
+        _show_read(console, read, found)
+        files["case.toml"] = _known(files["case.toml"], read, found, settings or [], f"{case}")
+        write_files(folder, files)
+        _show_written(console, case, data, files)
     console.print(f"  livepde check {case}\n  livepde run {case}", soft_wrap=True)
+
+
+def _read(data: Path, equation: Equation, time_format: str, skip: int | None) -> Measured:
+    """Read a table; on a terminal ask for the order of day and month where it is open."""
+    from livepde.cases.measured import measured
+    from livepde.cli.questions import asks, date_order
+
+    choose = date_order if asks() else None
+    return measured(data, equation.time_unit, time_format=time_format, skip=skip, choose=choose)
+
+
+def _known(text: str, read: Measured, equation: Equation, settings: list[str], where: str) -> str:
+    """Return the text of a case with what is known beside the table: by --set and by answers."""
+    from livepde.cases.fill import filled
+    from livepde.cases.settings import parse
+    from livepde.cli.questions import answered, asks
+
+    text = filled(text, parse(settings), where)
+    return answered(text, equation, read.samples.names, where) if asks() else text
+
+
+def _show_written(console: Console, case: Path, data: Path, files: Mapping[str, str]) -> None:
+    """Print which files were written and what is open in them."""
+    from livepde.cases.fill import blanks
+
+    left = len(blanks(files["case.toml"]))
+    told = ": nothing is left open" if not left else f": fill in what it says '?' for ({left})"
+    console.print(f"Wrote {case} for {data}{told}. Next:", soft_wrap=True)
+    for name in files:
+        if name != "case.toml":
+            console.print(f"  fill in {case.parent / name}", soft_wrap=True)
+
+
+def _show_read(console: Console, read: Measured, equation: Equation) -> None:
+    """Print what was read: times, and the columns with their roles, units and ranges."""
+    import numpy as np
+
+    from livepde.cases.from_table import channels_in
+    from livepde.runs import Table
+
+    rows: list[tuple[Any, ...]] = []
+    values = dict(zip(read.samples.names, read.samples.values.T, strict=True))
+    for item in channels_in(read, equation):
+        role, given = item.given["role"], item.given.get("unit", "")
+        state = equation.inputs[item.name] if role == "input" else equation.state
+        block = np.array([values[name] for name in item.columns])
+        present = block[np.isfinite(block)]
+        ends = (f"{present.min():.4g}", f"{present.max():.4g}") if present.size else ("–", "–")
+        columns = item.columns[0] if item.columns else "?"
+        if len(item.columns) > 1:
+            columns += f" ... {item.columns[-1]}"
+        gaps = "" if not item.columns else block.size - present.size
+        rows.append((columns, role, item.name, given or state.unit, *ends, gaps))
+    rows += [(name, "row number", "", "", "", "", "") for name in read.row_numbers]
+    rows += [(name, "text", "", "", "", "", "") for name in read.texts]
+    headings = ("column", "role", "channel", "unit", "least", "largest", "missing")
+    where = f"{read.path}: {read.span}"
+    console.print(f"{escape(where)}.", soft_wrap=True)
+    print_table(console, Table(f"Times in {' and '.join(read.time)}", headings, rows))
 
 
 def equations(

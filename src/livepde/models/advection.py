@@ -118,10 +118,10 @@ ADVECTION_DIFFUSION = Equation(
     state=Variable("degC", "temperature"),
     unknowns={
         "kappa": Variable("m^2/s", "diffusivity: a number, by layer, or a field"),
-        "v": Variable("m/s", "flux along z", True),
+        "v": Variable("m/s", "flux along z", True, transform=""),
         "K": Variable("m/s", "hydraulic conductivity, with the input dH", True),
         "dispersivity": Variable("m", "dispersivity", True),
-        "source": Variable("K/s", "heat gained over heat capacity", True),
+        "source": Variable("K/s", "heat gained over heat capacity", True, transform=""),
     },
     inputs={"dH": Variable("m", "head difference, positive if it drives along z", True)},
     options={
@@ -131,4 +131,5 @@ ADVECTION_DIFFUSION = Equation(
     },
     build=by_name(advection_diffusion),
     element=linear,
+    alternatives={"K": ("dH", "L", "ratio"), "v": ("ratio",)},
 )

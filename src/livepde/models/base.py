@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from livepde.errors import ModelError
 from livepde.fem import Place, Unknown
@@ -15,11 +15,23 @@ __all__ = ["Equation", "Fluxes", "Option", "Quantity", "Variable", "by_name", "c
 
 @dataclass(frozen=True)
 class Variable:
-    """An unknown, the state, or an input: its unit, what it is, and whether it may be left out."""
+    """An unknown, the state, or an input.
+
+    Attributes
+    ----------
+    unit, text
+        Its unit, and what it is.
+    optional
+        Whether it may be left out.
+    transform
+        Of an unknown in a case that `livepde init` writes: "log" of what is positive, "logit" of a
+        share between 0 and 1; empty of what may be negative.
+    """
 
     unit: str
     text: str
     optional: bool = False
+    transform: Literal["log", "logit", ""] = "log"
 
 
 @dataclass(frozen=True)
@@ -96,6 +108,14 @@ class Equation:
         mesh -> element of the state, and of an unknown field.
     fluxes
         Units of fluxes and sources (`livepde.models.with_conditions`); None: it takes none.
+    spacing
+        Of an interval's mesh: "geometric" where u changes most at the left end, as around a well.
+    alternatives
+        Unknowns of which a case needs at least one -> the inputs and options that belong to it.
+    components
+        Names of the components of u; empty if it has one.
+    dimension
+        Of the mesh that `livepde init` writes: 1 an interval, 2 a rectangle.
     """
 
     name: str
@@ -111,6 +131,15 @@ class Equation:
     length_unit: str = "m"
     time_unit: str = "s"
     fluxes: Fluxes | None = None
+    spacing: Literal["uniform", "geometric"] = "uniform"
+    alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    components: tuple[str, ...] = ()
+    dimension: Literal[1, 2] = 1
+
+    @property
+    def takes_values(self) -> bool:
+        """Whether a case may give values of the state on boundaries."""
+        return not isinstance(self.build, _Closed)
 
 
 def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
@@ -127,16 +156,27 @@ def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
     return build
 
 
-def closed(function: Callable[..., Model], why: str) -> Callable[..., Model]:
-    """Return the same for a function that takes no boundary values, and says why: `ModelError`."""
+@dataclass(frozen=True)
+class _Closed:
+    """The `build` of a function that takes no boundary values, and says why: `ModelError`."""
 
-    def build(
-        mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
+    function: Callable[..., Model]
+    why: str
+
+    def __call__(
+        self,
+        mesh: Any,
+        unknowns: Mapping[str, Unknown],
+        dirichlet: Mapping[str, Any],
+        **options: Any,
     ) -> Model:
         if dirichlet:
             raise ModelError(
-                f"{function.__name__} {why}: leave out the values on {sorted(dirichlet)}."
+                f"{self.function.__name__} {self.why}: leave out the values on {sorted(dirichlet)}."
             )
-        return function(mesh, **unknowns, **options)
+        return self.function(mesh, **unknowns, **options)
 
-    return build
+
+def closed(function: Callable[..., Model], why: str) -> Callable[..., Model]:
+    """Return the `build` of a function that takes no boundary values, and says why."""
+    return _Closed(function, why)

@@ -171,7 +171,7 @@ GROUTED_BOREHOLE = Equation(
         "k": Variable("W/(m K)", "conductivity of the ground"),
         "rho_c": Variable("J/(m^3 K)", "volumetric heat capacity of the ground"),
         "R_b": Variable("m K/W", "resistance between fluid and wall of the borehole"),
-        "share": Variable("", "part of R_b that the pipes make"),
+        "share": Variable("", "part of R_b that the pipes make", transform="logit"),
     },
     inputs={"Q": Variable("W", "power given to the fluid")},
     options={
@@ -186,4 +186,5 @@ GROUTED_BOREHOLE = Equation(
     },
     build=closed(grouted_borehole, "is heated by the input Q, with T0 far away"),
     element=linear,
+    spacing="geometric",
 )

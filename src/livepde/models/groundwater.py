@@ -211,6 +211,7 @@ PUMPING_TEST = Equation(
     options={"b": Option("m", "thickness of the aquifer; with 1 m k is T and Ss is S")},
     build=closed(pumping_test, "is pumped by the input Q, with 0 far away"),
     element=linear,
+    spacing="geometric",
 )
 
 GROUNDWATER = Equation(
@@ -231,4 +232,5 @@ GROUNDWATER = Equation(
     },
     build=_build_plane,
     element=linear,
+    dimension=2,
 )

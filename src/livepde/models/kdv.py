@@ -47,8 +47,8 @@ KDV = Equation(
     formula="u_t + a u u_x + b u_xxx = 0",
     state=Variable("", "height of the wave"),
     unknowns={
-        "advection": Variable("", "coefficient a of u u_x"),
-        "dispersion": Variable("", "coefficient b of u_xxx"),
+        "advection": Variable("", "coefficient a of u u_x", transform=""),
+        "dispersion": Variable("", "coefficient b of u_xxx", transform=""),
         "u0": INITIAL,
     },
     build=closed(kdv, "is periodic"),

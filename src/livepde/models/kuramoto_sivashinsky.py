@@ -54,9 +54,9 @@ KURAMOTO_SIVASHINSKY = Equation(
     formula="u_t + a u u_x + b u_xx + c u_xxxx = 0",
     state=Variable("", "velocity of the front"),
     unknowns={
-        "advection": Variable("", "coefficient a of u u_x"),
-        "instability": Variable("", "coefficient b of u_xx"),
-        "damping": Variable("", "coefficient c of u_xxxx"),
+        "advection": Variable("", "coefficient a of u u_x", transform=""),
+        "instability": Variable("", "coefficient b of u_xx", transform=""),
+        "damping": Variable("", "coefficient c of u_xxxx", transform=""),
         "u0": INITIAL,
     },
     build=closed(kuramoto_sivashinsky, "is periodic"),

@@ -113,4 +113,5 @@ BOREHOLE = Equation(
     },
     build=_build,
     element=linear,
+    spacing="geometric",
 )

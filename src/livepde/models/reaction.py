@@ -55,7 +55,7 @@ REACTION_DIFFUSION = Equation(
     summary="the paper's example: unknown reaction coefficient, no units",
     formula="u_t - div(D grad u) + q u = f",
     state=Variable("", "state"),
-    unknowns={"q": Variable("", "reaction coefficient")},
+    unknowns={"q": Variable("", "reaction coefficient", transform="")},
     options={"D": Option("", "diffusivity", 1.0), "f": Option("", "source density", 0.0)},
     build=by_name(reaction_diffusion),
     element=hermite,

@@ -189,13 +189,14 @@ MOBILE_IMMOBILE = Equation(
     state=Variable("", "concentration in the mobile (c) and the immobile water (s)"),
     unknowns={
         **COLUMN,
-        "phi": Variable("", "share of the water that moves"),
+        "phi": Variable("", "share of the water that moves", transform="logit"),
         "omega": Variable("1/h", "rate of exchange"),
     },
     inputs=INFLOW,
     options={"inlet": INLET},
     build=closed(mobile_immobile, FED),
     element=linear,
+    components=("c", "s"),
     length_unit="cm",
     time_unit="h",
 )

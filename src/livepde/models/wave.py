@@ -101,4 +101,5 @@ WAVE = Equation(
     },
     build=by_name(wave),
     element=linear,
+    components=("w", "p"),
 )

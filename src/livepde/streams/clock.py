@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta, tzinfo
+from itertools import product
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,6 +20,7 @@ __all__ = [
     "NO_POINT",
     "POINT",
     "Clock",
+    "date_formats",
     "guessed_format",
     "has_decimal_comma",
     "is_naive",
@@ -31,6 +33,12 @@ __all__ = [
 Instant: TypeAlias = float | str | date | datetime
 COMMA = "if that is a decimal comma, say decimal = ','."
 NO_POINT = "with decimal = ',' a point is none of decimals."
+FIRST_CELLS = 5  # of a column, in one of which a format of dates has to fit
+MOST = 0.8  # share of cells that a format of dates has to fit
+ORDERS = ("%d-%m-%Y", "%m-%d-%Y", "%Y-%m-%d", "%d-%m-%y", "%m-%d-%y", "%y-%m-%d", "%d-%b-%Y")
+POINTED = ("%d-%m-%Y", "%d-%m-%y", "%Y-%m-%d")  # with points the day is always before the month
+HOURS = ("", *(f" {h}" for h in ("%H:%M", "%H:%M:%S", "%H:%M:%S.%f")))
+HOURS += tuple(f" {h}{p}" for h in ("%I:%M", "%I:%M:%S") for p in (" %p", "%p"))
 POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals is no number
 
 
@@ -42,6 +50,8 @@ class Clock:
     ----------
     name
         The time column: numbers, or dates and times.
+    hour
+        The column of the times of day, where `name` holds days only; of CSV files.
     factor
         Multiplies numbers to give the model's time; dates become seconds divided by `second`.
     start, stop
@@ -65,6 +75,12 @@ class Clock:
     zone: tzinfo = UTC
     format: str = ""
     decimal: str = "."
+    hour: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns that hold the times: one, or days and times of day."""
+        return (self.name, self.hour) if self.hour else (self.name,)
 
     def bounds(self, dates: bool, where: str) -> tuple[float, float]:
         """Return start and stop in model time (dates: since 1970)."""
@@ -177,6 +193,48 @@ def number_of(cell: Any, decimal: str = ".") -> float | None:
 def has_decimal_comma(cell: Any) -> bool:
     """Return whether a cell is a number if its comma is one of decimals."""
     return isinstance(cell, str) and "," in cell and number_of(cell, ",") is not None
+
+
+def date_formats(cells: Sequence[str]) -> list[str]:
+    """Return the formats in which the cells of a column may be dates; "" is ISO.
+
+    A format has to fit most cells. More than one is left where the order of day, month and year
+    cannot be known: formats in which time goes back are dropped, and those with uneven steps where
+    exactly one gives even ones.
+
+    >>> date_formats(["16/06/28 06:45", "16/06/28 07:00"])
+    ['%d/%m/%y %H:%M', '%y/%m/%d %H:%M']
+    >>> date_formats(["06/28/2016 11:45 PM", "06/29/2016 12:00 AM"])
+    ['%m/%d/%Y %I:%M %p']
+    """
+    found: dict[str, Array] = {}
+    clock, begin = Clock(""), cells[:FIRST_CELLS]
+    guessed = dict.fromkeys(guessed_format(cell) for cell in begin)
+    for form in dict.fromkeys(["", *_known_formats(), *guessed]):
+        if all(clock.stamp(cell, form) is None for cell in begin):
+            continue
+        stamps = [clock.stamp(cell, form) for cell in cells]
+        given = np.array([stamp for stamp in stamps if stamp is not None])
+        if len(given) > MOST * len(cells):
+            found[form] = given
+    if "" in found:
+        return [""]
+    steps = {form: np.diff(given) for form, given in found.items()}
+    steps = {form: step for form, step in steps.items() if (step >= 0).all()} or steps
+    even = [form for form, step in steps.items() if len(step) > 1 and _are_even(step)]
+    return even if len(even) == 1 else list(steps)
+
+
+def _are_even(steps: Array) -> bool:
+    """Return whether the longest step is hardly longer than the median."""
+    return bool(0 < steps.max() <= 1.5 * np.median(steps))
+
+
+def _known_formats() -> Iterator[str]:
+    """Yield the formats of dates that loggers and spreadsheets write, beside ISO."""
+    for mark, hour in product("/-. ", HOURS):
+        for order in ORDERS if mark != "." else POINTED:
+            yield order.replace("-", mark) + hour
 
 
 def guessed_format(text: str) -> str:

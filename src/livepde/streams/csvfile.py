@@ -6,8 +6,9 @@ import codecs
 import csv
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
+from statistics import multimode
 from typing import Any
 
 import numpy as np
@@ -17,18 +18,18 @@ from livepde.linalg import Array
 from livepde.streams.clock import (
     POINT,
     Clock,
-    guessed_format,
+    date_formats,
     has_decimal_comma,
     number_of,
     read_times,
 )
 from livepde.streams.names import check_columns, is_data, no_file
-from livepde.streams.table import Column, Table, cell_number, to_table
+from livepde.streams.table import MISSING, Column, Table, cell_number, to_table
 
 __all__ = ["UTF_8", "Written", "how_written", "read_csv", "too_wide"]
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
-SEPARATORS = (",", ";", "\t")
+SEPARATORS = ("\t", ";", ",")  # in the order in which they are tried
 END = "end"  # of a file that is read
 LOOK = 100_000  # characters that are looked at to say how a file is written
 BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .ods, .xls
@@ -42,8 +43,11 @@ class Written:
     ----------
     separator, decimal, encoding
         As `read_csv`, `Column` and `Clock` take them.
-    time_format
-        Of its dates, if they are not in ISO format; else empty.
+    skip
+        Lines before the header: titles.
+    time_formats
+        In which its dates may be written, if they are not in ISO format: more than one where the
+        order of day, month and year cannot be known.
     header, rows
         Cells of the header, and of the first rows.
     """
@@ -51,9 +55,15 @@ class Written:
     separator: str
     decimal: str
     encoding: str
-    time_format: str
+    skip: int
+    time_formats: tuple[str, ...]
     header: list[str]
     rows: list[list[str]]
+
+    @property
+    def time_format(self) -> str:
+        """The only format of its dates; empty if there are none or several."""
+        return self.time_formats[0] if len(self.time_formats) == 1 else ""
 
 
 def read_csv(
@@ -65,6 +75,7 @@ def read_csv(
     missing: Iterable[float] = (),
     separator: str = ",",
     encoding: str = UTF_8,
+    skip: int = 0,
 ) -> Table:
     """Read channels from a CSV file with one header line.
 
@@ -80,6 +91,8 @@ def read_csv(
         What stands between two fields, as "," or ";".
     encoding
         How the text is written, as "cp1252" or "utf-16".
+    skip
+        Lines before the header.
 
     Raises
     ------
@@ -89,20 +102,21 @@ def read_csv(
     """
     path = Path(path)
     needed = list(
-        dict.fromkeys([clock.name, *(n for column in columns.values() for n in column.names)])
+        dict.fromkeys([*clock.names, *(n for column in columns.values() for n in column.names)])
     )
     try:
         _check_text(path)
-        rows, cells = _cells(path, needed, separator, encoding, clock)
+        rows, cells = _cells(path, needed, separator, encoding, clock, skip)
     except FileNotFoundError:
         raise no_file(path) from None
     except UnicodeError as error:
-        raise _not_text(path, separator, encoding, clock) from error
+        raise _not_text(path, separator, encoding, clock, skip) from error
     except (OSError, csv.Error) as error:
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
     if not rows:
         raise DataError(f"{path}: holds no rows beside its header.")
-    times, dates = read_times(cells[clock.name], clock, lambda k: f"{path}, row {rows[k]}, column")
+    stamps = [" ".join(parts) for parts in zip(*(cells[name] for name in clock.names), strict=True)]
+    times, dates = read_times(stamps, clock, lambda k: f"{path}, row {rows[k]}, column")
     decimals = {name: column.decimal for column in columns.values() for name in column.names}
 
     def numbers(name: str, use: Any) -> Array:
@@ -123,26 +137,36 @@ def _check_text(path: Path) -> None:
             raise DataError(f"{path} is a workbook, not text: save its sheet as 'CSV UTF-8'.")
 
 
-def _check_separator(
-    path: Path, header: list[str], separator: str, encoding: str, clock: Clock
+def _check_header(
+    path: Path, header: list[str], separator: str, encoding: str, clock: Clock, skip: int
 ) -> None:
-    """Refuse a header that another separator would divide."""
+    """Refuse a header that another separator would divide, or a title in its place."""
     others = [other for other in SEPARATORS if other != separator and other in header[0]]
-    if len(header) == 1 and others:
+    if len(header) > 1:
+        return
+    seems = how_written(path, encoding)
+    if seems.skip > skip and seems.separator == separator:
+        raise SampleError(
+            f"{path}: line {skip + 1} is no header, but a title: say "
+            f"{_as_written(path, separator, encoding, clock, '', skip)}."
+        )
+    if others:
         raise SampleError(
             f"{path}: the header is one field with {separator!r} between fields, and "
-            f"{header[0].count(others[0]) + 1} with {others[0]!r}: "
-            f"say {_as_written(path, others[0], encoding, clock, f'separator = {others[0]!r}')}."
+            f"{header[0].count(others[0]) + 1} with {others[0]!r}: say "
+            f"{_as_written(path, others[0], encoding, clock, f'separator = {others[0]!r}', skip)}."
         )
 
 
-def how_written(path: str | Path, encoding: str = "") -> Written:
+def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -> Written:
     """Return how a CSV file seems to be written, by its first rows.
 
     Parameters
     ----------
     encoding
         How its text is written, if that is known.
+    skip
+        Lines before the header, if that is known; else those with fewer cells than most lines.
 
     Raises
     ------
@@ -160,16 +184,56 @@ def how_written(path: str | Path, encoding: str = "") -> Written:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}.") from error
     whole = text if len(text) < LOOK else text.rpartition("\n")[0]
-    lines = [line for line in whole.splitlines() if line.strip()]
-    separator = max(SEPARATORS, key=lines[0].count) if lines else SEPARATORS[0]
-    found = csv.reader(lines, delimiter=separator, skipinitialspace=True)
-    header, *rows = [*found] or [[]]
+    lines = whole.splitlines()
+    separator = _separator(lines[skip or 0 :])
+    if skip is None:
+        skip = _titles(lines, separator)
+    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
+    header, *rows = [row for row in found if row] or [[]]
     cells = [cell for row in rows for cell in row]
     decimal = "," if any(map(has_decimal_comma, cells)) else "."
-    texts = (c for c in cells if number_of(c, decimal) is None and Clock("").stamp(c) is None)
-    formats = map(guessed_format, dict.fromkeys(texts))
-    time_format = next((form for form in formats if "%d" in form), "")
-    return Written(separator, decimal, encoding, time_format, header, rows)
+    formats = (_formats([row[k] for row in rows if k < len(row)], decimal) for k in _places(header))
+    return Written(
+        separator, decimal, encoding, skip, next(filter(None, formats), ()), header, rows
+    )
+
+
+def _places(header: Sequence[str]) -> Iterator[int]:
+    """Yield the places of the columns that have a name."""
+    return (k for k, name in enumerate(header) if name)
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """Return what divides most lines: a tab or a semicolon, or else a comma."""
+    for mark in SEPARATORS:
+        if max(multimode(line.count(mark) for line in lines if line.strip()), default=0):
+            return mark
+    return ","
+
+
+def _titles(lines: Sequence[str], separator: str) -> int:
+    """Return how many lines at the start have fewer cells than most, and are no header."""
+
+    def width(line: str) -> int:
+        row = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+        return max((k for k, cell in enumerate(row, start=1) if cell.strip()), default=0)
+
+    widths = [width(line) for line in lines]
+    usual = min(multimode(found for found in widths if found), default=0)
+    start = next((k for k, found in enumerate(widths) if found >= usual), 0)
+    names = next(csv.reader(lines[start : start + 1], delimiter=separator), [])
+    titled = all(found <= 1 for found in widths[:start])
+    if not titled or any(number_of(name.strip(), ",") is not None for name in names):
+        return 0  # it is the header that is short
+    return start
+
+
+def _formats(cells: Sequence[str], decimal: str) -> tuple[str, ...]:
+    """Return the formats in which a column's cells may be dates; none of numbers and ISO dates."""
+    texts = [cell.strip() for cell in cells if cell.strip().lower() not in MISSING]
+    if not texts or number_of(texts[0], decimal) is not None:
+        return ()
+    return tuple(filter(None, date_formats(texts)))
 
 
 def _likely(content: bytes, encoding: str) -> str:
@@ -182,11 +246,15 @@ def _likely(content: bytes, encoding: str) -> str:
         return "utf-16" if wide else "cp1252" if encoding == UTF_8 else "utf-8"
 
 
-def _as_written(path: Path, separator: str, encoding: str, clock: Clock, known: str) -> str:
+def _as_written(
+    path: Path, separator: str, encoding: str, clock: Clock, known: str, skip: int
+) -> str:
     """Return what to say of how a file is written: what is known, and what else it lacks."""
     seems = how_written(path, encoding)
-    said = [known]
+    said = [known] if known else []
     others = "separator" not in known and len(seems.header) > 1
+    if seems.skip > skip:
+        said.append(f"skip = {seems.skip}")
     if others and seems.separator != separator and separator not in "".join(seems.header):
         said.append(f"separator = {seems.separator!r}")
     if clock.decimal == "." and seems.decimal == ",":
@@ -208,19 +276,20 @@ def too_wide(cells: list[str], header: list[str]) -> bool:
 
 
 def _cells(
-    path: Path, needed: list[str], separator: str, encoding: str, clock: Clock
+    path: Path, needed: list[str], separator: str, encoding: str, clock: Clock, skip: int
 ) -> tuple[list[int], dict[str, list[str]]]:
     """Return the numbers of the rows that are not blank, and the text in the needed columns.
 
     Refuses a name that stands twice, more fields than names, and a quote that does not end.
     """
     with path.open(newline="", encoding=encoding) as file:
-        lines = csv.reader(chain(file, [f"{END}\n"]), delimiter=separator, skipinitialspace=True)
-        numbered = _whole(lines)
+        whole = chain(islice(file, skip, None), [f"{END}\n"])
+        lines = csv.reader(whole, delimiter=separator, skipinitialspace=True)
+        numbered = _whole(lines, skip + 1)
         header = next((row for _, row in numbered if row), None)
         if header is None:
             raise csv.Error("it is empty")
-        _check_separator(path, header, separator, encoding, clock)
+        _check_header(path, header, separator, encoding, clock, skip)
         check_columns(str(path), needed, header, told=is_data(path))
         for name in needed:
             if header.count(name) > 1:
@@ -242,13 +311,13 @@ def _cells(
     return rows, dict(zip(needed, columns, strict=True))
 
 
-def _whole(lines: Iterable[list[str]]) -> Iterator[tuple[int, list[str]]]:
+def _whole(lines: Iterable[list[str]], begin: int) -> Iterator[tuple[int, list[str]]]:
     """Iterate over rows and their numbers, without the END that follows the last line.
 
     Where a quote is still open there, END is part of it, and `csv.Error` is raised.
     """
     before: tuple[int, list[str]] | None = None
-    for item in enumerate(lines, start=1):
+    for item in enumerate(lines, start=begin):
         if before is not None:
             yield before
         before = item
@@ -256,7 +325,7 @@ def _whole(lines: Iterable[list[str]]) -> Iterator[tuple[int, list[str]]]:
         raise csv.Error("a quote does not end")
 
 
-def _not_text(path: Path, separator: str, encoding: str, clock: Clock) -> DataError:
+def _not_text(path: Path, separator: str, encoding: str, clock: Clock, skip: int) -> DataError:
     """Return an error about a file that is no text in this encoding."""
     content, row, byte = path.read_bytes(), 1, ""
     try:
@@ -264,7 +333,7 @@ def _not_text(path: Path, separator: str, encoding: str, clock: Clock) -> DataEr
     except UnicodeDecodeError as error:
         row, byte = content.count(b"\n", 0, error.start) + 1, f"byte 0x{content[error.start]:02x} "
     likely = _likely(content, encoding)
-    said = _as_written(path, separator, likely, clock, f"encoding = {likely!r}")
+    said = _as_written(path, separator, likely, clock, f"encoding = {likely!r}", skip)
     return DataError(
         f"{path} is not text in {encoding.removesuffix('-sig').upper()} ({byte}in row {row}): say "
         f"{said}; or save it as 'CSV UTF-8'."

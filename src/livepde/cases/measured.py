@@ -1,0 +1,271 @@
+"""How a table of measurements is written, and what its columns hold, for `livepde init`."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from livepde.cases.read import BLANK
+from livepde.cases.units import conversion
+from livepde.errors import CaseError, SampleError
+from livepde.linalg import Array
+from livepde.streams import Clock, Column, Table, read_csv
+from livepde.streams.clock import date_formats, number_of
+from livepde.streams.csvfile import Written, how_written
+from livepde.streams.table import JSON_LINES, MISSING
+
+__all__ = ["IN_BRACKETS", "DateOrder", "Measured", "measured", "unit_in"]
+
+IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
+AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
+HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
+CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
+ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
+
+DateOrder = Callable[[str, str, Sequence[str]], str]
+"""(column, first cell, formats) -> the format of dates whose order cannot be known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A table of measurements as it was read.
+
+    Attributes
+    ----------
+    path
+        The CSV file.
+    written
+        How it is written.
+    time
+        Column of times; or days and times of day, two columns.
+    time_format
+        Of its dates; empty: ISO format, or numbers.
+    time_unit
+        Of its times; `BLANK` if unknown, empty if the equation's time has none.
+    samples
+        Times, and the columns that hold numbers.
+    row_numbers, texts
+        Columns that are not used: numbers of rows, and those without numbers.
+    """
+
+    path: Path
+    written: Written
+    time: tuple[str, ...]
+    time_format: str
+    time_unit: str
+    samples: Table
+    row_numbers: tuple[str, ...]
+    texts: tuple[str, ...]
+
+    @property
+    def steps(self) -> Array:
+        """Intervals between the samples."""
+        return np.diff(self.samples.t)
+
+    @property
+    def span(self) -> str:
+        """Number of rows, first and last time, and intervals in one sentence."""
+        samples, steps = self.samples, self.steps
+        unit = self.time_unit.replace(BLANK, "")
+        begin, end = (_moment(t, samples.origin) for t in samples.t[[0, -1]])
+        told = f"{len(samples)} rows from {begin} to {end}{' UTC' if samples.origin else ''}"
+        if len(steps):
+            told += f", {np.median(steps):g} {unit}".rstrip() + " apart"
+        if len(steps) and steps.max() > 1.01 * steps.min():
+            told += f" (median), {steps.min():g} to {steps.max():g}"
+        return told
+
+
+def _moment(t: float, origin: datetime | None) -> str:
+    return f"{t:g}" if origin is None else f"{origin + timedelta(seconds=t)}"
+
+
+def measured(
+    table: Path,
+    time_unit: str,
+    *,
+    time_format: str = "",
+    skip: int | None = None,
+    choose: DateOrder | None = None,
+) -> Measured:
+    """Read a CSV file of which nothing is known.
+
+    Parameters
+    ----------
+    time_unit
+        The unit of time of the equation.
+    time_format
+        Of dates; empty: found from the cells.
+    skip
+        Lines before the header; None: found from the lines.
+    choose
+        Is asked for the order of day, month and year where the cells leave it open.
+
+    Raises
+    ------
+    DataError
+        There is no such file, or it is no table of times and measurements; one sentence.
+    """
+    if table.suffix in (*JSON_LINES, ".parquet"):
+        raise SampleError(f"{table}: a case is begun from a CSV file, with a header.")
+    written = how_written(table, skip=skip)
+    kinds = _kinds(table, written, time_format)
+    time = _times(table, written, kinds)
+    found = ""
+    if kinds[time[0]] == "date":
+        found = _format(table, written, time, time_format, choose)
+    numbers = [name for name, kind in kinds.items() if kind == "number" and name not in time]
+    counted = tuple(name for name in numbers if _counts_rows(name, written))
+    names = [name for name in numbers if name not in counted]
+    if not names:
+        raise SampleError(f"{table}: beside the times, '{time[0]}', no column holds numbers.")
+    samples = read_csv(
+        table,
+        {name: Column((name,), decimal=written.decimal) for name in names},
+        Clock(time[0], format=found, decimal=written.decimal, hour="".join(time[1:])),
+        separator=written.separator,
+        encoding=written.encoding,
+        skip=written.skip,
+    )
+    unit = time_unit
+    if unit:
+        unit = "s" if samples.origin else unit_in(time[0], unit, IN_BRACKETS, AT_THE_END) or BLANK
+    texts = tuple(name for name in kinds if name not in (*time, *numbers))
+    return Measured(table, written, time, found, unit, samples, counted, texts)
+
+
+def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
+    """Return the unit in the name of a column; empty if none can be converted to `unit`."""
+    for given in filter(None, (pattern.search(name) for pattern in patterns)):
+        for text in (given[1], re.sub(r"(?<=[A-Za-z])(?=\d)", "^", given[1])):  # m3/h, m^3/h
+            with suppress(CaseError):
+                conversion(text, unit, name)
+                return text
+    return ""
+
+
+def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
+    """Return column -> what most of its cells are: "number", "date", "hour" or "text"."""
+    header, rows = written.header, written.rows
+    if not rows:
+        raise SampleError(f"{table}: holds no rows beside its header.")
+    form = form or next(iter(written.time_formats), "")
+
+    def of_cell(cell: str) -> str:
+        if number_of(cell, written.decimal) is not None:
+            return "number"
+        if Clock("").stamp(cell, form) is not None or Clock("").stamp(cell) is not None:
+            return "date"
+        return "hour" if HOUR.fullmatch(cell.strip()) else "text"
+
+    def of_column(cells: list[str]) -> str:
+        found = Counter(of_cell(cell) for cell in cells if cell.lower() not in MISSING)
+        return found.most_common(1)[0][0] if found else "text"
+
+    if all(of_cell(cell) in ("number", "date") for cell in header if cell):
+        raise SampleError(f"{table}: has no header: begin it with a line of names of its columns.")
+    if len(header) < 2:
+        raise SampleError(
+            f"{table}: has one column, '{header[0]}'; expected times and measurements, with a "
+            "comma, a semicolon or a tab between them."
+        )
+    if not any(of_cell(cell) in ("number", "date") for cell in rows[0]):
+        raise SampleError(
+            f"{table}, row {written.skip + 2}: holds no numbers; the header is one line: delete "
+            "the second, or say --skip if the first are titles."
+        )
+    return {
+        name: of_column([row[k].strip() for row in rows if k < len(row)])
+        for k, name in enumerate(header)
+        if name
+    }
+
+
+def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the column of times: dates, or numbers that increase; or days and times of day."""
+    dates, hours, numbers = (
+        [n for n, k in kinds.items() if k == kind] for kind in ("date", "hour", "number")
+    )
+    complete = [name for name in dates if any(":" in cell for cell in _cells(name, written))]
+    if dates and hours and not complete:
+        return dates[0], hours[0]
+    timed = [name for name in numbers if unit_in(name, "s", IN_BRACKETS, AT_THE_END)]
+    rising = [name for name in numbers if _rises(name, written)]
+    named = [name for name in rising if CALLED_TIME.match(name)]
+    others = [name for name in rising if not _counts_rows(name, written)]
+    both = [name for name in timed if name in rising]
+    found = [*complete, *dates, *both, *named, *others, *rising, *timed]
+    if not found:
+        more = ""
+        if "" in written.header:
+            more = f" Column {written.header.index('') + 1} has no name: give it one."
+        elif hours:
+            more = f" '{hours[0]}' has times of day: add a column of days."
+        raise SampleError(
+            f"{table}: no column holds times: expected dates, or numbers that increase from row to "
+            f"row.{more}"
+        )
+    return (found[0],)
+
+
+def _format(
+    table: Path,
+    written: Written,
+    time: tuple[str, ...],
+    given: str,
+    choose: DateOrder | None,
+) -> str:
+    """Return the format of dates; asks where the order of day, month and year is open."""
+    cells = [" ".join(parts) for parts in zip(*(_cells(n, written) for n in time), strict=False)]
+    if given:
+        return given
+    formats = date_formats(cells)
+    if len(formats) == 1:
+        return formats[0]
+    if not formats:
+        raise SampleError(
+            f"{table}, column '{time[0]}': got '{cells[0]}'; say --time-format, as "
+            "'%d.%m.%Y %H:%M'."
+        )
+    if choose is not None:
+        return choose(time[0], cells[0], formats)
+    candidates = " or ".join(
+        f"'{form}' ({_moment(Clock('').stamp(cells[0], form) or 0.0, datetime(1970, 1, 1))})"
+        for form in formats
+    )
+    raise SampleError(
+        f"{table}, column '{time[0]}': the order of day, month and year in '{cells[0]}' cannot be "
+        f"known: say --time-format, {candidates}."
+    )
+
+
+def _cells(name: str, written: Written) -> list[str]:
+    """Return the first cells of a column that are not missing."""
+    k = written.header.index(name)
+    cells = (row[k].strip() for row in written.rows if k < len(row))
+    return [cell for cell in cells if cell.lower() not in MISSING]
+
+
+def _values(name: str, written: Written) -> list[float | None]:
+    k = written.header.index(name)
+    return [number_of(row[k], written.decimal) for row in written.rows if k < len(row)]
+
+
+def _rises(name: str, written: Written) -> bool:
+    values = _values(name, written)
+    return all(a is not None and b is not None and a < b for a, b in pairwise(values))
+
+
+def _counts_rows(name: str, written: Written) -> bool:
+    """Return whether a column numbers the rows, by its name and its values."""
+    values = _values(name, written)
+    counts = all(a is not None and b == a + 1 for a, b in pairwise(values))
+    return bool(ROW_NUMBER.fullmatch(name.strip())) and len(values) > 1 and counts

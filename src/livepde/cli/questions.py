@@ -1,0 +1,116 @@
+"""What `livepde init` asks on a terminal: what a table of measurements does not tell."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import typer
+
+from livepde.cases.fill import Blank, blanks, filled
+from livepde.cases.settings import parse
+from livepde.cases.units import convert
+from livepde.errors import CaseError
+from livepde.models import Equation
+
+__all__ = ["answered", "asks", "date_order"]
+
+ENDS = ("left", "right")
+TEXTS = ("column", "unit", "time_unit", "positions")  # keys whose values are no quantities
+SKIP = "Press Enter to leave a question open."
+
+
+def asks() -> bool:
+    """Return whether somebody is there to answer."""
+    return sys.stdin.isatty()
+
+
+def date_order(column: str, cell: str, formats: Sequence[str]) -> str:
+    """Ask for the order of day, month and year."""
+    known = {str(k): form for k, form in enumerate(formats, start=1)}
+    shown = "\n".join(f"  {k}  {form}" for k, form in known.items())
+    typer.echo(f"How is '{cell}' in column '{column}' to be read?\n{shown}")
+    while (number := typer.prompt("Number").strip()) not in known:
+        typer.echo(f"Expected one of {', '.join(known)}.")
+    return known[number]
+
+
+def answered(text: str, equation: Equation, columns: Sequence[str], where: str) -> str:
+    """Return the text of a case with what was answered; what was skipped stays open."""
+    if blanks(text):
+        typer.echo(SKIP)
+    asked: set[str] = set()
+    while left := [item for item in blanks(text) if item.key not in asked]:
+        blank = left[0]
+        asked.add(blank.key)
+        text = _ask(text, blank, equation, columns, where)
+    return text
+
+
+def _ask(text: str, blank: Blank, equation: Equation, columns: Sequence[str], where: str) -> str:
+    """Ask until the answer fits or the question is skipped."""
+    while True:
+        given = typer.prompt(_question(blank, equation), default="", show_default=False).strip()
+        if not given:
+            return text
+        try:
+            return filled(text, _settings(blank, given, equation, columns), where)
+        except CaseError as error:
+            typer.echo(str(error))
+
+
+def _question(blank: Blank, equation: Equation) -> str:
+    """Return a question in one line: key, unit, and the comment of the line."""
+    unit = f" [{blank.unit}]" if blank.unit else ""
+    about = blank.comment.removeprefix("#").strip()
+    more = ""
+    if _is_place(blank):
+        ends = "left or right for a value given there, " if equation.takes_values else ""
+        quantities = "".join(f"{name}, " for name in equation.quantities)
+        more = f" ({quantities}{ends}- to drop it)"
+    elif isinstance(blank.value, list):
+        more = " (two, with a comma between them)"
+    return f"{blank.key}{unit}{more}{': ' if about else ''}{about}\n "
+
+
+def _is_place(blank: Blank) -> bool:
+    return blank.path[0] == "channels" and blank.path[-1] == "at" and isinstance(blank.value, str)
+
+
+def _settings(
+    blank: Blank, given: str, equation: Equation, columns: Sequence[str]
+) -> Mapping[str, Any]:
+    """Return the settings of the case that an answer means."""
+    channel = ".".join(blank.path[:-1])
+    if _is_place(blank):
+        if given == "-":
+            return {channel: None}
+        if given in equation.quantities:
+            return {f"{channel}.at": None, f"{channel}.quantity": given}
+        if given in ENDS and equation.takes_values:
+            return {f"{channel}.role": "boundary", f"{channel}.at": given}
+    if blank.path[-1] in TEXTS:
+        if blank.path[-1] == "column" and given not in columns:
+            raise CaseError(f"There is no column '{given}' among {', '.join(columns)}.")
+        return {blank.key: given}
+    if isinstance(blank.value, list):
+        parts = [part.strip() for part in given.split(",")]
+        count = sum(isinstance(value, str) for value in blank.value)
+        if len(parts) != count:
+            raise CaseError(f"Got {len(parts)} values; expected {count}, as 0, 1.")
+        rest = [value for value in blank.value if not isinstance(value, str)]
+        return {blank.key: [*(_quantity(part, blank) for part in parts), *rest]}
+    return {blank.key: _quantity(given, blank)}
+
+
+def _quantity(given: str, blank: Blank) -> Any:
+    """Return a number with the unit of the question, or the unit that was given."""
+    (value,) = parse([f"x={given}"]).values()
+    difference = blank.path[-1] in ("std", "noise")
+    if isinstance(value, str):
+        convert(value, blank.unit, blank.key, difference=difference)
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise CaseError(f"{blank.key}: got {given}; expected a number.")
+    return f"{value:g} {blank.unit}" if blank.unit else value
