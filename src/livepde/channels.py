@@ -1,4 +1,4 @@
-"""The channels of an identifier: what a sample brings by name, and what holds in a gap."""
+"""Channels of an identifier: parsing and validation of samples, hold of missing inputs."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ NOTHING = np.zeros(0)  # withheld sensors without a value
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Names of all channels, and samples as checked arrays.
+    """Names of all channels; conversion of samples to validated arrays.
 
     Parameters
     ----------
     forced
         Channels that the model reads.
     observed, withheld
-        Sensors that are assimilated, and those that are only scored.
+        Assimilated sensors, and withheld sensors, which are only scored.
 
     Raises
     ------
@@ -71,17 +71,17 @@ class Channels:
 
     @cached_property
     def sensors(self) -> list[Observed]:
-        """The observations there are."""
+        """Observation operators: the assimilated, and the withheld one if present."""
         return [item for item in (self.observed, self.withheld) if item is not None]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Every channel a sample may name."""
+        """Names that a sample may contain."""
         return tuple(dict.fromkeys([*self.observed.names, *self.hidden, *self.inputs]))
 
     @cached_property
     def noise(self) -> dict[str, str]:
-        """Name of the noise of a reading -> its sensor."""
+        """Mapping from the name of a reading's noise to its sensor."""
         return {noise_channel(name): name for name in (*self.observed.names, *self.hidden)}
 
     @cached_property
@@ -120,7 +120,7 @@ class Channels:
     def _by_name(
         self, z: Mapping[str, Any], inputs: Mapping[str, float]
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
-        """Return what `parse` does, of inputs those among the values by name."""
+        """Return the values of `parse` for a mapping; it may contain inputs, too."""
         if not (self._known.issuperset(z) and self._known.issuperset(inputs)):
             unknown = next(name for name in (*z, *inputs) if name not in self._known)
             raise SampleError(
@@ -145,7 +145,7 @@ class Channels:
         return measured, own, withheld, named
 
     def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
-        """Return value and noise of a reading that is a pair."""
+        """Return value and noise of a reading given as a pair."""
         if len(given) != 2 or noise_channel(name) not in self.noise:
             raise SampleError(
                 f"channel '{name}': got {given!r}; expected a number, or of a sensor a pair "
@@ -155,7 +155,7 @@ class Channels:
         return value, check_noise(name, std)
 
     def _named(self, inputs: Mapping[str, float]) -> dict[str, float]:
-        """Return inputs, checked."""
+        """Return validated inputs."""
         named = {}
         for name, value in inputs.items():
             if name not in self.inputs:
@@ -166,7 +166,7 @@ class Channels:
         return named
 
     def filled(self, named: Mapping[str, float], known: Inputs) -> tuple[Inputs, tuple[str, ...]]:
-        """Return all inputs, and which of them hold their last known value as they are missing.
+        """Return all inputs, and the names of missing ones that hold their last value.
 
         Raises
         ------
@@ -193,14 +193,14 @@ class Channels:
     def planned(
         self, inputs: Mapping[str, ArrayLike], times: Iterable[float], t: float, known: Inputs
     ) -> list[Inputs]:
-        """Return all inputs at each of some times to come.
+        """Return all inputs at each of several future times.
 
         Parameters
         ----------
         inputs
-            Channel -> its value, or one for each time.
+            Mapping from channel to a value, or to one value for each time.
         t, known
-            Of the last sample.
+            Time and inputs of the last sample.
         """
         times, planned, last = list(times), [], known
         plans = {name: plan(name, values, len(times)) for name, values in inputs.items()}

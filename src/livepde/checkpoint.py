@@ -1,4 +1,4 @@
-"""State values on disk: a NumPy archive of plain arrays, no pickle, written atomically."""
+"""Checkpoint files: a NumPy archive of plain arrays, without pickle, written atomically."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from livepde.linalg import Array
 
 __all__ = ["flatten", "packed", "read", "rebuild", "unpacked", "write"]
 
-# What an archive that is none, is damaged, or was made to do harm, makes of reading it.
+# Exceptions of reading a file that is no archive, is damaged, or was crafted to do harm.
 DAMAGE = (
     EOFError,
     LookupError,
@@ -37,7 +37,7 @@ DAMAGE = (
 
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
-    """Return the leaves of nested dataclasses and tuples of arrays and numbers, by dotted path."""
+    """Return the leaves of nested dataclasses and tuples of arrays, keyed by dotted path."""
     if isinstance(value, tuple):
         parts = [flatten(item, f"{prefix}.{k}") for k, item in enumerate(value)]
         return {path: leaf for part in parts for path, leaf in part.items()}
@@ -52,11 +52,11 @@ def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
 def rebuild(
     template: Any, leaves: Mapping[str, Array], prefix: str = "state", grows: int = 0
 ) -> Any:
-    """Return a value shaped like `template` with the leaves given.
+    """Return a value of the structure of `template`, with the given leaves.
 
-    The first axis of an array may have another length (stored samples, members that are awake), and
-    what the metadata of its dataclass field say, as in field(metadata={"grows": 1}). A field with
-    the metadata "begins_anew" is as in the template, with the length that may differ, where it was
+    The first axis of an array may have another length (stored samples, active members), and so may
+    the axis declared in the metadata of its field, as in field(metadata={"grows": 1}). A field with
+    the metadata "begins_anew" is as in the template, with the length that may differ, if it was
     stored by something else: a verdict by a run that has kept none.
     """
     if isinstance(template, tuple):
@@ -97,7 +97,7 @@ def _others(array: Array, axis: int) -> list[int]:
 
 
 def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
-    """Return header and leaves as one archive."""
+    """Return an archive of header and leaves as bytes."""
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", allowZip64=True) as members:
         for name, leaf in {"header": json.dumps(dict(header)), **leaves}.items():
@@ -109,7 +109,7 @@ def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
 
 @lru_cache(maxsize=4096)
 def _array_header(dtype: str, shape: tuple[int, ...]) -> bytes:
-    """Return the header of an array in NumPy's format: a state has many, and often the same."""
+    """Return the header of an array in NumPy's format, cached: most arrays of a state repeat it."""
     header = io.BytesIO()
     about = {"descr": dtype, "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(header, about)
@@ -131,14 +131,14 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
 
 
 def _refuse_bombs(members: Iterable[zipfile.ZipInfo], size: int) -> None:
-    """Refuse an archive that would become larger than it is: `packed` compresses nothing."""
+    """Reject an archive that expands beyond its size (zip bomb): `packed` never compresses."""
     for member in members:
         if member.compress_type != zipfile.ZIP_STORED or member.file_size > size:
             raise ValueError(f"{member.filename} is compressed")
 
 
 def write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write an archive; the file appears whole or not at all."""
+    """Write an archive atomically: the file appears complete or not at all."""
     target = Path(path)
     try:
         write_bytes(target, content, sync=True)
@@ -149,7 +149,7 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def read(path: str | os.PathLike[str]) -> bytes:
-    """Return the archive in a file."""
+    """Return the contents of an archive file."""
     try:
         return Path(path).read_bytes()
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What sensors will show later, if nothing more is measured."""
+"""Forecast of sensor readings without further measurements."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Forecast", "ahead"]
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What the model expects sensors to show at some times.
+    """Predicted sensor readings at given times, with their standard deviations.
 
     Attributes
     ----------
@@ -29,12 +29,12 @@ class Forecast:
     names
         The assimilated sensors, then the withheld ones.
     z
-        What they will show, shape (times, sensors); NaN for a sensor whose position is not known.
+        Predicted readings, shape (times, sensors); NaN for a sensor whose position is not known.
     z_std
-        Standard deviation of z for what is not known of state and unknowns, without the noise of
-        the sensors; NaN for a law without covariance.
+        Standard deviation of z due to the uncertainty of state and unknowns, without sensor noise;
+        NaN for a law without covariance.
     status
-        How the first step went that failed; from there on all is NaN.
+        Status of the first failed step, after which all values are NaN; else of the last step.
     """
 
     t: Array
@@ -44,7 +44,7 @@ class Forecast:
     status: Status
 
     def __getitem__(self, name: str) -> Array:
-        """Return what one sensor will show, shape (times,); `SampleError` if there is none."""
+        """Return the prediction of one sensor, shape (times,); raise `SampleError` if unknown."""
         if name not in self.names:
             raise SampleError(
                 f"forecast: no sensor is called '{name}'; there are {list(self.names)}."
@@ -61,12 +61,12 @@ def ahead(
     state: Any,
     intervals: Sequence[Interval],
 ) -> Forecast:
-    """Return what sensors show at the ends of intervals, from the state of a law on.
+    """Return predicted readings at the ends of intervals, starting from the state of a law.
 
     Parameters
     ----------
     intervals
-        Each begins where the one before ends; the first may have no length.
+        Consecutive intervals; the first may have zero length.
     """
     names = tuple(name for each in sensors for name in each.names)
     z, std = np.full((2, len(intervals), len(names)), np.nan)
@@ -85,7 +85,7 @@ def ahead(
 
 
 def _seen(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Array]:
-    """Return what sensors show of a belief, and its standard deviation."""
+    """Return the predicted readings of a belief, and their standard deviations."""
     z = sensors.predict(belief.u, belief.q, moment)
     if belief.u_factor is None or belief.q_factor is None:
         return z, np.full_like(z, np.nan)

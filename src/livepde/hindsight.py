@@ -1,4 +1,4 @@
-"""What a run would have said of each time, had it known all samples."""
+"""Smoothed estimates of a run: fixed-interval smoothing of its recorded samples."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Hindsight", "with_smoothed"]
 
 
 class Hindsight:
-    """The samples of a run as they were taken, and its estimates of the unknowns.
+    """Record of the accepted samples of a run and its estimates, for smoothing.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ class Hindsight:
         Parameters
         ----------
         interval
-            From the sample before; the last one that was taken.
+            Interval since the last accepted sample.
         q
-            Latent parameter after it.
+            Latent parameter after the sample.
         """
         taken = estimate.status.taken
         opens = taken and interval.t0 == interval.t1
@@ -61,7 +61,7 @@ class Hindsight:
         self._estimates.append((len(self._intervals), estimate.t, estimate.status))
 
     def fixed_interval(self, fields_every: int) -> FixedInterval | None:
-        """Return the samples, with states where fields are kept; None if there are none."""
+        """Return the data of a fixed-interval smoother; None without samples."""
         if self._opening is None:
             return None
         last = len(self._estimates) - 1
@@ -70,7 +70,7 @@ class Hindsight:
         return FixedInterval(self._opening, self._intervals, self._q, self._jumps, kept)
 
     def dataset(self, result: Result, problem: Problem, beliefs: Iterable[Belief]) -> xr.Dataset:
-        """Return beliefs after all intervals, the last first, as a dataset of the run."""
+        """Return smoothed beliefs, given in reverse time order, as a dataset of the run."""
         records = list(self._records(result, problem, beliefs))
         data = result.layout.dataset(reversed(records))
         return data.drop_vars("steps").drop_dims(["sensor", "withheld"])
@@ -78,7 +78,7 @@ class Hindsight:
     def _records(
         self, result: Result, problem: Problem, beliefs: Iterable[Belief]
     ) -> Iterator[Record]:
-        """Iterate over the records, the last one first."""
+        """Iterate over the records in reverse time order."""
         count = len(self._estimates)
         said = groupby(reversed(list(enumerate(self._estimates))), key=lambda item: item[1][0])
         for (_, estimates), belief in zip(said, beliefs, strict=False):  # none may be at the start
@@ -96,12 +96,12 @@ class Hindsight:
 
 
 def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:
-    """Return the dataset of a run with what is smoothed beside it: `k_smoothed`, `k_smoothed_std`.
+    """Return the dataset of a run with added variables `k_smoothed` and `k_smoothed_std`.
 
     Parameters
     ----------
     smoothed
-        Of the same samples, as `Identifier.smoothed` returns it.
+        Smoothed dataset of the same samples, as `Identifier.smoothed` returns it.
     """
     attrs, found = data.attrs, {}
     own = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}

@@ -15,7 +15,7 @@ __all__ = ["DualOperator"]
 
 @dataclass(frozen=True, eq=False)
 class DualOperator:
-    """A linear operator T: source -> target*, as a weak form gives it.
+    """A linear operator T: source -> target*, given by a weak form.
 
     Parameters
     ----------

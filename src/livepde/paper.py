@@ -1,8 +1,8 @@
-"""The method exactly as Boiger and Kaltenbacher (2016) state it, by one name.
+"""The method exactly as stated by Boiger and Kaltenbacher (2016), in one namespace.
 
-livepde changes some of the paper's choices by default, where that serves its users. Here none is
-changed: q is never held, each step is solved to 1e-12 and never divided, M and N are (MN1) and
-(MN2). The page "The paper exactly" says what is different by default, and why.
+The defaults of livepde differ from some of the paper's choices. Here none is changed: q is never
+held, each step is solved to 1e-12 and never divided, M and N are (MN1) and (MN2). The page "The
+paper exactly" lists and explains the differences.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ STRICT = Newton(tolerance=1e-12, share=0.0)
 def space(mesh: Any, **options: Any) -> Field:
     """Return a field in the paper's space: cubic Hermite functions phi_j, psi_j, j = 2, ..., N - 1.
 
-    Neither a value nor a slope function stands at the ends, so every function of this space has
+    The basis has neither value nor slope functions at the ends, so every function of this space has
     zero values and zero slopes there.
 
     Parameters
     ----------
     mesh
-        Of an interval; of quadrilaterals, for Bogner-Fox-Schmit functions with the same conditions.
+        Mesh of an interval, or of quadrilaterals for Bogner-Fox-Schmit functions with the same
+        conditions.
     options
-        Of `Field`: inner, std, prior, name.
+        Options of `Field`: inner, std, prior, name.
     """
     return Field(mesh, smooth(mesh), dirichlet={"boundary": 0.0}, clamped=True, **options)
 
@@ -55,7 +56,7 @@ def law(
     damping
         Rule for mu; default `ResidualDamping()`, the lower bound of Assumption cond:mu02, c_1 = 1.
     D
-        Diffusivity in (MN1), (MN2): that of the model.
+        Diffusivity in (MN1), (MN2), equal to that of the model.
     nu, sigma
         As in the paper.
     """
@@ -81,11 +82,11 @@ def identifier(
     Parameters
     ----------
     model, observation
-        The process, its fields in `space`, and what is observed of it.
+        Model of the process, with fields in `space`, and its observation operator.
     gain, damping, D, nu, sigma
         As for `law`.
     q0, u0
-        Where to start (est_exact0), as for `Identifier`.
+        Initial estimates (est_exact0), as for `Identifier`.
 
     Examples
     --------

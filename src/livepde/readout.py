@@ -1,4 +1,4 @@
-"""Scalar unknowns of an estimate as one row of numbers: value, deviation, interval, share left."""
+"""Scalar unknowns of an estimate as one row: value, standard deviation, interval, share left."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
 
 
 def unknown_of(space: FunctionSpace, label: str) -> Any:
-    """Return the unknown that a label belongs to."""
+    """Return the unknown of a scalar label."""
     return space.unknowns[label.split("[")[0]]
 
 
 class ScalarReadout:
     """Numbers of the scalar unknowns, in the order of `Layout.numbers`.
 
-    The arithmetic is that of `Belief` and of `Scalar.interval`, number by number and to the last
-    bit; what does not change between samples is found once.
+    The arithmetic equals that of `Belief` and of `Scalar.interval` to the last bit; quantities that
+    do not change between samples are computed once.
     """
 
     def __init__(self, space: FunctionSpace) -> None:
@@ -39,7 +39,7 @@ class ScalarReadout:
         self._prior: tuple[Array | None, list[float]] = (None, [])
 
     def __call__(self, belief: Belief) -> list[float]:
-        """Return (value, deviation, ends of the interval, share left) of all, one after another."""
+        """Return (value, standard deviation, interval ends, share left) of all, concatenated."""
         if not self._ends:
             return []
         values = belief.q[self._rows].tolist()
@@ -50,11 +50,11 @@ class ScalarReadout:
         return found
 
     def _deviations(self, belief: Belief) -> tuple[list[float], list[float]]:
-        """Return standard deviations, and their shares of those of the prior."""
+        """Return standard deviations, and their ratios to those of the prior."""
         factor, nothing = belief.q_factor, [math.nan] * len(self._ends)
         if factor is None:
             return nothing, nothing
-        # Rows of a matrix that is stored by columns would be summed in another order.
+        # Rows of a column-major matrix would be summed in another order, with other rounding.
         chosen = factor[self._rows]
         after = np.sqrt(np.add.reduce(chosen * chosen, axis=1))
         std = after
@@ -70,14 +70,14 @@ class ScalarReadout:
         return std.tolist(), [share / before for share, before in pairs]
 
     def _before(self, prior: Array) -> list[float]:
-        """Return the deviations of the prior; NaN where there is none."""
+        """Return prior standard deviations; NaN if there is none."""
         before = np.linalg.norm(prior[self._rows], axis=1)
         found: list[float] = np.where(before > 0.0, before, np.nan).tolist()
         return found
 
 
 def _ends(unknown: Any) -> Ends:
-    """Return the function from value and deviation to the ends of the interval; () if symmetric."""
+    """Return the function from value and standard deviation to interval ends; () if symmetric."""
     if unknown.symmetric:
         return lambda value, std: ()
     if unknown.transform is not None:

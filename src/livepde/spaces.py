@@ -82,12 +82,12 @@ class HilbertSpace:
 
     @property
     def augmented(self) -> sp.csr_array:
-        """A sparse matrix whose Schur complement on the first `dim` unknowns is G; here G."""
+        """Sparse matrix whose Schur complement on the first `dim` unknowns is G; here G itself."""
         return self.gram
 
     @cached_property
     def free(self) -> Array:
-        """One for each free coefficient, zero for each fixed one, shape (n,)."""
+        """Mask of free coefficients: one if free, zero if fixed, shape (n,)."""
         mask = np.ones(self.dim)
         mask[self.fixed] = 0.0
         return mask
@@ -102,7 +102,7 @@ class HilbertSpace:
 
     @cached_property
     def factor(self) -> Factor:
-        """Factorised `tangent_gram`; of a large, well-conditioned one, as of L2, iterations."""
+        """Factorised `tangent_gram`; conjugate gradients for a large, well-conditioned one (L2)."""
         if (iterated := self._iterated()) is not None:
             return iterated
         pattern = Pattern.of(self.tangent_gram)
@@ -115,8 +115,8 @@ class HilbertSpace:
             factor = solver.factorise(_data(self.tangent_gram))
         except LinearAlgebraError as error:
             raise SpaceError(singular) from error
-        # Two steps of inverse iteration find a nearly zero eigenvalue that no pivot shows; on the
-        # matrix scaled to a unit diagonal, since unknowns of a product have different units.
+        # Two steps of inverse iteration find a nearly zero eigenvalue that the pivots do not show.
+        # The matrix is scaled to a unit diagonal, since unknowns of a product have different units.
         scale = np.sqrt(np.abs(self.tangent_gram.diagonal()))
         if not scale.all():
             raise SpaceError(singular)
@@ -138,7 +138,7 @@ class HilbertSpace:
         return factor
 
     def _iterated(self) -> Factor | None:
-        """Return conjugate gradients that see only the diagonal, where few iterations do."""
+        """Return diagonally preconditioned conjugate gradients if few iterations suffice."""
         diagonal = self.tangent_gram.diagonal()
         if self.dim <= LARGE or not np.all(diagonal > 0.0):
             return None
@@ -171,29 +171,29 @@ class HilbertSpace:
         return self.factor.solve(functional * free)
 
     def restricted(self, part: slice, fixed: IntArray) -> HilbertSpace:
-        """Return the space of some of the coefficients, with its own fixed ones."""
+        """Return the subspace of some coefficients, with its own fixed ones."""
         return HilbertSpace(sp.csr_array(self.gram[part, part]), self.name, fixed)
 
     def _form(self, free: IntArray) -> Any:
-        """Return G on the free coefficients, as an eigensolver wants it."""
+        """Return G on the free coefficients, in the form that an eigensolver needs."""
         return self.tangent_gram[free][:, free]
 
     @cached_property
     def variance(self) -> Array:
         """Prior variance of each coefficient: the diagonal of G^{-1}, shape (n,); 0 where fixed.
 
-        Solved for at most 1000 coefficients, evenly chosen; of more than 40 000 for fewer, in
-        inverse proportion to their number and at least 64, chosen at random. In between v_i G_ii,
-        or v_i where G is not written out, is harmonic on the graph of G: the mean of its
-        neighbours.
+        Computed by Riesz solves for at most 1000 coefficients, evenly spaced; in spaces of more
+        than 40 000 coefficients for fewer, in inverse proportion to their number and at least 64,
+        chosen at random. For the other coefficients v_i G_ii, or v_i if G is not explicit, is
+        interpolated harmonically on the graph of G: each value is the mean of its neighbours.
         """
         return self._between(*self._solved)
 
     def beyond(self, modes: Array) -> Array:
-        """Return the prior variance of each coefficient that modes leave out, shape (n,).
+        """Return the prior variance of each coefficient outside of given modes, shape (n,).
 
-        As `variance`, but of more than 20 000 coefficients what the modes leave out is harmonic in
-        between, not the whole. Zero where it is rounding.
+        As `variance`, but beyond 20 000 coefficients the remainder is interpolated instead of the
+        whole variance. Values at rounding level are set to zero.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class HilbertSpace:
 
     @cached_property
     def _solved(self) -> tuple[IntArray, Array]:
-        """Some coefficients and their prior variances."""
+        """Sampled coefficients and their prior variances, computed by Riesz solves."""
         free = np.flatnonzero(self.free)
         if len(free) > LARGE:
             count = max(min(SOLVED, 2 * SOLVED * LARGE // len(free)), FEWEST_SOLVED)
@@ -228,7 +228,7 @@ class HilbertSpace:
         return solved, variance
 
     def _between(self, solved: IntArray, values: Array) -> Array:
-        """Return values of all free coefficients, known at some, harmonic in between."""
+        """Return values at all free coefficients by harmonic interpolation of known ones."""
         found = np.zeros(self.dim)
         found[solved] = values
         rest = np.setdiff1d(np.flatnonzero(self.free), solved)
@@ -245,7 +245,7 @@ class HilbertSpace:
 
     @property
     def _links(self) -> sp.csr_array:
-        """One for each pair of coefficients that G couples, by auxiliary unknowns or not."""
+        """Adjacency matrix of the coefficients coupled by G, directly or by auxiliary unknowns."""
         whole = sp.csr_array(self.augmented)
         ones = sp.csr_array((np.ones(whole.nnz), whole.indices, whole.indptr), whole.shape)
         n = self.dim
@@ -253,11 +253,11 @@ class HilbertSpace:
         return sp.csr_array((np.ones(links.nnz), links.indices, links.indptr), links.shape)
 
     def spread(self, weights: Array, modes: Array) -> float:
-        """Return the trace of diag(weights) G^{-1}: the prior variance, summed with weights.
+        """Return the trace of diag(weights) G^{-1}: the weighted sum of prior variances.
 
-        Of more than 20 000 coefficients the part of `modes` is exact, and that of all others the
-        mean over 16 fixed random vectors (Hutchinson): its relative standard error is at most 0.35,
-        and the smaller the more modes have a part in it.
+        Beyond 20 000 coefficients the part of `modes` is exact, and the remainder is Hutchinson's
+        estimate with 16 fixed random vectors: its relative standard error is at most 0.35, and
+        decreases with the number of modes that contribute.
 
         Parameters
         ----------
@@ -283,17 +283,17 @@ class HilbertSpace:
         G-orthonormal, so q = Phi a with a ~ N(0, I) has covariance Phi Phi^T, the best
         approximation of G^{-1} of that rank in the norm of `mass`.
 
-        By Lanczos' method beyond 400 coefficients, with one Riesz solve an iteration and from a
-        fixed start: the same modes in every run. Each lambda is exact to rounding, of more than
-        20 000 coefficients to a relative error of 1e-8. What the modes leave out of the variance is
-        that of the measure, less the sum of theirs (`spread`).
+        By Lanczos' method beyond 400 coefficients, with one Riesz solve per iteration and a fixed
+        start vector, so that every run finds the same modes. Each lambda is exact to rounding,
+        beyond 20 000 coefficients to a relative error of 1e-8. The variance outside of the modes is
+        that of the measure minus the sum of theirs (`spread`).
 
         Returns
         -------
         phi
             Shape (n, count).
         variance
-            The lambdas, descending.
+            Eigenvalues lambda, descending.
         """
         from scipy.linalg import eigh
         from scipy.sparse.linalg import LinearOperator, eigsh
@@ -325,14 +325,14 @@ class HilbertSpace:
         order = np.argsort(values)[::-1]
         phi = np.zeros((self.dim, count))
         phi[free] = vectors[:, order]
-        # Eigenvectors have no sign of their own: fix it, so that runs can be compared.
+        # The sign of an eigenvector is arbitrary: it is fixed so that runs can be compared.
         phi *= np.sign(phi[np.abs(phi).argmax(axis=0), np.arange(count)])
         return phi, values[order]
 
 
 @dataclass(frozen=True, eq=False)
 class _Diagonal:
-    """Conjugate gradients with a diagonal preconditioner, in the place of a factor."""
+    """Conjugate gradients with a diagonal preconditioner, as a `Factor`."""
 
     matrix: sp.csr_array
     diagonal: Array
@@ -352,15 +352,15 @@ class _Diagonal:
 
 
 class BorderedSpace(HilbertSpace):
-    """A space whose Gram matrix is dense, but a Schur complement of a sparse matrix.
+    """A space whose dense Gram matrix is a Schur complement of a sparse matrix.
 
         K = [[E, F], [F^T, H]],    G = E - F H^{-1} F^T
 
-    So G is applied by one sparse solve with H, its Riesz map is one sparse solve with K, and a law
-    that solves a system with G solves one with K and auxiliary unknowns instead. H^s of fractional
-    order, and powers of operators, are of this kind (`livepde.fem.Sobolev`).
+    A product with G costs one sparse solve with H, the Riesz map costs one sparse solve with K, and
+    a law that needs a system with G solves one with K and auxiliary unknowns instead. H^s of
+    fractional order and powers of operators have this form (`livepde.fem.Sobolev`).
 
-    `gram` and `tangent_gram` write G out, which is possible up to 2000 coefficients.
+    `gram` and `tangent_gram` form the dense G, which is possible up to 2000 coefficients.
 
     Parameters
     ----------
@@ -395,7 +395,7 @@ class BorderedSpace(HilbertSpace):
 
     @cached_property
     def gram(self) -> sp.csr_array:
-        """G, written out."""
+        """Explicit Gram matrix G."""
         if self.dim > LARGEST_EXPLICIT:
             raise SpaceError(
                 f"The Gram matrix of {self.name} is dense and has {self.dim} rows; it is written "
@@ -417,13 +417,13 @@ class BorderedSpace(HilbertSpace):
 
     @property
     def _parts(self) -> tuple[sp.csr_array, sp.csr_array, sp.csr_array]:
-        """E, F and H."""
+        """Blocks E, F and H of the border matrix."""
         n, K = self.dim, self.border
         return sp.csr_array(K[:n, :n]), sp.csr_array(K[:n, n:]), sp.csr_array(K[n:, n:])
 
     @cached_property
     def factor(self) -> Factor:
-        """Factorised G on the free coefficients, by that of K."""
+        """Factorised G on the free coefficients, by the factor of K."""
         if (root := self._root()) is not None:
             return root
         free = sp.diags_array(np.concatenate([self.free, np.ones(self.border.shape[0] - self.dim)]))
@@ -432,9 +432,10 @@ class BorderedSpace(HilbertSpace):
         return Leading(factor, self.dim, self.border.shape[0])
 
     def _root(self) -> _Root | None:
-        """Return G^{-1} by solves with F if G = -F H^{-1} F with a symmetric F, as of H^2.
+        """Return the inverse of G = -F H^{-1} F with symmetric F, as for H^2; else None.
 
-        For large spaces: F has an engine that K, which is indefinite, has not.
+        For large spaces: F is positive definite and admits Cholesky or multigrid, the indefinite K
+        does not.
         """
         n, (E, F, H) = self.dim, self._parts
         if n <= LARGEST_EXPLICIT or E.count_nonzero() or F.shape != (n, n):
@@ -480,7 +481,7 @@ class BorderedSpace(HilbertSpace):
 
 @dataclass(frozen=True, eq=False)
 class _Negative:
-    """The factor of -K, from that of K."""
+    """Factor of -K, by the factor of K."""
 
     factor: Factor
 
@@ -491,13 +492,13 @@ class _Negative:
 
 @dataclass(frozen=True, eq=False)
 class _Root:
-    """The inverse of -F H^{-1} F, from the factor of F."""
+    """Inverse of -F H^{-1} F, by the factor of F."""
 
     F: Factor
     H: sp.csr_array
 
     def solve(self, b: Array) -> Array:
-        """Return the Riesz representative of b, which is zero at fixed coefficients."""
+        """Return the Riesz representative of b, zero at fixed coefficients."""
         return -self.F.solve(self.H @ self.F.solve(b))
 
 

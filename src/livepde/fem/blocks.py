@@ -1,4 +1,4 @@
-"""Each kind of unknown as coefficients with local shape functions on a measure."""
+"""Blocks: coefficients and local shape functions of each kind of unknown on a measure."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Local:
     dofs
         Coefficient of each local shape function, shape (local, elements).
     parts
-        What a form sees: (jet, tensor shape) in order, such as ("value", ()), ("grad", (d,)).
+        Derivatives passed to a form as (name, tensor shape), such as ("value", ()), ("grad", (d,)).
     components
         Number of components of all parts.
     """
@@ -59,7 +59,7 @@ class Local:
         self._known: dict[str, Array] = {}
 
     def part(self, name: str) -> Array:
-        """Return the components of a part, shape (components, local, elements, points)."""
+        """Return the components of a derivative, shape (components, local, elements, points)."""
         if name not in self._known:
             self._known[name] = self._evaluate(name)
         return self._known[name]
@@ -86,7 +86,7 @@ class Block(ABC):
 
     @abstractmethod
     def jet(self, parts: Local, values: Array) -> Any:
-        """Return what a form gets for component values of shape (components, ..., E, P)."""
+        """Return the argument of a form for component values of shape (components, ..., E, P)."""
 
     def prolongation(self, finer: Any) -> sp.csr_array:
         """Return the matrix from coefficients to those of the same unknown on a finer mesh."""
@@ -98,11 +98,11 @@ class Block(ABC):
 
     @abstractmethod
     def labels(self, name: str) -> tuple[str, ...]:
-        """Return a label for each coefficient that stands for itself (none for fields)."""
+        """Return labels of coefficients that are scalar unknowns (none for fields)."""
 
 
 class ScalarBlock(Block):
-    """Numbers: constant on the domain (`Scalar`) or on each region (`Piecewise`)."""
+    """Numbers that are constant on the domain (`Scalar`) or on each region (`Piecewise`)."""
 
     def __init__(self, unknown: Scalar | Piecewise) -> None:
         self.unknown = unknown
@@ -146,7 +146,7 @@ class ScalarBlock(Block):
 
 
 class NamesBlock(Block):
-    """Numbers by name (`Scalars`), the same everywhere."""
+    """Named numbers (`Scalars`), constant on the domain."""
 
     def __init__(self, unknown: Scalars) -> None:
         self.unknown = unknown
@@ -183,7 +183,7 @@ class FieldBlock(Block):
         self.size = int(self.dofs.N if self._tie is None else self._tie.max() + 1)
 
     def _tied(self, dofs: IntArray) -> IntArray:
-        """Return the coefficients that stand for those of scikit-fem."""
+        """Return coefficients after identification of periodic ones."""
         return dofs if self._tie is None else self._tie[dofs]
 
     @cached_property
@@ -197,7 +197,7 @@ class FieldBlock(Block):
 
     @cached_property
     def places(self) -> Array:
-        """Where each of scikit-fem's coefficients sits, shape (d, coefficients)."""
+        """Location of each of scikit-fem's degrees of freedom, shape (d, degrees of freedom)."""
         mesh, element = self.field.mesh, self.element
         found = np.zeros((mesh.dim(), int(self.dofs.N)))
         for at, piece in Measure(mesh, 1).pieces():
@@ -208,7 +208,7 @@ class FieldBlock(Block):
 
     @cached_property
     def doflocs(self) -> Array:
-        """Where each coefficient sits, shape (d, size)."""
+        """Location of each coefficient, shape (d, size)."""
         if self._tie is None:
             return self.places
         _, first = np.unique(self._tie, return_index=True)
@@ -216,14 +216,14 @@ class FieldBlock(Block):
         return found
 
     def at(self, facets: Any = None, names: Sequence[str] | None = None) -> IntArray:
-        """Return scikit-fem's coefficients on facets, by default on all of the boundary."""
+        """Return scikit-fem's degrees of freedom on facets, by default on the whole boundary."""
         facets = self.field.mesh.normalize_facets(facets)
         found: IntArray = self.dofs.get_facet_dofs(facets).all(names)
         return found
 
     @cached_property
     def boundary(self) -> IntArray:
-        """The coefficients on the boundary of the mesh, without sides that are tied."""
+        """Coefficients on the boundary of the mesh, without periodic sides."""
         mesh = self.field.mesh
         free = mesh.boundary_facets()
         for name in chain(*self.field.periodic):
@@ -233,7 +233,7 @@ class FieldBlock(Block):
 
     @cached_property
     def _spread(self) -> sp.csr_array:
-        """The matrix from coefficients to those of scikit-fem, where sides are not tied."""
+        """Matrix from coefficients to scikit-fem's degrees of freedom, before periodic ties."""
         n = int(self.dofs.N)
         if self._tie is None:
             return sp.csr_array(sp.eye_array(n))
@@ -241,12 +241,12 @@ class FieldBlock(Block):
 
     @cached_property
     def basis(self) -> Any:
-        """scikit-fem's basis with shape functions at all quadrature points of `measure`."""
+        """Basis of scikit-fem with shape functions at all quadrature points of `measure`."""
         return Basis(self.field.mesh, self.element, dofs=self.dofs)
 
     @cached_property
     def _one(self) -> DiscreteField:
-        """The first shape function in the first cell."""
+        """First shape function in the first cell, to inspect ranks and derivatives."""
         first = Measure(self.field.mesh, 1, members=np.zeros(1, dtype=np.int64), thin=True)
         return first.gbasis(self.element, 0)
 
@@ -256,13 +256,13 @@ class FieldBlock(Block):
         return np.ndim(self._one) > 2
 
     def variables(self, name: str) -> list[str]:
-        """Return names of its components: itself, or one for each direction of a vector."""
+        """Return the names of components: its own, or one for each direction of a vector."""
         axes = "xyz"[: self.field.mesh.dim()]
         return [f"{name}_{axis}" for axis in axes] if self.vector else [name]
 
     @property
     def bends(self) -> bool:
-        """True if the element has second derivatives."""
+        """True if the element provides second derivatives."""
         return self._one.hess is not None
 
     def local(self, measure: Measure) -> Local:
@@ -309,7 +309,7 @@ class FieldBlock(Block):
 
     @property
     def nodal(self) -> bool:
-        """True if coefficients are values at nodes: elements of first order."""
+        """True if coefficients are nodal values: elements of first order."""
         return is_nodal(self.field.element)
 
     def interpolate(self, value: Any) -> Array:
@@ -330,7 +330,7 @@ class FieldBlock(Block):
 
     @cached_property
     def measure(self) -> Measure:
-        """The mesh with the order of the mass matrix."""
+        """The whole mesh with the quadrature order of the mass matrix."""
         return Measure(self.field.mesh, 2 * int(self.element.maxdeg))
 
     def project(self, values: Array) -> Array:
@@ -339,7 +339,7 @@ class FieldBlock(Block):
         Parameters
         ----------
         values
-            Its values at the points of `measure`, of as many numbers as these have.
+            Values of the function at the quadrature points of `measure`, one or more per point.
         """
         grid = values.reshape(-1, *self.measure.shape)
         return self._projected(lambda at, piece: grid[:, at])
@@ -376,8 +376,8 @@ class FieldBlock(Block):
         return analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
 
     def _value_dofs(self, name: str) -> IntArray:
-        # Essential conditions fix values; derivative unknowns (u_x, u_n, ...) stay free, unless
-        # the field is clamped.
+        # Essential conditions fix values only; derivative degrees of freedom (u_x, u_n, ...) stay
+        # free unless the field is clamped.
         values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
         names = None if self.field.clamped else values
         found: IntArray = np.unique(
@@ -386,7 +386,7 @@ class FieldBlock(Block):
         return found
 
     def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
-        """Return the conditions for the values on a boundary, of a vector for each component."""
+        """Return the Dirichlet conditions of a boundary, one per component of a vector."""
         dofs = self._value_dofs(name)
         if not (isinstance(value, tuple) or (callable(value) and self.vector)):
             return [(dofs, value)]
@@ -412,7 +412,7 @@ class FieldBlock(Block):
         return found
 
     def _slope_dofs(self, name: str, axis: int) -> IntArray:
-        """Return the unknowns of the derivative along a boundary, on its sides along an axis."""
+        """Return the tangential-derivative coefficients on boundary sides parallel to an axis."""
         if not isinstance(self.field.element, ElementQuadBFS):
             return np.zeros(0, dtype=np.int64)
         mesh = self.field.mesh
@@ -427,10 +427,10 @@ class FieldBlock(Block):
 
     @cached_property
     def conditions(self) -> tuple[tuple[IntArray, Any], ...]:
-        """The Dirichlet conditions, in the order given: (coefficients, value).
+        """Dirichlet conditions in the order given: (coefficients, value).
 
-        Bogner-Fox-Schmit functions with the values of g at the vertices need its derivative along
-        the boundary, too, to be g on the sides between them.
+        Bogner-Fox-Schmit functions need the tangential derivative of g at the vertices in addition
+        to its values, to interpolate g along the sides.
         """
         found: list[tuple[IntArray, Any]] = []
         for name, value in self.field.dirichlet.items():
@@ -444,7 +444,7 @@ class FieldBlock(Block):
 
     @cached_property
     def width(self) -> float:
-        """Length of the shortest side of the mesh."""
+        """Length of the shortest edge of the mesh."""
         ends = self.field.mesh.p[:, self.field.mesh.facets]
         return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=0).min())
 
@@ -472,7 +472,7 @@ class FieldBlock(Block):
         Raises
         ------
         SpaceError
-            The element is not of first order: its coefficients are not values.
+            The element is not of first order, so its coefficients are not nodal values.
         """
         if not self.nodal:
             raise SpaceError(
@@ -483,16 +483,16 @@ class FieldBlock(Block):
 
     @cached_property
     def box(self) -> tuple[Array, Array]:
-        """Lowest and highest coordinates of the mesh, each of shape (d,)."""
+        """Bounding box of the mesh: lowest and highest coordinates, each of shape (d,)."""
         p: Array = self.field.mesh.p
         return p.min(axis=1), p.max(axis=1)
 
     def contains(self, point: Array) -> bool:
-        """Return true if a point, shape (d,), lies in the mesh."""
+        """Return True if a point, shape (d,), lies in the mesh."""
         return self._outside(point[:, None]) is None
 
     def _outside(self, points: Array) -> int | None:
-        """Return the first of some points, shape (d, k), that does not lie in the mesh."""
+        """Return the index of the first point, of shape (d, k), outside of the mesh; or None."""
         low, high = (corner[:, None] for corner in self.box)
         slack = 1e-12 * (high - low)
         out = ~((points >= low - slack) & (points <= high + slack)).all(axis=0)
@@ -510,7 +510,7 @@ class FieldBlock(Block):
         return True
 
     def _cells(self, points: Array) -> IntArray:
-        """Return the cell of each point, shape (k,); ValueError if one lies outside of the mesh."""
+        """Return the cell of each point, shape (k,); raise ValueError for a point outside."""
         mesh, whole = self.field.mesh, Measure(self.field.mesh, 1)
         finder = mesh.element_finder(mapping=whole.mapping)
         width = max(1, SEARCHED // mesh.nelements)  # points that may be sought in all cells
@@ -518,12 +518,13 @@ class FieldBlock(Block):
         try:
             parts = [finder(*points[:, k : k + width]) for k in starts]
         finally:
+            # scikit-fem stores its search tree on the mesh for good: of a large mesh it is dropped.
             if not whole.kept:
                 vars(mesh).pop("_cached_tree", None)
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def probe(self, points: Array, what: str = "point") -> sp.csr_array:
-        """Return the matrix that evaluates the function at points of shape (d, k)."""
+        """Return the matrix of point evaluations at points of shape (d, k)."""
         points = np.atleast_2d(np.asarray(points, dtype=float))
         low, high = self.box
         if points.shape[0] != len(low):
@@ -550,7 +551,7 @@ class FieldBlock(Block):
 
     @cached_property
     def at_vertices(self) -> sp.csr_array:
-        """Matrix that evaluates the function at the vertices of the mesh."""
+        """Matrix of point evaluations at the vertices of the mesh."""
         element, mesh = self.field.element, self.field.mesh
         names = element.dofnames or []
         if element.nodal_dofs and names and names[0] == "u":  # a coefficient is the value there
@@ -563,9 +564,9 @@ class FieldBlock(Block):
 
 @dataclass(frozen=True)
 class _Component:
-    """One component of boundary values g(x, t) of a vector.
+    """One component of vector boundary values g(x, t).
 
-    g returns a sequence or an array with a row for each component, or one row for all of them.
+    The function g returns a sequence or array with a row for each component, or one common row.
     """
 
     g: Callable[[Array, float], Any]
@@ -586,12 +587,12 @@ class _Component:
 
 
 def _jet(function: DiscreteField, name: str) -> Any:
-    """Return a part of a function by name, None where there is none."""
+    """Return a derivative of a function by name, None if the element lacks it."""
     return np.asarray(function) if name == "value" else getattr(function, name)
 
 
 def _slope(g: Any, axis: int, width: float) -> Any:
-    """Return the derivative of g(x, t) along an axis, by a difference of sixth order."""
+    """Return the derivative of g(x, t) along an axis, by a sixth-order central difference."""
     step = 0.01 * width
 
     def slope(x: Array, t: float) -> Array:

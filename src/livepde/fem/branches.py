@@ -1,7 +1,8 @@
-"""Functions with kinks, written so that a complex step differentiates them.
+"""Piecewise smooth functions that complex-step differentiation handles correctly.
 
 NumPy's abs of a complex number is its modulus, and max compares imaginary parts: both lose the
-derivative. These take the branch by the real part, so that derivatives are those of the branch.
+derivative. The functions here select the branch by the real part, so that the complex step
+differentiates that branch.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ def absolute(a: Any) -> Any:
 
 
 def maximum(a: Any, b: Any) -> Any:
-    """Return the larger one of two, point by point, with its derivative."""
+    """Return the larger of two values, pointwise, with its derivative."""
     a, b = np.asarray(a), np.asarray(b)
     return np.where(a.real >= b.real, a, b)
 
 
 def minimum(a: Any, b: Any) -> Any:
-    """Return the smaller one of two, point by point, with its derivative."""
+    """Return the smaller of two values, pointwise, with its derivative."""
     a, b = np.asarray(a), np.asarray(b)
     return np.where(a.real <= b.real, a, b)
 

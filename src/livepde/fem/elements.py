@@ -1,4 +1,4 @@
-"""Elements as they are used inside: exact to rounding, and never tied to another mesh."""
+"""Element wrappers: exact Hermite functions, and private copies of elements."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class _LineHermite(ElementLineHermite):  # type: ignore[misc]
 
 
 def own(element: Element) -> Element:
-    """Return an element of one's own that stands for the one given.
+    """Return a private copy of an element.
 
-    Elements with global degrees of freedom remember the first mesh they were used on, and are
-    silently wrong on the next.
+    Elements with global degrees of freedom cache the first mesh they are used on, and are silently
+    wrong on another one.
     """
     if type(element) is ElementLineHermite:
         return _LineHermite()

@@ -1,10 +1,10 @@
-"""Constant trilinear forms on large meshes: element by element, in place of a sparse matrix.
+"""Matrix-free trilinear forms: element tensors compressed to a common basis.
 
-The integrals of all products of local functions over an element are a small tensor. Those of all
-elements are combinations of few, to rounding: of q u v on triangles with straight sides, whatever
-their size and shape, of a single one. So r numbers for each element are kept, the r tensors, and
-where the entries of an element matrix stand: of P1 functions in the plane about 200 bytes for each
-node, for all three matrices of a form.
+The integrals of all products of local functions over an element form a small tensor. The tensors of
+all elements are, to rounding, linear combinations of few: on triangles with straight sides,
+whatever their size and shape, those of q u v are multiples of a single one. So only the r basis
+tensors, r coefficients of each element, and the positions of element matrices are stored: with P1
+functions in the plane about 200 bytes per node, for all three matrices of a form.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ BLOCK = 8_000  # elements that are multiplied at once
 
 
 @dataclass(frozen=True, eq=False)
-class _Term:
-    """Tensors of shape (i, j, n, r), and how much of each an element has, shape (r, elements)."""
+class _TensorTerm:
+    """Basis tensors, shape (i, j, n, r), and coefficients of each element, shape (r, elements)."""
 
     tensors: Array
     shares: Array
@@ -34,10 +34,10 @@ class _Term:
 
 @dataclass(frozen=True, eq=False)
 class ElementProducts:
-    """The integrals of all products of local functions of three arguments over each element."""
+    """Integrals over each element of all products of local functions of three arguments."""
 
     order: tuple[str, ...]
-    terms: tuple[_Term, ...]
+    terms: tuple[_TensorTerm, ...]
 
     @classmethod
     def of(
@@ -45,17 +45,17 @@ class ElementProducts:
         order: tuple[str, ...],
         terms: Iterable[tuple[Mapping[str, IntArray], Iterable[tuple[slice, Array]]]],
     ) -> ElementProducts:
-        """Collect them from parts of the elements.
+        """Collect the element tensors from parts of the mesh.
 
         Parameters
         ----------
         order
-            The three arguments.
+            Names of the three arguments.
         terms
-            For each term the coefficients of each argument, shape (local, elements), and the parts:
-            which elements, and their tensors, shape (i, j, n, elements).
+            For each term the coefficient numbers of each argument, shape (local, elements), and the
+            parts: slice of the elements, and their tensors, shape (i, j, n, elements).
         """
-        return cls(order, tuple(_Term(*_combined(parts), dofs) for dofs, parts in terms))
+        return cls(order, tuple(_TensorTerm(*_combined(parts), dofs) for dofs, parts in terms))
 
     def tensor(self, rows: str, cols: str, third: str, places: Scatter) -> ElementTensor:
         """Return the tensor of the matrices in two of the arguments."""
@@ -63,7 +63,7 @@ class ElementProducts:
 
 
 def _combined(parts: Iterable[tuple[slice, Array]]) -> tuple[Array, Array]:
-    """Return few tensors, and the shares with which they make up those of all elements."""
+    """Return a basis of the tensors, and the coefficients of each element in it."""
     shape: tuple[int, ...] = ()
     basis = np.zeros((0, 0))
     shares: list[Array] = []
@@ -77,6 +77,8 @@ def _combined(parts: Iterable[tuple[slice, Array]]) -> tuple[Array, Array]:
             vectors, values, _ = np.linalg.svd(left[:, missed] / size[missed], full_matrices=False)
             known = basis.shape[1]
             more = np.hstack([basis, vectors[:, values > EXACT * values.max()]])
+            # QR keeps the span of the known vectors but may flip their signs, and shares of earlier
+            # parts refer to them: the signs are restored.
             basis = np.linalg.qr(more)[0]
             basis[:, :known] *= np.sign((basis[:, :known] * more[:, :known]).sum(axis=0))
         shares.append(basis.T @ flat)
@@ -90,16 +92,16 @@ def _combined(parts: Iterable[tuple[slice, Array]]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class ElementTensor:
-    """T with T @ w = the data of a matrix that depends linearly on the coefficients w.
+    """Matrix-free T such that T @ w is the data of a matrix linear in the coefficients w.
 
     Parameters
     ----------
     products
-        Of the form.
+        Element tensors of the form.
     slots
-        Rows, columns, and the argument that w stands for.
+        Arguments of the rows, of the columns, and of w.
     places
-        Where the entries of the element matrices stand.
+        Positions of the entries of element matrices in the data.
     """
 
     products: ElementProducts
@@ -107,7 +109,7 @@ class ElementTensor:
     places: Scatter
 
     def _blocks(self) -> Iterator[tuple[int, slice, Array, list[IntArray], Array]]:
-        """Yield term, elements, tensors with their axes as `slots`, coefficients, and shares."""
+        """Yield term, elements, tensors with axes in order of `slots`, coefficients, shares."""
         axes = [self.products.order.index(slot) for slot in self.slots]
         for number, term in enumerate(self.products.terms):
             tensors = np.ascontiguousarray(term.tensors.transpose(*axes, 3))
@@ -127,7 +129,7 @@ class ElementTensor:
         return data
 
     def apply(self, w: Array, x: Array) -> Array:
-        """Return the product of the matrix and x, shape (rows,), without the matrix."""
+        """Return the product of the matrix with x, shape (rows,), without assembling the matrix."""
         result = np.zeros(self.places.pattern.shape[0])
         for _, _, tensors, (rows, cols, third), shares in self._blocks():
             i, j, n, r = tensors.shape

@@ -1,6 +1,7 @@
-"""How an unknown moves by itself between two samples: the model of q(t) that laws assume.
+"""Evolution models of unknowns q(t) between two samples, as assumed by the laws.
 
-Each is a linear stochastic equation for the latent coefficients about their prior mean,
+Each is a linear stochastic differential equation for the latent coefficients about their prior
+mean,
 
     d(q - prior) = K (q - prior) dt + noise.
 """
@@ -24,26 +25,26 @@ def _positive(what: str, value: float) -> None:
 
 @dataclass(frozen=True)
 class Evolution:
-    """How an unknown moves; this one, `CONSTANT`, does not."""
+    """Evolution model of an unknown; this base class, `CONSTANT`, does not move."""
 
     @property
     def copies(self) -> int:
-        """Number of parts that an unknown is made of; q is the sum of the `visible` ones."""
+        """Number of components of the evolution; q is a sum of the `visible` ones."""
         return 1
 
     @property
     def visible(self) -> Array:
-        """Weight of each part in q, shape (copies,)."""
+        """Weight of each component in q, shape (copies,)."""
         return np.ones(1)
 
     @property
     def generator(self) -> Array:
-        """K on the parts, shape (copies, copies)."""
+        """Drift matrix K of the components, shape (copies, copies)."""
         return np.zeros((1, 1))
 
     @property
     def moves(self) -> bool:
-        """True unless it stays as it is."""
+        """True unless the unknown is constant."""
         return self != CONSTANT
 
     def transition(self, h: float) -> Array:
@@ -51,13 +52,13 @@ class Evolution:
         return np.eye(1)
 
     def growth(self, h: float, std: float) -> Array:
-        """Return the variance that each part gains in h, as a share of the prior's, (copies,)."""
+        """Return the variance added to each component in h, relative to the prior's, (copies,)."""
         return np.zeros(1)
 
 
 @dataclass(frozen=True)
 class RandomWalk(Evolution):
-    """Drifts: a deviation of rate * sqrt(h) is gained in a time h.
+    """Random walk: a standard deviation of rate * sqrt(h) is added in a time h.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ class RandomWalk(Evolution):
 
 @dataclass(frozen=True)
 class MeanReverting(Evolution):
-    """Returns to the prior mean within `time`, with the prior deviation (Ornstein-Uhlenbeck)."""
+    """Ornstein-Uhlenbeck process: relaxation time `time`, stationary law the prior."""
 
     time: float
 
@@ -99,8 +100,8 @@ class MeanReverting(Evolution):
 class Periodic(Evolution):
     """A constant and harmonics: q(t) = q_0 + sum over k of a_k cos(2 pi k t/period + phase_k).
 
-    The prior mean belongs to the constant; each harmonic has the prior deviation. The parts rotate
-    with the time, so that a law needs no clock.
+    The constant has the prior mean; each harmonic has the prior standard deviation. The amplitudes
+    rotate with time, so that the equation is autonomous and a law needs no clock.
     """
 
     period: float

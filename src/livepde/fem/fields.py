@@ -1,4 +1,4 @@
-"""What a user writes to say what is unknown: fields on a mesh, scalars, values per region."""
+"""Declarations of unknowns: fields on a mesh, scalars, values per region, named scalars."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Predicate: TypeAlias = Callable[[Array], Any]
 
 @dataclass(frozen=True)
 class Channel:
-    """A value that arrives with the stream, by the name of its channel."""
+    """A value supplied by the stream, identified by the name of its channel."""
 
     name: str
 
@@ -83,10 +83,11 @@ def interval(
     regions
         Named subdomains, each a predicate on the midpoints of the elements.
     geometric
-        Elements grow by a constant ratio, as radial problems want; needs start > 0. Else uniform.
+        True for elements that grow by a constant ratio, as in radial problems; needs start > 0.
+        False for a uniform mesh.
     through
-        Points that the mesh shall have as nodes: the nearest inner node is moved to each, so that
-        a `Subdomain`, a layer or a sensor ends at a node.
+        Points that must be nodes of the mesh: the nearest inner node is moved to each, so that a
+        `Subdomain`, a layer or a sensor ends at a node.
     """
     if not stop > start or cells < 1 or cells != int(cells):
         raise SpaceError(
@@ -127,7 +128,7 @@ def line(nodes: Sequence[float]) -> MeshLine:
 
 
 def is_nodal(element: Element) -> bool:
-    """Return true if coefficients are values at nodes or in cells: elements of first order."""
+    """Return True if coefficients are values at nodes or in cells: elements of first order."""
     inner = element.facet_dofs + element.edge_dofs
     return not inner and element.nodal_dofs + element.interior_dofs == 1
 
@@ -150,7 +151,7 @@ def _check_prior(
 
 
 class _Prior:
-    """What all unknowns have in common: a prior, bounds, a transform, an evolution."""
+    """Common base of all unknowns: prior, bounds, transform, evolution."""
 
     prior: float
     std: float
@@ -171,27 +172,27 @@ class _Prior:
 
     @property
     def latent_std(self) -> float:
-        """Prior deviation of the latent coefficients: that of q, to first order."""
+        """Prior standard deviation of the latent coefficients: that of q, to first order."""
         return float(self.std / self.map.slope(np.array(self.latent_prior)))
 
     @property
     def latent_bounds(self) -> tuple[float, float]:
-        """Bounds of the latent coefficients: none where a transform keeps them."""
+        """Bounds of the latent coefficients; infinite if a transform enforces them."""
         return self.bounds if self.transform is None else (-np.inf, np.inf)
 
     @property
     def reach(self) -> float:
-        """How many prior deviations a latent value may lie from its prior mean; inf for a walk."""
+        """Allowed distance of a latent value from its prior mean, in prior standard deviations."""
         return np.inf if isinstance(self.evolution, RandomWalk) else self.within
 
     @property
     def point_std(self) -> float:
-        """Largest prior deviation of a latent value at a point; inf where it is not known."""
+        """Largest prior standard deviation of a latent value at a point; inf if unknown."""
         return self.latent_std
 
     @cached_property
     def _ends(self) -> tuple[Array, Array]:
-        """Values that belong to latent ones `reach` prior deviations from their mean."""
+        """Values of q at latent values `reach` prior standard deviations from their mean."""
         farthest = self.reach * self.point_std
         with np.errstate(over="ignore"):
             low, high = (
@@ -201,7 +202,7 @@ class _Prior:
 
     @property
     def symmetric(self) -> bool:
-        """True if intervals are value +- deviations: neither a transform nor bounds."""
+        """True if intervals are value +- multiples of std: neither a transform nor bounds."""
         return self.transform is None and not np.isfinite(self.bounds).any()
 
     def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
@@ -213,7 +214,7 @@ class _Prior:
         Parameters
         ----------
         value, std
-            Estimates and their deviations, of any one shape.
+            Estimates and their standard deviations, of equal shape.
         """
         from statistics import NormalDist
 
@@ -223,7 +224,7 @@ class _Prior:
         value, std = np.asarray(value, dtype=float), np.asarray(std, dtype=float)
         low, high = (np.clip(self.map.shifted(value, std, s), *self.bounds) for s in (-z, z))
         if self.transform is not None:
-            # A value that lies beyond, of another law say, stays inside of its interval.
+            # A value beyond these ends, as another law may report, stays inside of its interval.
             least, largest = self._ends
             low = np.maximum(low, np.minimum(least, value))
             high = np.minimum(high, np.maximum(largest, value))
@@ -252,7 +253,7 @@ class Field(_Prior):
     Parameters
     ----------
     mesh, element
-        Any scikit-fem mesh and element; `quadrature` is its integration order (default: exact for
+        Any scikit-fem mesh and element; `quadrature` is the integration order (default: exact for
         A(u)q with polynomial factors).
     inner
         Inner product of a parameter: "L2", "H1", "H2", a `Sobolev(s, length)` for H^s of any order,
@@ -263,18 +264,18 @@ class Field(_Prior):
         these hold for all components; a sequence has one of them for each component, None where it
         is free, and g may return one array for each.
     clamped
-        With `dirichlet`, all coefficients on these boundaries are zero: those of slopes, too. Else
-        only values are given there.
+        True: all coefficients on the boundaries of `dirichlet` are zero, including slopes. False:
+        only the values are prescribed.
     std
-        Prior deviation of a parameter: the inner product is divided by std**2, so that the
+        Prior standard deviation of a parameter: the inner product is divided by std**2, so that the
         prior covariance is the inverse Gram matrix.
     bounds, transform, evolution, within
         As for `Scalar`; bounds need a transform, and a transform an element of first order.
     unit, name
         For tables and plots.
     periodic
-        Pairs of boundaries of equal shape, as in (("left", "right"),): the function goes on behind
-        the second as behind the first.
+        Pairs of boundaries of equal shape, as in (("left", "right"),), whose coefficients are
+        identified.
     """
 
     mesh: Mesh
@@ -295,12 +296,12 @@ class Field(_Prior):
 
     @property
     def boundary_values(self) -> list[Any]:
-        """The plain Dirichlet values: numbers, functions, channels."""
+        """The individual Dirichlet values: numbers, functions, channels."""
         return [item for value in self.dirichlet.values() for item in _each_value(value)]
 
     @property
     def point_std(self) -> float:
-        """Largest prior deviation of a latent value at a point; inf where it is not known."""
+        """Largest prior standard deviation of a latent value at a point; inf if unknown."""
         pointwise = isinstance(self.inner, Sobolev) and self.inner.factor != 1.0
         return math.sqrt(2.0) * self.latent_std if pointwise else math.inf
 
@@ -321,7 +322,8 @@ class Field(_Prior):
                     f"dirichlet: the value on '{name}' is unknown; let it enter weakly, by a "
                     f"penalty: On('{name}', lambda q, u, v, x: 100 * D / x.h * (u - q.value) * v)."
                 )
-        # Arrays compare entry by entry; everyone else reads plain values or tuples of them.
+        # Arrays are stored as tuples, because the equality of frozen dataclasses would compare them
+        # entry by entry.
         given: Mapping[str, Any] = self.dirichlet
         plain = {name: v if _is_plain(v) else tuple(v) for name, v in given.items()}
         object.__setattr__(self, "dirichlet", plain)
@@ -352,12 +354,12 @@ class Field(_Prior):
 
 
 def _is_plain(value: Any) -> bool:
-    """Return true if a boundary value is not a sequence with one for each component."""
+    """Return True if a boundary value is not a sequence with one value per component."""
     return callable(value) or isinstance(value, Channel | _Prior) or np.ndim(value) == 0
 
 
 def _each_value(value: Any) -> Sequence[Any]:
-    """Return the plain values of a boundary value."""
+    """Return the individual values of a boundary value."""
     return [value] if _is_plain(value) else [item for item in value if item is not None]
 
 
@@ -372,15 +374,16 @@ class Scalar(_Prior):
     bounds
         (lower, upper). Without a transform estimates are clipped to them.
     transform
-        "log": positive (above a finite lower bound); the prior is the median and the deviation of
-        the logarithm is std / prior. "logit": strictly between two finite bounds.
+        "log": positive (above a finite lower bound); the prior is the median and the standard
+        deviation of the logarithm is std / prior. "logit": strictly between two finite bounds.
     evolution
-        How the unknown moves by itself: `RandomWalk`, `MeanReverting`, `Periodic`; default not.
+        Model of the change in time: `RandomWalk`, `MeanReverting`, `Periodic`; default constant.
     within
-        So many prior deviations its latent value (q itself, its logarithm or its logit) may lie
-        from the prior mean in the sensitivity law: neither the point of linearisation nor what is
-        reported goes beyond, and the note "bounded" tells how many values are held there. inf: no
-        such end. Of a `RandomWalk` there is none: the prior says nothing of later values.
+        Trust region of the sensitivity law: maximum distance of the latent value (q itself, its
+        logarithm or its logit) from the prior mean, in prior standard deviations. Neither the
+        linearisation point nor the reported estimate goes beyond it, and the note "bounded" counts
+        the values held there. inf: no limit. A `RandomWalk` has none, since its prior says nothing
+        about later values.
     """
 
     prior: float = 0.0

@@ -1,8 +1,8 @@
-"""Weak forms: the one place where integrands are evaluated.
+"""Weak forms: evaluation, differentiation and assembly of integrands.
 
 A form is a scalar functional of several functions, `integral of a(q, u, v, x)`. Each function is
 evaluated with the shape functions of *its own* space, so exchanging two spaces of equal size cannot
-pass unnoticed (fact 9 of the design). Everything a law needs of a form is a first derivative
+pass unnoticed (fact 9 of the design). All that a law needs of a form is a first derivative
 (`vector`) or a mixed second derivative (`data`) of that functional:
 
     A(u) q          = vector("v", q=q, u=u)
@@ -50,7 +50,7 @@ LARGEST_TENSOR = 5_000_000  # products of local functions up to which a trilinea
 
 @dataclass(frozen=True, eq=False)
 class _Term:
-    """One integrand on one measure, with every argument's space there."""
+    """One integrand on one measure, with the local space of every argument."""
 
     integrand: Integrand
     measure: Measure
@@ -58,12 +58,12 @@ class _Term:
 
     @cached_property
     def spaces(self) -> dict[str, LocalSpace]:
-        """Argument -> its space on the measure; one object for arguments of the same space."""
+        """Local space of each argument; one object for arguments of the same space."""
         found = {id(space): space.local(self.measure) for space in self.over.values()}
         return {key: found[id(space)] for key, space in self.over.items()}
 
     def pieces(self) -> Iterator[tuple[slice, _Term]]:
-        """Yield the term on parts of the measure that can be evaluated at once, and which."""
+        """Yield (slice of elements, term on them), small enough to be evaluated at once."""
         if self.measure.kept:
             yield slice(0, self.measure.shape[0]), self
             return
@@ -71,7 +71,7 @@ class _Term:
             yield at, replace(self, measure=piece)
 
     def samples(self) -> Iterator[_Term]:
-        """Yield the term, on every element of the measure, to see what the integrand is like."""
+        """Yield the term at one or all points of every element, to probe the integrand."""
         thin = (
             self if self.measure.kept else replace(self, measure=replace(self.measure, thin=True))
         )
@@ -85,7 +85,7 @@ class _Term:
 
 
 class FormMatrices(ABC):
-    """Matrices of mixed derivatives with fixed sparsity, from `pattern` and `data`."""
+    """Abstract source of matrices of mixed derivatives with fixed sparsity."""
 
     @abstractmethod
     def pattern(self, rows: str, cols: str) -> Pattern:
@@ -115,18 +115,18 @@ class Form(FormMatrices):
     Parameters
     ----------
     name
-        For messages: A, B, M, ...
+        Letter for messages: A, B, M, ...
     integrands
         One integrand or several; an `On` restricts one to a boundary or subdomain. Each is called
         with one jet per argument, in the order of `spaces`, and the place x.
     spaces
-        Argument -> function space.
+        Mapping from argument to function space.
     order
         Quadrature order.
     nonlinear
         The argument in which the form need not be linear, u.
     parameter
-        An argument in which it may be nonlinear, q: found out by probing.
+        The argument q, in which the form may be nonlinear; determined by probing.
     derivative
         Optional integrand of the derivative in the nonlinear argument: the same arguments, with
         the direction behind that argument, as in dB(u, du, v, x).
@@ -178,10 +178,10 @@ class Form(FormMatrices):
         self._products: ElementProducts | None = None
 
     def on(self, cells: IntArray) -> Form:
-        """Return the form integrated over some cells of the mesh, and over the facets they have.
+        """Return the form integrated over some cells of the mesh, and over their facets.
 
-        Terms that live elsewhere are left out. Its functions are those of the whole mesh; its
-        patterns hold what these cells couple.
+        Terms without such cells are omitted. The coefficients are those of the whole mesh; the
+        patterns contain only the couplings of these cells.
 
         Parameters
         ----------
@@ -197,7 +197,7 @@ class Form(FormMatrices):
         return part
 
     def _probe(self) -> frozenset[str]:
-        """Evaluate once: find errors early, and what of time and inputs the form reads."""
+        """Evaluate once, to find errors early, and return the names of time and inputs it reads."""
         rng = np.random.default_rng(0)
         used: set[str] = set()
         for term in self.terms:
@@ -207,7 +207,7 @@ class Form(FormMatrices):
         return frozenset(used)
 
     def _read(self, term: _Term, rng: np.random.Generator) -> set[str]:
-        """Evaluate a term at random values and return what of time and inputs it reads."""
+        """Evaluate a term at random values and return the names of time and inputs it reads."""
         values = {
             key: rng.standard_normal((local.components, *local.shape))
             for key, local in term.spaces.items()
@@ -237,7 +237,7 @@ class Form(FormMatrices):
         return not self.uses
 
     def _mentions_state(self, integrand: Integrand) -> bool:
-        """Return false if a function never uses its nonlinear argument, whatever its branches."""
+        """Return False if the code of an integrand never uses its nonlinear argument."""
         if self.nonlinear is None:
             return False
         return reads(integrand, list(self.spaces).index(self.nonlinear))
@@ -256,7 +256,9 @@ class Form(FormMatrices):
         return self._affine(slot, homogeneous=True)
 
     def _affine(self, slot: str, homogeneous: bool) -> bool:
-        """Return true if the form is affine (linear, if homogeneous) in an argument."""
+        """Return True if the form is affine (linear, if homogeneous) in an argument."""
+        # Probing has a fixed seed: whether a form counts as affine must not differ between two
+        # runs. Magnitudes up to 1e9 detect saturation and thresholds far from one.
         rng = np.random.default_rng(1)
         probe = Moment(0.3, self._inputs)
         for term in (piece for whole in self.terms for piece in whole.samples()):
@@ -276,7 +278,8 @@ class Form(FormMatrices):
                     change = at(a + b) - at(a) - at(b) + (0 * zero if homogeneous else zero)
                     sizes = np.abs(np.concatenate([at(a).ravel(), at(b).ravel()]))
                     size = max(sizes[np.isfinite(sizes)].max(initial=0.0), 1e-300)
-                # Points where the form is not a number (a root of a negative one) say nothing.
+                # Points at which the form is not finite (the root of a negative number) are not
+                # informative.
                 finite = np.isfinite(change)
                 if not finite.any() or np.abs(change[finite]).max() > 1e-11 * size:
                     return False
@@ -303,15 +306,15 @@ class Form(FormMatrices):
     def traced(
         self, slot: str, moment: Moment = START, **coefficients: Array
     ) -> tuple[Array, frozenset[str]]:
-        """Return what `vector` does by quadrature, and what of time and inputs it has read.
+        """Return `vector` by quadrature, with the names of time and inputs that were read.
 
-        A function that reads no more than that gives the same wherever that is the same, on
-        whichever of its branches it is.
+        The result is reusable as long as the values of these names are the same, on any branch of
+        the integrand.
         """
         return self._vector(slot, moment, coefficients)
 
     def _offset(self, slot: str) -> Array:
-        """Return the vector of an affine form where its other argument is zero, computed once."""
+        """Return the vector of an affine form at zero, cached."""
         if slot not in self._offsets:
             zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
             self._offsets[slot] = self._vector(slot, START, zero)[0]
@@ -349,8 +352,9 @@ class Form(FormMatrices):
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
         """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`.
 
-        The second derivative in one argument for rows = cols. Constant bilinear forms are assembled
-        once; constant trilinear ones become one sparse product with the third coefficients.
+        For rows = cols it is the second derivative in one argument. Constant bilinear forms are
+        assembled once; constant trilinear ones become one sparse product with the third
+        coefficients.
         """
         if rows == cols and rows not in self._curved:
             return np.zeros(self.pattern(rows, cols).nnz)
@@ -406,9 +410,10 @@ class Form(FormMatrices):
     ) -> Array:
         """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P).
 
-        Unit jets in arguments in which the form is linear; a complex step in one that is not; a
-        central difference of complex steps if both are not (only Jacobians of iterations use it),
-        in the one in which the form is affine, where there is one: then it is exact.
+        Unit jets are used in arguments in which the form is linear, and a complex step in a
+        nonlinear one. If both are nonlinear (only Jacobians of iterations need this), a central
+        difference of complex steps is used, in the argument in which the form is affine if there is
+        one: then it is exact.
         """
         place = term.measure.place(moment)
         if self.nonlinear not in (rows, cols):
@@ -449,6 +454,8 @@ class Form(FormMatrices):
         key = (rows, cols)[shifted]
         local = term.spaces[key]
         here = local.values(coefficients[key]) if key in coefficients else local.zeros()
+        # Fourth order in SHIFT: a difference of complex steps loses few digits, since each step is
+        # itself exact to rounding.
         near = evaluate(SHIFT) - evaluate(-SHIFT)
         far = evaluate(2.0 * SHIFT) - evaluate(-2.0 * SHIFT)
         difference = (8.0 * near - far) / (12.0 * SHIFT)
@@ -456,9 +463,10 @@ class Form(FormMatrices):
         return scaled
 
     def _scale(self, key: str, local: LocalSpace, values: Array) -> Array:
-        """Return the size of each component at each point, not too small: (components, 1, 1, E, P).
+        """Return the step scale of each component at each point: (components, 1, 1, E, P).
 
-        For the parameter not far below its prior deviation: a value near zero has no size.
+        It is bounded from below, for the parameter by its prior standard deviation: the magnitude
+        of a value near zero is no scale.
         """
         size = np.abs(values)
         whole = size.max(axis=(1, 2), keepdims=True)
@@ -471,7 +479,7 @@ class Form(FormMatrices):
         return np.where(size > SMALL * whole, size, whole)[:, None, None]
 
     def _constant(self, rows: str, cols: str) -> Array:
-        """Return data(rows, cols) of an affine form at zero, computed once."""
+        """Return data(rows, cols) of an affine form at zero, cached."""
         if (rows, cols) not in self._constants:
             data = self._quadrature(rows, cols, START, {}, keep=False)
             self._constants[rows, cols] = data if data.any() else np.broadcast_to(0.0, data.shape)

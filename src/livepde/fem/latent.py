@@ -1,6 +1,6 @@
-"""What laws estimate: latent coefficients a with a Gaussian prior, from which q = V T(a) follows.
+"""Latent coefficients a with a Gaussian prior, the unknowns of laws: q = V T(a).
 
-Without transforms and evolutions latent coefficients are those of q.
+Without transforms and evolutions, latent coefficients equal those of q.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = ["Composed", "Latent", "LatentPart", "compose"]
 
 @dataclass(frozen=True, eq=False)
 class LatentPart:
-    """The latent coefficients of one unknown: `copies` times `size`, copy by copy.
+    """Latent coefficients of one unknown: `copies` times `size`, copy by copy.
 
     Attributes
     ----------
     name, unknown, block
-        Of the function space.
+        Name, declaration and block of the unknown in the function space.
     part
-        Where they stand among all latent coefficients.
+        Slice of its coefficients among all latent ones.
     """
 
     name: str
@@ -43,27 +43,27 @@ class LatentPart:
 
     @cached_property
     def transform(self) -> Transform:
-        """T of this unknown."""
+        """Transform T of this unknown."""
         transform: Transform = self.unknown.map
         return transform
 
     @property
     def evolution(self) -> Evolution:
-        """How the unknown moves by itself."""
+        """Evolution model of the unknown."""
         evolution: Evolution = self.unknown.evolution
         return evolution
 
     @property
     def size(self) -> int:
-        """Coefficients of q."""
+        """Number of coefficients of q."""
         return int(self.block.size)
 
 
 class Latent:
-    """The map q = V T(a) from latent to physical coefficients of a function space, and its prior.
+    """Map q = V T(a) from latent to physical coefficients of a function space, and its prior.
 
-    T acts on each coefficient (`transform` of the unknown); V adds up the parts of an unknown with
-    harmonics (`Periodic`).
+    T acts on each coefficient (`transform` of the unknown); V sums the components of an unknown
+    with harmonics (`Periodic`).
     """
 
     def __init__(self, space: FunctionSpace) -> None:
@@ -79,7 +79,7 @@ class Latent:
 
     @cached_property
     def plain(self) -> bool:
-        """True if latent coefficients are those of q."""
+        """True if latent coefficients equal those of q."""
         return self.dim == self.space.dim and self.linear
 
     @cached_property
@@ -89,19 +89,19 @@ class Latent:
 
     @cached_property
     def moves(self) -> bool:
-        """True if an unknown moves by itself."""
+        """True if an unknown changes in time."""
         return any(p.evolution.moves for p in self.parts.values())
 
     @cached_property
     def V(self) -> sp.csr_array:
-        """Sum of the visible parts, shape (m, dim)."""
+        """Summation matrix of the visible components, shape (m, dim)."""
         blocks = [
             sp.kron(p.evolution.visible[None], sp.eye_array(p.size)) for p in self.parts.values()
         ]
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
 
     def visible(self, each: Array) -> Array:
-        """Return V applied to rows that belong to latent coefficients, (dim,) or (dim, k)."""
+        """Return V applied to an array of rows for latent coefficients, (dim,) or (dim, k)."""
         return each if self.dim == self.space.dim else self.V @ each  # the same but for harmonics
 
     def _each(self, a: Array, function: str) -> Array:
@@ -109,7 +109,7 @@ class Latent:
         return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
     def value(self, a: Array) -> Array:
-        """Return the coefficients of q, shape (m,), for latent ones of shape (dim,)."""
+        """Return the coefficients of q, shape (m,), from latent ones of shape (dim,)."""
         if self.plain:
             return a
         with np.errstate(over="ignore"):
@@ -132,7 +132,7 @@ class Latent:
         return self.visible(self.slopes(a)[:, None] * directions)
 
     def deviation(self, a: Array, std: Array) -> Array:
-        """Return deviations of q, shape (m,), for those of independent latent ones, (dim,)."""
+        """Return standard deviations of q, (m,), from those of independent latent ones, (dim,)."""
         if self.plain:
             return std
         each = self.slopes(a) * std
@@ -147,7 +147,7 @@ class Latent:
         Raises
         ------
         SpaceError
-            q lies outside of what a transform allows.
+            q lies outside of the range of a transform.
         """
         if self.plain:
             return q
@@ -163,7 +163,7 @@ class Latent:
         return a
 
     def _filled(self, values: Sequence[float]) -> Array:
-        """Return a number of each unknown for each of its latent coefficients."""
+        """Return an array with one number per unknown, repeated for its latent coefficients."""
         return np.repeat(values, [p.part.stop - p.part.start for p in self.parts.values()])
 
     @cached_property
@@ -175,12 +175,12 @@ class Latent:
 
     @cached_property
     def deviations(self) -> Array:
-        """Prior deviation that belongs to each latent coefficient, shape (dim,)."""
+        """Prior standard deviation of each latent coefficient, shape (dim,)."""
         return self._filled([p.unknown.latent_std for p in self.parts.values()])
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the latent coefficients, as laws have to respect them."""
+        """Lower and upper bounds of the latent coefficients, to be respected by laws."""
         lower, upper = zip(*(p.unknown.latent_bounds for p in self.parts.values()), strict=True)
         return self._filled(lower), self._filled(upper)
 
@@ -190,7 +190,7 @@ class Latent:
         return any(bool(np.isfinite(bound).any()) for bound in self.bounds)
 
     def clipped(self, a: Array) -> Array:
-        """Return latent coefficients as the bounds allow them."""
+        """Return latent coefficients clipped to their bounds."""
         lower, upper = self.bounds
         return np.minimum(np.maximum(a, lower), upper) if self.bounded else a
 
@@ -205,7 +205,7 @@ class Latent:
 
     @cached_property
     def fixed(self) -> IntArray:
-        """Latent coefficients that boundary conditions fix at zero."""
+        """Latent coefficients fixed at zero by boundary conditions."""
         found = []
         for p in self.parts.values():
             if p.name in self.space.fields:
@@ -215,12 +215,12 @@ class Latent:
 
     @cached_property
     def generator(self) -> sp.csr_array:
-        """K of the evolutions, d(a - prior)/dt = K (a - prior) + noise, shape (dim, dim)."""
+        """Drift matrix K of the evolutions, d(a - prior)/dt = K (a - prior) + noise, (dim, dim)."""
         blocks = [sp.kron(p.evolution.generator, sp.eye_array(p.size)) for p in self.parts.values()]
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
 
     def moved(self, a: Array, h: float) -> Array:
-        """Return the expected latent coefficients a time h later."""
+        """Return the expected latent coefficients after a time h."""
         if not self.generator.nnz:
             return a
         change = a - self.prior
@@ -231,7 +231,7 @@ class Latent:
 
 
 class Composed(FormMatrices):
-    """A form in which q = V T(a): the same interface, with latent coefficients in the slot q."""
+    """A form composed with q = V T(a): latent coefficients in the place of q."""
 
     def __init__(self, form: Form, latent: Latent) -> None:
         self.form = form
@@ -239,7 +239,7 @@ class Composed(FormMatrices):
         self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array | None]] = {}
 
     def on(self, cells: IntArray) -> Composed:
-        """Return the same integrals over some cells of the mesh only."""
+        """Return the form integrated over some cells of the mesh only."""
         return Composed(self.form.on(cells), self.latent)
 
     @property
@@ -276,7 +276,7 @@ class Composed(FormMatrices):
         return self._mapped(rows, cols)[0]
 
     def _mapped(self, rows: str, cols: str) -> tuple[Pattern, sp.csr_array | None]:
-        """Return the pattern, and the map of the data of the form in q; None: the same data."""
+        """Return the pattern, and the map from the data of the form in q; None: the identity."""
         if (rows, cols) not in self._maps:
             inner, V, dim = self.form.pattern(rows, cols), self.latent.V, self.latent.dim
             if (rows, cols) != ("q", "q") and dim == self.latent.space.dim:  # no harmonics
@@ -316,10 +316,10 @@ class Composed(FormMatrices):
         return data
 
     def tensor(self, rows: str, cols: str) -> sp.csr_array | None:
-        """Return None: the data are no linear function of the third argument."""
+        """Return None: the data are not linear in the third argument."""
         return None
 
 
 def compose(form: Form, latent: Latent) -> Form | Composed:
-    """Return the form in latent coefficients; the form itself where they are those of q."""
+    """Return the form in latent coefficients; the form itself if they equal those of q."""
     return form if latent.plain else Composed(form, latent)

@@ -1,4 +1,4 @@
-"""Where a form is integrated: quadrature points of cells or facets, and what is evaluated there."""
+"""Measures: quadrature points and weights of cells or facets, with geometric data."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ PIECE = 30_000  # quadrature points of a piece of a larger measure
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """Where a form is integrated: the whole mesh, a subdomain, or a boundary; with its order.
+    """Integration domain (whole mesh, subdomain or boundary) with a quadrature order.
 
     Parameters
     ----------
     members
-        Which cells, or facets of a boundary, are part of it; default all.
+        Numbers of its cells, or of its facets on a boundary; default all.
     thin
-        Only the first quadrature point of each, to see what an integrand is like.
+        True: only the first quadrature point of each, to probe an integrand.
     """
 
     mesh: Mesh
@@ -45,12 +45,12 @@ class Measure:
 
     @property
     def on_boundary(self) -> bool:
-        """True if the name is one of a boundary."""
+        """True if the name is that of a boundary."""
         return self.name is not None and self.name in (self.mesh.boundaries or {})
 
     @cached_property
     def _whole(self) -> IntArray | None:
-        """All cells or facets that the name stands for; None: all cells of the mesh."""
+        """All cells or facets of the name; None: all cells of the mesh."""
         if self.name is None:
             return None
         for named in (self.mesh.boundaries or {}, self.mesh.subdomains or {}):
@@ -65,7 +65,7 @@ class Measure:
         return self._whole if self.members is None else self.members
 
     def on(self, cells: IntArray) -> Measure:
-        """Return the part of it on some cells of the mesh, or on their facets."""
+        """Return the restriction to some cells of the mesh, or to their facets."""
         mine = self.cells
         mine = np.arange(self.mesh.nelements) if mine is None else mine
         at = np.flatnonzero(np.isin(mine, cells))
@@ -74,12 +74,12 @@ class Measure:
 
     @property
     def kept(self) -> bool:
-        """True if it is so small that what is evaluated on it is kept."""
+        """True if it is small enough to cache shape functions evaluated on it."""
         elements, points = self.shape
         return elements * points <= KEPT
 
     def pieces(self) -> Iterator[tuple[slice, Measure]]:
-        """Yield parts that are small enough to be evaluated at once, and which these are."""
+        """Yield (slice of elements, part), the parts being small enough to evaluate at once."""
         elements, points = self.shape
         if self.kept:
             yield slice(0, elements), self
@@ -92,20 +92,20 @@ class Measure:
 
     @cached_property
     def _rule(self) -> tuple[Array, Array]:
-        """Points and weights on the reference cell or facet."""
+        """Quadrature points and weights on the reference cell or facet."""
         mesh = self.mesh
         X, W = get_quadrature(mesh.brefdom if self.on_boundary else mesh.refdom, self.order)
         return (X[:, :1], W[:1]) if self.thin else (X, W)
 
     @cached_property
     def shape(self) -> tuple[int, int]:
-        """Number of elements and of quadrature points on each."""
+        """Number of elements, and of quadrature points on each."""
         where = self._where
         return self.mesh.nelements if where is None else len(where), len(self._rule[1])
 
     @cached_property
     def mapping(self) -> Any:
-        """scikit-fem's mapping; one of its own for a part, which keeps nothing for other cells."""
+        """Mapping of scikit-fem; a separate one for a part, without caches of other cells."""
         where = self._where
         if where is None and self.kept and not self.thin:
             return self.mesh._mapping()
@@ -114,7 +114,7 @@ class Measure:
         return self._empty_mapping()
 
     def _empty_mapping(self) -> Any:
-        """Return scikit-fem's mapping for all cells without what that of the mesh has cached."""
+        """Return a copy of scikit-fem's mapping for all cells with empty caches."""
         mapping = copy(self.mesh._mapping())
         for name in [name for name in vars(mapping) if name.startswith("_")]:
             delattr(mapping, name)
@@ -127,14 +127,14 @@ class Measure:
 
     @cached_property
     def _sides(self) -> _Sides:
-        """What a boundary knows of its facets."""
+        """Geometric data of the facets of a boundary."""
         basis = self.facets(own(self.mesh.elem()), self.mesh.dofs)
         x, normals = basis.global_coordinates(), basis.normals
         return _Sides(basis.tind, np.asarray(x), np.asarray(basis.dx), np.asarray(normals))
 
     @property
     def cells(self) -> IntArray | None:
-        """The cells, on a boundary those behind its facets; None: all of the mesh."""
+        """Numbers of the cells, on a boundary those adjacent to its facets; None: all cells."""
         return self._sides.cells if self.on_boundary else self._where
 
     @cached_property
@@ -158,7 +158,7 @@ class Measure:
 
     @cached_property
     def diameter(self) -> Array:
-        """Largest distance of two vertices of each cell, shape (elements, 1)."""
+        """Diameter of each cell, shape (elements, 1)."""
         cells = slice(None) if self.cells is None else self.cells
         corners = self.mesh.p[:, self.mesh.t[:, cells]]
         distances = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=0)
@@ -171,7 +171,7 @@ class Measure:
         return field
 
     def lbasis(self, element: Any, count: int) -> Array | None:
-        """Return the values of all shape functions, (local, points), if all cells see the same."""
+        """Return the values of shape functions, (local, points), if identical in all cells."""
         if self.on_boundary or not isinstance(element, ElementH1):
             return None
         X = self._rule[0]
@@ -179,17 +179,17 @@ class Measure:
         return np.array([np.broadcast_to(value, X.shape[1:]) for value in values])
 
     def mapped(self, X: Array) -> Array:
-        """Return where points of the reference cell lie, shape (d, elements, points)."""
+        """Return the images of points of the reference cell, shape (d, elements, points)."""
         x: Array = self.mapping.F(X, tind=self._where)
         return x
 
     def place(self, moment: Moment) -> Place:
-        """Return what an integrand sees as x at a moment."""
+        """Return the argument x of an integrand at a moment."""
         return Place(self.points, self.normal, moment, lambda: self.diameter)
 
 
 class _Sides(NamedTuple):
-    """The facets of a boundary: cells behind them, quadrature points and weights, normals."""
+    """Facets of a boundary: adjacent cells, quadrature points, weights, normals."""
 
     cells: IntArray
     points: Array
@@ -198,7 +198,7 @@ class _Sides(NamedTuple):
 
 
 def _chosen(members: IntArray, at: Any) -> IntArray:
-    """Return some of the members of a measure; facets keep their side."""
+    """Return some members of a measure; facets keep their orientation."""
     chosen: IntArray = np.asarray(members)[at]
     if isinstance(members, OrientedBoundary):
         chosen = OrientedBoundary(chosen, members.ori[at])

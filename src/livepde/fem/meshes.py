@@ -1,4 +1,4 @@
-"""Meshes and elements for those who have no wishes of their own."""
+"""Meshes and elements for common cases: rectangles, boxes, grids, mesh files."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def grid(
 ) -> MeshQuad:
     """Return a rectangle with a node at every (x, y) of two increasing lists.
 
-    For cells that grow away from where it matters. Boundaries and regions as for `rectangle`.
+    For graded meshes. Boundaries and regions as for `rectangle`.
 
     >>> grid([-100, -10, 0, 10, 100], [0, 1, 4]).nelements
     8
@@ -190,14 +190,14 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
     Parameters
     ----------
     path
-        The file; its ending tells the format.
+        Path of the file; its extension determines the format.
     scale
         Unit of length of the file in that of the model: 1e-3 for a drawing in mm and a model in m.
 
     Raises
     ------
     SpaceError
-        There is no such file, it cannot be read, or it holds no mesh.
+        The file does not exist, cannot be read, or contains no mesh.
     """
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
@@ -228,7 +228,7 @@ def _is_name(name: Any) -> bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep a reader from printing: what is wrong with a file is told by an error."""
+    """Suppress the printed output of a reader: problems with a file are raised as errors."""
     log = logging.getLogger("skfem")
     level = log.level
     log.setLevel(logging.ERROR)
@@ -241,7 +241,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
-    # meshio leaves the interpreter (SystemExit) when it does not know a format.
+    # For an unknown format meshio raises SystemExit, which would end the user's program.
     try:
         read = meshio.read(path)
     except (Exception, SystemExit) as error:
@@ -271,7 +271,7 @@ def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
     return mesh
 
 
-# scikit-fem numbers the corners of a hexahedron in its own way.
+# scikit-fem and meshio number the corners of a hexahedron differently.
 KINDS: dict[Any, tuple[str, list[int]]] = {
     MeshTri: ("triangle", [0, 1, 2]),
     MeshQuad: ("quad", [0, 1, 2, 3]),
@@ -281,9 +281,9 @@ KINDS: dict[Any, tuple[str, list[int]]] = {
 
 
 def cells(mesh: Mesh) -> dict[str, Any]:
-    """Return the kind of the cells as meshio names it -> vertices of each, shape (cells, corners).
+    """Return vertices of the cells by meshio's cell type, shape (cells, corners).
 
-    Empty for an interval, whose vertices are enough.
+    Empty for an interval, whose vertices suffice.
     """
     for kind, (name, corners) in KINDS.items():
         if isinstance(mesh, kind):

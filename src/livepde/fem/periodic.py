@@ -1,4 +1,4 @@
-"""Periodic functions: coefficients on two boundaries that are one and the same."""
+"""Periodic functions: identification of coefficients on pairs of boundaries."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ SLACK = 1e-6  # of the size of the mesh: how far apart two coefficients may be t
 
 
 def tied(field: Field, block: Any) -> IntArray | None:
-    """Return the coefficient that stands for each of scikit-fem's; None: each for itself.
+    """Return the representative of each of scikit-fem's degrees of freedom; None: no ties.
 
-    Coefficients of a pair of periodic boundaries are tied if they are of one kind (value, slope)
-    and in the same place up to the translation of one boundary to the other.
+    Coefficients of a pair of periodic boundaries are identified if they are of the same kind
+    (value, slope) and at the same place up to the translation of one boundary to the other.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Where and when a weak form is evaluated."""
+"""Arguments of a weak form: coordinates, time, input channels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["START", "Moment", "Place"]
 
 
 class Inputs(Mapping[str, float]):
-    """Values of the input channels at one moment; a missing name is one clear sentence."""
+    """Values of the input channels at one moment; a missing name raises a clear error."""
 
     def __init__(self, values: Mapping[str, float]) -> None:
         if isinstance(values, Inputs):  # they never change
@@ -57,8 +57,8 @@ class Place:
 
     `x[0], x[1], ...` are coordinates of the quadrature points; `x.t` the time; `x.inputs["Q"]` the
     value of an input channel; `x.normal` the outward normal (on boundaries); `x.h` the diameter of
-    the cell, shape (elements, 1), on a boundary of the cell behind it. What a form reads is
-    noted: a form that reads neither time nor inputs is constant in time and assembled once.
+    the cell, shape (elements, 1), on a boundary of the adjacent cell. Reads of time and inputs are
+    recorded: a form that reads neither is constant in time and assembled once.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Which of its arguments a function reads, by its code: whatever branches it has."""
+"""Static detection of unused arguments from the byte code of a function."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["reads"]
 
 
 def reads(function: Any, position: int) -> bool:
-    """Return false if a function never uses the argument at a position; true if it may."""
+    """Return False if a function never uses the argument at a position; True if it may."""
     if not isinstance(function, FunctionType) or function.__code__.co_argcount <= position:
         return True
     code = function.__code__

@@ -1,4 +1,4 @@
-"""Where the entries of element matrices stand in a sparse matrix; shared by all that are alike."""
+"""Scatter maps of element matrices into sparse matrices, shared between equal ones."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from livepde.linalg import Array, IntArray, Pattern
 __all__ = ["Scatter", "scatter", "shared"]
 
 Pairs = Sequence[tuple[IntArray, IntArray]]
+# Forms on one mesh repeat the same connectivity many times; on large meshes it would dominate the
+# memory. Weak references: entries vanish with their last user.
 _arrays: WeakValueDictionary[bytes, IntArray] = WeakValueDictionary()
 _known: WeakValueDictionary[bytes, Scatter] = WeakValueDictionary()
 
 
 def shared(array: IntArray) -> IntArray:
-    """Return an array that is equal to this one; the same object for all that are equal."""
+    """Return a canonical array equal to this one: the same object for all equal arrays."""
     key = _digest(array)
     found = _arrays.get(key)
     if found is None:
@@ -29,14 +31,15 @@ def shared(array: IntArray) -> IntArray:
 
 
 def scatter(pairs: Pairs, shape: tuple[int, int]) -> Scatter:
-    """Return the scatter of element matrices; the same object for all that are alike.
+    """Return the canonical scatter map of element matrices: one object for equal arguments.
 
     Parameters
     ----------
     pairs
-        Row and column of the local entries of each term, shapes (i, elements), (j, elements).
+        Row and column numbers of local functions for each term, shapes (i, elements), (j,
+        elements).
     shape
-        Of the matrix.
+        Shape of the matrix.
     """
     key = _digest(np.array(shape), *(dofs for pair in pairs for dofs in pair))
     found = _known.get(key)
@@ -55,12 +58,12 @@ def _digest(*arrays: Any) -> bytes:
 
 
 class Scatter:
-    """Adds the entries of element matrices, (i, j, elements), to the data of a sparse matrix.
+    """Scatter map: adds element matrices, (i, j, elements), to the data of a sparse matrix.
 
     Attributes
     ----------
     pattern
-        Of the matrix: every entry that an element has.
+        Pattern of the matrix: all entries of all element matrices.
     """
 
     def __init__(self, pairs: Pairs, shape: tuple[int, int]) -> None:
@@ -78,12 +81,12 @@ class Scatter:
         Parameters
         ----------
         keep
-            Keep where the entries of this term stand: they will come again.
+            Cache the positions of this term's entries, for repeated assembly.
         """
         np.add.at(data, self._at(term, at, keep).ravel(), local.ravel())
 
     def places(self, term: int) -> IntArray:
-        """Return where in the data the entries of a term stand, shape (i, j, elements)."""
+        """Return the positions of a term's entries in the data, shape (i, j, elements)."""
         if term not in self._places:
             rows, cols = self.pairs[term]
             found = np.empty((len(rows), *cols.shape), dtype=np.int32)
@@ -103,7 +106,7 @@ class Scatter:
 
 
 def _members(dofs: IntArray, count: int) -> sp.csr_array:
-    """Return which coefficients each element has, shape (elements, count)."""
+    """Return the incidence matrix of elements and coefficients, shape (elements, count)."""
     width, elements = dofs.shape
     flat = np.ascontiguousarray(dofs.T, dtype=np.int32).ravel()
     starts = np.arange(0, width * elements + 1, width, dtype=np.int32)

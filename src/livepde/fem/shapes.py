@@ -1,4 +1,4 @@
-"""What a weak form may write: scikit-fem's helpers, under the names of the mathematics."""
+"""Notation of weak forms: scikit-fem's helpers under their mathematical names."""
 
 from __future__ import annotations
 

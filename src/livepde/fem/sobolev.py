@@ -1,4 +1,4 @@
-"""Inner products of Sobolev spaces H^s of any order, sparse to apply and to solve with."""
+"""Inner products of Sobolev spaces H^s of any order by sparse matrices."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Sobolev:
     - s = 0 and 1 are M and K, sparse.
     - s = 2 with an element of class C^1 (Hermite on lines, Bogner-Fox-Schmit, Argyris) is the form
       q xi + 2 length^2 grad q . grad xi + length^4 hess q : hess xi, sparse.
-    - Everything else is dense, but the Schur complement of a sparse matrix, `border`: s = 2 is
+    - All others are dense, but Schur complements of a sparse matrix, `border`: s = 2 is
       K M^{-1} K, with one auxiliary field; orders above 2 are reduced by 2 with two more; for
       fractional orders, lambda^sigma = c_0 + sum of w_i lambda/(lambda + b_i) by Balakrishnan's
       formula and the trapezoidal rule in log b, with one auxiliary field for each of the 10 to 15
@@ -76,21 +76,21 @@ class Sobolev:
             raise SpaceError(f"Sobolev: length must be a positive number; got {self.length}.")
 
     def pointwise(self, dimension: int) -> Sobolev:
-        """Return the inner product for which `std` of a field is its deviation at a point.
+        """Return the inner product with `std` of a field as its pointwise standard deviation.
 
-        The prior covariance std^2 G^{-1} is then that of Whittle and Matern with variance std^2 in
-        the interior; within about a length of a free boundary the deviation grows, to sqrt(2) std
-        on it.
+        The prior covariance std^2 G^{-1} is then the Whittle-Matern covariance with variance std^2
+        in the interior; within about a length of a free boundary the standard deviation grows, to
+        sqrt(2) std on it.
 
         Parameters
         ----------
         dimension
-            Of the mesh.
+            Dimension of the mesh.
 
         Raises
         ------
         SpaceError
-            Unless s > dimension/2: values at points have no finite deviation.
+            If s <= dimension/2, where point values have infinite variance.
 
         Examples
         --------
@@ -108,7 +108,7 @@ class Sobolev:
         return replace(self, factor=float(gamma(self.s - half) / gamma(self.s) / volume))
 
     def form(self, element: Any) -> Any:
-        """Return the inner product as a weak form, or None if it has none on this element."""
+        """Return the inner product as a weak form; None if the element admits none."""
         form, factor = self._plain_form(element), self.factor
         return form and (lambda u, v, x: factor * form(u, v, x))
 
@@ -125,7 +125,7 @@ class Sobolev:
         return None
 
     def operator(self, u: Any, v: Any, x: Any) -> Any:
-        """The weak form of L = I - length^2 Laplace."""
+        """Weak form of L = I - length^2 Laplace."""
         return u * v + self.length**2 * dot(grad(u), grad(v))
 
     def border(self, M: sp.csr_array, K: sp.csr_array, free: Array) -> sp.csr_array:
@@ -136,7 +136,7 @@ class Sobolev:
         M, K
             Mass matrix and matrix of `operator`, shape (n, n).
         free
-            One for each free coefficient, zero for each fixed one: they are decoupled.
+            Mask: one for each free coefficient, zero for each fixed one, which is decoupled.
         """
         mask, fixed = sp.diags_array(free), sp.diags_array(1.0 - free)
         M, K = (sp.csr_array(mask @ matrix @ mask + fixed) for matrix in (M, K))
@@ -169,21 +169,24 @@ def _border(s: float, M: Any, K: Any) -> Any:
 
 
 def _largest(M: sp.csr_array, K: sp.csr_array) -> float:
-    """Return a little more than the largest eigenvalue of M^{-1} K."""
+    """Return an upper estimate of the largest eigenvalue of M^{-1} K."""
     if M.shape[0] < 3:
         return float(np.linalg.eigvals(np.linalg.solve(M.toarray(), K.toarray())).real.max())
     start = np.random.default_rng(0).standard_normal(M.shape[0])
     factor = analyse(Pattern.of(M), symmetric=True).factorise(sp.csr_array(M).sorted_indices().data)
     inverse = LinearOperator(M.shape, matvec=factor.solve, dtype=float)
     value = eigsh(K, k=1, M=M, Minv=inverse, v0=start, tol=0.05, return_eigenvectors=False)
+    # The eigenvalue is computed to 5 % only; the margin of 20 % makes it an upper bound. The poles
+    # depend on it logarithmically, so accuracy would not pay.
     return 1.2 * float(value[0])
 
 
 def _balakrishnan(sigma: float, largest: float) -> tuple[float, Array, Array]:
     """Return c_0, w, b with lambda^sigma = c_0 + sum of w lambda/(lambda + b) on [1, largest].
 
-    lambda^sigma = sin(pi sigma)/pi times the integral over y of b^sigma lambda/(lambda + b) with
-    b = e^y. The terms beyond the last poles are geometric series, and go into c_0 and one far pole.
+    lambda^sigma = sin(pi sigma)/pi times the integral over y of b^sigma lambda/(lambda + b) with b
+    = e^y. The terms beyond the outermost poles are geometric series, summed in c_0 and one far
+    pole.
     """
     low, high = -np.log(REACH), np.log(REACH * largest)
     b = np.exp(low + SPACING * np.arange(int(np.ceil((high - low) / SPACING)) + 1))

@@ -1,4 +1,4 @@
-"""Function spaces as products of blocks, as the weak forms and the laws see them."""
+"""Function spaces as products of blocks, for weak forms and laws."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ __all__ = ["FunctionSpace", "LocalSpace", "Named"]
 
 
 class Named(SimpleNamespace):
-    """What forms and sensors see of several unknowns or components: q.D, u.c."""
+    """Namespace of several unknowns or components in forms and sensors: q.D, u.c."""
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"there is no '{name}'; there are {sorted(vars(self))}")
 
 
 class LocalSpace:
-    """A function space on one measure: values, and integrals against its shape functions.
+    """Function space on one measure: point values, and integrals against shape functions.
 
-    On a measure that is kept all is done by sparse and dense products that are precomputed. On a
-    piece of a larger one nothing is: what a form does not ask for is not computed.
+    On a cached measure all operations are products with precomputed sparse or dense matrices. On a
+    piece of a larger measure nothing is precomputed, and derivatives that a form does not use are
+    never evaluated.
     """
 
     def __init__(self, space: FunctionSpace, measure: Measure) -> None:
@@ -46,7 +47,7 @@ class LocalSpace:
 
     @cached_property
     def _owners(self) -> list[tuple[Local, slice, str, int]]:
-        """Of each component: its block, the block's local functions, its part, and which there."""
+        """Owner of each component: block, slice of local functions, derivative, index in it."""
         owners, left = [], 0
         for local in self.locals:
             columns = slice(left, left + len(local.dofs))
@@ -56,7 +57,7 @@ class LocalSpace:
         return owners
 
     def component(self, k: int) -> tuple[slice, Array]:
-        """Return which local functions a component has, and it: shape (local, elements, points)."""
+        """Return the slice of local functions of a component, and its values (local, E, P)."""
         local, columns, name, at = self._owners[k]
         return columns, local.part(name)[at]
 
@@ -71,7 +72,7 @@ class LocalSpace:
 
     @cached_property
     def evaluation(self) -> sp.csr_array:
-        """Coefficients -> all components at all quadrature points (fact 10 of the design)."""
+        """Matrix from coefficients to all components at all points (fact 10 of the design)."""
         components, _, elements, points = self.phi.shape
         c, i, e, p = np.nonzero(self.phi)
         rows = (c * elements + e) * points + p
@@ -153,19 +154,19 @@ class LocalSpace:
         return np.zeros((self.components, *self.shape))
 
     def units(self, axis: int, axes: int) -> Array:
-        """Return all unit jets at once, along batch axis `axis` of `axes`."""
+        """Return all unit jets as one batch, along batch axis `axis` of `axes`."""
         batch = [1] * axes
         batch[axis] = self.components
         return np.eye(self.components).reshape(self.components, *batch, 1, 1)
 
     def unit_jets(self, axis: int, axes: int) -> Any:
-        """Return the jets of `units(axis, axes)`, kept: they never change."""
+        """Return the jets of `units(axis, axes)`, cached because they never change."""
         if (axis, axes) not in self._units:
             self._units[axis, axes] = self.jets(self.units(axis, axes))
         return self._units[axis, axes]
 
     def jets(self, values: Array) -> Any:
-        """Return what a form gets for component values of shape (components, ..., E, P)."""
+        """Return the argument of a form for component values of shape (components, ..., E, P)."""
         start, jets = 0, []
         for block, local in zip(self.space.blocks.values(), self.locals, strict=True):
             stop = start + local.components
@@ -177,7 +178,7 @@ class LocalSpace:
 
 
 def _parts(density: Array, axes: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Array]]:
-    """Yield the components of a density that are not zero: their numbers, and their values."""
+    """Yield index and values of the non-zero components of a density."""
     density = np.asarray(density)
     density = density.reshape((1,) * (len(axes) + 2 - density.ndim) + density.shape)
     density = np.broadcast_to(density, axes + density.shape[len(axes) :])
@@ -193,7 +194,7 @@ class FunctionSpace:
     Parameters
     ----------
     unknowns
-        Name -> unknown. `single` says that forms get the unknown itself, not a namespace.
+        Mapping from name to unknown. With `single`, forms get the unknown itself, not a namespace.
     """
 
     unknowns: Mapping[str, Unknown]
@@ -213,7 +214,7 @@ class FunctionSpace:
 
     @cached_property
     def blocks(self) -> dict[str, Any]:
-        """Name -> block."""
+        """Block of each unknown, by name."""
         return {name: block_of(unknown) for name, unknown in self.unknowns.items()}
 
     @cached_property
@@ -228,7 +229,7 @@ class FunctionSpace:
         return sum(block.size for block in self.blocks.values())
 
     def part(self, name: str) -> slice:
-        """Return where the coefficients of one block stand."""
+        """Return the slice of one block among the coefficients."""
         start = self.starts[list(self.blocks).index(name)]
         return slice(start, start + self.blocks[name].size)
 
@@ -249,7 +250,7 @@ class FunctionSpace:
 
     @cached_property
     def labels(self) -> dict[str, int]:
-        """Label of each scalar unknown -> its coefficient."""
+        """Coefficient number of each scalar unknown, by label."""
         found: dict[str, int] = {}
         for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
             for k, label in enumerate(block.labels(name)):
@@ -258,16 +259,16 @@ class FunctionSpace:
 
     @cached_property
     def fields(self) -> dict[str, FieldBlock]:
-        """Name -> block of each unknown that is a field."""
+        """Block of each unknown that is a field, by name."""
         return {n: block for n, block in self.blocks.items() if isinstance(block, FieldBlock)}
 
     def component(self, of: str = "") -> tuple[FieldBlock, slice]:
-        """Return a component of the state and where its coefficients stand.
+        """Return a component of the state and the slice of its coefficients.
 
         Parameters
         ----------
         of
-            Its name; empty stands for the only one.
+            Name of the component; empty stands for the only one.
 
         Raises
         ------
@@ -286,7 +287,7 @@ class FunctionSpace:
         return self.fields[of], self.part(of)
 
     def widen(self, matrix: sp.csr_array, of: str = "") -> sp.csr_array:
-        """Return a matrix on the coefficients of one component as one on all, (k, dim)."""
+        """Return a matrix on one component, padded to act on all coefficients, (k, dim)."""
         _, part = self.component(of)
         entries = (matrix.data, matrix.indices + part.start, matrix.indptr)
         return sp.csr_array(entries, shape=(matrix.shape[0], self.dim))
@@ -322,7 +323,7 @@ class FunctionSpace:
         )
 
     def local(self, measure: Measure) -> LocalSpace:
-        """Return the space on a measure; one that is kept is built once: all forms share it."""
+        """Return the local space on a measure; cached ones are shared by all forms."""
         if measure.members is not None or measure.thin or not measure.kept:
             return LocalSpace(self, measure)
         key = (id(measure.mesh), measure.order, measure.name)
@@ -337,7 +338,7 @@ class FunctionSpace:
     def interpolate(self, value: Any) -> Array:
         """Return coefficients of a number, a function of x, coefficients, or a mapping by name.
 
-        For several fields a number stands for all of them.
+        With several fields, a number is the value of all of them.
         """
         if isinstance(value, Mapping):
             unknown = set(value) - set(self.blocks)

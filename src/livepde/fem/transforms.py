@@ -1,6 +1,7 @@
-"""Unknowns that stay positive or within bounds: q = T(latent), coefficient by coefficient.
+"""Transforms q = T(latent) of unknowns that stay positive or within bounds.
 
-Laws work with the latent coefficients, whose prior is Gaussian; weak forms and sensors see q.
+Transforms act coefficient by coefficient. Laws work with the latent coefficients, whose prior is
+Gaussian; weak forms and sensors see q.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ class Transform(ABC):
         """Return the latent value of q; not finite where q lies outside of the range of T."""
 
     def shifted(self, q: Array, std: Array, z: float) -> Array:
-        """Return q with its latent value moved by z deviations: a quantile of T(Gaussian).
+        """Return q shifted by z latent standard deviations: a quantile of T(Gaussian).
 
         Parameters
         ----------
         q, std
-            T of the latent mean, and T' times the latent deviation; NaN stays NaN. Where q has
-            reached the end of T's range to rounding, that deviation is not known any more, and the
-            end on the side of z is returned.
+            T of the latent mean, and T' times the latent standard deviation; NaN stays NaN. Where q
+            equals an end of T's range to rounding, the latent standard deviation cannot be
+            recovered, and the end on the side of z is returned.
         """
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             latent = self.inverse(q)
@@ -54,7 +55,7 @@ class Transform(ABC):
 
 @dataclass(frozen=True)
 class Identity(Transform):
-    """q itself."""
+    """Identity transform: q = latent."""
 
     def value(self, latent: Array) -> Array:
         return latent
@@ -71,7 +72,7 @@ class Identity(Transform):
 
 @dataclass(frozen=True)
 class Log(Transform):
-    """q = lower + exp(latent): above a bound."""
+    """Logarithmic transform: q = lower + exp(latent), above a bound."""
 
     lower: float = 0.0
 
@@ -91,7 +92,7 @@ class Log(Transform):
 
 @dataclass(frozen=True)
 class Logit(Transform):
-    """q = lower + (upper - lower) / (1 + exp(-latent)): between two bounds."""
+    """Logistic transform: q = lower + (upper - lower) / (1 + exp(-latent)), between bounds."""
 
     lower: float
     upper: float
@@ -116,7 +117,7 @@ class Logit(Transform):
 
 
 def transform_of(what: str, name: str | None, bounds: tuple[float, float]) -> Transform:
-    """Return the transform that an unknown names: None, "log" or "logit"."""
+    """Return the transform of an unknown by name: None, "log" or "logit"."""
     lower, upper = bounds
     if name is None:
         return Identity()

@@ -1,4 +1,4 @@
-"""Stabilisation of transport that is faster than diffusion over a cell."""
+"""Streamline-upwind stabilisation of convection-dominated transport."""
 
 from __future__ import annotations
 

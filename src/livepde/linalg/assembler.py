@@ -1,4 +1,4 @@
-"""One sparse system from blocks L·K·R, where only the data of K change."""
+"""Assembly of a sparse matrix from blocks L·K·R of which only the data of K change."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ __all__ = ["Assembler"]
 
 
 class Assembler:
-    """Collects blocks of a square matrix; then maps the data of each into the whole.
+    """Assembler of a square block matrix, with linear maps from block data to its data.
 
     Every block is `left @ K @ right` at an offset, with K of a fixed pattern. After `build`,
-    `maps[name] @ data_of_K` is its contribution to the data of the whole.
+    `maps[name] @ data_of_K` is the contribution of a block to the data of the assembled matrix.
     """
 
     def __init__(self, size: int) -> None:
         self.size = size
-        self._blocks: dict[str, list[_Block]] = {}
+        self._blocks: dict[str, list[_MatrixBlock]] = {}
 
     def add(
         self,
@@ -34,19 +34,20 @@ class Assembler:
         at: tuple[int, int] = (0, 0),
         transposed: bool = False,
     ) -> None:
-        """Add a block; the same name may be added at several places, also as left @ K^T @ right."""
-        block = _Block(inner, left, right, at, transposed)
+        """Add a block; one name may be added at several places, also as left @ K^T @ right."""
+        block = _MatrixBlock(inner, left, right, at, transposed)
         known = (other for group in self._blocks.values() for other in group)
         same = next((other for other in known if other.alike(block)), block)
         self._blocks.setdefault(name, []).append(same)
 
     def build(self) -> tuple[Pattern, dict[str, sp.csr_array]]:
-        """Return the pattern of the whole and, for each name, the map of its data.
+        """Return the pattern of the assembled matrix and, for each name, the map of its data.
 
-        Blocks with the same pattern and factors have one map.
+        Blocks with the same pattern and factors share one map.
         """
         blocks = {id(block): block for group in self._blocks.values() for block in group}
         entries = [block.entries for block in blocks.values()]
+        # The diagonal is part of every pattern, so that rows of fixed coefficients can hold ones.
         diagonal = np.arange(self.size, dtype=np.int32)
         rows = np.concatenate([diagonal, *(rows for rows, _, _ in entries)])
         cols = np.concatenate([diagonal, *(cols for _, cols, _ in entries)])
@@ -62,8 +63,8 @@ class Assembler:
 
 
 @dataclass(frozen=True, eq=False)
-class _Block:
-    """left @ K @ right or left @ K^T @ right, with K of a pattern."""
+class _MatrixBlock:
+    """Block left @ K @ right or left @ K^T @ right, with K of a fixed pattern."""
 
     inner: Pattern
     left: Sparse | None
@@ -71,15 +72,15 @@ class _Block:
     at: tuple[int, int]
     transposed: bool
 
-    def alike(self, other: _Block) -> bool:
-        """Return true if the other is made of the same objects."""
+    def alike(self, other: _MatrixBlock) -> bool:
+        """Return True if the other block consists of the same objects."""
         pairs = zip(*((b.inner, b.left, b.right) for b in (self, other)), strict=True)
         same = (self.at, self.transposed) == (other.at, other.transposed)
         return same and all(mine is theirs for mine, theirs in pairs)
 
     @cached_property
     def entries(self) -> tuple[IntArray, IntArray, sp.csr_array]:
-        """Rows and columns in the whole, and their values from the data of K."""
+        """Rows and columns in the assembled matrix, and map from the data of K to the values."""
         shape = self.inner.shape[::-1] if self.transposed else self.inner.shape
         left = sp.eye_array(shape[0]) if self.left is None else self.left
         right = sp.eye_array(shape[1]) if self.right is None else self.right
@@ -89,7 +90,7 @@ class _Block:
     def _scaled(
         self, left: Sparse, right: Sparse
     ) -> tuple[IntArray, IntArray, sp.csr_array] | None:
-        """Return the entries if both factors are diagonal: nothing is added up then."""
+        """Return the entries if both factors are diagonal, when no entries are summed."""
         a, b = _diagonal(left), _diagonal(right)
         if a is None or b is None:
             return None
@@ -111,7 +112,7 @@ class _Block:
         return rows, cols, weights
 
     def mapped(self, pattern: Pattern) -> sp.csr_array:
-        """Return the map from the data of K to those of the whole."""
+        """Return the map from the data of K to the data of the assembled matrix."""
         rows, cols, weights = self.entries
         return sp.csr_array(pattern.gather(rows, cols) @ weights)
 

@@ -1,4 +1,4 @@
-"""LAPACK's banded LU after a bandwidth-reducing permutation: the engine of 1D problems."""
+"""Banded LU by LAPACK after a bandwidth-reducing permutation: the solver of 1D problems."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class BandedFactor:
 
     @cached_property
     def _triangles(self) -> tuple[Array, Array] | None:
-        """L and U in band storage, if no rows were exchanged and they are solved with faster."""
+        """L and U in band storage, if no rows were exchanged and triangular solves are faster."""
         if self.lower * len(self.pivots) < FEW or not np.array_equal(
             self.pivots, np.arange(len(self.pivots))
         ):
@@ -60,10 +60,11 @@ class BandedFactor:
 
 @dataclass(frozen=True, eq=False)
 class BandedSolver:
-    """Banded LU of one sparsity pattern; cost n·b² to factorise, n·b to solve.
+    """Banded LU of one sparsity pattern; n·b² operations to factorise, n·b to solve.
 
-    With `units`, powers of two of shape (n,), the matrix is factorised as units K units: where that
-    has a diagonal of about one, rows are hardly exchanged, which takes a third of the time.
+    With `units`, powers of two of shape (n,), the scaled matrix units K units is factorised: with a
+    diagonal of about one it needs few row exchanges, and a factorisation without them takes a third
+    of the time.
     """
 
     pattern: Pattern
@@ -74,7 +75,7 @@ class BandedSolver:
 
     @cached_property
     def order(self) -> IntArray:
-        """Reverse Cuthill–McKee order of the unknowns; the natural one if its band is no wider."""
+        """Reverse Cuthill-McKee order of the unknowns; the natural one if its band is no wider."""
         structure = self.pattern.matrix(np.ones(self.pattern.nnz))
         found: IntArray = reverse_cuthill_mckee(structure + structure.T, symmetric_mode=True)
         rows, cols, place = self.pattern.rows, self.pattern.indices, np.argsort(found)
@@ -101,22 +102,22 @@ class BandedSolver:
 
     @cached_property
     def storage(self) -> tuple[tuple[int, int], IntArray]:
-        """Shape of LAPACK's band storage, and where in it each entry of the pattern stands."""
+        """Shape of LAPACK's band storage, and position in it of each entry of the pattern."""
         lower, upper = self.band
         row, col = self.inverse[self.pattern.rows], self.inverse[self.pattern.indices]
-        # LAPACK's storage is column major: the flat position counts down the columns.
+        # LAPACK's band storage is column major: flat positions count down the columns.
         height = 2 * lower + upper + 1
         return (self.pattern.shape[0], height), col * height + (lower + upper + row - col)
 
     @cached_property
     def _scale(self) -> Array | float:
-        """What each entry of the pattern is multiplied by."""
+        """Scaling factor of each entry of the pattern."""
         if self.units is None:
             return 1.0
         return self.units[self.pattern.rows] * self.units[self.pattern.indices]
 
     def factorise(self, data: Array) -> BandedFactor:
-        """Factorise; raises `LinearAlgebraError` for a singular or non-finite matrix."""
+        """Factorise; raise `LinearAlgebraError` for a singular or non-finite matrix."""
         shape, position = self.storage
         storage = np.zeros(shape)
         storage.ravel()[position] = data * self._scale

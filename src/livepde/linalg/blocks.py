@@ -1,4 +1,4 @@
-"""Many banded systems of one pattern, factorised and solved by one LAPACK call each."""
+"""Batches of banded systems with one pattern, factorised and solved by one LAPACK call each."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ NONE = np.zeros(0, dtype=np.intp)
 
 @dataclass(frozen=True, eq=False)
 class BlockFactor:
-    """Factors of the blocks of a block-diagonal matrix.
+    """Factors of the diagonal blocks of a block-diagonal matrix.
 
     Attributes
     ----------
     triangles
-        Solves with the factors of the whole matrix, in the order of the band; overwrites its
-        argument.
+        Triangular solves with the factors of the whole matrix, in the order of the band; they
+        overwrite their argument.
     bad
         Numbers of the blocks that could not be factorised.
     """
@@ -35,10 +35,10 @@ class BlockFactor:
     bad: IntArray
 
     def solve(self, b: Array) -> Array:
-        """Return x with K x = b for each block: shape (columns, blocks, n) as b, overwritten.
+        """Return x with K x = b for each block, of shape (columns, blocks, n); overwrites b.
 
-        NaN for blocks whose matrix is singular; not finite where b is not. Where a solution
-        overflows, other blocks may be NaN with it; what is finite is right.
+        NaN for blocks with a singular matrix; not finite where b is not. If a solution overflows,
+        other blocks may become NaN with it; finite values are correct.
         """
         columns, count, n = b.shape
         bad = self.bad
@@ -57,11 +57,11 @@ class BlockFactor:
 
 @dataclass(frozen=True, eq=False)
 class BandedBlocks:
-    """Banded factors of many matrices of one sparsity pattern.
+    """Banded factorisation of many matrices with one sparsity pattern.
 
-    They are the blocks of one block-diagonal matrix, whose band is that of a block: no pivot is
-    taken from another block, because what couples the blocks is zero. LU with partial pivoting; for
-    tridiagonal matrices that are symmetric and positive definite L D L^T, at a third of the price.
+    The matrices are the blocks of one block-diagonal matrix with the bandwidth of a block: no pivot
+    is taken from another block, because the coupling entries are zero. LU with partial pivoting; L
+    D L^T for symmetric positive definite tridiagonal matrices, at a third of the cost.
     """
 
     solver: BandedSolver

@@ -1,8 +1,8 @@
-"""Which engine serves a sparsity pattern: the only place where this is decided.
+"""Choice of the solver for a sparsity pattern: the only place of this decision.
 
-The measure is the band, the number of diagonals on each side after reverse Cuthill and McKee: about
-sqrt(n) in 2D and n^(2/3) in 3D, twice that for quadratic elements. The dense blocks of a sparse
-factor are about as large, whatever the dimension:
+The criterion is the half bandwidth after reverse Cuthill-McKee ordering: about sqrt(n) in 2D and
+n^(2/3) in 3D, twice that for quadratic elements. The dense blocks of a sparse factor have about
+this size in any dimension:
 
     band          2D P1       3D P1       engine
     to 48         2 000         300       banded LU
@@ -11,8 +11,9 @@ factor are about as large, whatever the dimension:
     to 2500   5 000 000     120 000       CHOLMOD or Pardiso if installed, else multigrid
     beyond                                multigrid
 
-Multigrid serves symmetric positive definite matrices; others are factorised, by Pardiso if it is
-installed, at any size. An engine in use (`livepde.linalg.using`) comes before all but banded LU.
+Multigrid serves symmetric positive definite matrices only; others are factorised at any size, by
+Pardiso if it is installed. An engine in use (`livepde.linalg.using`) takes precedence over all but
+banded LU.
 """
 
 from __future__ import annotations
@@ -39,28 +40,28 @@ WIDEST_FACTOR = 2500
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """An engine bound to a pattern, and why it was chosen."""
+    """A solver bound to a pattern, and the reason of its choice."""
 
     solver: Solver
     reason: str
 
 
 def analyse(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Solver:
-    """Return the engine for a pattern, as `choose` does."""
+    """Return the solver for a pattern, as chosen by `choose`."""
     return choose(pattern, symmetric=symmetric, approximate=approximate).solver
 
 
 def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = False) -> Choice:
-    """Choose the engine for a pattern, by its band and by what is installed.
+    """Choose the solver for a pattern by its bandwidth and the installed packages.
 
     Parameters
     ----------
     pattern
-        Of the matrices to come.
+        Sparsity pattern of the matrices.
     symmetric
-        Each will be symmetric positive definite.
+        True if every matrix is symmetric positive definite.
     approximate
-        Its `approximate_inverse` is all that is needed: multigrid serves from a band of 500 on.
+        True if only `approximate_inverse` is needed: then multigrid serves from a bandwidth of 500.
     """
     banded = BandedSolver(pattern)
     band = max(banded.band)

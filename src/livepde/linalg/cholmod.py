@@ -1,4 +1,4 @@
-"""CHOLMOD by scikit-sparse: Cholesky factors of large symmetric positive definite matrices."""
+"""Cholesky factors of large symmetric positive definite matrices by CHOLMOD (scikit-sparse)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["CholmodSolver"]
 
 @dataclass(frozen=True, eq=False)
 class CholmodFactor:
-    """A Cholesky factor."""
+    """Cholesky factor of CHOLMOD."""
 
     inner: Any
 
@@ -30,9 +30,9 @@ class CholmodFactor:
 
 @dataclass(frozen=True, eq=False)
 class CholmodSolver:
-    """Sparse Cholesky of one pattern, ordered once; needs scikit-sparse.
+    """Sparse Cholesky of one pattern with a fixed fill-reducing order; needs scikit-sparse.
 
-    A factor proves that its matrix is positive definite.
+    A successful factorisation proves that the matrix is positive definite.
     """
 
     pattern: Pattern
@@ -44,7 +44,7 @@ class CholmodSolver:
     def _order(self) -> Any:
         from sksparse.cholmod import analyze
 
-        # The other mode makes L D L^T, of indefinite matrices, too.
+        # The other mode computes L D L^T, which also exists for indefinite matrices.
         return analyze(self._matrix(np.ones(self.pattern.nnz)), mode="supernodal")
 
     def _matrix(self, data: Array) -> sp.csc_matrix:
@@ -52,7 +52,7 @@ class CholmodSolver:
         return sp.csc_matrix((data, self.pattern.indices, self.pattern.indptr), self.pattern.shape)
 
     def factorise(self, data: Array) -> CholmodFactor:
-        """Factorise; raises `LinearAlgebraError` unless positive definite and finite."""
+        """Factorise; raise `LinearAlgebraError` unless positive definite and finite."""
         from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
         if not np.isfinite(data).all():

@@ -1,4 +1,4 @@
-"""An engine of several processes, in the place of those that `choose` would take."""
+"""Multi-process engine that takes precedence over the solvers of `choose`."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ __all__ = ["Engine", "in_use", "using"]
 
 
 class Engine(Protocol):
-    """What serves large patterns while it is in use; see `livepde.parallel`."""
+    """Provider of solvers for large patterns while it is in use; see `livepde.parallel`."""
 
     @property
     def reason(self) -> str:
-        """Why it serves, for `Choice`."""
+        """Reason of its choice, for `Choice`."""
         ...
 
     def solver(self, pattern: Pattern, *, symmetric: bool) -> Solver | None:
-        """Return a solver for a pattern whose band is not small; None leaves it to the rule."""
+        """Return a solver for a pattern of large bandwidth; None defers to the rule of `choose`."""
         ...
 
     def build(self, function: Callable[..., Any], *args: Any, known: Any = None) -> Any:
-        """Return the model `function(*args)`, or `known`, which other processes may build, too."""
+        """Return the model `function(*args)`, or `known`; other processes may build it, too."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Krylov methods that return to a stated tolerance, or say why they did not."""
+"""Krylov methods with a guaranteed residual tolerance: they reach it or raise an error."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def conjugate_gradients(
     tolerance
         Bound on the residual, relative to each right-hand side.
     limit
-        At most this many iterations.
+        Maximum number of iterations.
     remedy
-        What to do if they do not suffice.
+        Advice for the message of the error if they do not suffice.
 
     Returns
     -------
@@ -60,6 +60,8 @@ def conjugate_gradients(
                 "The matrix is not positive definite to working precision: check the signs of the "
                 "forms, or take a smaller time step."
             )
+        # Converged right-hand sides are frozen, so that a column gets no other rounding from the
+        # number of columns solved with it.
         step = _ratio(new * active, curvature)
         x += step * p
         r -= step * Kp
@@ -72,7 +74,7 @@ def conjugate_gradients(
 
 
 def _ratio(a: Array, b: Array) -> Array:
-    """Return a/b, zero where b is."""
+    """Return a/b, zero where b is zero."""
     ratio: Array = np.divide(a, b, out=np.zeros_like(np.asarray(b, dtype=float)), where=b != 0)
     return ratio
 
@@ -80,18 +82,18 @@ def _ratio(a: Array, b: Array) -> Array:
 def gmres(
     apply: Map, precondition: Map, b: Array, tolerance: float, limit: int, remedy: str
 ) -> tuple[Array, int]:
-    """Solve with any regular matrix, preconditioned from the left.
+    """Solve with any nonsingular matrix by GMRES with a left preconditioner.
 
-    Unlike SciPy's it applies the preconditioner once for b and once in each iteration.
+    In contrast to SciPy's, it applies the preconditioner only once for b and once per iteration.
 
     Parameters
     ----------
     apply, precondition, limit, remedy
-        As for `conjugate_gradients`; all directions are kept.
+        As for `conjugate_gradients`; there is no restart.
     b
         Shape (n,).
     tolerance
-        Bound on the preconditioned residual, about the error, relative to that of x = 0.
+        Bound on the preconditioned residual, an estimate of the error, relative to that of x = 0.
 
     Returns
     -------

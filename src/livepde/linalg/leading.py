@@ -1,4 +1,4 @@
-"""The leading unknowns of a larger system, whose other equations have no right-hand side."""
+"""Schur complement solves by the factor of a larger system."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["Leading"]
 
 @dataclass(frozen=True, eq=False)
 class Leading:
-    """Solves with the Schur complement of a matrix, by the factor of the matrix itself.
+    """Factor of the Schur complement on the leading unknowns of a factorised matrix.
 
     Parameters
     ----------
     factor
-        Of the larger matrix, shape (total, total).
+        Factor of the larger matrix, shape (total, total).
     size, total
-        Number of leading unknowns, and of all.
+        Number of leading unknowns, and of all unknowns.
     """
 
     factor: Factor
@@ -29,7 +29,7 @@ class Leading:
     total: int
 
     def solve(self, b: Array) -> Array:
-        """Return the leading unknowns for a right-hand side of the leading equations."""
+        """Return the leading unknowns; the right-hand sides of the other equations are zero."""
         return self.factor.solve(self._padded(b))[: self.size]
 
     def _padded(self, b: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Values computed once for each key, which threads may ask for at the same time."""
+"""Bounded memoisation of values by key, safe for threads."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Value = TypeVar("Value")
 
 
 class Memo(Generic[Key, Value]):
-    """A bounded memo of a function: it empties itself rather than grow beyond `most` values.
+    """A bounded memo of a function: cleared when it would grow beyond `most` values.
 
-    Two threads that ask for the same key at once both compute it, and get equal values; what is
-    kept must never change.
+    Two threads that ask for the same key at once both compute it, and get equal values. Values must
+    be immutable.
 
     >>> squares = Memo(most=2)
     >>> sum(squares.get(k, lambda k=k: k**2) for k in (1, 2, 3))
@@ -24,11 +24,12 @@ class Memo(Generic[Key, Value]):
 
     def __init__(self, most: int) -> None:
         self._most = most
-        # Replaced as a whole and never changed: a thread that has read it finds what it has seen.
+        # The dictionary is replaced as a whole and never mutated, so that a thread may keep reading
+        # the one it has: no lock is needed.
         self._values: Mapping[Key, Value] = {}
 
     def get(self, key: Key, make: Callable[[], Value]) -> Value:
-        """Return the value of a key, made if it is not known."""
+        """Return the value of a key, computed on first use."""
         values = self._values
         if key in values:
             return values[key]

@@ -1,4 +1,4 @@
-"""Algebraic multigrid by PyAMG, as preconditioner of conjugate gradients."""
+"""Conjugate gradients preconditioned by algebraic multigrid (PyAMG)."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ REMEDY = (
 
 @dataclass(frozen=True, eq=False)
 class MultigridFactor:
-    """A hierarchy of coarser matrices, and the matrix itself."""
+    """Multigrid hierarchy of a matrix, and the matrix itself."""
 
     matrix: sp.csr_array
     levels: Any
 
     def precondition(self, b: Array) -> Array:
-        """Return one V-cycle for each right-hand side, an approximate solution."""
+        """Return one V-cycle for each right-hand side: an approximate solution."""
         if b.ndim == 1:
             cycle: Array = self.levels(b)
             return cycle
@@ -72,6 +72,6 @@ class MultigridSolver:
 
 
 def approximate_inverse(factor: Factor) -> Callable[[Array], Array]:
-    """Return what a factor offers a Krylov method: one V-cycle instead of an iteration within."""
+    """Return the preconditioner of a factor: one V-cycle of multigrid, else an exact solve."""
     cycle: Callable[[Array], Array] = getattr(factor, "precondition", factor.solve)
     return cycle

@@ -1,4 +1,4 @@
-"""Pardiso of Intel's MKL by pypardiso: factors of large matrices."""
+"""Sparse factors of large matrices by MKL Pardiso (pypardiso)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REPRODUCIBLE = 2  # MKL_CBWR_AUTO: the last digit does not follow where arrays l
 
 @dataclass(frozen=True, eq=False)
 class PardisoFactor:
-    """The factors that a handle of Pardiso holds; it goes back to the solver with this object."""
+    """Factors held by a Pardiso handle, which returns to the solver with this object."""
 
     solver: PardisoSolver
     handle: Any
@@ -44,13 +44,13 @@ class PardisoFactor:
 
 @dataclass(frozen=True, eq=False)
 class PardisoSolver:
-    """Sparse factors of one pattern; needs pypardiso.
+    """Sparse factors of one pattern by MKL Pardiso; needs pypardiso.
 
-    `symmetric` for symmetric positive definite matrices: a factor proves that its matrix is one,
-    and the pattern is ordered once. The order of others depends on their values, and is made anew
-    for each: what a factor gives must not depend on what was factorised before.
-    pypardiso's own `solve` takes no symmetric storage and compares the whole matrix each time;
-    so its phases are called one by one.
+    `symmetric` is for symmetric positive definite matrices: a successful factorisation proves
+    definiteness, and the fill-reducing order is computed once. The order of other matrices depends
+    on their values and is recomputed for each, since the numbers of a factor must not depend on
+    earlier factorisations. pypardiso's own `solve` takes no symmetric storage and compares the
+    whole matrix each time; hence its phases are called one by one.
     """
 
     pattern: Pattern
@@ -62,22 +62,22 @@ class PardisoSolver:
 
     @property
     def name(self) -> str:
-        """How the engine introduces itself."""
+        """Name of the solver for messages."""
         return "Pardiso (MKL)" + (", symmetric positive definite" if self.symmetric else "")
 
     @property
     def price(self) -> float:
-        """About how many solves a factorisation costs."""
+        """Approximate cost of a factorisation in triangular solves."""
         return 4.0 if self.symmetric else 15.0
 
     @property
     def definite(self) -> bool:
-        """True for symmetric matrices: their factor is that of Cholesky."""
+        """True for symmetric matrices, which have a Cholesky factor."""
         return self.symmetric
 
     @cached_property
     def _stored(self) -> tuple[IntArray, Pattern]:
-        """Which data Pardiso gets, and where they stand: of a symmetric matrix the upper part."""
+        """Data indices and pattern passed to Pardiso: the upper triangle if symmetric."""
         rows, cols = self.pattern.rows, self.pattern.indices
         kept = np.flatnonzero(cols >= rows) if self.symmetric else np.arange(len(cols))
         if len(np.unique(rows[cols == rows])) < self.pattern.shape[0] and self.symmetric:
@@ -87,7 +87,7 @@ class PardisoSolver:
         return kept, Pattern.from_entries(rows[kept], cols[kept], self.pattern.shape)
 
     def factorise(self, data: Array) -> PardisoFactor:
-        """Factorise; raises `LinearAlgebraError` for a singular or non-finite matrix."""
+        """Factorise; raise `LinearAlgebraError` for a singular or non-finite matrix."""
         from pypardiso import PyPardisoSolver
         from pypardiso.pardiso_wrapper import PyPardisoError
 

@@ -1,4 +1,4 @@
-"""Sparse matrices whose sparsity is fixed: only their `data` changes from step to step."""
+"""Sparsity patterns: sparse matrices with a fixed structure and changing data."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class Pattern:
     indices: IntArray
 
     def __post_init__(self) -> None:
-        # Matrices share these arrays: an operation that would change them in place fails instead.
+        # Matrices share these arrays: they are read-only, so that an in-place operation fails
+        # instead of corrupting all matrices of the pattern.
         self.indptr.setflags(write=False)
         self.indices.setflags(write=False)
 
@@ -62,7 +63,7 @@ class Pattern:
 
     @cached_property
     def places(self) -> IntArray:
-        """Where in a dense matrix each structural non-zero stands, counted along the rows."""
+        """Row-major positions of the structural non-zeros in a dense matrix."""
         return self.rows.astype(np.intp) * self.shape[1] + self.indices
 
     @property
@@ -71,7 +72,7 @@ class Pattern:
         return np.repeat(np.arange(self.shape[0], dtype=np.int32), np.diff(self.indptr))
 
     def positions(self, rows: IntArray, cols: IntArray) -> IntArray:
-        """Return where in `data` the given entries stand; each must be in the pattern."""
+        """Return the positions of given entries in `data`; each must be in the pattern."""
         if not len(rows):
             return np.zeros(0, dtype=np.int32)
         numbers = np.arange(1, self.nnz + 1, dtype=np.int32)  # 0: not in the pattern
@@ -87,7 +88,7 @@ class Pattern:
         return sp.csr_array((data, self.indices, self.indptr), shape=self.shape, copy=False)
 
     def compact(self, data: Array) -> sp.csr_array | Array:
-        """Return the matrix as what multiplies fastest by a vector: a small one is dense."""
+        """Return the matrix in the format of the fastest product: dense if small."""
         if not self.small:
             return self.matrix(data)
         dense = np.zeros(self.shape)
@@ -101,7 +102,7 @@ class Pattern:
 
     def product(self, data: Array, x: Array) -> Array:
         """Return `matrix(data) @ x`, for x of shape (columns,) or (columns, k)."""
-        # Nothing is kept between two products: a pattern serves any number of threads at once.
+        # No buffer is kept between two products: a pattern may be used by several threads at once.
         product: Array = self.compact(data) @ x
         return product
 
@@ -113,12 +114,12 @@ class Pattern:
 
 
 def compact(matrix: sp.csr_array) -> sp.csr_array | Array:
-    """Return what multiplies fastest by a vector: a small matrix as a dense one."""
+    """Return a matrix in the format of the fastest product: dense if small."""
     return matrix.toarray() if np.prod(matrix.shape) <= DENSE else matrix
 
 
 def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:
-    """Return (owner, rank within owner) for `counts[i]` items of each owner i."""
+    """Return (owner, rank within owner) of `counts[i]` items of each owner i."""
     owner = np.repeat(np.arange(len(counts)), counts)
     first = np.cumsum(counts) - counts
     return owner, np.arange(len(owner)) - first[owner]
@@ -127,12 +128,12 @@ def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:
 def sandwich(
     left: Sparse, inner: Pattern, right: Sparse
 ) -> tuple[IntArray, IntArray, sp.csr_array]:
-    """Return how `left @ inner @ right` depends on the data of `inner`.
+    """Return the linear dependence of `left @ inner @ right` on the data of `inner`.
 
     Returns
     -------
     rows, cols
-        Entries of the product, repeated where several terms add up.
+        Rows and columns of the entries of the product, repeated if several terms contribute.
     weights
         Sparse matrix of shape (len(rows), inner.nnz): values of those entries from `inner`'s data.
     """

@@ -1,4 +1,4 @@
-"""What an engine offers: analyse a pattern once, factorise data often, solve many times."""
+"""Solver protocol: analyse a pattern once, factorise data often, solve many times."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class Factor(Protocol):
 
 
 class Solver(Protocol):
-    """An engine bound to one sparsity pattern."""
+    """A solver bound to one sparsity pattern."""
 
     @property
     def name(self) -> str:
-        """How the engine introduces itself."""
+        """Name of the solver for messages."""
         ...
 
     @property
     def pattern(self) -> Pattern:
-        """The sparsity pattern it is bound to."""
+        """Sparsity pattern of its matrices."""
         ...
 
     @property
@@ -38,9 +38,9 @@ class Solver(Protocol):
 
     @property
     def price(self) -> float:
-        """About how many solves a factorisation costs; 0: a factor is not worth keeping.
+        """Approximate cost of a factorisation in solves; 0: reusing a factor does not pay.
 
-        A stated number, not a measured one: nothing that is timed steers what is computed.
+        A constant, not a measured time: timings must not influence the numbers computed.
         """
         ...
 

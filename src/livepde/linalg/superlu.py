@@ -39,8 +39,8 @@ class SuperLUFactor:
 class SuperLUSolver:
     """Sparse LU of one pattern; `symmetric` for symmetric positive definite matrices.
 
-    The symmetric mode orders A + A^T and does not pivot: 1.6 to 9 times cheaper there. Where that
-    has cost accuracy, the matrix is not positive definite, and is refused.
+    The symmetric mode orders A + A^T and does not pivot, which is 1.6 to 9 times cheaper. If the
+    residual of a test solve is large, the matrix is not positive definite, and is refused.
     """
 
     pattern: Pattern
@@ -49,18 +49,18 @@ class SuperLUSolver:
 
     @property
     def name(self) -> str:
-        """How the engine introduces itself."""
+        """Name of the solver for messages."""
         return "SuperLU (SciPy)" + (", symmetric mode" if self.symmetric else "")
 
     @property
     def definite(self) -> bool:
-        """False: pivots may have any sign."""
+        """False: SuperLU does not check the signs of pivots."""
         return False
 
     def factorise(self, data: Array) -> SuperLUFactor:
-        """Factorise; raises `LinearAlgebraError` for a singular or non-finite matrix.
+        """Factorise; raise `LinearAlgebraError` for a singular or non-finite matrix.
 
-        In symmetric mode also for one that is indefinite, unless its factor is accurate.
+        In symmetric mode it is also raised for an indefinite matrix, unless its factor is accurate.
         """
         if not np.isfinite(data).all():
             raise LinearAlgebraError("The matrix holds values that are not finite.")
@@ -76,6 +76,8 @@ class SuperLUSolver:
         except RuntimeError as error:
             raise LinearAlgebraError(message) from error
         if self.symmetric:
+            # Without pivoting, an indefinite matrix can have a factor with large element growth. A
+            # test solve detects that; SuperLU itself reports exact zeros only.
             b = np.cos(np.arange(n))  # of no symmetry that could hide an error
             x = factor.solve(b)
             size = np.abs(data).max() * np.abs(x).max() + 1.0
@@ -85,9 +87,9 @@ class SuperLUSolver:
 
 
 def positive_definite(matrix: sp.csr_array) -> bool:
-    """Return whether a symmetric matrix is positive definite: all its pivots are positive.
+    """Return True if a symmetric matrix is positive definite: all its pivots are positive.
 
-    By Sylvester's law of inertia, as long as rows and columns are exchanged together.
+    By Sylvester's law of inertia, which applies if rows and columns are permuted together.
     """
     try:
         lu = splu(sp.csc_array(matrix), **SYMMETRIC)

@@ -1,4 +1,4 @@
-"""A stage solved by the factor of another, whose unknowns were nearby: iterative refinement."""
+"""Iterative refinement of an implicit stage with the LU factor of a nearby matrix."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ SLOW = 0.3  # a factor whose corrections leave more than this share of the error
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What a stage leaves to the next one: where its factor was made, and how the state moved.
+    """Warm-start data of a stage: parameter and step of its cached factor, trend of the state.
 
-    The factor itself is made again from this where it is gone, after a restart say: the numbers
-    that follow are the same.
+    The factor itself is not stored: it is recomputed from these data if it is missing, as after a
+    restart, and the subsequent numbers are the same.
 
     Attributes
     ----------
     q, h
-        Latent parameter, shape (m,), and step; q is empty if nothing is kept.
+        Latent parameter, shape (m,), and step of the cached factor; q is empty if there is none.
     spent
-        Solves that stages have taken beyond those that a factor of a q nearby takes.
+        Excess solves since the factor was computed, beyond those expected with a nearby q.
     trend
-        Change of the state per unit of time, with which the next stage starts, shape (n,).
+        Rate of change of the state, for the predictor of the next stage, shape (n,).
     """
 
     q: Array
@@ -45,37 +45,38 @@ class Kept:
 
     @classmethod
     def none(cls) -> Kept:
-        """Return the value before any stage."""
+        """Return empty warm-start data, as before the first stage."""
         return cls(np.zeros(0), 0.0, 0.0, np.zeros(0))
 
 
 class At(NamedTuple):
-    """Where a matrix is taken."""
+    """Parameter and step at which the matrix of a stage is evaluated."""
 
     q: Array
     h: float
 
     def same(self, q: Array, h: float) -> bool:
-        """Return whether it is the one of (q, h)."""
+        """Return True if parameter and step equal (q, h)."""
         return self.h == h and (self.q is q or np.array_equal(self.q, q))
 
 
 @dataclass(eq=False)
 class Corrections:
-    """Solves with the matrix of one stage by the factor of another.
+    """Iterative refinement with the matrix of one stage and the factor of another.
 
     Attributes
     ----------
     matrix, at, free
-        Of the stage, where it is taken, and one for each free coefficient, zero for fixed ones.
+        Matrix of the stage, its (q, h), and the mask of free coefficients: one if free, zero if
+        fixed.
     factor
-        (q, h) -> the factor there.
+        Function (q, h) -> factorised matrix.
     price
-        Solves that a factorisation costs.
+        Cost of a factorisation in triangular solves.
     factor_at
-        Where the factor was made that is used now.
+        Parameter and step of the factor in use.
     spent
-        As for `Kept`.
+        Excess solves, as in `Kept`.
     """
 
     matrix: sp.csr_array | Array
@@ -87,27 +88,28 @@ class Corrections:
     spent: float
 
     def once(self, start: Array, b: Array) -> Array:
-        """Return x with matrix x = b, by one correction: a share of the change is left.
+        """Return the solution of matrix x = b after a single correction.
 
-        At most `SLOW`, or the factor would have been made again; mostly less than a hundredth.
+        The remaining error is at most `SLOW` of the initial one, since the factor would have been
+        replaced otherwise; usually less than a hundredth.
         """
         r = (b - self.matrix @ start) * self.free[:, None]
         return start + solved(self.factor(*self.factor_at), r)
 
     def solve(self, before: Array, start: Array, b: Array, tolerance: float, passes: int) -> Array:
-        """Return x with matrix x = b on the free coefficients.
+        """Return the solution of matrix x = b on the free coefficients.
 
         Parameters
         ----------
         before
-            What x was where the stage begins.
+            Value of x at the beginning of the stage.
         start
-            What x is on the fixed ones, and about elsewhere, shape (n,) or (n, r).
+            Initial guess of x, exact on the fixed coefficients, shape (n,) or (n, r).
         tolerance
-            Bound on the error relative to x, both in the Euclidean norm over all columns: that does
-            not change where columns of a square root are rotated.
+            Bound on the error relative to x, both in the Frobenius norm over all columns, which is
+            invariant under rotations of the columns of a covariance square root.
         passes
-            Corrections that are as many as expected.
+            Expected number of corrections; only those beyond it count as excess solves.
         """
         free = self.free.reshape(-1, *[1] * (b.ndim - 1))
         width = b[0].size
@@ -121,6 +123,8 @@ class Corrections:
             if exact or moved <= ROUNDING * size:
                 return x
             last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
+            # The contraction rate is estimated from residuals, not from updates: the residual of
+            # the new iterate is needed anyway for the next correction.
             rate = float(np.linalg.norm(r)) / last if last else math.inf  # squares may underflow
             if rate <= SLOW:
                 left = moved * rate / (1.0 - rate)
@@ -134,13 +138,14 @@ class Corrections:
                     return x
                 if spent <= self.price:
                     continue
-            # Keeping the factor has cost as much as a new one, or would.
+            # The refinement with the old factor has cost, or would cost, as much as a
+            # factorisation.
             self.factor_at, self.spent, exact = self.at, 0.0, True
             x, r = start, first
 
 
 def solved(factor: Factor, b: Array) -> Array:
-    """Return the solution by a factor; raises `StepFailed`."""
+    """Return the solution by a factor; raise `StepFailed` for a singular matrix."""
     try:
         return factor.solve(b)
     except LinearAlgebraError as error:

@@ -1,4 +1,4 @@
-"""Vectors of a model that time and input channels drive: sources and boundary values."""
+"""Load vectors and boundary values as affine functions of the input channels."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ __all__ = ["DrivenVector"]
 
 SCALES = (1e-3, 1.0, 1e3, 1e6)  # of random inputs that tell whether a vector is affine in them
 ROUNDING = 1e-11  # relative: less is no curvature
-# Input at which a response is measured: the vector without inputs costs it no digit.
+# Inputs at which responses are measured: so large that subtracting the vector without inputs
+# cancels no digits, and a power of two so that the division is exact.
 LARGE = 2.0**20
 
 
 class DrivenVector:
-    """A vector v(t, inputs) that is mostly affine in the inputs, and mostly does not read the time.
+    """A vector v(t, inputs), usually affine in the inputs and usually independent of time.
 
-    Then it is assembled once, and a moment costs one small product.
+    In that case it is assembled once, and its evaluation is one small matrix product.
 
     Parameters
     ----------
     vector
-        Moment -> coefficients, shape (n,).
+        Function moment -> coefficients, shape (n,).
     channels
-        Names of the inputs.
+        Names of the input channels.
     timed
-        () -> whether the vector has read the time so far.
+        Function () -> True if the vector has read the time so far.
     """
 
     def __init__(
@@ -53,6 +54,8 @@ class DrivenVector:
         """True if the vector is affine in the inputs, probed at several magnitudes."""
         if not self.channels:
             return True
+        # A fixed seed: whether a model counts as affine must not differ between two runs. Several
+        # magnitudes, since a kink or a saturation may lie far from one.
         rng = np.random.default_rng(2)
         for scale in SCALES:
             a, b = scale * rng.standard_normal((2, len(self.channels)))
@@ -66,9 +69,9 @@ class DrivenVector:
 
     @cached_property
     def responses(self) -> tuple[Array, Array] | None:
-        """The vector without inputs, (1, n), and its change with each, (channels, n).
+        """Vector without inputs, (1, n), and its derivative by each input, (channels, n).
 
-        None if it reads the time or is not affine.
+        None if the vector reads the time or is not affine.
         """
         if not self.affine:
             return None

@@ -1,4 +1,4 @@
-"""From one sample to the next: the data in between, substeps, and what happens when one fails."""
+"""Sample intervals: linear interpolation of inputs, substeps, and step halving after a failure."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_HALVINGS = 30  # beyond, a substep is shorter than what times resolve
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """The time between two samples, with inputs and measurements interpolated linearly.
+    """A sample interval, with inputs and measurements interpolated linearly.
 
     Attributes
     ----------
@@ -35,11 +35,10 @@ class Interval:
     z0, z1
         Measurements at both ends, shape (sensors,), NaN where missing.
     noise
-        Standard deviation of each value of z1, shape (sensors,), NaN where it is that of the
-        sensor; None if all are.
+        Standard deviation of each value of z1, shape (sensors,), NaN for the default of the sensor;
+        None if all are defaults.
     gaps
-        Channel that is held at either end -> for how long it was held before, and whether it is at
-        the end.
+        Channel held at either end -> duration of the gap before, and whether it lasts at the end.
     """
 
     t0: float
@@ -71,11 +70,11 @@ class Interval:
 
     @property
     def silent(self) -> Interval:
-        """The same without a measurement at the end."""
+        """Copy of the interval without a measurement at the end."""
         return replace(self, z1=np.full_like(self.z1, np.nan))
 
     def divided(self, count: int) -> list[Interval]:
-        """Return the interval as equal parts, in time order."""
+        """Return equal subintervals, in time order."""
         if count == 1:
             return [self]
         share = [k / count for k in range(count + 1)]
@@ -89,11 +88,11 @@ class Interval:
 
     @cached_property
     def present(self) -> Array:
-        """Sensors with a value at the end, shape (sensors,)."""
+        """Mask of the sensors with a value at the end, shape (sensors,)."""
         return np.isfinite(self.z1)
 
     def z(self, t: float) -> Array:
-        """Return measurements at t; where the value at t0 is missing, those of t1."""
+        """Return measurements interpolated at t; where the value at t0 is missing, those of t1."""
         if t == self.t1:
             return self.z1
         s = self._weight(t)
@@ -101,7 +100,7 @@ class Interval:
         return (1 - s) * start + s * self.z1
 
     def change(self, start: float, stop: float) -> Array:
-        """Return how much z changes between two times; zero where it is missing at t0."""
+        """Return the change of z between two times; zero where z is missing at t0."""
         share = (stop - start) / (self.t1 - self.t0)
         change: Array = share * (self.z1 - self.z0)
         change[np.isnan(change)] = 0.0
@@ -109,14 +108,14 @@ class Interval:
 
 
 def own_noise(noise: ArrayLike) -> Array | None:
-    """Return the standard deviations of readings, None if all are those of the sensors (NaN)."""
+    """Return noise standard deviations of readings; None if all are sensor defaults (NaN)."""
     found: Array = np.asarray(noise, dtype=float)
     return None if np.isnan(found).all() else found
 
 
 @dataclass(frozen=True)
 class Advance:
-    """How a step is controlled.
+    """Step control: time scheme, substeps, and halving after a failure.
 
     Parameters
     ----------
@@ -125,12 +124,12 @@ class Advance:
     dt_max
         Longest substep; a longer interval is divided evenly.
     halvings
-        A substep that fails is halved at most this often; 0: it fails at once.
+        Maximum number of successive halvings of a failed substep; 0: no retry.
     hold
-        Whether inputs are held between samples at what the later one brings, as an actuator that
-        is set anew at each sample leaves them; else they change linearly.
+        True for zero-order hold: inputs have the value of the later sample over the whole interval,
+        as with an actuator that is set at each sample. False for linear interpolation.
     parts
-        Every substep is divided into so many: for the same interval with shorter steps.
+        Number of parts of every substep, to repeat an interval with shorter steps.
     """
 
     scheme: Scheme
@@ -148,22 +147,23 @@ class Advance:
             )
 
     def over(self, interval: Interval) -> Interval:
-        """Return an interval with its inputs as they are taken."""
+        """Return an interval with inputs held or interpolated, as configured."""
         if not self.hold or interval.inputs0 is interval.inputs1:
             return interval
         return replace(interval, inputs0=interval.inputs1)
 
     def count(self, length: float) -> int:
-        """Return the number of even substeps of an interval of that length."""
+        """Return the number of equal substeps of an interval of that length."""
         ratio = length / self.dt_max
+        # The factor keeps rounding of the length from adding a substep when dt_max divides it.
         return self.parts * max(1, math.ceil(ratio * (1 - 1e-12)))
 
 
 def _width(t: float, stop: float) -> float:
-    """Return stop - t, rounded to what both times resolve.
+    """Return stop - t, rounded to the resolution of both times.
 
-    Differences of equidistant times differ in their last digits; rounded they are one number, so
-    that what depends on the step alone is computed once.
+    Differences of equidistant times differ in their last digits. Rounding makes them identical, so
+    that a matrix factorised for one step length serves all equal steps.
     """
     unit = math.ldexp(1.0, math.frexp(max(abs(t), abs(stop)))[1] - 49)
     width = stop - t
@@ -180,15 +180,17 @@ def advance(
     Returns
     -------
     y
-        At the end of the interval; unchanged from the last good substep if one failed for good.
+        State at the end of the interval, or after the last successful substep if halving failed.
     steps
-        Substeps taken.
+        Number of substeps taken.
     failure
-        None, or why the last halving still failed.
+        None, or the failure of the shortest substep.
     """
     substeps = control.count(t1 - t0)
     finest = substeps << control.halvings
     width = (t1 - t0) / finest
+    # Time is counted in ticks of the finest halving: all times are integer multiples of one width,
+    # and a stride can grow again at every multiple of its double.
     tick, stride, steps = 0, 1 << control.halvings, 0
     while tick < finest:
         t = t0 + tick * width

@@ -1,6 +1,6 @@
-"""The implicit stage of several members of one model: their states, and tangents behind them.
+"""Batched implicit stage: states and tangents of several members of one model.
 
-Columns of members have the shape (1 + r, members, n): the state and r tangents of each.
+Column arrays have the shape (1 + r, members, n): the state and r tangents of each member.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class KeptFactors:
-    """`Kept` of each member: what a stage leaves to the next one.
+    """Warm-start data of each member, as `Kept` of a single process.
 
     Attributes
     ----------
     q, h, spent, trend
-        Shapes (members, m), (members,), (members,) and (members, n); h = 0 if nothing is kept. A
-        stage that keeps nothing leaves q and trend without columns.
+        Shapes (members, m), (members,), (members,) and (members, n); h = 0 for a member without a
+        cached factor. For stages that cache no factors, q and trend have no columns.
     """
 
     q: Array
@@ -65,39 +65,40 @@ class KeptFactors:
 
     @classmethod
     def none(cls, members: int, m: int = 0, n: int = 0) -> KeptFactors:
-        """Return the value before any stage."""
+        """Return empty warm-start data, as before the first stage."""
         zero = np.zeros(members)
         return cls(np.zeros((members, m)), zero, zero, np.zeros((members, n)))
 
     def member(self, k: int) -> Kept:
-        """Return what is kept of one member."""
+        """Return the warm-start data of one member."""
         if not self.h[k]:
             return Kept.none()
         return Kept(self.q[k], float(self.h[k]), float(self.spent[k]), self.trend[k])
 
 
 class StageOfMembers(NamedTuple):
-    """What one stage of several members depends on, beside where it begins.
+    """Arguments of a batched stage, besides its initial states and tangents.
 
     Attributes
     ----------
     members
-        Numbers of the members, by which they find their own factors again, shape (members,).
+        Numbers of the members, as keys of their cached factors, shape (members,).
     q, directions
-        Latent parameters, (members, dim), and how q changes along each tangent, (members, r, m).
+        Latent parameters, (members, dim), and derivative of q along each tangent, (members, r, m).
     h, at
-        Length of the stage; time and inputs at its end.
+        Step length; time and inputs at its end.
     kept
-        What the last stage has left.
+        Warm-start data of the previous stage.
     off_centre
-        Members whose last tangent is the estimated deviation of the state, which has to be more
-        accurate than a square root of the covariance; shape (members,).
+        Mask of members whose last tangent is the offset of the estimated mean from the
+        linearisation point, which has to be more accurate than a covariance square root; shape
+        (members,).
     factors
-        Of the matrices for the same q by the length of their stage, which a stage may use and add
-        to: those of one step of a time scheme.
+        Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
+        step of a time scheme; a stage may read it and add to it.
     apart
-        How many of the last tangents are solved apart from all others, whose numbers are then what
-        they are without them.
+        Number of trailing tangents that are solved separately, so that their presence does not
+        change the rounding of the other columns.
     """
 
     members: IntArray
@@ -112,41 +113,41 @@ class StageOfMembers(NamedTuple):
 
 
 class MemberStage(ABC):
-    """Solves M (u - c)/h + B(u) + A(u) q = F for the state u of each member, and its tangents."""
+    """Abstract solver of M (u - c)/h + B(u) + A(u) q = F for states and tangents of members."""
 
     @abstractmethod
     def kept(self, members: int) -> KeptFactors:
-        """Return what is kept before any stage."""
+        """Return empty warm-start data of members, as before the first stage."""
 
     @abstractmethod
     def twin(self) -> MemberStage:
-        """Return a stage of the same model with factors of its own: for other steps."""
+        """Return a stage of the same model with its own factor cache, for other step lengths."""
 
     @abstractmethod
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
-        """Return states and tangents at the end of a stage, and what it leaves to the next.
+        """Return states and tangents at the end of a stage, and its warm-start data.
 
         Parameters
         ----------
         columns
-            Where the stage begins, shape (1 + r, members, n).
+            States and tangents at the beginning of the stage, shape (1 + r, members, n).
 
         Raises
         ------
         StepFailed
-            A stage has no solution that is found.
+            The solver finds no solution of a stage.
         """
 
 
 class SeparateStages(MemberStage):
-    """One `ForwardStage` for each member: for any model."""
+    """Loop of one `ForwardStage` per member: serves any model."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self._stages: list[ForwardStage] = []
 
     def _stage(self, k: int) -> ForwardStage:
-        """Return the stage of a member: the analysis is common, factors are its own."""
+        """Return the stage of a member: symbolic analysis is shared, numeric factors are not."""
         if not self._stages:
             self._stages.append(ForwardStage(self.model))
         while len(self._stages) <= k:
@@ -186,9 +187,10 @@ class SeparateStages(MemberStage):
 
 
 class BandedStage(MemberStage):
-    """Stages of a model whose matrices are banded sums of constant ones, q_j A_j and M/h + B.
+    """Batched stage of models whose matrices are constant, banded and affine in q.
 
-    The matrices are assembled once; those of all members are the blocks of one banded matrix.
+    The matrices M/h + B and A_j are assembled once. The matrices of all members are the diagonal
+    blocks of one banded matrix, which is factorised by one LAPACK call.
     """
 
     def __init__(self, model: Model) -> None:
@@ -201,7 +203,8 @@ class BandedStage(MemberStage):
         self.pattern, maps = _analysed(model)
         rows, cols = self.pattern.rows, self.pattern.indices
         inner, outer = free[rows] * free[cols], free[rows] * (1.0 - free[cols])
-        # What depends on time or inputs is none of the matrices, but is evaluated with them.
+        # The matrices depend on neither time nor inputs; the forms still need some moment as
+        # argument.
         some = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
         mass = maps["M"] @ model.mass.data
         rest = maps["B"] @ model.form_B.data("v", "u", some, u=zero)
@@ -213,7 +216,7 @@ class BandedStage(MemberStage):
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
         self._rest_band = self._blocks.band(rest * inner + ones)
         self._slope_bands = self._blocks.band(np.array(slopes) * inner)
-        # What Dirichlet values do to the equations of free coefficients stands in the vectors.
+        # The couplings of free coefficients to Dirichlet values are moved to the right-hand side.
         mass_edge, rest_edge = self._product(mass * outer), self._product(rest * outer)
         slope_edge = self._product(*(slope * outer for slope in slopes))
 
@@ -241,7 +244,7 @@ class BandedStage(MemberStage):
 
     @staticmethod
     def refuses(model: Model) -> str:
-        """Return why a model cannot be stepped so; empty if it can."""
+        """Return the reason why a model does not fit this stage; empty if it fits."""
         if not (model.physical_A.linear_in_parameter and model.affine):
             return "the model is not affine in its state and its unknowns"
         if model.parameter_space.dim > MOST_UNKNOWNS:
@@ -254,13 +257,13 @@ class BandedStage(MemberStage):
 
     @property
     def refusal(self) -> str:
-        """Why members whose inputs differ cannot be stepped together; empty if they can."""
+        """Reason why members with different inputs cannot be batched; empty if they can."""
         if not all(item.affine for item in (self._boundary, self._load, self._offset)):
             return "the model is not affine in its input channels"
         return ""
 
     def _product(self, *parts: Array) -> sp.csr_array | Array:
-        """Return matrices of the pattern one below the other, for products."""
+        """Return vertically stacked matrices of the pattern, for products."""
         blocks = [self.pattern.matrix(part) for part in parts]
         whole = sp.csr_array(sp.vstack(blocks, format="csr"))
         whole.eliminate_zeros()  # an unknown of a layer has an effect there only
@@ -273,7 +276,8 @@ class BandedStage(MemberStage):
         return KeptFactors.none(members)
 
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
-        # The equations times h: so nothing of the size of all columns has to be divided by it.
+        # The equations are multiplied by h, which avoids dividing an array of the size of all
+        # columns.
         (size, n), h, at = columns.shape[1:], stage.h, stage.at
         together = len(columns) - stage.apart
         columns, apart = columns[:together], columns[together:]
@@ -308,14 +312,15 @@ class BandedStage(MemberStage):
             new[0] += self._boundary(at)
         if not len(apart):
             return new, stage.kept
-        # Products of other shapes may round in another way: none is shared with the rest.
+        # BLAS may round products of other shapes differently, so the separate columns share no
+        # product with the others.
         known = np.array((self._mass @ apart.reshape(-1, n).T).T, order="C").reshape(apart.shape)
         known -= ((h * stage.directions[:, together - 1 :]) @ driven).transpose(1, 0, 2)
         return np.concatenate([new, factor.solve(known)]), stage.kept
 
 
 def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
-    """Return the pattern of the matrix of a stage, and the maps of its parts."""
+    """Return the sparsity pattern of the stage matrix, and the maps of its parts."""
     whole = Assembler(model.X.dim)
     whole.add("M", model.form_M.pattern("v", "u"))
     whole.add("B", model.form_B.pattern("v", "u"))
@@ -324,7 +329,7 @@ def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
 
 
 def member_stage(model: Model) -> MemberStage:
-    """Return the fastest stage that serves a model: the only place where this is decided."""
+    """Return the fastest applicable batched stage; the only place of this decision."""
     if BandedStage.refuses(model):
         return SeparateStages(model)
     return BandedStage(model)

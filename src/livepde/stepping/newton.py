@@ -1,4 +1,4 @@
-"""The nonlinear iteration of an implicit stage: Newton, accepted by the residual."""
+"""Newton's method for an implicit stage, with acceptance by the residual norm."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FACTORS = 3  # made from a prediction before the iteration begins anew from the 
 
 
 class StepFailed(Exception):
-    """A stage that was not solved; caught by the step control, never seen by users."""
+    """Failure of a stage; caught by the step control, never seen by users."""
 
     def __init__(self, code: str, detail: str) -> None:
         super().__init__(detail)
@@ -30,11 +30,11 @@ class StepFailed(Exception):
 
 
 class StagePoint(Protocol):
-    """A stage evaluated at a point."""
+    """Stage equation evaluated at an iterate."""
 
     @property
     def y(self) -> Array:
-        """The point, shape (n,)."""
+        """The iterate, shape (n,)."""
         ...
 
     @property
@@ -49,7 +49,7 @@ class StagePoint(Protocol):
 
     @property
     def resolved(self) -> bool:
-        """False while the residual is too large for a small difference that the equation needs."""
+        """False if the residual is too large to resolve a small difference in the equation."""
         ...
 
 
@@ -57,33 +57,33 @@ Point = TypeVar("Point", bound=StagePoint)
 
 
 class StageEquation(Protocol[Point]):
-    """One implicit stage: pure functions of the iterate."""
+    """Nonlinear equation of one implicit stage: pure functions of the iterate."""
 
     def evaluate(self, y: Array) -> Point:
-        """Return the stage at y."""
+        """Return the evaluation at y."""
         ...
 
     def factor(self, at: Point) -> Factor:
-        """Return the factorised Jacobian at a point."""
+        """Return the factorised Jacobian at an iterate."""
         ...
 
     def limited(self, at: Point, allowed: float) -> bool:
-        """Return true if rounding errors are all that keeps a residual above the size allowed."""
+        """Return True if rounding errors alone keep the residual above `allowed`."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Near:
-    """A predicted solution.
+    """Predictor of a stage: starting value and cached Jacobian factor.
 
     Attributes
     ----------
     y
         The prediction.
     factor
-        Of a Jacobian not far away, with which to begin; None: one is made at y.
+        Factor of a nearby Jacobian, for the first updates; None: the Jacobian at y is factorised.
     refresh
-        Share of the residual beyond which an update by it makes a new factor worth its cost.
+        Contraction factor of the residual above which `factor` is replaced by a new one.
     """
 
     y: Array
@@ -93,16 +93,16 @@ class Near:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[Point]):
-    """A solved stage, and how the iteration went.
+    """Solution of a stage with iteration statistics.
 
     Attributes
     ----------
     at
-        The solution: its residual was evaluated and is below the tolerance.
+        The solution, with its residual, which is below the tolerance.
     updates
-        Number of updates.
+        Number of Newton updates.
     made
-        Where the last Jacobian was factorised, and its factor; None: nowhere.
+        Iterate of the last factorised Jacobian, and its factor; None without a factorisation.
     """
 
     at: Point
@@ -112,28 +112,28 @@ class Solution(Generic[Point]):
 
 @dataclass(frozen=True)
 class Newton:
-    """Newton's iteration with kept factors, and when a stage counts as solved.
+    """Simplified Newton method with cached factors and residual-based acceptance.
 
     A stage is solved when its residual, in the dual norm and relative to the largest term of the
-    equation, is at most `tolerance`, or what rounding leaves; from a prediction that is good, at
-    most `share` of what it had there and at most `ceiling`: what a prediction misses is about what
-    the time step leaves out.
-    The size of an update is no criterion: a factor of another point makes it small, too.
+    equation, is at most `tolerance` or at rounding level. From a good prediction a reduction to
+    `share` of the initial residual, and at most `ceiling`, is enough: the error of a prediction is
+    about the truncation error of the time step. The size of an update is no criterion: an outdated
+    factor can make it small, too.
 
-    An update that does not reduce the residual is shortened until it does.
+    An update that does not reduce the residual is damped by halving (line search).
 
     Parameters
     ----------
     tolerance
         Bound on the relative residual.
     share
-        Of the residual of a prediction that may be left. 0: always to `tolerance`.
+        Accepted fraction of the residual of a prediction. 0: always solve to `tolerance`.
     ceiling
         Bound on the relative residual with `share`. The default keeps q and u within 1e-3 of those
-        of strict solves (`livepde reproduce exact`): the next stage makes up for what one leaves.
+        of strict solves (`livepde reproduce exact`): the next stage corrects the remaining error.
         Large coupled stages, solved by blocks, raise it to 5e-3.
     iterations
-        At most this many updates.
+        Maximum number of updates.
     refresh
         The Jacobian is factorised again when an update leaves more than this share of the residual.
     """
@@ -156,9 +156,9 @@ class Newton:
         Parameters
         ----------
         start
-            Where to begin, or a function that returns it: with `near` it may not be needed.
+            Initial iterate, or a function that returns it: with `near` it may not be needed.
         near
-            A prediction.
+            Predicted solution.
 
         Raises
         ------
@@ -185,16 +185,16 @@ class _Iteration(Generic[Point]):
         self.made: tuple[Point, Factor] | None = None
 
     def run(self, at: Point, near: Near, allowed: float, factors: int) -> Solution[Point]:
-        """Return the solution; raises `StepFailed`.
+        """Return the solution; raise `StepFailed` without convergence.
 
         Parameters
         ----------
         at, near
-            Where to begin, and with which factor.
+            Initial iterate and its predictor data.
         allowed
-            Relative size of the residual at which the stage is solved.
+            Accepted relative residual.
         factors
-            At most this many are made.
+            Maximum number of factorisations.
         """
         newton, factor = self.newton, near.factor
         while not self._solved(at, allowed):
@@ -245,11 +245,13 @@ class _Iteration(Generic[Point]):
         return new, update
 
     def _damped(self, at: Point, update: Array) -> Point:
-        """Return the stage after a part of an update that reduces the residual."""
+        """Return the stage after a damped update that reduces the residual."""
         part = 1.0
         for _ in range(HALVINGS):
             part *= 0.5
             new = self.equation.evaluate(at.y - part * update)
+            # A sufficient decrease proportional to the step (Armijo): any decrease at all would let
+            # the iteration stall.
             if new.size <= (1.0 - 0.1 * part) * at.size:
                 return new
         raise StepFailed(

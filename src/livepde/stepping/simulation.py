@@ -1,4 +1,4 @@
-"""The forward model with a known parameter, from time to time."""
+"""Time integration of the forward model with a known parameter."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def simulate(
     u0
         Initial state: a number, a function of x, or coefficients.
     inputs
-        t -> mapping of input channels.
+        Function t -> mapping of input channels.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""From one sample to the next, for one process or for many that are stepped together."""
+"""Batched sample intervals: times, inputs and measurements of all members."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Moments", "Span"]
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """One time and the input channels of each member.
+    """One time, with the input channels of each member.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Moments:
     moment: Moment | None = None
 
     def member(self, k: int) -> Moment:
-        """Return time and inputs of one member."""
+        """Return the moment of one member."""
         if self.moment is not None:
             return self.moment
         row = self.inputs[k if len(self.inputs) > 1 else 0]
@@ -45,7 +45,7 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Span:
-    """The interval of each member: they end together.
+    """Sample intervals of all members, with a common end.
 
     Attributes
     ----------
@@ -58,13 +58,13 @@ class Span:
     z0, z1
         Measurements at both ends, shape (members, sensors), NaN where missing; or (1, sensors).
     interval
-        The interval of a single process, None for members of a fleet.
+        Interval of a single process; None for members of a fleet.
     noise
-        Standard deviation of each value of z1, of its shape, NaN where it is that of the sensor;
-        None if all are.
+        Standard deviation of each value of z1, of its shape, NaN for the default of the sensor;
+        None if all are defaults.
     gaps
-        Time for which each channel was held before this interval, and 1 if it is held at its end,
-        shape (2, channels); None if there is no gap.
+        Duration of the gap of each channel before this interval, and 1 if it lasts at its end,
+        shape (2, channels); None without a gap.
     """
 
     t0: Array
@@ -80,7 +80,7 @@ class Span:
 
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
-        """Return the interval of one process, which all members have in common."""
+        """Return the span of one interval, common to all members."""
         first = last = NO_INPUTS
         if channels:
             last = np.array([[interval.inputs1[name] for name in channels]])
@@ -99,7 +99,7 @@ class Span:
 
     @cached_property
     def start(self) -> float:
-        """Time at which most members begin."""
+        """Most frequent start time of the members."""
         if len(self.t0) == 1:
             return float(self.t0[0])
         times, counts = np.unique(self.t0, return_counts=True)
@@ -107,18 +107,18 @@ class Span:
 
     @property
     def together(self) -> Mask:
-        """Members that begin where most do, shape (members,)."""
+        """Mask of the members that start at `start`, shape (members,)."""
         most: Mask = self.t0 == self.start
         return most
 
     @cached_property
     def present(self) -> Mask:
-        """Whether each member has a measurement at the end, shape (members,) or (1,)."""
+        """Mask of members with a measurement at the end, shape (members,) or (1,)."""
         some: Mask = np.asarray(np.isfinite(self.z1).any(axis=1))
         return some
 
     def at(self, t: float) -> Moments:
-        """Return time and inputs at t of members that begin together."""
+        """Return time and inputs at t of members with a common start."""
         if t == self.t1:
             return self.end
         moment = None if self.interval is None else self.interval.at(t)

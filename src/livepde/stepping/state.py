@@ -1,4 +1,4 @@
-"""The forward model with a known parameter: its implicit stage and its tangent."""
+"""Implicit stage of the forward model with a known parameter, and its tangents."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ LINEAR = 1e-12  # relative asymmetry that is rounding
 
 
 class ForwardStage:
-    """Solves M (u - c)/h + B(u) + A(u) q = F(t) for u, with Dirichlet values imposed.
+    """Implicit stage M (u - c)/h + B(u) + A(u) q = F(t) for u, with Dirichlet values imposed.
 
     If B and A are affine in u with derivatives that read neither time nor inputs, the matrix is
-    factorised once for each (h, q) and a stage is one back-substitution. That never changes the
-    numbers. `advance` solves for tangents, too, and keeps a factor while q and h change.
+    factorised once for each (h, q) and a stage is one back-substitution. This never changes the
+    numbers. `advance` also solves for tangents, and reuses a factor for nearby q and h.
     """
 
     def __init__(self, model: Model, newton: Newton | None = None) -> None:
@@ -53,7 +53,7 @@ class ForwardStage:
         self._rate: tuple[float, Array] | None = None
 
     def twin(self) -> ForwardStage:
-        """Return a stage with the same analysis and factors of its own."""
+        """Return a stage with the same symbolic analysis and its own factors."""
         _ = self._dual_weights, self.engine  # common to both
         other = copy.copy(self)
         other._made = other._last = other._rate = None
@@ -72,7 +72,7 @@ class ForwardStage:
 
     @cached_property
     def _free(self) -> tuple[Pattern, sp.csr_array, Array]:
-        """Pattern and map from the data of the rows to the free part, completed by ones."""
+        """Pattern and map from row data to the free block, with ones on fixed diagonals."""
         model = self.model
         whole = Assembler(model.X.dim)
         whole.add("rows", self._rows[0], right=sp.diags_array(model.X.free))
@@ -82,9 +82,10 @@ class ForwardStage:
 
     @cached_property
     def symmetric(self) -> bool:
-        """True if the matrix of a stage should be symmetric for all q and h.
+        """True if the matrix of a stage is expected to be symmetric for all q and h.
 
-        M is, and the rest is at one q that is random: `_factorise` looks at each matrix again.
+        M is symmetric, and the rest is tested at one random q. `_factorise` tests each matrix
+        again.
         """
         if not self.keeps:
             return False
@@ -99,15 +100,15 @@ class ForwardStage:
 
     @cached_property
     def _mirror(self) -> IntArray:
-        """Where in the data of the free part the entries of its transpose stand."""
+        """Positions of transposed entries in the data of the free block."""
         pattern = self._free[0]
         return pattern.positions(pattern.indices, pattern.rows)
 
     def _mirrored(self, data: Array) -> bool:
-        """Return whether data of the free part are symmetric, each beside its own diagonal.
+        """Return True if data of the free block are symmetric, relative to the diagonal.
 
-        A positive definite matrix has no entry beyond the root of the product of its two diagonal
-        entries: that measure does not depend on the units of the state's components.
+        The entries of a positive definite matrix satisfy |a_ij| <= sqrt(a_ii a_jj), which gives a
+        tolerance that does not depend on the units of the state's components.
         """
         pattern = self._free[0]
         scale = np.sqrt(np.abs(pattern.matrix(data).diagonal()))
@@ -116,21 +117,21 @@ class ForwardStage:
 
     @cached_property
     def engine(self) -> Choice:
-        """The engine of the matrix of a stage, and why it was chosen."""
+        """Solver chosen for the matrix of a stage, with the reason."""
         return choose(self._free[0], symmetric=self.symmetric)
 
     @property
     def solver(self) -> Solver:
-        """The engine of the matrix of a stage."""
+        """Solver of the matrix of a stage."""
         return self.engine.solver
 
     @cached_property
     def _general(self) -> Solver:
-        """The engine of a symmetric matrix that is not positive definite."""
+        """Solver of a symmetric matrix that is not positive definite."""
         return analyse(self._free[0])
 
     def _data(self, u: Array, q: Array, h: float, moment: Moment) -> Array:
-        """Return the rows of the matrix at a state, as data; q is physical here and below."""
+        """Return the data of the matrix rows at a state; q is physical here and below."""
         model, maps = self.model, self._rows[1]
         data: Array = maps["M"] @ (model.mass.data / h)
         data += maps["B"] @ model.form_B.data("v", "u", moment, u=u)
@@ -138,7 +139,7 @@ class ForwardStage:
         return data
 
     def _data_at(self, q: Array, h: float, moment: Moment) -> Array:
-        """Return the same where they do not depend on u; what does not change is kept."""
+        """Return the data of the matrix rows of an affine model; constant parts are cached."""
         model, maps = self.model, self._rows[1]
         zero = np.zeros(model.X.dim)
         rate = self._rate  # read once: copies of an identifier may step in other threads
@@ -154,14 +155,14 @@ class ForwardStage:
 
     @cached_property
     def _slope(self) -> sp.csr_array | Array | None:
-        """Map from q to the data of d(A q)/du, where it is one."""
+        """Linear map from q to the data of d(A q)/du; None if there is no sparse one."""
         tensor = self.form.tensor("v", "u")
         if not isinstance(tensor, sp.csr_array):  # none, or one of a large mesh
             return None
         return compact(sp.csr_array(self._rows[1]["A"] @ tensor))
 
     def dual(self, functional: Array) -> float:
-        """Return the dual norm of a functional on the state, by the diagonal of the mass."""
+        """Return the dual norm of a functional on the state, by the lumped (diagonal) mass."""
         return math.sqrt(float((functional * functional) @ self._dual_weights))
 
     @cached_property
@@ -182,7 +183,7 @@ class ForwardStage:
     def _factorise(self, data: Array) -> Factor:
         _, rows, fixed = self._free
         complete = rows @ data + fixed if len(self.model.X.fixed) else data
-        # An engine for definite matrices reads half of each, and would not see the other half.
+        # A Cholesky solver reads one triangle only: it would silently accept a nonsymmetric matrix.
         if not self.solver.definite or self._mirrored(complete):
             try:
                 return self.solver.factorise(complete)
@@ -213,11 +214,11 @@ class ForwardStage:
 
     @property
     def keeps(self) -> bool:
-        """True if the matrix of a stage depends on h and q only, and its factor is kept."""
+        """True if the matrix of a stage depends on h and q only, so that its factor is reusable."""
         return self.model.affine and self.model.steady
 
     def _system(self, q: Array, h: float, moment: Moment) -> _System:
-        """Return the matrix, and B(0) + A(0) q if it is constant, for the last (q, h)."""
+        """Return matrix and constant offset B(0) + A(0) q, cached for the last (q, h)."""
         last = self._last
         if last is None or not last[0].same(q, h):
             physical = self.model.latent.value(q)
@@ -228,7 +229,7 @@ class ForwardStage:
         return last[1]
 
     def factor(self, q: Array, h: float, moment: Moment) -> Factor:
-        """Return the factor of an affine model for (q, h), made unless it was the last one."""
+        """Return the factor of an affine model for (q, h), cached for the last pair."""
         made, last = self._made, self._last
         if made is None or not made[0].same(q, h):
             self._made = made = None  # two at once may be more than there is memory
@@ -248,7 +249,7 @@ class ForwardStage:
         return known
 
     def solve(self, c: Array, q: Array, h: float, moment: Moment) -> Array:
-        """Return u of one stage; raises `StepFailed`."""
+        """Return the state at the end of a stage; raise `StepFailed` without a solution."""
         u = self.model.impose(c, moment)
         if self.keeps:
             system = self._system(q, h, moment)
@@ -286,31 +287,31 @@ class ForwardStage:
         tolerance: float = STATE,
         apart: int = 0,
     ) -> tuple[Array, Kept]:
-        """Return state and tangents at the end of a stage, and what it leaves to the next.
+        """Return state and tangents at the end of a stage, and its warm-start data.
 
-        Where the matrix depends on q and h only, the factor of an earlier q corrects the solution
-        until the error of the state is 1e-8 of its norm, and a hundredth of its change. It is made
-        again where that would cost more solves than a factorisation (`Solver.price`), counted from
-        when it was made.
+        If the matrix depends on q and h only, the factor of an earlier q is reused by iterative
+        refinement until the error of the state is 1e-8 of its norm and a hundredth of its change.
+        The matrix is factorised again as soon as the excess solves since the last factorisation
+        would cost more than a new one (`Solver.price`).
 
         Parameters
         ----------
         c
-            The state where the stage begins, and tangents behind it, shape (n, 1 + r).
+            State and tangents at the beginning of the stage, shape (n, 1 + r).
         directions
-            How the coefficients of q change along each tangent, shape (m, r).
+            Derivative of the latent coefficients of q along each tangent, shape (m, r).
         kept
-            What the stage before has left.
+            Warm-start data of the previous stage.
         tolerance
-            Bound on the error of the tangents, relative to the norm of all of them; it is a
-            hundredth of their change, too.
+            Bound on the error of the tangents, relative to the norm of all of them; a hundredth of
+            their change is a second bound.
         apart
-            How many of the last tangents are solved apart from all others, by one correction.
+            Number of trailing tangents that are solved separately, by one correction.
 
         Raises
         ------
         StepFailed
-            The stage has no solution that is found.
+            The solver finds no solution of the stage.
         """
         model, begin, free = self.model, c[:, 0], self.model.X.free[:, None]
         new, end = np.empty_like(c), c.shape[1] - apart
@@ -361,7 +362,7 @@ class ForwardStage:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """The matrix of a stage, as data and as a matrix, and B(0) + A(0) q if it is constant."""
+    """Matrix of a stage, as data and as a matrix, and its offset B(0) + A(0) q if constant."""
 
     data: Array
     matrix: sp.csr_array | Array
@@ -369,8 +370,8 @@ class _System:
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
-    """The stage of a nonlinear model at a state; see `livepde.stepping.newton.StagePoint`."""
+class _StateEvaluation:
+    """Nonlinear stage equation evaluated at a state, a `StagePoint`."""
 
     y: Array
     residual: Array
@@ -380,6 +381,8 @@ class _Point:
 
 @dataclass(frozen=True, eq=False)
 class _Equation:
+    """Nonlinear equation of a stage, a `StageEquation`."""
+
     stage: ForwardStage
     c: Array
     q: Array
@@ -390,7 +393,7 @@ class _Equation:
     def source(self) -> Array:
         return self.stage.model.F(self.moment)
 
-    def evaluate(self, y: Array) -> _Point:
+    def evaluate(self, y: Array) -> _StateEvaluation:
         model = self.stage.model
         rate = model.mass @ ((y - self.c) / self.h)
         driven = self.stage.form.vector("v", self.moment, q=self.q, u=y)
@@ -399,12 +402,12 @@ class _Equation:
         own, *sizes = (
             self.stage.dual(term) for term in (residual, rate, flux, driven, self.source)
         )
-        return _Point(y, residual, own / max(*sizes, TINY))
+        return _StateEvaluation(y, residual, own / max(*sizes, TINY))
 
-    def factor(self, at: _Point) -> Factor:
+    def factor(self, at: _StateEvaluation) -> Factor:
         return self.stage._factorise(self.stage._data(at.y, self.q, self.h, self.moment))
 
-    def limited(self, at: _Point, allowed: float) -> bool:
+    def limited(self, at: _StateEvaluation, allowed: float) -> bool:
         stage, moment = self.stage, self.moment
         data = np.abs(stage._data(at.y, self.q, self.h, moment))
         sizes = stage._rows[0].matrix(data) @ np.maximum(np.abs(at.y), np.abs(self.c))
