@@ -451,6 +451,25 @@ def honest(
     _report(context, found, as_json)
 
 
+WALKS = Count(20, 2)
+
+
+@app.command("first-hour")
+def first_hour(
+    context: typer.Context,
+    seeds: Annotated[int, WALKS.option("Truths of each walk.")] = WALKS.usual,
+    quick: Annotated[bool, typer.Option("--quick", help="Two truths of each walk.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Count how often the walks of docs/first-hour.md find truths of another code.
+
+    Example:  python -m benchmarks first-hour --seeds 4
+    """
+    from benchmarks.first_hour import first_hour as benchmark
+
+    _report(context, benchmark(seeds=WALKS.of(context, "seeds"), progress=True), as_json)
+
+
 JUMPS = Count(5, 1)
 
 

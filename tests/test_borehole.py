@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import exp1
 
 import livepde as lp
 from livepde import cases
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
-from livepde.models import EQUATIONS, grouted_borehole
+from livepde.models import EQUATIONS, borehole, grouted_borehole
 from livepde.stepping import Advance, Alexander2, simulate
 from livepde.streams import AbsoluteNoise, Twin
 
@@ -238,3 +239,29 @@ def test_the_sandbox_from_five_hours_on(data_dir, monkeypatch):
     assert (off[hours > 20.0] < 0.05 * 2.88).all()
     assert (off < 1.96 * std)[hours > 5.0].all()
     assert std[-1] < 0.05 * 2.88
+
+
+@pytest.mark.parametrize("rho_c", [2.3e6, lp.Scalar(2e6, 5e5, transform="log")])
+def test_the_ground_alone_with_known_and_unknown_heat_capacity(rho_c: Any) -> None:
+    """Late the wall follows the line source, T = T0 + Q/(4 pi k H) E1(r^2 rho_c/(4 k t))."""
+    mesh = lp.interval(0.01, 30.0, 200, geometric=True)
+    k, R_b = lp.Scalar(2.0, 1.0), lp.Scalar(0.1, 0.05)
+    process = borehole(mesh, k, R_b, H=100.0, rho_c=rho_c, T0=10.0)
+    check_model(process, u=12.0, spread=2.0, inputs={"Q": 5000.0}).raise_if_failed()
+    known = isinstance(rho_c, float)
+    q = process.initial_parameter({"k": 2.0, "R_b": 0.1} | ({} if known else {"rho_c": 2.3e6}))
+    times, control = np.geomspace(1.0, 50 * HOUR, 400).tolist(), Advance(Alexander2())
+    *_, (t, u) = simulate(process, q, 10.0, [0.0, *times], control, lambda t: {"Q": 5000.0})
+    wall = 10.0 + 5000.0 / (4 * np.pi * 2.0 * 100.0) * exp1(0.01**2 * 2.3e6 / (4 * 2.0 * t))
+    assert (process.state_block.at_vertices @ u)[0] == pytest.approx(wall, rel=5e-3)
+
+
+def test_a_case_may_leave_the_heat_capacity_unknown() -> None:
+    mesh, equation = lp.interval(0.1, 5.0, 10, geometric=True), EQUATIONS["borehole"]
+    unknowns = {name: lp.Scalar(1.0, 0.1) for name in ("k", "R_b", "rho_c")}
+    options = {"H": 100.0, "rho_c": 2.3e6, "T0": 10.0}
+    assert set(equation.build(mesh, unknowns, {}, **options).parameter_space.labels) == set(
+        unknowns
+    )
+    with pytest.raises(ModelError, match="far away"):
+        equation.build(mesh, unknowns, {"right": 1.0}, **options)

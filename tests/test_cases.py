@@ -479,7 +479,6 @@ REFUSED = [
     ('equation = "heat"', 'equation = "heet"', "did you mean 'heat'?"),
     ("[law]", "[options]\nD = 1\n[law]", "has no 'D' here; leave it out"),
     ('kind = "sensitivity"', 'kind = "sensitive"', "law.kind: got 'sensitive'; did you mean"),
-    ('kind = "sensitivity"', "", "'law.kind' is missing"),
     ("replay = true", "replya = true", "no key 'law.replya'; did you mean 'replay'?"),
     ("replay = true", "replay = {frist = 3}", "did you mean 'first'?"),
     ("replay = true", 'replay = true\nmemory = "1 h"', "law: SensitivityLaw: replay"),

@@ -88,3 +88,21 @@ def test_the_health_check_asks_the_run():
     assert "503" in ill.stderr
     monitor.close()
     assert ask("a-token-of-the-example").returncode == 1
+
+
+def test_the_dashboard_draws_metrics_that_are_served():
+    metrics = Metrics(["T_1"])
+    health = {"ok": True, "silent": False, "waiting": 0, "seconds": 1.0, "counts": ()}
+    monitor = Monitor(Address(), lambda: health, metrics)
+    try:
+        served = {sample.name for family in metrics.registry.collect() for sample in family.samples}
+        served |= {family.name for family in metrics.registry.collect()}
+    finally:
+        monitor.close()
+    served |= {f"{name}_total" for name in served}
+    text = (DEPLOY / "grafana.json").read_text(encoding="utf-8")
+    drawn = set(re.findall(r"\blivepde_\w+", text))
+    assert drawn
+    assert drawn <= served
+    panels = json.loads(text)["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)

@@ -113,8 +113,11 @@ def test_scalars_have_a_line_and_a_band_each_and_one_panel_for_all_regions() -> 
     regions, k = panel(figure, "D"), panel(figure, "k")
     assert len(regions.lines) == 2
     assert len(regions.collections) == 2
-    assert texts(regions) == ["top = 1.368 ± 0.2", "bottom = 2.368 ± 0.2"]
-    assert texts(k) == ["k = 3.368 ± 0.2"]
+    assert texts(regions) == [
+        "top = 1.368, 95 %: 1.172 to 1.564",
+        "bottom = 2.368, 95 %: 2.172 to 2.564",
+    ]
+    assert texts(k) == ["k = 3.368, 95 %: 3.172 to 3.564"]
     assert k.get_ylabel() == "k [W/(m K)]"
     assert "95 %" in k.get_title()
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import driven_rod, readings
 
 import livepde as lp
 from livepde.models import heat
@@ -144,6 +145,25 @@ def test_predicts_the_shift_by_the_mesh(cells: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_follows_a_drive_that_turns_between_two_shadows_of_the_mesh() -> None:
+    """A mesh shift of nearly nothing is not found large where eight samples see half a turn."""
+
+    def left(t: float) -> float:
+        return float(np.sin(3.0 * t))
+
+    points, times = lp.Points([0.25, 0.5, 0.75], noise=0.01), 0.05 * np.arange(401)
+    unknown, ends = {"a": lp.Scalar(0.2, std=0.2)}, {}
+    models = {n: driven_rod(unknown, left, lp.interval(0.0, 1.0, n)) for n in (16, 64)}
+    rows = readings(models[16], points, lambda t: 0.3, times, 0.01, 0)
+    for cells, model in models.items():
+        given = lp.Identifier(model, points, lp.SensitivityLaw(), u0=0.0)
+        ends[cells] = [given.step(t, z) for t, z in rows][-1]
+    coarse, fine = ends[16], ends[64]
+    assert abs(coarse.q - fine.q)[0] < 0.01 * fine.q_std[0]
+    assert abs(coarse.notes["a_mesh_shift"]) < 0.1 * fine.q_std[0]
+
+
 def test_predicts_the_shift_by_input_lines() -> None:
     """Against a run that is told the inputs ten times for each reading of the sensors."""
     rows = samples()

@@ -203,6 +203,35 @@ class Model:
         unknowns = {**space.unknowns, **more}
         return Model(self.state, unknowns, **self._parts, time_unit=self.time_unit)
 
+    def with_terms(
+        self,
+        A: Sequence[Integrand | On] = (),
+        B: Sequence[Integrand | On] = (),
+        inputs: Sequence[str] = (),
+    ) -> Model:
+        """Return a process with more terms in A and B: fluxes, sources.
+
+        Parameters
+        ----------
+        A, B
+            Integrands (q, u, v, x) and (u, v, x), linear in v.
+        inputs
+            Names of the channels that these read.
+
+        Raises
+        ------
+        ModelError
+            The derivative of A or B was given and would lack that of the terms.
+        """
+        parts = dict(self._parts)
+        for name, more in (("A", A), ("B", B)):
+            if more and parts[f"d{name}"] is not None:
+                raise ModelError(f"with_terms: the model has d{name}; add the terms to {name}.")
+            given = parts[name] if isinstance(parts[name], Sequence) else [parts[name]]
+            parts[name] = [*given, *more]
+        parts["inputs"] = tuple(dict.fromkeys([*self.inputs, *inputs]))
+        return Model(self.state, self.parameter, **parts, time_unit=self.time_unit)
+
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from livepde.cases.conditions import conditioned
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.equations import resolve
 from livepde.cases.frame import Frame
@@ -196,7 +197,7 @@ def load(
         text = to_toml(document)
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
-    frame = expanded(Frame(file, spec, resolve(*place), reader_of(*place)))
+    frame = conditioned(expanded(Frame(file, spec, resolve(*place), reader_of(*place))))
     case = Case(frame, text, original)
     case.check()
     return case

@@ -12,7 +12,7 @@ from livepde.cases.schema import CaseSpec
 from livepde.errors import CaseError, LivepdeError
 from livepde.fem import linear
 from livepde.model import Model
-from livepde.models import EQUATIONS, Equation, Option, Variable
+from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
 
 __all__ = ["resolve"]
 
@@ -73,6 +73,7 @@ def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
         options={key: _option(value) for key, value in spec.options.items()},
         build=build,
         element=linear,
+        fluxes=Fluxes("", "", ""),
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from livepde.cases.frame import Frame
 from livepde.cases.limits import MEMBERS
@@ -18,24 +19,72 @@ __all__ = ["calibrated", "expanded", "positions_of", "unknowns_of"]
 
 
 def expanded(frame: Frame) -> Frame:
-    """Return the frame with every family of channels, `each`, as single ones."""
+    """Return the frame with every family of channels, `each` or `positions`, as single ones."""
     channels: dict[str, ChannelSpec] = {}
     for name, channel in frame.spec.channels.items():
-        if channel.each is None:
+        if channel.each is not None:
+            key, members = f"channels.{name}.each", _evenly(frame, name, channel)
+        elif channel.positions is not None:
+            key, members = f"channels.{name}.positions", _listed(frame, name, channel)
+        else:
             channels[name] = channel
             continue
-        start, stop, count = channel.each
-        unit, key = frame.equation.length_unit, f"channels.{name}.each"
-        if count > MEMBERS:
-            raise frame.error(key, f"got {count} channels; expected at most {MEMBERS}.")
-        ends = (frame.convert(start, unit, key), frame.convert(stop, unit, key))
-        for k, x in enumerate(np.linspace(*ends, count).tolist()):
-            member = {"each": None, "at": x, "column": str(channel.column).replace("{}", str(k))}
-            if f"{name}_{k}" in frame.spec.channels:
-                raise frame.error(key, f"there is a channel '{name}_{k}' already; rename it.")
-            channels[f"{name}_{k}"] = channel.model_copy(update=member)
+        for label, (at, column) in members.items():
+            if label in frame.spec.channels or label in channels:
+                raise frame.error(key, f"there is a channel '{label}' already; rename it.")
+            member = {"each": None, "positions": None, "at": at, "column": column}
+            channels[label] = channel.model_copy(update=member)
     spec: CaseSpec = frame.spec.model_copy(update={"channels": channels})
     return Frame(frame.path, spec, frame.equation, frame.reader)
+
+
+def _evenly(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+    """Return place and column of each sensor of a row with even distances."""
+    start, stop, count = channel.each or (0.0, 0.0, 0)
+    unit, key = frame.equation.length_unit, f"channels.{name}.each"
+    if count > MEMBERS:
+        raise frame.error(key, f"got {count} channels; expected at most {MEMBERS}.")
+    ends = (frame.convert(start, unit, key), frame.convert(stop, unit, key))
+    return {
+        f"{name}_{k}": (x, str(channel.column).replace("{}", str(k)))
+        for k, x in enumerate(np.linspace(*ends, count).tolist())
+    }
+
+
+def _listed(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+    """Return place and column of each sensor of a table of positions."""
+    key, file = f"channels.{name}.positions", frame.path.parent / str(channel.positions)
+    try:
+        table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
+    except (OSError, ValueError) as error:
+        raise frame.error(key, f"{file} cannot be read as a CSV table: {error}.") from None
+    axes = [axis for axis in "xyz" if axis in table.columns]
+    if "name" not in table.columns or not axes:
+        got = ", ".join(map(str, table.columns[:8]))
+        raise frame.error(key, f"{file}: got the columns {got}; expected name, x (and y, z).")
+    if len(table) > MEMBERS:
+        raise frame.error(key, f"{file} has more than {MEMBERS} sensors.")
+    found: dict[str, tuple[Any, str]] = {}
+    for row, label in enumerate(table["name"], 2):
+        if not label or label in found:
+            what = f"the name '{label}' stands there twice" if label else "the name is missing"
+            raise frame.error(key, f"{file}, row {row}: {what}.")
+        where = f"{key}: {file}, row {row}"
+        place = tuple(_coordinate(frame, table[axis][row - 2], where) for axis in axes)
+        column = str(channel.column or "{}").replace("{}", label)
+        found[label] = (place if len(place) > 1 else place[0], column)
+    return found
+
+
+def _coordinate(frame: Frame, cell: str, where: str) -> float:
+    try:
+        value: float | str = float(cell)
+    except ValueError:
+        value = cell
+    number = frame.convert(value, frame.equation.length_unit, where)
+    if not np.isfinite(number):
+        raise frame.error(where, f"got '{cell}'; expected a coordinate.")
+    return number
 
 
 def unknowns_of(frame: Frame) -> dict[str, Unknown]:

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from livepde.cases.conditions import held
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import unknowns_of
 from livepde.cases.limits import check_cells
 from livepde.cases.read import did_you_mean
+from livepde.cases.regions import inside, sides_of
 from livepde.cases.schema import EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
 from livepde.errors import ModelError, NameClashError, SpaceError
@@ -34,7 +36,7 @@ from livepde.fem import (
 from livepde.model import Model
 from livepde.models import Option
 
-__all__ = ["mesh_of", "model_of", "options_of", "process_notes", "sides_of"]
+__all__ = ["mesh_of", "model_of", "options_of", "process_notes"]
 
 
 def mesh_of(frame: Frame) -> Any:
@@ -134,10 +136,10 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
 def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
     known = [*(mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
-    for name, value in frame.spec.boundary.items():
+    for name, value in held(frame).items():
         if name not in known:
             raise frame.error("boundary", f"no boundary '{name}'; {did_you_mean(name, known)}")
-        values[name] = frame.convert(value, frame.equation.state.unit, f"boundary.{name}")
+        values[name] = value
     for name, channel in frame.roles("boundary").items():
         key, at = f"channels.{name}.at", str(channel.at)
         if at not in known:
@@ -245,15 +247,10 @@ def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> d
             found[name] = given
             count[known[given]] += 1
             continue
-        sides = sides_of(frame, given, len(mesh.p), f"{key}.{name}")
-
-        def inside(x: Any, sides: list[tuple[float, float]] = sides) -> Any:
-            return np.logical_and.reduce(
-                [(x[k] >= low) & (x[k] < high) for k, (low, high) in enumerate(sides)]
-            )
-
-        here = inside(middle)
+        place = inside(frame, given, len(mesh.p), f"{key}.{name}")
+        here = place(middle)
         if not here.any():
+            sides = sides_of(frame, given, len(mesh.p), f"{key}.{name}")
             spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
             ends = " x ".join(f"{a:g} to {b:g}" for a, b in zip(*_ends(mesh), strict=True))
             raise frame.error(
@@ -261,7 +258,7 @@ def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> d
                 f"{spans} {unit} holds no cell of the mesh, which spans {ends} {unit}.",
             )
         count += here
-        found[name] = inside
+        found[name] = place
     wrong = np.flatnonzero(count != 1)
     if len(wrong):
         x, times = middle[:, wrong[0]], int(count[wrong[0]])
@@ -273,17 +270,6 @@ def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> d
 
 def _ends(mesh: Any) -> tuple[Any, Any]:
     return mesh.p.min(axis=1), mesh.p.max(axis=1)
-
-
-def sides_of(frame: Frame, given: Any, dimension: int, key: str) -> list[tuple[float, float]]:
-    """Return (low, high) for each coordinate."""
-    if len(given) != 2 * dimension:
-        expected = {1: "[from, to]", 2: "[x0, x1, y0, y1]"}.get(
-            dimension, "the name of a subdomain"
-        )
-        raise frame.error(key, f"got {list(given)}; expected {expected}.")
-    unit = frame.equation.length_unit
-    return [frame.pair((given[k], given[k + 1]), unit, key) for k in range(0, len(given), 2)]
 
 
 def process_notes(frame: Frame, mesh: Any) -> list[str]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     NonNegativeInt,
@@ -33,6 +35,7 @@ from livepde.streams.csvfile import UTF_8
 
 __all__ = [
     "AutoSpec",
+    "BoundarySpec",
     "CaseSpec",
     "ChannelSpec",
     "CorrelatedSpec",
@@ -41,6 +44,7 @@ __all__ = [
     "GradientSpec",
     "MeshSpec",
     "SensitivitySpec",
+    "SourceSpec",
     "StepsSpec",
     "TikhonovSpec",
     "UnknownSpec",
@@ -242,6 +246,7 @@ class ChannelSpec(Spec):
     along: tuple[Point, Point] | None = None
     follows: Name | tuple[Name, ...] | None = None
     each: tuple[Quantity, Quantity, PositiveInt] | None = None
+    positions: Name | None = None
     quantity: str | None = None
     of: Name | None = None
     noise: Quantity | None = None
@@ -273,9 +278,10 @@ class ChannelSpec(Spec):
 
     @model_validator(mode="after")
     def _consistent(self) -> ChannelSpec:
-        if (self.column is None) == (not self.columns):
+        if self.positions is None and (self.column is None) == (not self.columns):
             raise ValueError("expected column = name, or columns = [names] that are averaged")
-        places = (self.at, self.over, self.along, self.follows, self.quantity, self.each)
+        families = (self.each, self.positions)
+        places = (self.at, self.over, self.along, self.follows, self.quantity, *families)
         placed = sum(place is not None for place in places)
         if self.role in ("input", "position") and placed:
             raise ValueError(f"a channel of role {self.role} has no place: leave it out")
@@ -284,11 +290,13 @@ class ChannelSpec(Spec):
         if self.role in ("sensor", "withheld") and placed != 1:
             raise ValueError(
                 "expected one of: at = position, over = [from, to], along = [start, end], "
-                "follows = channel, each = [from, to, count], quantity = name"
+                "follows = channel, each = [from, to, count], positions = file, quantity = name"
             )
         if self.each is not None and "{}" not in (self.column or ""):
             raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
-        if self.at_std is not None and self.at is None and self.each is None:
+        if self.positions is not None and (self.columns or "{}" not in (self.column or "{}")):
+            raise ValueError('positions takes column = a name with {} for that of a row, as "T_{}"')
+        if self.at_std is not None and all(place is None for place in (self.at, *families)):
             raise ValueError("at_std belongs to at = position")
         own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
         if own and self.role != "sensor":
@@ -444,7 +452,52 @@ class VariantSpec(Spec):
     expect: Expected = Field(default_factory=dict)
 
 
-Law: TypeAlias = Annotated[AutoSpec | SensitivitySpec | GradientSpec, Field(discriminator="kind")]
+def _kind(value: Any) -> Any:
+    """Take a table that names no law as one of the sensitivity law."""
+    return {"kind": "sensitivity", **value} if isinstance(value, Mapping) else value
+
+
+Law: TypeAlias = Annotated[
+    Annotated[AutoSpec | SensitivitySpec | GradientSpec, Field(discriminator="kind")],
+    BeforeValidator(_kind),
+]
+
+
+class BoundarySpec(Spec):
+    """A boundary: its value, or what passes through it; each a number, a channel or an unknown."""
+
+    value: Quantity | None = None
+    flux: Quantity | None = None
+    transfer: Quantity | None = None
+    ambient: Quantity | None = None
+
+    @property
+    def passes(self) -> bool:
+        """Whether something passes through the boundary."""
+        return self.flux is not None or self.transfer is not None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> BoundarySpec:
+        if (self.transfer is None) != (self.ambient is None):
+            raise ValueError("transfer and ambient belong together: give both")
+        if (self.value is None) != self.passes:
+            raise ValueError("expected a value, or flux, or transfer with ambient")
+        return self
+
+
+def _value(given: Any) -> Any:
+    """Take what is no table as the value of a boundary."""
+    return given if isinstance(given, Mapping) else {"value": given}
+
+
+Boundary: TypeAlias = Annotated[BoundarySpec, BeforeValidator(_value)]
+
+
+class SourceSpec(Spec):
+    """What is gained in a region, or everywhere: a number, a channel or an unknown."""
+
+    value: Quantity
+    over: Pair | Box | Name | None = None
 
 
 class CaseSpec(Spec):
@@ -455,12 +508,13 @@ class CaseSpec(Spec):
     initial: Quantity | dict[Name, Quantity] | None = None
     mesh: MeshSpec
     options: dict[Identifier, StrictBool | Quantity] = Field(default_factory=dict)
-    boundary: dict[Name, Quantity] = Field(default_factory=dict)
+    boundary: dict[Name, Boundary] = Field(default_factory=dict)
+    sources: dict[Name, SourceSpec] = Field(default_factory=dict)
     data: DataSpec
     intake: IntakeSpec = Field(default_factory=IntakeSpec)
     unknowns: dict[Identifier, UnknownSpec] = Field(min_length=1)
     channels: dict[Name, ChannelSpec] = Field(min_length=1)
-    law: Law
+    law: Law = SensitivitySpec(kind="sensitivity")
     steps: StepsSpec = Field(default_factory=StepsSpec)
     output: OutputSpec = Field(default_factory=OutputSpec)
     reference: dict[Name, Quantity] = Field(default_factory=dict)

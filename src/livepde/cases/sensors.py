@@ -11,8 +11,8 @@ import numpy as np
 
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import calibrated, positions_of
-from livepde.cases.process import sides_of
 from livepde.cases.read import did_you_mean
+from livepde.cases.regions import sides_of
 from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.errors import MissingInputError

@@ -100,6 +100,14 @@ def equations(
     rows += [
         ("[channels], quantity", key, item.text, unit, "") for key, item in found.quantities.items()
     ]
+    if found.fluxes is not None:
+        flux, transfer, source = found.fluxes
+        rows += [
+            ("[boundary.NAME]", "flux", "flux into the domain", flux, ""),
+            ("[boundary.NAME]", "transfer", "coefficient of exchange", transfer, ""),
+            ("[boundary.NAME]", "ambient", "of that exchange", unit, ""),
+            ("[sources.NAME]", "value", "gained in a region", source, ""),
+        ]
     columns = ("where", "name", "what", "unit", "default")
     print_table(console, Table("What a case says about it", columns, rows))
     console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")

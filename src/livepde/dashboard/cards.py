@@ -230,7 +230,7 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
     lines = [html.P(f"field, mean {mean}", className="interval")]
     if f"{name}_std" in data:
         deviation = pretty(f"{float(np.mean(data[f'{name}_std'].values[k])):.2g}")
-        lines.append(html.P(f"mean deviation ± {deviation}", className="interval"))
+        lines.append(html.P(f"mean standard deviation {deviation}", className="interval"))
     if f"{name}_modes" in data:
         modes = data[f"{name}_modes"]
         count, some = int(modes.attrs["of"]), float(modes.values[k])

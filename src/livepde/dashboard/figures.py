@@ -61,7 +61,9 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
             reach += [low[late], high[late]]
             if len(labels) <= MOST_LINES:
                 band(figure, t, low, high, colour, label, opacity)
-        half = np.nan_to_num(np.maximum(high - value, value - low), nan=0.0)
+        std = np.zeros_like(value)
+        if f"{label}_std" in data:
+            std = np.nan_to_num(data[f"{label}_std"].values, nan=0.0)
         figure.add_scatter(
             x=t,
             y=value,
@@ -70,8 +72,8 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
             name=text(_short(label)),
             legendgroup=label,
             showlegend=len(labels) > 1,
-            customdata=half,
-            hovertemplate="%{y:.4g} ± %{customdata:.2g}" if half.any() else "%{y:.4g}",
+            customdata=std,
+            hovertemplate="%{y:.4g} ± %{customdata:.2g}" if std.any() else "%{y:.4g}",
         )
         reference = data[label].attrs.get("reference")
         if reference is not None:

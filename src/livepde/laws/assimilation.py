@@ -184,7 +184,7 @@ def _absorbed(
     if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
     if shadows is not None and off is not None:
-        parts["shadows"] = shadows.updated(x, new, made, used / noise, off)
+        parts["shadows"] = shadows.updated(x, new, made, used / noise, off, span.t1)
     # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
     # overflows would leave statistics that are not finite.
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)

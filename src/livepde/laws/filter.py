@@ -99,7 +99,7 @@ class FollowedErrors(Protocol):
         ...
 
     def updated(
-        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array, t: float
     ) -> ShadowState:
         """Return what is known after a sample; weights: one over noise, (members, sensors)."""
         ...

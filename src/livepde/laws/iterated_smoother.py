@@ -9,6 +9,7 @@ probable, and serves unknowns that stay and unknowns that move.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -41,6 +42,7 @@ ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 4  # of a step that makes samples and prior less probable
 CONVERGED = 0.3  # standard deviations that a step moves the trajectory by, at the end of it
 HOLDS = 0.1  # the same, of the first step, for a linearisation that holds
+ENOUGH = 16  # samples that no other trajectory explains as well as one that is found
 STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
 
@@ -83,10 +85,11 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     ends = []
     for trajectory in _beginnings(samples, shape):
         one = samples.about(trajectory)
-        if one is not None:
-            ends.append(_descended(samples, one))
-        if one is not None and _holds(one) and one.misfit <= samples.usual_misfit:
-            break  # linear where the filter is, and that explains the samples
+        if one is None:
+            continue
+        ends.append(_descended(samples, one))
+        if samples.explained(ends[-1]) and (len(samples.intervals) >= ENOUGH or _holds(one)):
+            break
     if not ends:
         return None
     best: _Pass | None = min(ends, key=lambda one: one.misfit)
@@ -183,15 +186,14 @@ class _Samples:
         self.opening = opening
         self.intervals = intervals
 
-    @property
-    def usual_misfit(self) -> float:
-        """Return what minus twice the logarithm of the probability rarely exceeds.
+    def explained(self, one: _Pass) -> bool:
+        """True if a pass misses the samples by no more than their noise makes usual.
 
         Squared misfits of m readings, each in standard deviations of its noise, sum up to m, give
         or take the square root of 2 m.
         """
-        readings = sum(int(np.isfinite(one.z1).sum()) for one in self.intervals)
-        return float(readings + 3.0 * np.sqrt(2.0 * readings))
+        readings = sum(int(np.isfinite(interval.z1).sum()) for interval in self.intervals)
+        return one.misfit <= readings + 3.0 * math.sqrt(2.0 * readings)
 
     @property
     def reached(self) -> Array:

@@ -47,7 +47,10 @@ class ShadowState:
         The state on the halved mesh minus that of the filter, shape (members, N), and what the last
         stage there has left.
     seen
-        What the sensors see of that until the next shadow, shape (members, sensors).
+        What the sensors see of that, shape (members, sensors).
+    gains
+        Sum of the gains of the samples since the shadows were taken last, each times the time since
+        then, shape (members, sensors, k); without sensors if no shadow needs it.
     failed
         How many shadow steps had no solution, shape (members,).
     """
@@ -74,6 +77,7 @@ class ShadowState:
     fine: Array
     fine_stage: KeptFactors
     seen: Array
+    gains: Array
     failed: IntArray
 
     def __len__(self) -> int:
@@ -108,10 +112,19 @@ class ShadowState:
             fine=nothing,
             fine_stage=kept,
             seen=nothing,
+            gains=np.zeros((members, 0, k)),
             failed=zero,
         )
 
     def without_stages(self) -> ShadowState:
         """Return the shifts alone, without what the next steps need."""
         kept, nothing = KeptFactors.none(len(self)), np.zeros((len(self), 0))
-        return replace(self, halves=kept, blocks=kept, fine_stage=kept, u0=nothing, inputs0=nothing)
+        return replace(
+            self,
+            halves=kept,
+            blocks=kept,
+            fine_stage=kept,
+            u0=nothing,
+            inputs0=nothing,
+            gains=self.gains[:, :0],
+        )

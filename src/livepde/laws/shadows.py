@@ -25,7 +25,7 @@ from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
 from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter, Update
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.members import changed, put, take
 from livepde.laws.shadow_state import ShadowState
@@ -39,11 +39,9 @@ CALM = 4  # steps after a jump that are all shadowed
 JUMP = 4.0  # times the usual difference of two changes of the state: something has jumped
 USUAL = 16.0  # steps over which that is averaged
 ALIKE = 3.0  # ratio of the errors of two steps that others between them have, too
-AHEAD = 0.5  # share of the last change of the mesh error that is expected to follow
 # Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
 # phase alone; on average 8, of which each stands for those before it.
 LATER = np.array([5, 11, 7, 9])
-LONG = 256  # steps from which on they are twice as many: one of 256 tells little
 MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
 KINDS = ("step", "mesh", "input")
 HELD = "hold"  # kind of the shift by inputs that are held: no error if they are what is stated
@@ -57,10 +55,9 @@ class Shadows:
     Their signed shifts are summed, and widen what is reported: variance plus square of the sum. The
     estimate itself, and the filter, stay as they are.
 
-    The first 16 steps are shadowed, later one of eight, from 256 on one of sixteen, which stands
-    for those around it: an error of step or input lines that changes much faster is found on
-    average only. The mesh is followed by one step in the place of several: where the process is
-    driven by something that turns within them, its shift is overstated.
+    The first 16 steps are shadowed, later one of eight, which stands for those around it: an error
+    of step or input lines that changes much faster is found on average only. The mesh is followed
+    by one step in the place of eight: its shift is overstated where the drive turns within them.
 
     Parameters
     ----------
@@ -126,11 +123,14 @@ class Found(NamedTuple):
         Fields of `ShadowState` to exchange.
     failed
         Members whose shadow could not be stepped, shape (members,); nothing is added for them.
+    a
+        What the reduced unknowns are off by more, shape (members, k); None for nothing.
     """
 
     error: Array | None
     parts: dict[str, Any]
     failed: Mask
+    a: Array | None = None
 
 
 class Shadow(ABC):
@@ -255,7 +255,7 @@ class InputShadow(Shadow):
         In a gap a channel is expected to go on as before; once it has a value again the line across
         the gap is known.
         """
-        held, missing = gaps[0], gaps[1] > 0.0
+        held, missing = gaps[:, 0], gaps[:, 1] > 0.0
         whole = held + h
         slope = np.where(missing, s.slope, change / whole)
         bend = (slope - s.slope) * whole**3 / (6.0 * (whole + s.length[:, None]))
@@ -316,7 +316,8 @@ class MeshShadow(Shadow):
 
     It has the unknowns of the filter, and follows where samples move the state: only its difference
     to the state of the filter is kept. Several steps are taken at once on both meshes. Until the
-    next the sensors see the difference as it is expected to be halfway.
+    next the sensors see the difference as it was; then it is known how it has changed, linearly in
+    between, and what that would have done to the unknowns is added.
 
     Attributes
     ----------
@@ -352,7 +353,8 @@ class MeshShadow(Shadow):
             difference = self.mesh.begun(given, x.q[0], x.u[0], moment)[None]
             seen = self.mesh.seen(x.u[0], x.q[0], difference[0], moment)[None]
         kept = {"blocks": self.mean.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
-        return changed(s, u0=x.u, fine=difference, seen=seen, **kept)
+        gains = np.zeros((1, seen.shape[1], x.C.shape[2]))
+        return changed(s, u0=x.u, fine=difference, seen=seen, gains=gains, **kept)
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
         x, end, mesh = steps.x, steps.end, self.mesh
@@ -363,13 +365,13 @@ class MeshShadow(Shadow):
         u, kept, wrong = _followed(self.fine, x, start, s.fine_stage, steps.block)
         failed = (failed | wrong)[:, None]
         fine = np.where(failed, s.fine, u - mesh.prolonged(coarse))
-        ahead = np.minimum(0.5 * (steps.next - 1) / steps.waited, AHEAD)
-        halfway = fine + ahead[:, None] * (fine - s.fine)
         at = steps.block.end
-        each = enumerate(zip(end.u, end.q, halfway, strict=True))
+        each = enumerate(zip(end.u, end.q, fine, strict=True))
         seen = np.array([mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in each])
+        slope = (seen - s.seen) / (steps.block.t1 - steps.block.t0)[:, None]
+        a = MESH * (slope[:, None] @ s.gains)[:, 0]
         parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
-        return Found(None, parts, failed[:, 0])
+        return Found(None, parts | {"gains": np.zeros_like(s.gains)}, failed[:, 0], a)
 
     def seen(self, s: ShadowState) -> Array | None:
         return -MESH * s.seen
@@ -504,13 +506,19 @@ class ShadowSet:
         if (waited > 1).any():
             block = replace(span, t0=s.begun, inputs0=s.inputs0, interval=None)
         wait = np.where(s.count - s.jumped < CALM, 1, _wait(s.count))
-        steps, u = Steps(x, end, span, block, waited, wait, jumps), s.u.copy()
+        steps, u, a = Steps(x, end, span, block, waited, wait, jumps), s.u.copy(), s.a.copy()
         for row, shadow in enumerate(self.shadows):
             found = shadow.found(s, steps)
             if found.error is not None:
                 u[:, row] += np.where(found.failed[:, None], 0.0, found.error)
+            if found.a is not None:
+                good = np.isfinite(found.a).all(axis=1) & np.isfinite(end.C).all(axis=(1, 2))
+                for k in np.flatnonzero(good & ~found.failed).tolist():
+                    a[k, row] += found.a[k]
+                    u[k, row] += along(end, k, found.a[k])
             s = changed(s, **found.parts, failed=s.failed + found.failed)
-        return changed(s, u=u, last=s.count, due=s.count + wait)
+        begun = np.full(len(s), span.t1)
+        return changed(s, u=u, a=a, begun=begun, last=s.count, due=s.count + wait)
 
     def seen(self, x: FilterState, at: Moments) -> Array:
         """Return by how much predictions are off, (members, shadows, sensors)."""
@@ -523,7 +531,7 @@ class ShadowSet:
         return seen
 
     def updated(
-        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array
+        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array, t: float
     ) -> ShadowState:
         """Return the shadows after a sample.
 
@@ -533,10 +541,12 @@ class ShadowSet:
             The filter before and after it.
         weights
             One over the noise of each value that was used, zero for others, (members, sensors).
-        seen
-            By how much predictions were off, as `seen` says.
+        seen, t
+            By how much predictions were off, as `seen` says, and the time.
         """
         s = x.shadows
+        if s.gains.size:
+            s = _recalled(s, x, new, made, weights, t)
         used = (weights > 0.0)[:, None]
         half = (np.where(used, seen, 0.0) * weights[:, None]) @ made.left.transpose(0, 2, 1)
         return changed(s, u=s.u - half @ new.U, a=s.a - half @ new.C)
@@ -598,6 +608,19 @@ class ShadowSet:
         ) * factor
 
 
+def _recalled(
+    s: ShadowState, x: FilterState, new: FilterState, made: Update, weights: Array, t: float
+) -> ShadowState:
+    """Return members with the gain of one more sample, which makes those before count less."""
+    since = (t - s.begun)[:, None, None]
+    if not since.any():
+        return s
+    gain = (weights[:, None] * made.left).transpose(0, 2, 1) @ new.C
+    before, after = ((C * C).sum(axis=1, keepdims=True) for C in (x.C, new.C))
+    left = np.divide(after, before, out=np.zeros_like(after), where=before > 0.0)
+    return changed(s, gains=left * s.gains + since * gain)
+
+
 def _watched(
     s: ShadowState, x: FilterState, end: FilterState, span: Span
 ) -> tuple[ShadowState, Mask]:
@@ -619,8 +642,7 @@ def _watched(
 
 def _wait(count: IntArray) -> IntArray:
     """Return after how many more steps shadows are taken that were taken after so many."""
-    later = LATER[count // 8 % len(LATER)] * np.where(count < LONG, 1, 2)
-    return np.where(count < FIRST, 1, later)
+    return np.where(count < FIRST, 1, LATER[count // 8 % len(LATER)])
 
 
 def _opened(s: ShadowState, fresh: Mask, x: FilterState, span: Span, mesh: bool) -> ShadowState:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
 from livepde.models.allen_cahn import ALLEN_CAHN, allen_cahn
-from livepde.models.base import Equation, Option, Quantity, Variable
+from livepde.models.base import Equation, Fluxes, Option, Quantity, Variable
 from livepde.models.battery import BATTERY_PARTICLE, battery_particle
 from livepde.models.borehole import GROUTED_BOREHOLE, grouted_borehole
 from livepde.models.burgers import BURGERS, burgers
+from livepde.models.conditions import Exchange, Flux, Source, with_conditions
 from livepde.models.diffusion import CONDUCTION, HEAT, conduction, heat
 from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
 from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
@@ -26,8 +27,12 @@ from livepde.models.wave import WAVE, wave
 __all__ = [
     "EQUATIONS",
     "Equation",
+    "Exchange",
+    "Flux",
+    "Fluxes",
     "Option",
     "Quantity",
+    "Source",
     "Variable",
     "advection_diffusion",
     "advection_dispersion",
@@ -48,6 +53,7 @@ __all__ = [
     "pumping_test",
     "reaction_diffusion",
     "wave",
+    "with_conditions",
 ]
 
 EQUATIONS: dict[str, Equation] = {

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from livepde.errors import ModelError
 from livepde.fem import Place, Unknown
 from livepde.model import Model
 
-__all__ = ["Equation", "Option", "Quantity", "Variable", "by_name", "closed"]
+__all__ = ["Equation", "Fluxes", "Option", "Quantity", "Variable", "by_name", "closed"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +61,21 @@ class Quantity:
     direct: Callable[[Mapping[str, Any]], Callable[[Any, Place], Any]]
 
 
+class Fluxes(NamedTuple):
+    """Units of what a case may let pass through boundaries and gain inside.
+
+    Attributes
+    ----------
+    flux, transfer, source
+        Of D u_n, of the coefficient of an exchange h (ambient - u), and of what is gained for each
+        unit of volume and time.
+    """
+
+    flux: str
+    transfer: str
+    source: str
+
+
 @dataclass(frozen=True)
 class Equation:
     """A PDE with a name, and what a case file may say about it.
@@ -79,6 +94,8 @@ class Equation:
         Measured quantities besides the state itself.
     element
         mesh -> element of the state, and of an unknown field.
+    fluxes
+        Units of fluxes and sources (`livepde.models.with_conditions`); None: it takes none.
     """
 
     name: str
@@ -93,6 +110,7 @@ class Equation:
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
     length_unit: str = "m"
     time_unit: str = "s"
+    fluxes: Fluxes | None = None
 
 
 def by_name(function: Callable[..., Model]) -> Callable[..., Model]:

@@ -8,7 +8,7 @@ from typing import Any
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable, by_name
+from livepde.models.base import Equation, Fluxes, Option, Variable, by_name
 
 __all__ = ["CONDUCTION", "HEAT", "conduction", "heat"]
 
@@ -194,6 +194,7 @@ HEAT = Equation(
     inputs=SURROUNDINGS,
     build=by_name(heat),
     element=linear,
+    fluxes=Fluxes("K m/s", "m/s", "K/s"),
 )
 
 CONDUCTION = Equation(
@@ -211,4 +212,5 @@ CONDUCTION = Equation(
     options={"C": Option("J/(m^3 K)", "volumetric heat capacity")},
     build=by_name(conduction),
     element=linear,
+    fluxes=Fluxes("W/m^2", "W/(m^2 K)", "W/m^3"),
 )

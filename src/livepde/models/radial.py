@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import pi
 from typing import Any
 
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
 from livepde.models.base import Equation, Option, Quantity, Variable, closed
+from livepde.models.common import Number
 
 __all__ = ["BOREHOLE", "borehole", "fluid"]
 
 
 def borehole(
-    mesh: Any, k: Unknown, R_b: Unknown, *, H: float, rho_c: float, T0: float, element: Any = None
+    mesh: Any,
+    k: Unknown,
+    R_b: Unknown,
+    *,
+    H: float,
+    rho_c: Number,
+    T0: float,
+    element: Any = None,
 ) -> Model:
     """Return rho_c r T_t - (k r T_r)_r = 0 around a borehole that gives off the power Q(t).
 
@@ -33,20 +41,33 @@ def borehole(
     H
         Length of the borehole in m.
     rho_c
-        Volumetric heat capacity of the ground in J/(m^3 K).
+        Volumetric heat capacity of the ground in J/(m^3 K), known or unknown.
     T0
-        Undisturbed temperature.
+        Undisturbed temperature in degC.
 
     The power in W is the input channel "Q".
     """
     # Of order four: the weight r and the elements of first order are integrated exactly.
     state = Field(mesh, element or linear(mesh), dirichlet={"right": T0}, unit="degC", quadrature=4)
+    if isinstance(rho_c, int | float):
+        return Model(
+            state,
+            {"k": k, "R_b": R_b},
+            A=lambda q, u, v, x: q.k * x[0] * dot(grad(u), grad(v)),
+            M=lambda u, v, x: rho_c * x[0] * u * v,
+            f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
+            inputs=["Q"],
+            time_unit="s",
+        )
+    # The mass term has no unknowns: the equation is divided by the heat capacity.
     return Model(
         state,
-        {"k": k, "R_b": R_b},
-        A=lambda q, u, v, x: q.k * x[0] * dot(grad(u), grad(v)),
-        M=lambda u, v, x: rho_c * x[0] * u * v,
-        f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
+        {"k": k, "R_b": R_b, "rho_c": rho_c},
+        A=[
+            lambda q, u, v, x: q.k / q.rho_c * x[0] * dot(grad(u), grad(v)),
+            On("left", lambda q, u, v, x: -x.inputs["Q"] / (2 * pi * H * q.rho_c) * v),
+        ],
+        M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
         time_unit="s",
     )
@@ -57,6 +78,16 @@ def fluid(H: float) -> Callable[[Any, Place], Any]:
     return lambda q, x: q.R_b * x.inputs["Q"] / H
 
 
+def _build(
+    mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
+) -> Model:
+    """Return the process of a case; an unknown heat capacity stands in the place of the option."""
+    known = {name: value for name, value in options.items() if name not in unknowns}
+    return closed(borehole, "is heated by the input Q, with T0 far away")(
+        mesh, unknowns, dirichlet, **known
+    )
+
+
 BOREHOLE = Equation(
     name="borehole",
     summary="thermal response test: radial conduction around a heated borehole",
@@ -65,6 +96,7 @@ BOREHOLE = Equation(
     unknowns={
         "k": Variable("W/(m K)", "conductivity of the ground"),
         "R_b": Variable("m K/W", "resistance between fluid and wall of the borehole"),
+        "rho_c": Variable("J/(m^3 K)", "volumetric heat capacity, instead of the option", True),
     },
     inputs={"Q": Variable("W", "power given to the fluid")},
     options={
@@ -79,6 +111,6 @@ BOREHOLE = Equation(
             direct=lambda options: fluid(options["H"]),
         )
     },
-    build=closed(borehole, "is heated by the input Q, with T0 far away"),
+    build=_build,
     element=linear,
 )

@@ -89,10 +89,8 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
         short = label[len(name) :].strip("[]") or name
         known = bool(np.isfinite(low[-1]))
         end = f"{short} = {value[-1]:.4g}"
-        if f"{label}_low" in data:
-            end += f", {low[-1]:.3g} to {high[-1]:.3g}" if known else ""
-        elif known:
-            end += f" ± {high[-1] - value[-1]:.2g}"
+        if known:
+            end += f", 95 %: {low[-1]:.4g} to {high[-1]:.4g}"
         ax.plot(t, value, color=colour, label=end)
         reach.append(value)
         if known:

@@ -1,0 +1,19 @@
+// An L-shaped plate of 1 m; gmsh -2 plate.geo writes plate.msh
+size = 0.05;
+Point(1) = {0, 0, 0, size};
+Point(2) = {1, 0, 0, size};
+Point(3) = {1, 0.5, 0, size};
+Point(4) = {0.5, 0.5, 0, size};
+Point(5) = {0.5, 1, 0, size};
+Point(6) = {0, 1, 0, size};
+Line(1) = {1, 2};
+Line(2) = {2, 3};
+Line(3) = {3, 4};
+Line(4) = {4, 5};
+Line(5) = {5, 6};
+Line(6) = {6, 1};
+Curve Loop(1) = {1, 2, 3, 4, 5, 6};
+Plane Surface(1) = {1};
+Physical Curve("heated") = {6};
+Physical Curve("closed") = {1, 2, 3, 4, 5};
+Physical Surface("plate") = {1};

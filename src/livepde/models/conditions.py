@@ -1,0 +1,204 @@
+"""Fluxes through boundaries and sources in regions, added to a process: known, measured or unknown.
+
+In the weak form of M u_t - div(D grad u) = f a flux J into the domain is the boundary integral of
+J v: it is given in the unit of D u_n.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from livepde.errors import ModelError
+from livepde.fem import Channel, On, Place, Unknown
+from livepde.model import Model
+
+__all__ = ["Amount", "Exchange", "Flux", "Source", "with_conditions"]
+
+Amount: TypeAlias = "float | Channel | str"
+"""A number, an input channel, or an unknown by its name."""
+
+
+@dataclass(frozen=True)
+class Flux:
+    """Flux into the domain through a boundary: D u_n = value.
+
+    Attributes
+    ----------
+    value
+        In the unit of D u_n, W/m^2 for heat conduction.
+    """
+
+    value: Amount
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """Exchange with surroundings through a boundary (Newton, Robin): D u_n = h (ambient - u).
+
+    Attributes
+    ----------
+    coefficient
+        h, the transfer coefficient: W/(m^2 K) for heat conduction.
+    ambient
+        Value of u outside.
+    """
+
+    coefficient: Amount
+    ambient: Amount
+
+
+Condition: TypeAlias = Flux | Exchange
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is gained in a part of the domain, for each unit of volume and time.
+
+    Attributes
+    ----------
+    value
+        In the unit of the equation, W/m^3 for heat conduction.
+    over
+        Predicate on x or name of a subdomain of the mesh; None for all of the domain.
+    """
+
+    value: Amount
+    over: Callable[[Any], Any] | str | None = None
+
+
+def with_conditions(
+    model: Model,
+    boundary: Mapping[str, Condition | Sequence[Condition]] | None = None,
+    sources: Mapping[str, Source] | None = None,
+    unknowns: Mapping[str, Unknown] | None = None,
+) -> Model:
+    """Return a process with fluxes through boundaries and with sources.
+
+    Parameters
+    ----------
+    model
+        A process of one component whose unknowns have names.
+    boundary
+        Name of a boundary -> what passes through it, one or more.
+    sources
+        Name, for messages -> source.
+    unknowns
+        The unknowns that these name, beside those of the model.
+
+    Raises
+    ------
+    ModelError
+        A boundary that the mesh does not have or whose value is given, or an unknown that no
+        condition names.
+
+    Examples
+    --------
+    Inverse heat conduction, a conductivity and the heat flux J(t) into the hot face:
+
+    >>> import livepde as lp
+    >>> from livepde.models import Flux, conduction, with_conditions
+    >>> wall = lp.interval(0.0, 0.1, 40)
+    >>> k = lp.Scalar(20.0, 10.0, transform="log")
+    >>> J = lp.Scalar(0.0, 2e4, evolution=lp.RandomWalk(2e3))
+    >>> slab = conduction(wall, k, {"right": lp.Channel("T_cold")}, C=3.6e6)
+    >>> slab = with_conditions(slab, {"left": Flux("J")}, unknowns={"J": J})
+    >>> tuple(slab.parameter_space.labels)
+    ('k', 'J')
+    """
+    more = dict(unknowns or {})
+    terms = _Terms(tuple(more))
+    for name, given in (boundary or {}).items():
+        _check_boundary(model, name)
+        for condition in given if isinstance(given, Sequence) else [given]:
+            if isinstance(condition, Flux):
+                terms.gained(condition.value, name)
+            else:
+                terms.exchanged(condition, name)
+    for name, source in (sources or {}).items():
+        terms.gained(source.value, *_region(model, name, source.over))
+    if unused := [name for name in more if name not in terms.named]:
+        raise ModelError(f"with_conditions: no condition names the unknown '{unused[0]}'.")
+    whole = model.with_unknowns(more) if more else model
+    return whole.with_terms(terms.A, terms.B, terms.inputs)
+
+
+def _everywhere(x: Place) -> float:
+    return 1.0
+
+
+class _Terms:
+    """Terms of A, with unknowns, and of B, without."""
+
+    def __init__(self, unknowns: tuple[str, ...]) -> None:
+        self.unknowns = unknowns
+        self.named: set[str] = set()
+        self.inputs: list[str] = []
+        self.A: list[Any] = []
+        self.B: list[Any] = []
+
+    def gained(
+        self, value: Amount, where: str | None, inside: Callable[[Any], Any] = _everywhere
+    ) -> None:
+        """Add a flux or a source."""
+        amount = self._amount(value)
+        self._add(where, lambda q, u, v, x: -amount(q, x) * inside(x) * v, value)
+
+    def exchanged(self, condition: Exchange, boundary: str) -> None:
+        """Add an exchange; as two terms, since what depends on u should read no input."""
+        h, ambient = self._amount(condition.coefficient), self._amount(condition.ambient)
+        given = condition.coefficient, condition.ambient
+        self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, given[0])
+        self._add(boundary, lambda q, u, v, x: -h(q, x) * ambient(q, x) * v, *given)
+
+    def _add(self, where: str | None, term: Callable[..., Any], *amounts: Amount) -> None:
+        def known(u: Any, v: Any, x: Place) -> Any:
+            return term(None, u, v, x)
+
+        unknown = any(isinstance(amount, str) for amount in amounts)
+        form = term if unknown else known
+        (self.A if unknown else self.B).append(form if where is None else On(where, form))
+
+    def _amount(self, value: Amount) -> Callable[[Any, Place], Any]:
+        """Return an amount as a function of q and x."""
+        if isinstance(value, Channel):
+            self.inputs.append(value.name)
+            return lambda q, x: x.inputs[value.name]
+        if not isinstance(value, str):
+            return lambda q, x: value
+        if value not in self.unknowns:
+            raise ModelError(
+                f"with_conditions: '{value}' is none of the unknowns {list(self.unknowns)}; "
+                f"write Channel('{value}') for an input channel."
+            )
+        self.named.add(value)
+        return lambda q, x: getattr(q, value)
+
+
+def _check_boundary(model: Model, name: str) -> None:
+    known = model.mesh.boundaries or {}
+    if name not in known:
+        raise ModelError(
+            f"with_conditions: the mesh has no boundary '{name}'; it has {sorted(known)}."
+        )
+    if {name, "boundary"} & set(model.state_block.field.dirichlet):
+        raise ModelError(
+            f"with_conditions: the boundary '{name}' has a value: a flux through it belongs to the "
+            "solution; keep one of both."
+        )
+
+
+def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[Any], Any]]:
+    """Return the subdomain of a source, None for all, and where in it the source is."""
+    if over is None:
+        return None, _everywhere
+    if isinstance(over, str):
+        if over not in (model.mesh.subdomains or {}):
+            raise ModelError(f"source '{name}': the mesh has no subdomain '{over}'.")
+        return over, _everywhere
+    if not np.any(over(model.mesh.p[:, model.mesh.t].mean(axis=1))):
+        raise ModelError(f"source '{name}': no cell of the mesh lies in it.")
+    return None, over

@@ -1,0 +1,231 @@
+"""Fluxes, exchange and sources as conditions of a model and of a case: known, measured, unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import livepde as lp
+from livepde.cases import load
+from livepde.errors import CaseError, ModelError
+from livepde.models import Exchange, Flux, Source, conduction, heat, with_conditions
+from livepde.stepping import Advance, Alexander2, simulate
+
+K, C, LENGTH = 2.0, 4.0, 1.0
+
+
+def slab(dirichlet: Any = None) -> lp.Model:
+    return conduction(lp.interval(0.0, LENGTH, 40), lp.Scalar(K, 1.0), dirichlet, C=C)
+
+
+def steady(model: lp.Model, values: Mapping[str, float], inputs: Any = None) -> Any:
+    """Return the state at the vertices after a long time."""
+    q = model.initial_parameter(values)
+    times = np.linspace(0.0, 400.0, 400).tolist()
+    *_, (_, u) = simulate(model, q, 0.0, times, Advance(Alexander2()), inputs)
+    return model.state_block.at_vertices @ u
+
+
+@pytest.mark.parametrize("kind", ["number", "channel", "unknown"])
+def test_a_flux_gives_the_exact_gradient(kind: str) -> None:
+    amount = {"number": 6.0, "channel": lp.Channel("J"), "unknown": "J"}[kind]
+    unknowns = {"J": lp.Scalar(0.0, 1.0)} if kind == "unknown" else {}
+    model = with_conditions(slab({"right": 20.0}), {"left": Flux(amount)}, unknowns=unknowns)
+    values = {"k": K} | ({"J": 6.0} if unknowns else {})
+    inputs = (lambda t: {"J": 6.0}) if kind == "channel" else None
+    found = steady(model, values, inputs)
+    x = np.linspace(0.0, LENGTH, 41)
+    assert found == pytest.approx(20.0 + 6.0 / K * (LENGTH - x), abs=1e-6)
+
+
+@pytest.mark.parametrize("coefficient", [3.0, "h"])
+@pytest.mark.parametrize("ambient", [50.0, "T_w"])
+def test_an_exchange_gives_the_exact_profile(coefficient: Any, ambient: Any) -> None:
+    given = {"h": 3.0, "T_w": 50.0}
+    unknowns = {name: lp.Scalar(1.0, 1.0) for name in given if name in (coefficient, ambient)}
+    model = with_conditions(
+        slab({"right": 0.0}), {"left": Exchange(coefficient, ambient)}, unknowns=unknowns
+    )
+    found = steady(model, {"k": K, **{name: given[name] for name in unknowns}})
+    left = 3.0 * 50.0 / (3.0 + K / LENGTH)  # h (ambient - u) = k u/L
+    assert found == pytest.approx(left * (1.0 - np.linspace(0.0, 1.0, 41)), abs=1e-6)
+
+
+def test_flux_and_exchange_of_one_boundary_add_up() -> None:
+    both = {"left": [Flux(6.0), Exchange(3.0, 50.0)]}
+    found = steady(with_conditions(slab({"right": 0.0}), both), {"k": K})
+    assert found[0] == pytest.approx((6.0 + 150.0) / (3.0 + K))
+
+
+@pytest.mark.parametrize("over", [None, lambda x: x[0] < 0.5])
+def test_a_source_heats_its_region(over: Any) -> None:
+    model = with_conditions(slab({"right": 0.0}), sources={"heater": Source(6.0, over)})
+    found = steady(model, {"k": K})
+    # -k u'' = 6 in the region, u'(0) = 0, u(1) = 0
+    exact = 6.0 / K / 2.0 if over is None else 6.0 / K * (0.5**2 / 2.0 + 0.5 * 0.5)
+    assert found[0] == pytest.approx(exact, rel=1e-6)
+
+
+def test_says_what_is_wrong_with_a_condition() -> None:
+    for given, text in (
+        ({"boundary": {"top": Flux(1.0)}}, "no boundary 'top'"),
+        ({"boundary": {"right": Flux(1.0)}}, "has a value"),
+        ({"boundary": {"left": Flux("J")}}, "none of the unknowns"),
+        ({"unknowns": {"J": lp.Scalar()}}, "no condition names the unknown 'J'"),
+        ({"sources": {"s": Source(1.0, "core")}}, "no subdomain 'core'"),
+        ({"sources": {"s": Source(1.0, lambda x: x[0] > 2.0)}}, "no cell"),
+    ):
+        with pytest.raises(ModelError, match=text):
+            with_conditions(slab({"right": 20.0}), **given)  # type: ignore[arg-type]
+
+
+def test_terms_beside_a_given_derivative_are_refused() -> None:
+    mesh = lp.interval(0.0, 1.0, 4)
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh)),
+        {"a": lp.Scalar()},
+        A=lambda q, u, v, x: q.a * u * v,
+        dA=lambda q, u, du, v, x: q.a * du * v,
+    )
+    with pytest.raises(ModelError, match="dA"):
+        model.with_terms(A=[lambda q, u, v, x: v])
+
+
+CASE = """\
+equation = "conduction"
+initial = 20
+mesh = { from = 0, to = "10 cm", cells = 20 }
+options.C = "3.7e6 J/(m^3 K)"
+data = { file = "wall.csv", time = "t", time_unit = "s" }
+
+[boundary]
+left = { flux = "J" }
+
+[unknowns]
+k = { prior = "20 W/(m K)", std = "10 W/(m K)", transform = "log" }
+J = { prior = 0, std = "3 W/cm^2" }
+
+[channels]
+T1 = { role = "sensor", column = "T1", at = "5 mm", noise = "0.1 K" }
+T2 = { role = "sensor", column = "T2", at = "50 mm", noise = "0.1 K" }
+T_cold = { role = "boundary", column = "T3", at = "right" }
+"""
+
+
+def wall(folder: Path, k: float = 28.5, J: float = 2e4) -> Path:
+    """Write a case and measurements of a wall, by finite volumes, and return the case."""
+    cells, width, rng = 200, 20.0, np.random.default_rng(1)
+    h = 0.1 / cells
+    x, u = h * (np.arange(cells) + 0.5), np.full(cells, 20.0)
+    A = np.diag(np.full(cells, -2.0)) + np.diag(np.ones(cells - 1), 1)
+    A += np.diag(np.ones(cells - 1), -1)
+    A[0, 0], A[-1, -1] = -1.0, -3.0  # the value at the right end, half a cell away
+    A *= k / (3.7e6 * h**2)
+    gained = np.zeros(cells)
+    gained[0], gained[-1] = J / (3.7e6 * h), 2 * k * 20.0 / (3.7e6 * h**2)
+    steady, decay = np.linalg.solve(-A, gained), expm(A * width)
+    lines = ["t,T1,T2,T3"]
+    for n in range(61):
+        T = np.interp([0.005, 0.05], x, u) + 0.1 * rng.standard_normal(2)
+        lines.append(f"{n * width},{T[0]:.3f},{T[1]:.3f},20.0")
+        u = steady + decay @ (u - steady)  # exact in time
+    (folder / "wall.csv").write_text("\n".join(lines) + "\n")
+    (folder / "case.toml").write_text(CASE)
+    return folder / "case.toml"
+
+
+def test_a_case_finds_conductivity_and_heat_flux(tmp_path: Path) -> None:
+    """The law is the default one; the truth comes from finite volumes on another mesh."""
+    prepared = load(wall(tmp_path)).prepare()
+    for sample in prepared.stream:
+        estimate = prepared.identifier.step(sample.t, sample.z, sample.inputs)
+    low, high = np.array([estimate.interval(name) for name in ("k", "J")]).reshape(2, 2).T
+    assert (low < [28.5, 2e4]).all()
+    assert (high > [28.5, 2e4]).all()
+    assert estimate.q_std[1] < 500.0
+
+
+def changed(folder: Path, *pairs: tuple[str, str]) -> Path:
+    path, text = folder / "case.toml", CASE
+    for old, new in pairs:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return path
+
+
+def test_conditions_of_a_case_are_numbers_and_channels_too(tmp_path: Path) -> None:
+    file = changed(
+        tmp_path,
+        ('left = { flux = "J" }', 'left = { transfer = "h", ambient = "T_air" }'),
+        ("J = { prior = 0", 'h = { prior = "5 W/(m^2 K)"'),
+        ("3 W/cm^2", "3 W/(m^2 K)"),
+        ("[channels]", '[sources]\ns = { value = "P", over = [0, "2 cm"] }\n[channels]'),
+        ("[channels]", '[channels]\nT_air = { role = "input", column = "T", unit = "degF" }'),
+        ("[channels]", '[channels]\nP = { role = "input", column = "P", unit = "kW/m^3" }'),
+    )
+    case = load(file)
+    assert tuple(case.model.parameter_space.labels) == ("k", "h")
+    assert set(case.model.inputs) == {"P", "T_air"}
+    assert case.frame.unit("T_air") == "degC"
+    assert case.frame.unit("P") == "W/m^3"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('"J" }', '"j" }', "boundary.left.flux: there is no unknown and no channel 'j'; expected"),
+        ('"J" }', '"T1" }', "the channel 'T1' has to be of role 'input'"),
+        ('"J" }', '"k" }', "'k' is the conductivity"),
+        ('"J" }', '"5 K" }', "boundary.left.flux"),
+        ("left =", "lft =", "no boundary 'lft'"),
+        ('{ flux = "J" }', '{ transfer = "J" }', "transfer and ambient belong together"),
+        ('{ flux = "J" }', '{ value = 1, flux = "J" }', "expected a value, or flux"),
+        ("left =", "right =", "'right' has a value"),
+        ('"conduction"', '"burgers"', "takes no fluxes"),
+    ],
+)
+def test_a_case_says_what_is_wrong_with_a_condition(
+    tmp_path: Path, old: str, new: str, text: str
+) -> None:
+    with pytest.raises(CaseError, match=text.replace("(", r"\(")):
+        load(changed(tmp_path, (old, new)))
+
+
+def test_sensors_from_a_table_of_positions(tmp_path: Path) -> None:
+    sensor = CASE[CASE.index("T1 =") : CASE.index("T_cold")]
+    table = 'T = { role = "sensor", positions = "places.csv", noise = "0.1 K" }\n'
+    (tmp_path / "places.csv").write_text("name,x\nT1,0.005\nT2,50 mm\n")
+    places = load(changed(tmp_path, (sensor, table))).frame.spec.channels
+    assert {name: item.at for name, item in places.items() if item.role == "sensor"} == {
+        "T1": 0.005,
+        "T2": 0.05,
+    }
+    assert places["T2"].column == "T2"
+    for text, found in (
+        ("name,x\nT1,0.005\nT1,0.05\n", "row 3: the name 'T1' stands there twice"),
+        ("sensor,x\nT1,0.005\n", "expected name, x"),
+        ("name,x\nT1,far\n", "row 2"),
+        ("name,x\n,0.005\n", "row 2: the name is missing"),
+        ("name,x\nT_cold,0.005\n", "a channel 'T_cold' already"),
+    ):
+        (tmp_path / "places.csv").write_text(text)
+        with pytest.raises(CaseError, match=found):
+            load(changed(tmp_path, (sensor, table)))
+    (tmp_path / "places.csv").unlink()
+    with pytest.raises(CaseError, match="cannot be read"):
+        load(changed(tmp_path, (sensor, table)))
+
+
+def test_heat_takes_fluxes_over_the_heat_capacity() -> None:
+    """The flux J/C into u_t = div(alpha grad u) is that of J into C u_t = div(k grad u)."""
+    mesh = lp.interval(0.0, LENGTH, 40)
+    one = with_conditions(slab({"right": 0.0}), {"left": Flux(6.0)})
+    two = heat(mesh, lp.Scalar(K / C, 1.0), {"right": 0.0})
+    two = with_conditions(two, {"left": Flux(6.0 / C)})
+    assert steady(one, {"k": K}) == pytest.approx(steady(two, {"alpha": K / C}))

@@ -1,0 +1,50 @@
+"""The walks of docs/first-hour.md: what the page shows is what runs, and it finds the truth.
+
+The page itself is run by tests/test_pages.py, word for word.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+
+from benchmarks import ROOT
+from benchmarks.first_hour import FOLDER, WALKS, WRITTEN, first_hour, write
+
+PAGE = (ROOT / "docs" / "first-hour.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["furnace.toml", "borehole.toml", "plate.py"])
+def test_the_page_shows_the_files(name: str) -> None:
+    shown = (FOLDER / name).read_text(encoding="utf-8")
+    assert shown in PAGE
+    limit = 15 if name.endswith(".toml") else 26  # twenty lines of code
+    assert len(shown.splitlines()) <= limit
+
+
+@pytest.mark.parametrize("walk", WALKS)
+def test_the_tables_are_those_of_another_code(walk: str, tmp_path) -> None:
+    write(tmp_path, walk, WRITTEN)
+    for file in tmp_path.iterdir():
+        assert file.read_text() == (FOLDER / file.name).read_text()
+
+
+@pytest.mark.parametrize("walk", ["furnace", "borehole"])
+def test_the_page_tells_the_truths(walk: str, tmp_path) -> None:
+    for name, truth in write(tmp_path, walk, WRITTEN).items():
+        told = re.findall(rf"\b{name} = ([\d.]+)", PAGE)
+        assert any(float(value) == pytest.approx(truth, rel=1e-3) for value in told)
+
+
+def test_each_case_is_one_file_without_a_law() -> None:
+    for name in ("furnace.toml", "borehole.toml"):
+        case = tomllib.loads((FOLDER / name).read_text(encoding="utf-8"))
+        assert not {"law", "steps", "intake"} & set(case)
+
+
+@pytest.mark.slow
+def test_intervals_of_the_walks_hold_the_truth() -> None:
+    outcome = first_hour(("furnace", "borehole"), seeds=2)
+    assert outcome.ok, outcome.checks
