@@ -255,7 +255,7 @@ class InputShadow(Shadow):
         In a gap a channel is expected to go on as before; once it has a value again the line across
         the gap is known.
         """
-        held, missing = gaps[0], gaps[1] > 0.0
+        held, missing = gaps[:, 0], gaps[:, 1] > 0.0
         whole = held + h
         slope = np.where(missing, s.slope, change / whole)
         bend = (slope - s.slope) * whole**3 / (6.0 * (whole + s.length[:, None]))
@@ -541,10 +541,8 @@ class ShadowSet:
             The filter before and after it.
         weights
             One over the noise of each value that was used, zero for others, (members, sensors).
-        seen
-            By how much predictions were off, as `seen` says.
-        t
-            Time of the sample.
+        seen, t
+            By how much predictions were off, as `seen` says, and the time.
         """
         s = x.shadows
         if s.gains.size:

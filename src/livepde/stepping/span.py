@@ -64,7 +64,7 @@ class Span:
         None if all are defaults.
     gaps
         Duration of the gap of each channel before this interval, and 1 if it lasts at its end,
-        shape (2, channels); None without a gap.
+        shape (1, 2, channels); None without a gap.
     """
 
     t0: Array
@@ -91,7 +91,7 @@ class Span:
         noise = None if interval.noise is None else interval.noise[None]
         gaps = None
         if interval.gaps:
-            gaps = np.array([interval.gaps.get(name, (0.0, False)) for name in channels]).T
+            gaps = np.array([interval.gaps.get(name, (0.0, False)) for name in channels]).T[None]
         return cls(t0, interval.t1, channels, first, last, z0, z1, interval, noise, gaps)
 
     def __len__(self) -> int:
