@@ -137,6 +137,9 @@ class Live:
     waits
         The feed may wait for samples: who reads the journal is shown the last estimate before.
         Else it is shown with the next sample, in one transaction.
+    patient
+        A journal that cannot be written (a full disk) is waited for, and the run is not well
+        meanwhile; else the journal's `RunError` ends the run.
     stopping
         Ends the run when it is set; it may be set already.
     clock
@@ -164,6 +167,7 @@ class Live:
         begun: Iterable[Ready] = (),
         irregular: Iterable[Remark] = (),
         waits: bool = True,
+        patient: bool = False,
         stopping: threading.Event | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -177,6 +181,7 @@ class Live:
         self.silence = silence
         self.strict = strict
         self.waits = waits
+        self.patient = patient
         self.silent = False
         self.stopping = stopping or threading.Event()
         self.busy = False  # a step is taken
@@ -226,7 +231,7 @@ class Live:
         """
         begun, again = self._clock(), None
         while again is None:
-            if not (self.waits and self.journal.remedy):
+            if not (self.patient and self.journal.remedy):
                 raise error
             why = f"the journal cannot be written ({error.__cause__}): {self.journal.remedy}"
             if not self._unwritten:
