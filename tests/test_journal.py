@@ -261,7 +261,8 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
 
     run = live(failing, Rows(broken), patient=True, sinks=[Sink()])
     run.run()
-    assert run.health["ok"] and run.journal.health == ""
+    assert run.health["ok"]
+    assert run.journal.health == ""
     run.journal.close()
     assert seen == [0.1 * k for k in range(40)]
     with Journal.open(whole / NAME) as one, Journal.open(failing / NAME) as other:

@@ -250,7 +250,8 @@ class Live:
             except RunError as still:
                 error, again = still, None
         self._unwritten = ""
-        self._tell("disk", f"nothing could be written for {self._clock() - begun:.1f} s: {error}")
+        self._heard = self._taken = now = self._clock()  # meanwhile nobody has listened
+        self._tell("disk", f"nothing could be written for {now - begun:.1f} s ({error.__cause__})")
         return again
 
     def _restore(self) -> None:
