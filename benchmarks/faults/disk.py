@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import socket
 import sys
 import urllib.error
@@ -16,7 +17,7 @@ from typing import Any
 
 from benchmarks.faults.damage import Damage, Found
 from benchmarks.faults.plan import Plan
-from benchmarks.faults.plants import GrowingFile, wait
+from benchmarks.faults.plants import PATIENCE, GrowingFile, wait
 from benchmarks.faults.rod import Row, rod_rows
 from benchmarks.faults.run import Run, undisturbed
 from livepde.runs import JOURNAL, Check, Outcome, Table
@@ -27,15 +28,13 @@ __all__ = ["failing_disks"]
 FILLED = 4  # times that the disk is full
 SAID = "cannot be written"  # by /health
 BAD_INPUT = 2  # exit code
-CHANCE = 0.005  # of each call to fail
-LIMIT = 40  # processes that may end with an error in one trial
-CALLS = {  # what fails -> name of the failure point, error number
-    "writes of the journal, disk full": ("posix/io/rw/pwrite", 28),
-    "writes of the journal, input/output error": ("posix/io/rw/pwrite", 5),
-    "other writes, disk full": ("posix/io/rw/write", 28),
-    "fsync": ("posix/io/sync/*", 5),
-    "truncate": ("posix/io/rw/ftruncate", 5),
-    "rename": ("posix/io/dir/rename", 28),
+SIZES = [2**k for k in (14, 16, 18)]  # bytes that a file may have at the end of a run
+LIMIT = 10  # processes that may end with an error in one trial
+CALLS = {  # what fails -> name of the failure point, error number, chance of each call
+    "writes of the journal, disk full": ("posix/io/rw/pwrite", 28, 0.005),
+    "writes of the journal, input/output error": ("posix/io/rw/pwrite", 5, 0.005),
+    "fsync": ("posix/io/sync/*", 5, 0.3),
+    "rename": ("posix/io/dir/rename", 28, 0.2),
 }
 
 
@@ -46,11 +45,12 @@ def failing_disks(plan: Plan) -> Outcome:
     notes = []
     if sys.platform == "linux":
         trials["full, and room again"] = lambda folder: _filled(folder, rows, plan.seed)
+        trials["full when the run ends"] = lambda folder: _full_at_the_end(folder, rows, plan.seed)
     else:
         notes.append("disk: full disks were left out, they need Linux (prlimit).")
     if shutil.which("fiu-run") is not None:
-        for what, (point, number) in CALLS.items():
-            command = f"enable_random name={point},probability={CHANCE},failinfo={number}"
+        for what, (point, number, chance) in CALLS.items():
+            command = f"enable_random name={point},probability={chance},failinfo={number}"
             wrapper = ["fiu-run", "-x", "-f", "", "-c", command]
             trials[what] = lambda folder, wrapper=wrapper: _failing(  # type: ignore[misc]
                 folder, rows, plan.seed, wrapper
@@ -107,6 +107,26 @@ def _filled(folder: Path, rows: Sequence[Row], seed: int) -> tuple[int, int, int
         return Found.of(run.out).events["disk"], 0, silent
 
 
+def _full_at_the_end(folder: Path, rows: Sequence[Row], seed: int) -> tuple[int, int, int]:
+    """Let no file grow beyond a size while a run ends; then let it end."""
+    import resource
+
+    plant, ended, riddles = GrowingFile(folder, rows, seed), 0, 0
+    plant.supply(len(rows))
+    with closing(Run(folder, plant.source, codes=(0, BAD_INPUT))) as run:
+        for size in SIZES:
+            _start(run)
+            run.wait_for(len(rows))
+            limits = (size, resource.RLIM_INFINITY)
+            resource.prlimit(run.process.pid, resource.RLIMIT_FSIZE, limits)
+            bad = _ended(run)
+            ended += bad
+            riddles += bad and not _told(folder)
+        _start(run)
+        run.end(len(rows))
+        return Found.of(run.out).events["disk"], ended, riddles
+
+
 def _failing(
     folder: Path, rows: Sequence[Row], seed: int, wrapper: Sequence[str]
 ) -> tuple[int, int, int]:
@@ -115,16 +135,32 @@ def _failing(
     plant.supply(len(rows))
     with closing(Run(folder, plant.source, wrapper=wrapper, codes=(0, BAD_INPUT))) as run:
         for _ in range(LIMIT):
-            run.start()
+            _start(run)
             wait(lambda: not run.alive() or run.look() == len(rows), "a run does not go on")
-            if run.alive():
+            if not _ended(run):
                 break
             ended += 1
             riddles += not _told(folder)
     with closing(Run(folder, plant.source)) as run:
-        run.start()
+        _start(run)
         run.end(len(rows))
         return Found.of(run.out).events["disk"], ended, riddles
+
+
+def _start(run: Run) -> None:
+    """Start a run, and wait until it hears signals or has ended."""
+    log = run.folder / "log.txt"
+    before = log.stat().st_size if log.exists() else 0
+    run.start()
+    wait(lambda: not run.alive() or log.stat().st_size > before, "a run does not begin")
+
+
+def _ended(run: Run) -> bool:
+    """End a run, if it has not ended by itself; return whether with an error."""
+    run.signal(signal.SIGTERM)
+    code = run.process.wait(PATIENCE)
+    run.alive()  # refuses other codes
+    return code == BAD_INPUT
 
 
 def _told(folder: Path) -> bool:
