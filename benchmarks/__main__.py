@@ -578,7 +578,9 @@ FLIPS = Count(200, 20)
 @app.command()
 def faults(
     context: typer.Context,
-    kills: Annotated[int, KILLS.option("Kills, with a file and with a broker.")] = KILLS.usual,
+    kills: Annotated[
+        int, KILLS.option("Kills, with a file, standard input and a broker.")
+    ] = KILLS.usual,
     samples: Annotated[
         int, LENGTH.option("Samples of a run that is killed.", least=50)
     ] = LENGTH.usual,
@@ -588,8 +590,8 @@ def faults(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            help="One of file, mqtt, restart, malformed, messages, journals, clocks, visitors, "
-            "cases. Repeat it."
+            help="One of file, stdin, mqtt, restart, disk, malformed, messages, journals, clocks, "
+            "visitors, cases. Repeat it."
         ),
     ] = None,
     quick: Annotated[

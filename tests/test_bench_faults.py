@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from commands import bench
 
 import livepde as lp
 from benchmarks import faults, soak
-from benchmarks.faults import breaks, broken, damage, hostile, plants, rod
+from benchmarks.faults import breaks, broken, damage, disk, hostile, plants, rod
 from benchmarks.journal import journal
 from benchmarks.overhead import overhead
 from livepde import cases
@@ -31,14 +32,28 @@ def failed(outcome) -> list[str]:
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("part", ["file", pytest.param("mqtt", marks=MQTT)])
+@pytest.mark.parametrize("part", ["file", "stdin", pytest.param("mqtt", marks=MQTT)])
 def test_runs_are_killed_and_lose_nothing(part):
-    pytest.importorskip("paho.mqtt")
+    if part == "mqtt":
+        pytest.importorskip("paho.mqtt")
     outcome = faults.faults(kills=2, samples=100, only=[part], seed=2)
     assert not failed(outcome)
     (table,) = outcome.tables
     assert table.rows[0][0] >= 1
     assert sum(table.rows[0][1:5]) == 2
+
+
+@pytest.mark.process
+@pytest.mark.skipif(sys.platform != "linux", reason="needs prlimit")
+def test_disks_fail_and_nothing_is_lost(monkeypatch):
+    monkeypatch.setattr(disk, "CALLS", {})
+    monkeypatch.setattr(disk, "FILLED", 1)
+    monkeypatch.setattr(disk, "SIZES", [2**14])
+    outcome = faults.faults(samples=60, only=["disk"])
+    assert not failed(outcome)
+    full, at_the_end = outcome.tables[0].rows
+    assert full[1] >= 1
+    assert at_the_end[2] == 1
 
 
 @pytest.mark.broker

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -208,6 +209,104 @@ def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
     with Journal.open(tmp_path / NAME) as kept:
         assert kept.accepted - len(kept) in (0, 1)  # the last one may lack its estimate
         assert kept.estimated == len(kept)
+
+
+class Failing:
+    """A connection of which writes fail while it is told so, as those of a full disk do."""
+
+    def __init__(self, path: Path, failing) -> None:
+        self._raw, self._failing = database.writer(path), failing
+
+    def _refuse(self):
+        if self._failing():
+            error = sqlite3.OperationalError("disk I/O error")
+            error.sqlite_errorcode = sqlite3.SQLITE_IOERR_WRITE
+            raise error
+
+    def execute(self, command, values=()):
+        if not command.startswith(("SELECT", "PRAGMA", "BEGIN")):
+            self._refuse()
+        return self._raw.execute(command, values)
+
+    def commit(self):
+        self._refuse()
+        self._raw.commit()
+
+    def __getattr__(self, name):
+        return getattr(self._raw, name)
+
+
+@pytest.mark.parametrize("first", [2, 40, 43, 60, 73, 100])
+def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first):
+    whole, failing = tmp_path / "whole", tmp_path / "failing"
+    whole.mkdir(), failing.mkdir()
+    broken = [*rows(40)]
+    broken[20:20] = [{"t": 0.1, "a": "none", "left": 1.0}, {"t": -1.0, "a": 1.0, "left": 1.0}] * 3
+    calm = live(whole, Rows(broken))
+    calm.run()
+    calm.journal.close()
+    writes, seen = itertools.count(1), []
+    bad = {first, first + 1, first + 9, first + 80}  # also while it is mended
+    monkeypatch.setattr("livepde.runs.live.LOOK", 0.0)
+    monkeypatch.setattr(
+        "livepde.runs.journal.writer", lambda path: Failing(path, lambda: next(writes) in bad)
+    )
+
+    class Sink:
+        def put(self, estimate):
+            seen.append(estimate.t)
+
+        def close(self):
+            pass
+
+    run = live(failing, Rows(broken), patient=True, sinks=[Sink()])
+    run.run()
+    assert run.health["ok"]
+    assert run.journal.health == ""
+    run.journal.close()
+    assert seen == [0.1 * k for k in range(40)]
+    with Journal.open(whole / NAME) as one, Journal.open(failing / NAME) as other:
+        same(other, one)
+        assert other.counts == one.counts
+        assert other.accepted == one.accepted == 40
+        told = {(event.kind, event.channel, event.message) for event in one.events}
+        found = {(event.kind, event.channel, event.message) for event in other.events}
+        assert told <= found
+        assert {kind for kind, *_ in found - told} == {"disk", "well"}
+
+
+def test_a_disk_that_does_not_come_back_is_no_health_until_the_run_is_stopped(
+    tmp_path, monkeypatch
+):
+    away = []
+    monkeypatch.setattr(
+        "livepde.runs.journal.writer", lambda path: Failing(path, lambda: bool(away))
+    )
+    looks = itertools.count()
+
+    class Stopping(threading.Event):
+        def wait(self, timeout=None):
+            said.append(run.health)
+            if next(looks) == 2:
+                self.set()
+            return self.is_set()
+
+    class Leaving(Rows):
+        def poll(self, wait):
+            if run.journal.accepted == 10:
+                away.append(True)
+            return super().poll(wait)
+
+    said: list[dict] = []
+    run = live(tmp_path, Leaving(rows(40)), patient=True, stopping=Stopping())
+    with pytest.raises(lp.RunError, match=r"What was written before is safe; make room or mend"):
+        run.run()
+    run.journal.close()
+    why = "the journal cannot be written (disk I/O error): make room or mend the disk"
+    assert [(health["ok"], health["why"]) for health in said] == [(False, why)] * 3
+    away.clear()
+    with Journal.open(tmp_path / NAME) as kept:
+        assert kept.accepted == 10
 
 
 FULL = """

@@ -1,4 +1,4 @@
-"""Kills of runs at any moment, that take rows from a file or from a broker."""
+"""Kills of runs at any moment, that take rows from a file, a pipe or a broker."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ import numpy as np
 
 from benchmarks.faults.damage import Damage, Found
 from benchmarks.faults.plan import Plan
-from benchmarks.faults.plants import GrowingFile, Mosquitto, Plant, Topic, wait
+from benchmarks.faults.plants import GrowingFile, Mosquitto, Plant, StandardInput, Topic, wait
 from benchmarks.faults.rod import Row, rod_rows
 from benchmarks.faults.run import Run, undisturbed
 from livepde.runs import Check, Outcome, Table
 
-__all__ = ["kills_of_files", "kills_of_topics"]
+__all__ = ["kills_of_files", "kills_of_pipes", "kills_of_topics"]
 
 STRIDE = 0.25  # seconds after a sign of life within which a kill falls
 LEAD = (20, 400)  # rows that are there before they are asked for
@@ -31,6 +31,16 @@ def kills_of_files(plan: Plan) -> Outcome:
     """Kill runs of a file that grows."""
     with TemporaryDirectory() as folder:
         return _killed(plan, Path(folder), "file", GrowingFile)
+
+
+def kills_of_pipes(plan: Plan) -> Outcome:
+    """Kill runs that read standard input, and send them again what they have not kept."""
+
+    def plant(here: Path, rows: Sequence[Row], seed: int) -> StandardInput:
+        return StandardInput(rows, seed)
+
+    with TemporaryDirectory() as folder:
+        return _killed(plan, Path(folder), "stdin", plant)
 
 
 def kills_of_topics(plan: Plan) -> Outcome:
@@ -52,13 +62,14 @@ def _killed(
     rows, rng = rod_rows(plan.samples), np.random.default_rng(plan.seed)
     expected, start = undisturbed(plan.samples)
     damage, fallen, progress = Damage(), Counter[str](), 0
+    again = untold = 0  # rows that were sent twice, and counted or not
     bar = plan.watched(plan.kills, f"kills, {name}")
     next(bar, None)
     while fallen.total() < plan.kills:
         here = folder / f"{name}-{damage.runs}"
         here.mkdir()
         plant = plants(here, rows, plan.seed + damage.runs)
-        with closing(Run(here, plant.source)) as run:
+        with closing(_run(here, plant)) as run:
             while run.look() < len(rows) - LEAD[0] and fallen.total() < plan.kills:
                 before = run.look()
                 moment = str(rng.choice([*MOMENTS], p=[*MOMENTS.values()]))
@@ -69,7 +80,11 @@ def _killed(
             plant.supply(len(rows))
             run.start()
             run.end(len(rows))
-        damage.compare(Found.of(here / "run"), expected)
+        found = Found.of(here / "run")
+        damage.compare(found, expected)
+        if isinstance(plant, StandardInput):
+            again += found.counts["repeated"]
+            untold += max(plant.twice - found.counts["repeated"], 0)
         shutil.rmtree(here)
     table = Table(
         f"Kills, {name}: {plan.samples} samples a run",
@@ -80,6 +95,7 @@ def _killed(
             "doubled",
             "different",
             "after new samples",
+            "rows sent again",
         ),
         [
             (
@@ -89,11 +105,20 @@ def _killed(
                 damage.doubled,
                 damage.different,
                 progress,
+                again,
             )
         ],
     )
     enough = Check(f"{name}: kills", fallen.total(), plan.kills, ">=")
-    return Outcome(tables=[table], checks=[enough, *damage.checks(name)])
+    counted = Check(f"{name}: rows sent again and not counted", untold, 0, "<=")
+    return Outcome(tables=[table], checks=[enough, *damage.checks(name), counted])
+
+
+def _run(folder: Path, plant: Plant) -> Run:
+    """Return the run of a plant."""
+    if isinstance(plant, StandardInput):
+        return Run(folder, plant.source, options=("--data", "-"), feeder=plant)
+    return Run(folder, plant.source)
 
 
 def _kill(

@@ -9,16 +9,27 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import numpy as np
 
 from benchmarks.faults.rod import Row
 from livepde.errors import RunError
 
-__all__ = ["BROKER", "PATIENCE", "GrowingFile", "Mosquitto", "Plant", "Topic", "wait"]
+__all__ = [
+    "BROKER",
+    "PATIENCE",
+    "GrowingFile",
+    "Mosquitto",
+    "Plant",
+    "StandardInput",
+    "Topic",
+    "wait",
+]
 
+AGAIN = 6  # fewer rows than this are sent again that are kept already
 PATIENCE = 120.0  # seconds after which a run that does not go on is given up
 BROKER = "/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin:/opt/homebrew/sbin"
 
@@ -54,6 +65,46 @@ class GrowingFile:
         with self.path.open("a") as file:
             file.write(self._text[self._written : end])
         self._written = end
+
+
+class StandardInput:
+    """Rows as lines of JSON to standard input: a new process is sent again what it has not kept.
+
+    And some rows that it has, as of a feeder that knows the last stored time not quite.
+    """
+
+    source = ""
+
+    def __init__(self, rows: Sequence[Row], seed: int) -> None:
+        self._lines = [(json.dumps(row) + "\n").encode() for row in rows]
+        self._rng = np.random.default_rng(seed)
+        self._stream: IO[bytes] | None = None
+        self._count = self._sent = 0
+        self.twice = 0  # rows that the process of now was sent although they are kept
+
+    def connect(self, stream: IO[bytes], stored: int) -> None:
+        """Begin with a new process, whose journal has so many rows."""
+        self.close()
+        self._stream = stream
+        self.twice = min(int(self._rng.integers(1, AGAIN)), stored)
+        self._sent = stored - self.twice
+        self.supply(0)
+
+    def supply(self, count: int) -> None:
+        self._count = max(count, self._count)
+        if self._stream is None:
+            return
+        with suppress(BrokenPipeError):  # it was killed
+            self._stream.write(b"".join(self._lines[self._sent : self._count]))
+            self._stream.flush()
+        self._sent = self._count
+
+    def close(self) -> None:
+        """Let go of the last process."""
+        if self._stream is not None:
+            with suppress(BrokenPipeError):
+                self._stream.close()
+        self._stream = None
 
 
 class Topic:

@@ -13,7 +13,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from benchmarks.faults.damage import Found
-from benchmarks.faults.plants import PATIENCE, GrowingFile, Mosquitto, Topic, wait
+from benchmarks.faults.plants import (
+    PATIENCE,
+    GrowingFile,
+    Mosquitto,
+    StandardInput,
+    Topic,
+    wait,
+)
 from benchmarks.faults.rod import Row, case_text, rod_rows
 from livepde.errors import RunError
 from livepde.runs import JOURNAL, Journal
@@ -23,10 +30,33 @@ __all__ = ["Run", "hearing", "undisturbed", "undisturbed_journal"]
 
 
 class Run:
-    """`livepde run` of the case in a folder, as a process that can be killed."""
+    """`livepde run` of the case in a folder, as a process that can be killed.
 
-    def __init__(self, folder: Path, source: str) -> None:
+    Parameters
+    ----------
+    folder, source
+        Where it runs, and the lines of its case that name the source.
+    options, wrapper
+        What comes after its command, and before it.
+    codes
+        With which it may end by itself.
+    feeder
+        Writes to its standard input.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        source: str,
+        *,
+        options: Sequence[str] = (),
+        wrapper: Sequence[str] = (),
+        codes: Sequence[int] = (0, -signal.SIGKILL),
+        feeder: StandardInput | None = None,
+    ) -> None:
         self.folder = folder
+        self._options, self._wrapper = options, wrapper
+        self._codes, self._feeder = codes, feeder
         self.out = folder / "run"
         self._journal: Journal | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -36,8 +66,14 @@ class Run:
         command = [sys.executable, "-m", "livepde", "run", "case.toml", "--out", "run", "--resume"]
         with (self.folder / "log.txt").open("ab") as log:
             self._process = subprocess.Popen(
-                command, cwd=self.folder, stdout=subprocess.DEVNULL, stderr=log
+                [*self._wrapper, *command, *self._options],
+                cwd=self.folder,
+                stdin=None if self._feeder is None else subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=log,
             )
+        if self._feeder is not None and self._process.stdin is not None:
+            self._feeder.connect(self._process.stdin, self.look())
 
     def look(self) -> int:
         """Return how many samples are accepted; a reader is open all the time."""
@@ -61,7 +97,7 @@ class Run:
     def alive(self) -> bool:
         """Return whether it runs; one that has ended by itself is an error."""
         code = self.process.poll()
-        if code is not None and code not in (0, -signal.SIGKILL):
+        if code is not None and code not in self._codes:
             told = (self.folder / "log.txt").read_text()[-2000:]
             raise RunError(f"benchmark faults: a run ended with code {code}:\n{told}")
         return code is None
@@ -111,6 +147,8 @@ class Run:
         if self._process is not None and self._process.poll() is None:
             self._process.kill()
             self._process.wait()
+        if self._feeder is not None:
+            self._feeder.close()
         if self._journal is not None:
             self._journal.close()
 

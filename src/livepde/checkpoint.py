@@ -144,7 +144,8 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
         write_bytes(target, content, sync=True)
     except OSError as error:
         raise RunError(
-            f"Cannot write the checkpoint {target}: {error.strerror or error}."
+            f"Cannot write the checkpoint {target}: {error.strerror or error}; make room or mend "
+            "the folder."
         ) from error
 
 

@@ -156,6 +156,7 @@ class Wiring:
             silence=silence,
             begun=waiting,
             irregular=irregular.values(),
+            patient=True,
             stopping=stopping,
         )
         again = live.resume()

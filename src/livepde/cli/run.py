@@ -73,7 +73,8 @@ def run(
         typer.Option(
             "--resume",
             help="Go on with the run in --out as if it had never stopped; begin it if there is "
-            "none.",
+            "none. Standard input is then read as with --realtime, and rows that were sent before "
+            "are counted.",
         ),
     ] = False,
     realtime: Annotated[
@@ -143,7 +144,9 @@ def run(
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
     own = loaded.goes_on(data)
-    goes_on, live = own or source is sys.stdin, own or realtime
+    goes_on = own or source is sys.stdin
+    # What is sent to a run that is gone on with begins anywhere: times count from the first start.
+    live = own or realtime or (resume and source is sys.stdin)
     only = {
         "--speed": speed is not None,
         "--listen": listen,

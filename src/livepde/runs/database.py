@@ -23,6 +23,7 @@ __all__ = [
     "log_of",
     "reader",
     "released",
+    "remedy_of",
     "salvager",
     "sound",
     "told",
@@ -45,13 +46,13 @@ DAMAGE = (
 AGAIN = "run the case again into another folder"
 SALVAGE = f"'livepde export RUN FILE --salvage' reads what is whole, or {AGAIN}"
 REMEDIES = {  # primary result code of SQLite -> what to do
-    sqlite3.SQLITE_FULL: "make room, and go on with --resume",
-    sqlite3.SQLITE_IOERR: "make room or mend the disk, and go on with --resume",
-    sqlite3.SQLITE_READONLY: "let the folder and its files be written, and go on with --resume",
+    sqlite3.SQLITE_FULL: "make room",
+    sqlite3.SQLITE_IOERR: "make room or mend the disk",
+    sqlite3.SQLITE_READONLY: "let the folder and its files be written",
     sqlite3.SQLITE_CANTOPEN: "let the folder and its files be read and written",
     sqlite3.SQLITE_PERM: "let the folder and its files be read and written",
-    sqlite3.SQLITE_BUSY: "stop the other program that holds it, and go on with --resume",
-    sqlite3.SQLITE_LOCKED: "stop the other program that holds it, and go on with --resume",
+    sqlite3.SQLITE_BUSY: "stop the other program that holds it",
+    sqlite3.SQLITE_LOCKED: "stop the other program that holds it",
 }
 CORRUPT = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -183,8 +184,13 @@ def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     if code & 0xFF in CORRUPT:
         return damaged(path, str(error))
-    remedy = REMEDIES.get(code & 0xFF, "mend the folder, and go on with --resume")
-    return f"{path}: {error}. What was written before is safe; {remedy}."
+    remedy = remedy_of(error) or "mend the folder"
+    return f"{path}: {error}. What was written before is safe; {remedy}, and go on with --resume."
+
+
+def remedy_of(error: Exception) -> str:
+    """Return after what a file can be used again that is whole; empty if nothing is known."""
+    return REMEDIES.get(getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF, "")
 
 
 def damaged(path: Path, why: str) -> str:

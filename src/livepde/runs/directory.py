@@ -224,7 +224,10 @@ class RunWriter:
         except RunError:
             raise
         except OSError as error:
-            raise RunError(f"{self.path}: cannot be written: {error}.") from error
+            raise RunError(
+                f"{self.path} cannot be written: {error.strerror or error}; make room or mend the "
+                "folder."
+            ) from error
 
     def _report(self, text: str, checks: Sequence[Check], notes: Sequence[str]) -> None:
         """Write the report, and the record."""

@@ -16,8 +16,8 @@ Each record has a checksum, which is compared on each read, and numbers follow o
 gaps but those that the journal knows of: what is damaged or gone is told, and `salvage` reads the
 rest.
 
-A write that fails (a full disk) is the end of a journal's writer: it takes nothing more, so that no
-checkpoint can pass over what was lost. What was written before is there, and a new one goes on.
+After a write that fails (a full disk) a journal takes nothing more, so that no checkpoint can pass
+over what was lost. What was written before is there; `reopen`, or a new writer, goes on with it.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ from livepde.runs.database import (
     locked,
     reader,
     released,
+    remedy_of,
     sound,
     told,
     writer,
@@ -140,7 +141,7 @@ class Journal:
         self.path = path
         self._db = connection
         self._lock = lock
-        self._failure = ""
+        self._failure = self._remedy = ""
         meta = self._meta()
         with sound(path):
             self.channels = tuple(map(str, json.loads(meta["channels"])))
@@ -222,10 +223,40 @@ class Journal:
         try:
             return action(*arguments)
         except sqlite3.Error as error:
-            with suppress(sqlite3.Error):
-                self._db.rollback()
-            self._failure = told(self.path, error)
+            self._fail(error)
             raise RunError(self._failure) from error
+
+    def _fail(self, error: sqlite3.Error) -> None:
+        """Take nothing more: what was not committed is lost."""
+        with suppress(sqlite3.Error):
+            self._db.rollback()
+        self._failure = told(self.path, error)
+        self._remedy = "" if self.path is MEMORY else remedy_of(error)
+
+    @property
+    def remedy(self) -> str:
+        """After what `reopen` may go on; empty if nothing has failed, or nothing would help."""
+        return self._remedy if self._failure and self.in_place else ""
+
+    def reopen(self) -> None:
+        """Go on after a write that failed, with what was committed before.
+
+        Raises
+        ------
+        RunError
+            It still cannot be written, or what is there is damaged.
+        """
+        with suppress(sqlite3.Error):
+            self._db.close()
+        try:
+            self._db = writer(self.path)
+            self._db.execute("BEGIN IMMEDIATE")
+            self._db.rollback()
+        except sqlite3.Error as error:
+            self._fail(error)
+            raise RunError(self._failure) from error
+        self._failure = self._remedy = ""
+        self._stand()
 
     def _execute(self, command: str, *values: Any) -> sqlite3.Cursor:
         cursor: sqlite3.Cursor = self._write(self._db.execute, command, values)
@@ -235,6 +266,8 @@ class Journal:
         try:
             return self._db.execute(command, values).fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter of a damaged file
+            if self._lock is not None and isinstance(error, sqlite3.OperationalError):
+                self._fail(error)  # SQLite may have rolled back what was not committed
             raise RunError(told(self.path, error)) from error
 
     def _one(self, command: str, *values: Any) -> Any:

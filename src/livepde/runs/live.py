@@ -30,6 +30,7 @@ CHECKPOINT = 256  # samples between two checkpoints
 JUDGED = 50  # samples between two looks at the verdict, of which a change is an event
 LOOK = 0.5  # seconds between two looks at whether to stop
 LONGEST = 500  # characters of an event
+RECENT = 1000  # events that are written again when a journal has lost them
 TRIES = 2  # times that a sample in whose step the process has ended is tried again
 REFUSED = 20  # rows and values refused in a row, after which a run is not well
 UNUSED = frozenset({"malformed", "late", "leap", "outside", "skipped"})  # rows of no use
@@ -138,6 +139,9 @@ class Live:
     waits
         The feed may wait for samples: who reads the journal is shown the last estimate before.
         Else it is shown with the next sample, in one transaction.
+    patient
+        A journal that cannot be written (a full disk) is waited for, and the run is not well
+        meanwhile; else the journal's `RunError` ends the run.
     stopping
         Ends the run when it is set; it may be set already.
     clock
@@ -166,6 +170,7 @@ class Live:
         begun: Iterable[Ready] = (),
         irregular: Iterable[Remark] = (),
         waits: bool = True,
+        patient: bool = False,
         stopping: threading.Event | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -179,6 +184,7 @@ class Live:
         self.silence = silence
         self.strict = strict
         self.waits = waits
+        self.patient = patient
         self.silent = False
         self.stopping = stopping or threading.Event()
         self.busy = False  # a step is taken
@@ -187,7 +193,10 @@ class Live:
         self._refused = self._failed = 0  # in a row
         self._refusal = self._failure = ""
         self._unwell, self._told, self._doubt = "", (-1, "well"), ""
+        self._unwritten = ""  # why the journal cannot be written
+        self._put_last = -math.inf  # time of the last estimate that sinks were given
         self.ailments: list[Callable[[], str]] = [
+            lambda: self._unwritten,
             self._unlinked,
             self._silence,
             self._refusing,
@@ -197,6 +206,8 @@ class Live:
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._remarked = set(self._counts)
+        self._uncounted: deque[Remark] = deque()
+        self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
         told = [event for event in journal.events if event.kind == "verdict"]
         self._level = told[-1].message.partition(":")[0] if told else LEVELS[0]
@@ -210,12 +221,64 @@ class Live:
 
         A sample with which the process has ended again and again is set aside.
         """
-        again = self._again(self.journal.estimated)
+        try:
+            again = self._again(self.journal.estimated)
+        except RunError as error:
+            again = self._mend(error)
         if again and self.result.last is not None:
             self._put(self.result.last)
         return again
 
-    def _again(self, reached: int) -> int:
+    def _mend(self, error: RunError) -> int:
+        """Wait until the journal can be written again; return how many samples were taken again.
+
+        What it has lost is written again: estimates are computed from the last checkpoint on,
+        counts and events are still known. Raises the error where nothing helps, or nobody waits.
+        """
+        begun, again = self._clock(), None
+        while again is None:
+            if not (self.patient and self.journal.remedy):
+                raise error
+            why = f"the journal cannot be written ({error.__cause__}): {self.journal.remedy}"
+            if not self._unwritten:
+                about = {"kind": "disk", "channel": "", "t": self.identifier.t}
+                LOG.warning("disk: %s, and the run goes on", why, extra=about)
+            self._unwritten = self._unwell = why
+            self._told = 0, "unwell"
+            if self.stopping.wait(LOOK):
+                raise error
+            try:
+                self.journal.reopen()
+                self.journal.say_health(why)  # something is written before steps are taken again
+                again = self._again(math.inf)  # not marked: it was not the samples' fault
+                self.journal.commit()
+                self._restore()
+            except RunError as still:
+                error, again = still, None
+        self._unwritten = ""
+        self._heard = self._taken = now = self._clock()  # meanwhile nobody has listened
+        self._tell("disk", f"nothing could be written for {now - begun:.1f} s ({error.__cause__})")
+        return again
+
+    def _restore(self) -> None:
+        """Write again the events and counts that the journal has lost."""
+        for event in self._events:
+            self.journal.note(event)
+        written = Counter(self.journal.counts)
+        lost = self._counts - written
+        lost.pop(("aside", ""), None)  # counted when it was set aside again
+        self._counts = written + lost
+        for key, number in lost.items():
+            self.journal.count(*key, number)
+        self._count(())
+        while self._waiting and self._waiting[0].since is None:
+            if self._waiting[0].t > self.journal.last:
+                return  # the next sample is kept together with this
+            self.feed.acknowledge(self._waiting.popleft())  # kept although that was not said
+        if not self._waiting:
+            self.journal.commit(self.feed.position(()))
+
+    def _again(self, reached: float) -> int:
         """Go back to the last checkpoint and take again what came after it, `reached` at most."""
         state = self.journal.rewind()
         self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
@@ -274,6 +337,19 @@ class Live:
             self.journal.keep(self.result.snapshot(last or self.identifier.estimate()))
 
     def _run(self) -> None:
+        ended = False
+        while not ended:
+            try:
+                self._go_on()
+                ended = True
+            except RunError as error:
+                self._mend(error)
+                last = self.result.last
+                if last is not None and last.t > self._put_last:
+                    self._put(last)
+
+    def _go_on(self) -> None:
+        """Take samples until the source ends or `stopping` is set."""
         while not self.stopping.is_set():
             if self.waits and not self._waiting:
                 self._settle()  # who reads the journal sees all before it is waited for more
@@ -282,7 +358,7 @@ class Live:
                 self._listen(self.feed.heard())
             self._relieve()
             if self._waiting:
-                self._take(self._waiting.popleft())
+                self._take()
             elif self.feed.done:
                 break
             self._look()
@@ -305,24 +381,27 @@ class Live:
 
     def _count(self, remarks: Iterable[Remark]) -> None:
         """Count remarks; the first of each kind and channel is an event, with its words."""
-        for remark in remarks:
+        self._uncounted.extend(remarks)
+        while self._uncounted:
+            remark = self._uncounted.popleft()
             if remark.kind in UNUSED:
                 self._refused += remark.number
                 self._refusal = f"{remark.kind}: {remark.message}"
             self._counts[remark.kind, remark.channel] += remark.number
-            self.journal.count(remark.kind, remark.channel, remark.number)
             if remark.kind == "clock" or (remark.kind, remark.channel) not in self._remarked:
                 self._remarked.add((remark.kind, remark.channel))
                 self._tell(remark.kind, remark.message, remark.channel)
+            self.journal.count(remark.kind, remark.channel, remark.number)
 
     def _tell(self, kind: str, message: str, channel: str = "") -> None:
         if len(message) > LONGEST:  # it may repeat what has come
             message = message[:LONGEST] + "..."
         event = Event(self.identifier.t, kind, channel, message)
-        self.journal.note(event)
+        self._events.append(event)
         level = logging.INFO if kind in HARMLESS else logging.WARNING
         about = {"kind": kind, "channel": channel, "t": event.t}  # fields of a log in JSON
         LOG.log(level, "%s%s: %s", kind, f" ({channel})" if channel else "", message, extra=about)
+        self.journal.note(event)
 
     @property
     def health(self) -> dict[str, Any]:
@@ -402,12 +481,18 @@ class Live:
         elif kind == "unwell":  # of the end of a silence it has been said that it is heard
             self._tell("well", "all is well again")
 
-    def _take(self, ready: Ready) -> None:
-        if ready.since is not None:
-            self._go_back(ready.since)
-        position = self.feed.position(self._waiting)
-        self._count(self.feed.remarks(self._waiting))
-        taken = self.journal.accept(ready.t, ready.values, position)
+    def _take(self) -> None:
+        """Take the first of the samples that wait; it waits on if it cannot be kept."""
+        ready = self._waiting.popleft()
+        try:
+            if ready.since is not None:
+                self._go_back(ready.since)
+            position = self.feed.position(self._waiting)
+            self._count(self.feed.remarks(self._waiting))
+            taken = self.journal.accept(ready.t, ready.values, position)
+        except RunError:
+            self._waiting.appendleft(ready)
+            raise
         self.feed.acknowledge(ready)
         self._step(taken)
 
@@ -496,6 +581,7 @@ class Live:
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; one that fails is given up, the run goes on."""
+        self._put_last = estimate.t
         for sink in list(self.sinks):
             try:
                 sink.put(estimate)
