@@ -1,4 +1,4 @@
-"""A model as a linear system in its free coefficients, for one value of the unknown numbers."""
+"""Linear state-space form of a model in its free coefficients, for given unknown numbers."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ LATER = 12345.6789  # a time at which a model that reads the clock is another on
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """M u' = -K u + E c + f for the channels c.
+    """Linear system M u' = -K u + E c + f for the channels c.
 
     Attributes
     ----------
     K, E, f
-        Shapes (n, n), (n, channels) and (n,); rows of fixed coefficients mean nothing.
+        Shapes (n, n), (n, channels) and (n,); rows of fixed coefficients are undefined.
     """
 
     K: sp.csr_array
@@ -37,14 +37,14 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Linear systems of a model, about a state and inputs: exact where it is affine in both.
+    """Linearisation of a model at a state and inputs; exact if it is affine in both.
 
     Attributes
     ----------
     model
         The process.
     u, inputs
-        Where it is linearised: coefficients, shape (n,), and a value for each channel.
+        Linearisation point: coefficients, shape (n,), and a value for each channel.
     """
 
     model: Model
@@ -53,7 +53,7 @@ class Linearisation:
 
     @cached_property
     def moment(self) -> Moment:
-        """The inputs at time zero."""
+        """Time zero with the inputs of the linearisation point."""
         return self._moment(0.0, {})
 
     def _moment(self, t: float, change: Mapping[str, float]) -> Moment:
@@ -87,7 +87,7 @@ class Linearisation:
     def boundary(self) -> tuple[Array, Array]:
         """Return the lifting of boundary channels, (n, channels), and of known values, (n,).
 
-        Coefficients that are not fixed are zero.
+        They are zero at free coefficients.
         """
         model, zero = self.model, np.zeros(self.model.X.dim)
         off = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
@@ -99,7 +99,7 @@ class Linearisation:
         return np.column_stack(columns) if columns else np.zeros((len(zero), 0)), known
 
     def check(self, q: Array) -> None:
-        """Raise `ModelError` where no linear system with constant coefficients stands for it."""
+        """Raise `ModelError` if the model has no linear system with constant coefficients."""
         model, free = self.model, self.model.X.free
         steady = self.residual(self.u, q, self.moment)
         later = self.residual(self.u, q, self._moment(LATER, {}))
