@@ -1,4 +1,4 @@
-"""What a ready-made equation is, for programs, case files and `livepde init`."""
+"""Descriptions of predefined equations, for programs, case files and `livepde init`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Equation", "Fluxes", "Option", "Quantity", "Variable", "by_name", "c
 
 @dataclass(frozen=True)
 class Variable:
-    """An unknown, the state, or an input: its unit, what it is, and whether it may be left out."""
+    """Unknown, state, or input of an equation: unit, meaning, and if it is optional."""
 
     unit: str
     text: str
@@ -24,7 +24,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Option:
-    """A known number of an equation; `default` None means that it must be given.
+    """Known number of an equation; `default` None means that it is required.
 
     An option whose default is text or a boolean, or that has `choices`, takes such a value.
     """
@@ -36,7 +36,7 @@ class Option:
 
     @property
     def kind(self) -> type[float] | type[str] | type[bool]:
-        """What it takes."""
+        """Type of its value."""
         if isinstance(self.default, bool):
             return bool
         return str if self.choices or isinstance(self.default, str) else float
@@ -44,16 +44,17 @@ class Option:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something that is measured and is not simply the state at a point.
+    """Measured quantity other than the state at a point.
 
     Attributes
     ----------
     text
-        What it is.
+        Meaning of the quantity.
     at
-        (left end, right end) of the mesh -> where the state enters.
+        Function (left end, right end) of the mesh -> position at which the state is read.
     direct
-        Options -> the part (q, x) that depends on the parameter directly, linear in q.
+        Function of the options that returns the direct dependence on the parameter, (q, x), linear
+        in q.
     """
 
     text: str
@@ -62,13 +63,13 @@ class Quantity:
 
 
 class Fluxes(NamedTuple):
-    """Units of what a case may let pass through boundaries and gain inside.
+    """Units of boundary fluxes and sources in a case.
 
     Attributes
     ----------
     flux, transfer, source
-        Of D u_n, of the coefficient of an exchange h (ambient - u), and of what is gained for each
-        unit of volume and time.
+        Units of D u_n, of the coefficient h of an exchange h (ambient - u), and of a source per
+        volume and time.
     """
 
     flux: str
@@ -78,7 +79,7 @@ class Fluxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Equation:
-    """A PDE with a name, and what a case file may say about it.
+    """Named PDE, with the entries that a case file may contain.
 
     Attributes
     ----------
@@ -87,15 +88,15 @@ class Equation:
     state
         Unit and meaning of u.
     unknowns, inputs, options
-        By name.
+        Mappings from name to description.
     build
-        (mesh, unknowns, dirichlet, **options) -> `Model`.
+        Function (mesh, unknowns, dirichlet, **options) -> `Model`.
     quantities
         Measured quantities besides the state itself.
     element
-        mesh -> element of the state, and of an unknown field.
+        Function mesh -> element of the state, and of unknown fields.
     fluxes
-        Units of fluxes and sources (`livepde.models.with_conditions`); None: it takes none.
+        Units of fluxes and sources (`livepde.models.with_conditions`); None: not supported.
     """
 
     name: str
@@ -114,9 +115,9 @@ class Equation:
 
 
 def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
-    """Return the `build` of a function that takes unknowns, `dirichlet` and options by name.
+    """Return the `build` of a function with unknowns, `dirichlet` and options as keywords.
 
-    Without boundary values `dirichlet` is None: what the function takes by default.
+    Without boundary values `dirichlet` is None, the default of the function.
     """
 
     def build(
@@ -128,7 +129,7 @@ def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
 
 
 def closed(function: Callable[..., Model], why: str) -> Callable[..., Model]:
-    """Return the same for a function that takes no boundary values, and says why: `ModelError`."""
+    """Return `build` of a function without boundary values: giving some raises `ModelError`."""
 
     def build(
         mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
