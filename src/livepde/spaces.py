@@ -24,18 +24,30 @@ from livepde.linalg import (
 
 __all__ = ["BorderedSpace", "HilbertSpace", "product"]
 
+# Beyond this condition number of the scaled Gram matrix a space counts as singular: fewer than two
+# digits of a Riesz representative would be correct.
 LARGEST_CONDITION = 1e14
-LARGEST_EXPLICIT = 2000  # coefficients up to which a bordered Gram matrix is written out
-LARGE = 20_000  # coefficients from which modes and traces have a stated error
-SOLVED = 1000  # coefficients whose prior variance is computed; that of others lies in between
-FEWEST_SOLVED = 64  # of a large space
-BLOCK = 250  # right-hand sides solved at once,
-ENTRIES = 2_500_000  # and at most so many numbers of them
-ITERATED = 1e-12  # residual of the Riesz map of a large space, where iterations do:
-FEW = 50  # at most so many
-PROBES = 16  # random vectors of a trace
-ROUNDING = 1e-9  # share of a variance that is none
-PRECISE = 1e-8  # relative error of the modes of a large space
+# Number of coefficients up to which the Gram matrix of a bordered space is formed.
+LARGEST_EXPLICIT = 2000
+# Number of coefficients from which modes and traces are approximated, with a stated error.
+LARGE = 20_000
+# Number of coefficients with a computed prior variance; the others are interpolated.
+SOLVED = 1000
+# Smallest number of computed variances in a large space.
+FEWEST_SOLVED = 64
+# Number of right-hand sides solved at once, and largest number of their entries.
+BLOCK = 250
+ENTRIES = 2_500_000
+# Relative residual of the Riesz map of a large space by conjugate gradients, which are used if they
+# converge within the following number of iterations.
+ITERATED = 1e-12
+FEW = 50
+# Number of random vectors of Hutchinson's trace estimate.
+PROBES = 16
+# Share of a variance that is attributed to rounding.
+ROUNDING = 1e-9
+# Relative error of the modes of a large space.
+PRECISE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)

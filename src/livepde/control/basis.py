@@ -13,9 +13,12 @@ from livepde.linalg import Array, IntArray
 
 __all__ = ["basis"]
 
-SHIFT = 1e-9  # of the fastest rate: so that a process without a steady state has responses, too
-KEPT = 1e-4  # of the largest direction: smaller ones add nothing
-SYMMETRIC = 1e-10  # relative asymmetry that is rounding
+# Shift of static responses relative to the fastest rate, for processes without a steady state.
+SHIFT = 1e-9
+# Relative size below which a direction of the snapshots is dropped.
+KEPT = 1e-4
+# Relative asymmetry that is attributed to rounding.
+SYMMETRIC = 1e-10
 
 
 def basis(

@@ -19,8 +19,10 @@ from livepde.result import unknown_of
 
 __all__ = ["GalerkinReduction", "likely"]
 
-LIKELY = 0.95  # probability of the range of an unknown number over which responses are taken
-LINEAR = 1e-8  # relative error of a system that should be linear in the unknown numbers
+# Probability of the interval of an unknown number whose ends define the responses in the basis.
+LIKELY = 0.95
+# Relative nonlinearity in the unknown numbers that is attributed to rounding.
+LINEAR = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +145,7 @@ class GalerkinReduction:
         W, known = self.boundary
         y = observed.predict(self.u, self.q, moment)
         H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
+        # The lifted state is W c + known + V (x - V^T M (W c + known)), which is affine in x and c.
         C = H @ self.V
         D = H @ W - C @ (self.test @ W)
         d = y - H @ self.u + H @ known - C @ (self.test @ known)

@@ -18,8 +18,10 @@ from livepde.samples import labelled, number, readings
 
 __all__ = ["Kalman"]
 
-FLOOR = 1e-6  # process noise of each coordinate, relative to the largest
-SAME = 1e-6  # relative difference of two times that is rounding
+# Standard deviation of the isotropic process noise, relative to that of the channels.
+FLOOR = 1e-6
+# Relative difference of two sampling intervals that is attributed to rounding.
+SAME = 1e-6
 
 
 class Kalman:

@@ -16,8 +16,10 @@ from livepde.model import Model
 
 __all__ = ["Linear", "Linearisation"]
 
-SAME = 1e-9  # relative difference that is rounding
-LATER = 12345.6789  # a time at which a model that reads the clock is another one
+# Relative difference that is attributed to rounding.
+SAME = 1e-9
+# Arbitrary time at which a model is evaluated to detect an explicit dependence on time.
+LATER = 12345.6789
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,8 @@ from livepde.linalg import Array
 
 __all__ = ["LQ"]
 
-TINY = 1e-10  # weight of what costs nothing, relative to the largest: the equation has a root
+# Weight of states that no tracked output sees, relative to the trace of the weight matrix.
+TINY = 1e-10
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,10 @@ from livepde.linalg import Array
 __all__ = ["MPC", "packages", "quiet"]
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
-FARTHEST = 0.9  # of the way from the estimate to a bound that a scenario goes
-FAR = 1e12  # stands for a limit that is infinite for a while
+# Largest distance of a scenario from the estimate, as a share of the distance to the bound.
+FARTHEST = 0.9
+# Finite substitute of a limit that is temporarily infinite: Ipopt needs finite parameters.
+FAR = 1e12
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
@@ -166,6 +168,7 @@ class MPC:
         mpc, model = self.problem, known.model or self.model
         found = known.scenarios(self.kappa, (self.scenarios - 1) // 2)
         found = np.array([model.shifted(known.q, one - known.q) for one in found])
+        # The optimisation problem has a fixed number of scenarios; unused ones repeat the estimate.
         q = np.vstack([found, np.tile(known.q, (self.scenarios - len(found), 1))])
         # A scenario on a bound can make the model degenerate (zero diffusivity), so scenarios stop
         # short of the bounds.

@@ -22,7 +22,8 @@ from livepde.stepping import Advance, Alexander2, simulate
 
 __all__ = ["ReducedModel", "reduce"]
 
-FINER = 8  # steps of the full model between two samples, where it is compared
+# Substeps of the full model per sample in `error`, so that its own time error is small.
+FINER = 8
 
 
 @dataclass(frozen=True, eq=False)

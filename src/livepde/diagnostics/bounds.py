@@ -29,7 +29,8 @@ from livepde.streams import Twin
 __all__ = ["Errors", "TwinTracker", "bounds", "conditions"]
 
 Data = Literal["exact", "noisy", "smoothed"]
-ROUNDING = 1e-9  # of an inequality between norms, relative
+# Relative violation of an inequality between norms that is attributed to rounding.
+ROUNDING = 1e-9
 # For each section the paper's labels of the bound on mu, of a stronger one, and of the bound on nu.
 CONDITIONS: dict[Data, tuple[str, str, str]] = {
     "exact": ("cond:mu_1", "cond:mu02", "cond:nu"),

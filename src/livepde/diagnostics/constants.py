@@ -25,8 +25,10 @@ __all__ = ["Part", "Spaces", "constants"]
 
 Pair: TypeAlias = tuple[sp.csr_array, sp.csr_array]
 
-LARGEST_DENSE_BASIS = 2000  # unknowns, where R is not a selection
-LARGEST_TRACE = 2e7  # m n^2 up to which the bound of A(v) is computed over all of Q
+# Largest number of unknowns for a dense basis, needed if R is not a selection.
+LARGEST_DENSE_BASIS = 2000
+# Largest m n^2 up to which the bound of A(v) is computed over all of Q.
+LARGEST_TRACE = 2e7
 NONLINEAR = (
     "The constants are those of C(q, u) = A(u) q + B(u) (ass:equation). This model is not linear "
     "in what is estimated (a transform, or a form nonlinear in q): the paper's theory is silent."

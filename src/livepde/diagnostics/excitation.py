@@ -18,8 +18,10 @@ from livepde.spaces import HilbertSpace
 
 __all__ = ["Excitation", "ExcitationState", "Spectrum"]
 
-ENTRIES = 5_000_000  # numbers of a block of states
-DENSE = 1000  # parameters up to which the sum over windows is kept as a matrix
+# Number of entries of a block of states, which bounds the size of temporary arrays.
+ENTRIES = 5_000_000
+# Number of parameters up to which the Gramian is stored as a matrix.
+DENSE = 1000
 
 
 @dataclass(frozen=True, eq=False)

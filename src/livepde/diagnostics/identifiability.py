@@ -19,10 +19,14 @@ from livepde.model import Model
 
 __all__ = ["FLAT", "Direction", "Identifiability", "Known", "identifiability"]
 
-PINNED = 0.1  # of the prior deviation left, at most
-FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly anything
-TRADED = 0.9  # correlation from which two unknowns are one
-WEIGHT = 0.3  # least weight in a combination of length one that is named
+# Largest remaining share of the prior standard deviation of a well-determined unknown.
+PINNED = 0.1
+# Smallest remaining share of an unknown about which the data carry no information.
+FLAT = 0.9
+# Correlation from which only a combination of two unknowns is determined.
+TRADED = 0.9
+# Smallest coefficient in a unit vector with which an unknown is listed in a combination.
+WEIGHT = 0.3
 
 
 @dataclass(frozen=True)

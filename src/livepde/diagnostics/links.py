@@ -13,7 +13,8 @@ from livepde.linalg import Array
 
 __all__ = ["Interpolation", "Link", "interpolation", "link"]
 
-STEADY = 1.5  # growth of the constant from the first to the second half that still counts as none
+# Growth of the constant from the first to the second half of a run that counts as none.
+STEADY = 1.5
 
 
 @dataclass(frozen=True)

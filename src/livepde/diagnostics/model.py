@@ -19,12 +19,19 @@ from livepde.spaces import HilbertSpace
 
 __all__ = ["check_model"]
 
-ROUNDING = 1e-12  # of identities between sums of products
-LINEARITY = 1e-10  # of the integrand, which may hold functions such as exp
-STEPS = 0.5 ** np.arange(2, 22)  # of the Taylor tests
-FLOOR = 1e-11  # remainders below this share of the function are rounding
-LARGEST_INVERSE = 1e12  # of the equations of algebraic components, scaled to rows of size 1
-SLOWEST = 1.8  # rate of a remainder of second order
+# Relative error of identities between sums of products.
+ROUNDING = 1e-12
+# Relative nonlinearity of an integrand; functions such as exp have larger rounding errors.
+LINEARITY = 1e-10
+# Step sizes of the Taylor tests.
+STEPS = 0.5 ** np.arange(2, 22)
+# Remainders below this share of the function value are rounding errors.
+FLOOR = 1e-11
+# Largest norm of the inverse for algebraic components, with rows scaled to size 1: beyond, their
+# equations do not determine them.
+LARGEST_INVERSE = 1e12
+# Smallest accepted rate of a Taylor remainder, whose theoretical rate is 2.
+SLOWEST = 1.8
 
 
 def check_model(

@@ -18,9 +18,12 @@ from livepde.observation import Observation, Observed, Split
 __all__ = ["check_observation"]
 
 ROUNDING = 1e-12
-STEP = 1e-5  # of central differences, relative
+# Relative step of central differences: the cube root of the rounding unit balances truncation and
+# rounding errors.
+STEP = 1e-5
 TAYLOR = 1e-6
-INVERSE = 1e-9  # G^+ of sensors that nearly repeat each other amplifies rounding
+# Tolerance for identities with G^+, which amplifies rounding for nearly redundant sensors.
+INVERSE = 1e-9
 
 
 def check_observation(

@@ -21,7 +21,8 @@ __all__ = ["Border", "Images", "Part", "largest"]
 Map: TypeAlias = Callable[[Array], Array]
 Images: TypeAlias = Sequence[tuple[HilbertSpace, sp.csr_array]]  # regions of X, operators there
 
-DENSE = 400  # eigenproblems up to this size are solved densely, larger ones by Lanczos
+# Size up to which eigenproblems are solved densely; larger ones by Lanczos.
+DENSE = 400
 
 
 def _columns(apply: Map) -> Map:

@@ -23,9 +23,13 @@ __all__ = [
     "stopping_time",
 ]
 
-MOST_SENSORS = 2000  # whose errors are added up one by one
-PROBES = 32  # random vectors in their place
-MOST_COLUMNS = 10_000  # sensors up to which G_alpha is written out
+# Number of sensors up to which the error norms are computed exactly, sensor by sensor.
+MOST_SENSORS = 2000
+# Number of random vectors beyond that: the relative standard error is at most sqrt(2/(4 PROBES)) =
+# 1/8.
+PROBES = 32
+# Number of sensors up to which the matrix of G_alpha is formed.
+MOST_COLUMNS = 10_000
 
 
 def stopping_time(errors: Sequence[Errors], c: Constants) -> float:

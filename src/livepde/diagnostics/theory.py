@@ -61,10 +61,13 @@ LINKED = (
     "(asspof) and the link conditions (cond:link). Those fail for every data error that does not "
     "vanish."
 )
-SNAPSHOTS = 6  # states at which C_A is taken
-SHOWN = 8  # modes
+# Number of states at which C_A is computed.
+SNAPSHOTS = 6
+# Number of modes in the table.
+SHOWN = 8
 NORMS = ("X", "VX", "V")
-MATRICES = 16  # of G_alpha kept, for different alpha
+# Number of cached matrices of G_alpha, one for each alpha.
+MATRICES = 16
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ from livepde.samples import Sample
 
 __all__ = ["Component"]
 
-SAME = 1e-9  # of a period: a difference of times that is rounding
+# Difference of times that is attributed to rounding, relative to the period.
+SAME = 1e-9
 
 
 class Component:
@@ -64,6 +65,8 @@ class Component:
                 self._identifier = self._begun(np.array([t, *z.values()]))
             estimate = self._identifier.step(t, z)
             if self.period > 0.0:
+                # Sample times are multiples of the period, with a tolerance: rounding of
+                # communication times must neither skip nor repeat a sample.
                 self._next = self.period * (math.floor(seconds / self.period + SAME) + 1.0 - SAME)
         except LivepdeError as error:
             if math.isnan(self.outputs[0]):  # the first one: the next may begin

@@ -36,10 +36,13 @@ __all__ = [
     "of_code",
 ]
 
-PERIOD = "sample_period"  # the parameter of a unit
+# Name of the parameter of a unit.
+PERIOD = "sample_period"
 REFUSED, WAITING = -2, -1  # beside the indices of `STATUS_CODES`
-LARGEST = 1000  # vertices of a field that become outputs, one for each
-STEPS = {"degC": "K", "degF": "degR"}  # units of differences on scales with a zero of their own
+# Largest number of vertices of a field that become outputs, one for each vertex.
+LARGEST = 1000
+# Units of differences on temperature scales with an offset.
+STEPS = {"degC": "K", "degF": "degR"}
 STATUS = "How the last step went: {}, {} waits for a first sample, {} sample refused.".format(
     ", ".join(f"{k} {code}" for k, code in enumerate(STATUS_CODES)), WAITING, REFUSED
 )

@@ -21,7 +21,8 @@ from livepde.exchange.recipe import opened
 
 __all__ = ["FOLDER", "IdentifierSlave"]
 
-FOLDER = "process"  # of the resources
+# Name of the folder within the resources of the unit.
+FOLDER = "process"
 
 if not sys.orig_argv:
     # In a host program other than Python the exporters finalise the interpreter from a thread of

@@ -17,7 +17,8 @@ from livepde.linalg import IntArray
 
 __all__ = ["tied"]
 
-SLACK = 1e-6  # of the size of the mesh: how far apart two coefficients may be to count as one
+# Distance of two coefficients that count as the same place, relative to the size of the mesh.
+SLACK = 1e-6
 
 
 def tied(field: Field, block: Any) -> IntArray | None:

@@ -16,7 +16,8 @@ from livepde.linalg.types import Array, IntArray
 
 __all__ = ["BandedSolver"]
 
-FEW = 300  # entries of a triangle up to which copying it takes longer than it saves
+# Number of entries of a triangle up to which copying it costs more than the faster solve saves.
+FEW = 300
 
 
 @dataclass(frozen=True, eq=False)

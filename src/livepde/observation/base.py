@@ -26,11 +26,16 @@ from livepde.spaces import HilbertSpace
 __all__ = ["Observation", "Observed", "numbers"]
 
 Direct = Callable[[Any, Place], Any]
-STEP = 1e-30  # of the complex step
-DEPENDENT = 1e-12  # eigenvalues of G G* below this share of the largest count as zero
-ROUNDING = 1e-14  # entries of G below this share of the largest of their row count as zero
-LARGEST_PROJECTION = 100_000_000  # entries of R
-LARGEST_MEMO = 64  # splits kept for different patterns of missing samples
+# Complex step: exact to rounding, as in `livepde.fem.forms`.
+STEP = 1e-30
+# Eigenvalues of G G* below this share of the largest count as zero: redundant sensors.
+DEPENDENT = 1e-12
+# Entries of G below this share of the largest in their row are rounding errors of shape functions.
+ROUNDING = 1e-14
+# Largest number of entries of R, which is dense on the support of the sensors (800 MB).
+LARGEST_PROJECTION = 100_000_000
+# Number of cached splits, one for each pattern of missing sensors.
+LARGEST_MEMO = 64
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

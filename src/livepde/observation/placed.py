@@ -16,9 +16,12 @@ from livepde.spaces import HilbertSpace
 
 __all__ = ["POSITION", "PlacedObserved", "shift_names"]
 
-POSITION = "position"  # name of the unknown: one number for each sensor and coordinate
+# Name of the unknown: one number for each sensor and coordinate.
+POSITION = "position"
 AXES = "xyz"
-NEAR = 1e-6  # deviations from the end of the mesh within which a sensor lies on it
+# Distance from the end of the mesh, in standard deviations of the position, within which a sensor
+# lies on the end.
+NEAR = 1e-6
 
 
 def shift_names(sensor: str, dimension: int) -> list[str]:

@@ -42,8 +42,10 @@ __all__ = [
 ]
 
 SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
-ROOT = 1e-10  # relative accuracy of that alpha
-MOST_SENSORS = 10_000  # of a dense decomposition
+# Relative accuracy of alpha in the discrepancy principle.
+ROOT = 1e-10
+# Largest number of sensors for a dense eigendecomposition.
+MOST_SENSORS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,6 +354,7 @@ class Spectral(Reconstructor):
         cost = (cost + cost.T) / 2
         self.rho = float(np.trace(fit) / (np.trace(cost) or 1.0))
         s, phi = sl.eigh(fit, fit + self.rho * cost)
+        # s is a divisor below, and rounding may make it zero or negative.
         self.s = np.clip(s, np.finfo(float).tiny, 1.0)
         # In the null space of |.| k must be exactly zero, since alpha k would amplify rounding
         # errors for large alpha.
@@ -369,6 +372,8 @@ class Spectral(Reconstructor):
         beta = self.fitted @ known
         shift = boundary @ self.pulled
         scaled = self.root @ known
+        # The part of the data outside of the range of G, where redundant sensors disagree, cannot
+        # be fitted by any alpha.
         outside = scaled - self.image @ (self.image.T @ scaled)
         rest = float(outside @ outside)
 

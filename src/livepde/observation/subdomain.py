@@ -15,7 +15,9 @@ from livepde.observation.base import Observation
 
 __all__ = ["Full", "Subdomain"]
 
-INTERIOR = 3  # quadrature order of the points at which omega is asked: all inside of the element
+# Quadrature order of the points at which the predicate is evaluated. All are inside of the element,
+# so that its boundary nodes do not decide.
+INTERIOR = 3
 
 
 @dataclass(frozen=True, eq=False)

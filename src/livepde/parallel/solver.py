@@ -21,7 +21,8 @@ from livepde.parallel.team import Handle, Team
 
 __all__ = ["PetscFactor", "PetscSolver", "direct", "krylov", "owned"]
 
-TOLERANCE = 1e-10  # residual relative to the right-hand side
+# Residual relative to the right-hand side.
+TOLERANCE = 1e-10
 ITERATIONS = 200
 DIRECT = ("mumps", "superlu_dist")
 REMEDY = (

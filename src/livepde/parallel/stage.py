@@ -28,9 +28,13 @@ from livepde.parallel.team import Team
 
 __all__ = ["SharedEquation", "SharedJacobian", "SharedStage"]
 
-TOLERANCE = 1e-2  # of the residual, in the norm of Newton's: it goes on from there
-ITERATIONS = 60  # each keeps a vector
-MORE = 2  # times as many iterations as with new multigrid hierarchies: then they are made again
+# Residual of GMRES in the norm of Newton's residual. Newton's method corrects the rest (inexact
+# Newton method).
+TOLERANCE = 1e-2
+# Maximum number of iterations, each of which stores a vector.
+ITERATIONS = 60
+# Hierarchies are rebuilt when GMRES needs this multiple of the iterations with new ones.
+MORE = 2
 REMEDY = "take a smaller gain or a smaller time step."
 
 

@@ -25,8 +25,10 @@ __all__ = [
 ]
 
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
-MOST_LINES = 7  # in one panel; more sensors are drawn as one line with their range
-CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))  # span from which, factor, unit
+# Largest number of lines in a panel; more sensors are drawn as one line with their range.
+MOST_LINES = 7
+# Time span from which a unit of the time axis is used, its length in seconds, its name.
+CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
 
 
 def scalars(data: xr.Dataset) -> list[str]:

@@ -27,8 +27,10 @@ __all__ = [
 # is omitted, because it is invisible on white.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#7f7f7f"
-MOST_POINTS = 20_000  # for which a free place for the legend is looked for
-PANEL = (5.4, 3.4)  # inches
+# Number of points up to which Matplotlib searches a free place for the legend.
+MOST_POINTS = 20_000
+# Width and height of a panel in inches.
+PANEL = (5.4, 3.4)
 
 
 def figure_class() -> type[Figure]:

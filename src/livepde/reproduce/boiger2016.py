@@ -44,9 +44,11 @@ __all__ = ["BOIGER2016", "Ensemble", "NoisyTwin"]
 LEVELS = (0.01, 0.05, 0.10)
 SEEDS = (0, 1, 2, 3, 4)
 END = 75.0
-BAND = 4  # modes of the band-limited noise
+# Number of modes of the band-limited noise.
+BAND = 4
 SHOWN = (0.0, 6.0, 15.0, 30.0, 45.0, 75.0)
-NUS = (0.0, 0.01, 0.1)  # of the first figure; the paper varies nu between 0.1 and 1000
+# Values of nu in the first figure; the paper varies nu between 0.1 and 1000.
+NUS = (0.0, 0.01, 0.1)
 FIRST = paper.law(100.0, ResidualDamping(1.0))
 NOISY = paper.law(100.0, ConstantDamping(mu=1.0))
 STIFF = paper.law(100.0, ConstantDamping(mu=10.0))

@@ -43,7 +43,8 @@ __all__ = ["DEGENERATE"]
 
 CELLS = 20
 OMEGA = 0.3
-FAILED = 1e3  # size of p at which a run is stopped: u* is of size 1
+# Size of p at which a run is stopped; u* is of size 1.
+FAILED = 1e3
 
 
 def omega(x: Any) -> Any:

@@ -287,9 +287,9 @@ SEED_EXCITED_NOISE = Experiment(
 # gain and c1 are those of the design (fact 4), measured on this twin; window, degree and tau come
 # from about ten combinations (windows of 0.5 to 2, degrees 1 to 3, tau 0.9 to 1.1), each over a
 # grid of gain and c1, on this twin with seeds 0 and 1, their errors in view: over 200 runs. The
-# seeds below took no part in that. On them, at 1 %: tau = 1.1 gives 0.077 instead of 0.054; q* = 5
-# - 3x with these settings 0.050 (raw 0.173), and q* = 3 + 2 sin(3 pi x) 0.143 (raw 0.154), so they
-# are no recipe for every q*.
+# seeds below took no part in that. On them, at 1 %: tau = 1.1 gives 0.077 instead of 0.054;
+# q* = 5 - 3x with these settings 0.050 (raw 0.173), and q* = 3 + 2 sin(3 pi x) 0.143 (raw 0.154),
+# so they are no recipe for every q*.
 GAIN = 1000.0  # as with exact data
 C1 = 100.0
 WINDOW = 1.0  # a sixth of the shortest period of the known source f
@@ -301,7 +301,8 @@ CASES: tuple[tuple[float, Kind], ...] = (*WHITE, (0.01, "nodal"))
 GRID = (1.0, 10.0, 100.0, 1e3, 1e4)
 
 # Expected results.
-REACHED = 0.10  # the information limit without a prior is about 0.09 (design, fact 5)
+# Accepted error of q. The information limit without a prior is about 0.09 (fact 5 of the design).
+REACHED = 0.10
 WORSE = 2.0
 NOTES = [
     "Noise: Gaussian and white in L2, independent from sample to sample, of a size relative to the "

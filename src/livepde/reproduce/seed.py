@@ -295,7 +295,8 @@ WITH_SLOPES = {
     (1e4, 1.0): 0.0643,
 }
 TOLERANCE = 0.02
-AUTO = 0.06  # without a hand-set gain
+# Bound on the error of the self-tuning law, without a hand-set gain.
+AUTO = 0.06
 LIKE_PAPER = (100.0, 1.0)
 BEST = (1e4, 1.0)
 SETTLED = ((1e4, 0.1), (1e4, 1.0))

@@ -33,7 +33,8 @@ D = 1.0
 N = 31
 TIMES = 0.05 * np.arange(1201)
 SHOWN = (0.0, 0.5, 2.0, 10.0, 60.0)
-NOISE_LEVEL = 1e-3  # told to the sensitivity law; the data are exact
+# Noise level passed to the sensitivity law, although the data are exact.
+NOISE_LEVEL = 1e-3
 
 
 def q_true(x: Any) -> Any:
