@@ -87,6 +87,8 @@ class Learned:
         self.estimate = estimate = identifier.step(t, z, inputs)  # a bad sample changes nothing
         if isinstance(z, Mapping):  # with what is withheld, perhaps
             z = {name: z[name] for name in model.sensors.names if name in z}
+        # The nominal filter runs at every sample, trusted or not, so that a fallback starts from a
+        # converged state.
         nominal = self.nominal.step(t, z, inputs)
         doubt = self.trust.doubt(estimate, model)
         self._good = 0 if doubt else min(self._good + 1, self.trust.patience)

@@ -79,6 +79,8 @@ class Linearisation:
         """Return the system for physical coefficients q, shape (m,)."""
         K, known = self.slope(q, self.moment), self.residual(self.u, q, self.moment)
         columns = [
+            # The model is affine in its channels (see `check`): one difference gives the exact
+            # column.
             known - self.residual(self.u, q, self._moment(0.0, {name: 1.0}))
             for name in self.model.channels
         ]
@@ -103,6 +105,7 @@ class Linearisation:
     def check(self, q: Array) -> None:
         """Raise `ModelError` if the model has no linear system with constant coefficients."""
         model, free = self.model, self.model.X.free
+        # An explicit dependence on time is detected by evaluation at an arbitrary other time.
         steady = self.residual(self.u, q, self.moment)
         later = self.residual(self.u, q, self._moment(LATER, {}))
         moved = model.impose(self.u, self._moment(LATER, {})) - model.impose(self.u, self.moment)
@@ -111,6 +114,8 @@ class Linearisation:
                 "reduce: the model reads the time. Make what changes with time an input channel, "
                 "so that a controller can be given its forecast."
             )
+        # A random change of all channels at once detects products of channels with the state, and
+        # of channels with each other.
         rng = np.random.default_rng(0)
         change = dict(zip(model.channels, rng.standard_normal(len(model.channels)), strict=True))
         there = self._moment(0.0, change)

@@ -133,6 +133,8 @@ class ReducedModel:
         """
         K, E, f = self.system(q)
         r, columns = self.size, np.column_stack([E, f])
+        # Van Loan's method: one exponential of the augmented matrix gives A, B and f together, also
+        # for singular K.
         whole = np.zeros((r + columns.shape[1], r + columns.shape[1]))
         whole[:r, :r], whole[:r, r:] = -h * K, h * columns
         moved = np.asarray(expm(whole))[:r]
@@ -196,6 +198,8 @@ class ReducedModel:
         """
         frame, c = self.frame, self.values(inputs)
         observed = frame.sensors
+        # Linear sensors have a constant output equation; all others need the lifted state of the
+        # full model.
         if type(observed) is Observed and observed.linear:
             return self.sensors(x, c), self.sensors.C
         full, moment = frame.q.copy(), Moment(0.0, Inputs(inputs))
@@ -263,6 +267,8 @@ class ReducedModel:
         model, times = frame.model, (h * np.arange(samples + 1)).tolist()
         for control in self.controls:
             inputs = dict(frame.inputs) | {control: frame.inputs[control] + 1.0}
+            # The boundary values of the initial state must be those after the step of the control,
+            # since the reduced coordinates include them.
             u0 = model.impose(frame.u, Moment(0.0, Inputs(inputs)))
             states = simulate(
                 model,

@@ -175,6 +175,7 @@ class TwinTracker:
             u_alpha = spaces.observed.reconstruct(z, boundary=boundary).u
         error = estimate.u - exact
         # Estimate and truth have the same Dirichlet values, so the error lies in the tangent space.
+        # The data error d is defined for the free coefficients, hence without the boundary values.
         d = u_alpha - split.R @ (exact - boundary)
         residual = split.R @ error - d
         seen, hidden = spaces.observed_part, spaces.hidden_part

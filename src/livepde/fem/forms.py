@@ -371,6 +371,8 @@ class Form(FormMatrices):
             if not others:
                 return self._constant(rows, cols)
             if len(others) == 1:
+                # A constant trilinear form needs no quadrature in a step: its matrix is linear in
+                # the third coefficients.
                 tensor = self._tensor(rows, cols, others[0])
                 if tensor is not None:
                     product: Array = tensor @ coefficients[others[0]]

@@ -327,6 +327,8 @@ class Observed:
         tangent = sp.csr_array(G @ sp.diags_array(self.X.free))
         tangent.eliminate_zeros()
         if self.observation.nodal and is_selection(tangent):
+            # Sensors that read single coefficients need no linear algebra: R is diagonal with zeros
+            # and ones, and G^+ is G^T.
             inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
             omega = self._observed_elements(tangent.indices)
@@ -341,6 +343,7 @@ class Observed:
             rows = tangent.toarray()
             representers = rows.T if self.observation.nodal else self.X.riesz(rows.T)
             values, vectors = np.linalg.eigh(rows @ representers)
+            # Redundant sensors give zero eigenvalues of G G*, which the pseudoinverse omits.
             kept = values > DEPENDENT * max(values.max(initial=0.0), 1e-300)
             C = vectors[:, kept] / np.sqrt(values[kept])
             # V W is idempotent to rounding only if W V = I to rounding. C alone does not ensure

@@ -102,6 +102,7 @@ class SharedModel:
 
 def _lowest(dofs: IntArray, owner: IntArray, size: int, ranks: int) -> IntArray:
     """Return the lowest rank with each coefficient on its cells."""
+    # Written from the highest rank to the lowest, so that the lowest remains.
     found = np.full(size, ranks - 1)
     for rank in range(ranks - 1, -1, -1):
         found[dofs[:, owner == rank]] = rank
@@ -116,6 +117,8 @@ def _cell_owners(team: Team, mesh: Any) -> IntArray:
     if team.size == 1:
         return owner
     corners = mesh.t[: mesh.elem.refdom.nnodes].T
+    # Only rank 0 passes cells to PETSc: every rank has the whole mesh, and the cells would be
+    # counted several times.
     cells = corners if team.rank == 0 else corners[:0]
     points = mesh.p.T if team.rank == 0 else mesh.p.T[:0]
     plex = PETSc.DMPlex().createFromCellList(

@@ -234,7 +234,7 @@ class SharedEquation:
         Parameters
         ----------
         values
-            Of each rank: u and q where it reaches; on rank 0.
+            For each rank u and q in its reach; on rank 0 only.
         """
         stage = self.stage
         got = np.empty(len(stage.u.reach) + len(stage.q.reach))
@@ -274,7 +274,7 @@ class SharedJacobian:
     scales
         Dual norms by which the residuals of the two equations are scaled.
     values
-        Of each rank: u and q where it reaches; on rank 0.
+        For each rank u and q in its reach; on rank 0 only.
     border
         For each rank its rows of b and a, for the rank-one term b a^T of S; on rank 0 only.
     """
