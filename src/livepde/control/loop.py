@@ -186,6 +186,8 @@ class Loop:
         channels = dict(zip(model.controls, applied.tolist(), strict=True))
         channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
         plan = self._plan(reference or {}, forecast or {}, now, limits or {})
+        # All arguments are validated before the estimator is stepped, so that an invalid sample
+        # changes nothing.
         known = self.estimator.step(t, z, channels)
         self._before, self._disturbances = applied, now  # should the controller raise
         decision = self._possible(controller.decide(known, plan, applied, self._memory), applied)

@@ -167,6 +167,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
         for label, row in zip(labels, numbers, strict=True)
     ]
     pairs = _pairs(labels, numbers)
+    # Coordinates of the posterior in the prior modes, where the prior covariance is the identity.
     reduced = prior.T @ model.Q.dual(posterior)
     for name in space.fields:
         item = latent.parts[name]
@@ -203,6 +204,7 @@ def _pairs(labels: list[str], factor: Array) -> list[tuple[str, str, float]]:
 
 def _explained(row: Array, block: Array) -> float:
     """Return the multiple correlation of a number with the modes of a field."""
+    # The best linear prediction of the number by the field is a projection of its row.
     fit = np.linalg.lstsq(block.T, row, rcond=1e-10)[0]
     return float(np.linalg.norm(fit @ block) / np.linalg.norm(row))
 

@@ -93,6 +93,7 @@ def link(
     a = _slope(x, theta) if exponent is None else exponent
     if not a >= 1:
         raise ConfigurationError(f"link: the exponent must be at least 1; got {a}.")
+    # Close to 1 the integral norm tends to the maximum norm, which is used instead.
     if a - 1 < 1e-2:
         values, at = x / theta, t
     else:

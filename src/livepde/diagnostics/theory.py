@@ -196,6 +196,8 @@ class OnlineTracker:
         if (len(self.moments) - 1) % self._every == 0:
             self.states.append(estimate.u)
             if len(self.states) > 2 * SNAPSHOTS:
+                # The length of the run is unknown: snapshots are thinned and their spacing doubled
+                # whenever there are too many, so that they always cover the whole run.
                 self.states = self.states[::2]
                 self._every *= 2
 
@@ -214,6 +216,8 @@ class OnlineTracker:
         observed, part = self.identifier.observed, self.spaces.observed_part
         given = self.noise(z) if callable(self.noise) else self.noise
         std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
+        # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
+        # every sample, and each matrix is dense.
         key = round(float(np.log2(alpha))) if alpha > 0 else 0
         if key not in self._matrices:
             if len(self._matrices) >= MATRICES:

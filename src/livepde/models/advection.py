@@ -98,6 +98,7 @@ def advection_diffusion(
         w = velocity(q, x)
         spread = q.kappa
         if dispersivity is not None:
+            # `absolute` instead of abs: complex steps must differentiate the term by w.
             spread = spread + q.dispersivity * absolute(w)
         moved = spread * dot(grad(u), grad(test)) + w * grad(u)[0] * test
         if stabilise:  # along the flow only

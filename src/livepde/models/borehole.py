@@ -104,6 +104,7 @@ def grouted_borehole(
         return around / (2 * pi * (1 - q.share) * q.R_b) * x[0] * dot(grad(u), grad(v))
 
     def ground(q: Any, u: Any, v: Any, x: Place) -> Any:
+        # The weak form in the coordinate x of constant heat content, see above.
         more, radial = q.rho_c / rho_0, _outwards(u, v)
         square = r_b**2 + (x[0] ** 2 - r_b**2) / more
         along = dot(grad(u), grad(v)) - radial
@@ -140,6 +141,8 @@ def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
     points = mesh.p.copy()
     radii = points[0]
     first, last = float(radii.min()), float(radii.max())
+    # The nearest nodes are moved onto the radii, so that layers end at nodes: a coefficient that
+    # jumps inside of a cell would cost an order of convergence.
     inner, wall = (float(radii[np.abs(radii - r).argmin()]) for r in (r_p, r_b))
     if not first < r_p < r_b < last or not first < inner < wall < last:
         raise ModelError(

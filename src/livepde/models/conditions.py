@@ -150,6 +150,8 @@ class _Terms:
         """Add an exchange as two terms, so that the term in u reads no input."""
         h, ambient = self._amount(condition.coefficient), self._amount(condition.ambient)
         given = condition.coefficient, condition.ambient
+        # A term in u that reads an input would make the matrix of a stage depend on time, and
+        # prevent the reuse of its factor.
         self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, given[0])
         self._add(boundary, lambda q, u, v, x: -h(q, x) * ambient(q, x) * v, *given)
 

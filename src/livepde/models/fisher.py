@@ -94,6 +94,7 @@ def porous_fisher(
     return Model(
         _state(mesh, dirichlet, element, unit),
         {"D": D, "r": r},
+        # `positive` keeps the equation parabolic where discretisation errors make u negative.
         A=lambda q, u, v, x: (
             q.D * positive(u / K) ** m * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v
         ),

@@ -117,6 +117,7 @@ def groundwater(
     ('Q',)
     """
     sources = {name: _place(mesh, name, at, radius) for name, at in (wells or {}).items()}
+    # The term grad(1/S) would be a delta function at the jumps of S.
     if not hasattr(S, "mesh") and hasattr(S, "regions"):
         raise ModelError("groundwater: S by region is not possible; take a number or a Field.")
     varies = isinstance(S, Field)

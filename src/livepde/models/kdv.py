@@ -30,6 +30,8 @@ def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = N
     u = state(mesh, smooth(mesh), None)
     c = Coefficients({"advection": advection, "dispersion": dispersion})
     begun, initial = beginning(u0, u)
+    # Integration by parts is applied once to the third derivative, so that second derivatives of u
+    # remain: hence C^1 elements.
     return Model(
         u,
         {**c.unknown, **begun},

@@ -77,6 +77,7 @@ def wave(
     def stiffness(q: Any, u: Any, v: Any, x: Any) -> Any:
         return q.c2 * dot(grad(u.w), grad(v.p))
 
+    # First-order form: implicit one-step schemes and the laws need a single time derivative.
     return Model(
         {
             "w": Field(mesh, element, dirichlet=held, unit="m"),

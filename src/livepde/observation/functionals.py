@@ -77,6 +77,8 @@ class FunctionalsObserved(Observed):
         parameter: FunctionSpace,
     ) -> None:
         super().__init__(observation, state, X, parameter)
+        # State and parameter form one nonlinear argument, so that one complex step differentiates
+        # with respect to both.
         unknowns = {STATE + name: unknown for name, unknown in state.unknowns.items()}
         unknowns |= {PARAMETER + name: unknown for name, unknown in parameter.unknowns.items()}
         spaces = {"w": FunctionSpace.of(Scalar(), "w"), "uq": FunctionSpace(unknowns, False)}

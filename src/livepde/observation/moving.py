@@ -128,6 +128,7 @@ class MovingObserved(Observed):
                     (np.ones(len(rows)), (rows, np.arange(len(rows)))), (len(points), len(rows))
                 )
                 G = sp.csr_array(place @ values)
+            # Callers share the cached mask, so it must not be changed in place.
             seen.setflags(write=False)
             self._last = last = (key, G, seen)
         return last[1], last[2]

@@ -153,5 +153,6 @@ class TransformedObserved(Observed):
             for _ in range(sensors.iterations):
                 step = (z - sensors.read(y)) / sensors.slope(y)
                 step[np.isinf(step)] = np.nan  # an insensitive sensor says nothing
+                # A step of Newton's method may be huge where g' is small: `reach` limits it.
                 y = y + np.clip(step, -sensors.reach, sensors.reach)
         return y

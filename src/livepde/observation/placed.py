@@ -120,6 +120,8 @@ class PlacedObserved(Observed):
                         "model.with_unknowns(observation.unknowns)."
                     )
                 start = at[sensor]
+                # The interpolation points lie a standard deviation away, where the shift is
+                # expected, and are moved into the mesh at its boundary.
                 low, high = (_reached(block, start, axis, step) for step in (-std, std))
                 below, above = float(start[axis] - low[axis]), float(high[axis] - start[axis])
                 ends = (difference(low, start), difference(high, start))

@@ -238,6 +238,8 @@ class LineIntegrals(Observation):
         length = float(np.linalg.norm(b - a))
         if not length > 0:
             raise ObservationError(f"LineIntegrals: line '{name}' has no length.")
+        # This number of Gauss points is exact for the degree of the element on each straight
+        # segment.
         nodes, weights = np.polynomial.legendre.leggauss(int(block.field.element.maxdeg) // 2 + 1)
         cuts = _cuts(mesh, a, b)
         width = np.diff(cuts)[:, None]
@@ -267,6 +269,7 @@ def _cuts(mesh: Any, a: Array, b: Array) -> Array:
         s = np.einsum("fd,fd->f", normals, corners[:, :, 0] - a) / across
     s, corners = s[np.isfinite(s)], corners[np.isfinite(s)]
     points = a + s[:, None] * (b - a)
+    # A line along a facet or through a vertex must not miss its cut by rounding.
     slack = 1e-9 * (mesh.p.max() - mesh.p.min())
     low, high = corners.min(axis=2) - slack, corners.max(axis=2) + slack
     hit = s[np.all((points >= low) & (points <= high), axis=1) & (s > 0) & (s < 1)]
