@@ -354,7 +354,7 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
             estimate = digits(numbers[label], numbers[f"{label}.std"])
             error = shown(100 * numbers.get(f"{label}.error", math.nan), ".2g", " %")
             rows.append((job.label, label, *estimate, unit, shown(reference, ".5g"), error))
-    columns = ("case", "unknown", "estimate", "± deviation", "unit", "reference", "error")
+    columns = ("case", "unknown", "estimate", "± std. dev.", "unit", "reference", "error")
     more = ("case", "RMSE", "withheld", "prior", "samples", "time", "failed steps")
     return [Table("Estimates", columns, rows), Table("Runs", more, quality)]
 

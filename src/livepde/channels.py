@@ -28,7 +28,8 @@ from livepde.stepping import own_noise
 
 __all__ = ["Channels"]
 
-NOTHING = np.zeros(0)  # withheld sensors without a value
+# Values of the withheld sensors if there are none.
+NOTHING = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)

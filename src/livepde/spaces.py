@@ -24,18 +24,30 @@ from livepde.linalg import (
 
 __all__ = ["BorderedSpace", "HilbertSpace", "product"]
 
+# Beyond this condition number of the scaled Gram matrix a space counts as singular: fewer than two
+# digits of a Riesz representative would be correct.
 LARGEST_CONDITION = 1e14
-LARGEST_EXPLICIT = 2000  # coefficients up to which a bordered Gram matrix is written out
-LARGE = 20_000  # coefficients from which modes and traces have a stated error
-SOLVED = 1000  # coefficients whose prior variance is computed; that of others lies in between
-FEWEST_SOLVED = 64  # of a large space
-BLOCK = 250  # right-hand sides solved at once,
-ENTRIES = 2_500_000  # and at most so many numbers of them
-ITERATED = 1e-12  # residual of the Riesz map of a large space, where iterations do:
-FEW = 50  # at most so many
-PROBES = 16  # random vectors of a trace
-ROUNDING = 1e-9  # share of a variance that is none
-PRECISE = 1e-8  # relative error of the modes of a large space
+# Number of coefficients up to which the Gram matrix of a bordered space is formed.
+LARGEST_EXPLICIT = 2000
+# Number of coefficients from which modes and traces are approximated, with a stated error.
+LARGE = 20_000
+# Number of coefficients with a computed prior variance; the others are interpolated.
+SOLVED = 1000
+# Smallest number of computed variances in a large space.
+FEWEST_SOLVED = 64
+# Number of right-hand sides solved at once, and largest number of their entries.
+BLOCK = 250
+ENTRIES = 2_500_000
+# Relative residual of the Riesz map of a large space by conjugate gradients, which are used if they
+# converge within the following number of iterations.
+ITERATED = 1e-12
+FEW = 50
+# Number of random vectors of Hutchinson's trace estimate.
+PROBES = 16
+# Share of a variance that is attributed to rounding.
+ROUNDING = 1e-9
+# Relative error of the modes of a large space.
+PRECISE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +142,8 @@ class HilbertSpace:
         largest = abs(unit @ self.tangent_gram @ unit).sum(axis=1).max()
         if not np.isfinite(x).all() or np.linalg.norm(x) * largest > LARGEST_CONDITION:
             raise SpaceError(singular)
+        # An LU solver factorises indefinite matrices as well, so their definiteness is tested
+        # separately.
         if not (solver.definite or positive_definite(self.tangent_gram)):
             raise SpaceError(
                 f"The Gram matrix of {self.name} is not positive definite: check the sign of the "
@@ -142,6 +156,8 @@ class HilbertSpace:
         diagonal = self.tangent_gram.diagonal()
         if self.dim <= LARGE or not np.all(diagonal > 0.0):
             return None
+        # A trial solve decides: the condition number of the scaled matrix is not known otherwise. A
+        # mass matrix needs few iterations on any mesh, a stiffness matrix more on finer ones.
         probe = np.random.default_rng(0).standard_normal(self.dim) * np.sqrt(diagonal)
         try:
             _Diagonal(self.tangent_gram, diagonal, FEW).solve(probe)
@@ -202,10 +218,13 @@ class HilbertSpace:
         """
         held = (modes**2).sum(axis=1)
         if self.dim <= LARGE:
+            # Differences at rounding level are set to zero, since a negative variance has no root.
             left = self.variance - held
             return np.where(left > ROUNDING * self.variance, left, 0.0)
         solved, variance = self._solved
         left = variance - held[solved]
+        # Only the remainder is interpolated: the part of the modes is known at every coefficient.
+        # The tolerance is larger than above because modes of large spaces are less accurate.
         return self._between(solved, np.where(left > 10 * PRECISE * variance, left, 0.0))
 
     @cached_property
@@ -218,6 +237,7 @@ class HilbertSpace:
         else:
             solved = free[np.unique(np.linspace(0, len(free) - 1, SOLVED).astype(int))]
         variance = np.zeros(len(solved))
+        # Unit vectors are solved in blocks, which bounds the memory of large spaces.
         block = max(1, min(BLOCK, ENTRIES // max(self.dim, 1)))
         for start in range(0, len(solved), block):
             at = solved[start : start + block]
@@ -234,6 +254,8 @@ class HilbertSpace:
         rest = np.setdiff1d(np.flatnonzero(self.free), solved)
         if len(rest):
             whole, links = self.augmented, self._links
+            # The product v_i G_ii is dimensionless, so that neighbouring values and slopes can be
+            # averaged.
             scale = whole.diagonal() if whole.shape[0] == self.dim else np.ones(self.dim)
             graph = sp.csr_array(sp.diags_array(links.sum(axis=1)) - links)
             inner = sp.csr_array(graph[rest][:, rest])
@@ -268,6 +290,8 @@ class HilbertSpace:
         """
         if self.dim <= LARGE:
             return float(weights @ self.variance)
+        # Random signs (Rademacher vectors) have the smallest variance in Hutchinson's estimate.
+        # Their fixed seed makes runs reproducible.
         signs = 2.0 * np.random.default_rng(0).integers(0, 2, (self.dim, PROBES)) - 1.0
         total = float((weights @ modes**2).sum())
         for sign in signs.T:

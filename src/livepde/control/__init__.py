@@ -1,4 +1,4 @@
-"""An identified model in a control loop: reduced model, trust, controllers, one call per sample."""
+"""Control with an identified model: reduced models, trust in estimates, controllers, loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is affine in the reduced state and the channels: one step, and what is seen."""
+"""Affine maps of reduced state and channels: output equation and discrete time step."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ __all__ = ["Discrete", "Output"]
 
 @dataclass(frozen=True, eq=False)
 class Output:
-    """What is seen of the reduced state: y = C x + D c + d for the channels c.
+    """Output equation of a reduced model: y = C x + D c + d for the channels c.
 
     Attributes
     ----------
     names
-        Of the outputs.
+        Names of the outputs.
     C, D, d
         Shapes (outputs, r), (outputs, channels) and (outputs,).
     noise
-        Standard deviation of each as a measurement, shape (outputs,); None if it is not known.
+        Measurement noise of each output as a standard deviation, shape (outputs,); None if unknown.
     """
 
     names: tuple[str, ...]
@@ -37,14 +37,14 @@ class Output:
 
 @dataclass(frozen=True, eq=False)
 class Discrete:
-    """One step x+ = A x + B c + f, with the channels c held in between."""
+    """Discrete-time model x+ = A x + B c + f with a zero-order hold of the channels c."""
 
     A: Array
     B: Array
     f: Array
 
     def with_offset(self, offset: Array | None) -> Discrete:
-        """Return the step with something added to the channels, shape (channels,)."""
+        """Return the model with a constant added to the channels, shape (channels,)."""
         return self if offset is None else replace(self, f=self.f + self.B @ offset)
 
     def __call__(self, x: Array, c: Array) -> Array:

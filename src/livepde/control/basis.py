@@ -1,4 +1,4 @@
-"""The subspace of a reduced model: static responses, and the slowest modes."""
+"""Projection basis of a reduced model: static responses and slowest eigenmodes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ from livepde.linalg import Array, IntArray
 
 __all__ = ["basis"]
 
-SHIFT = 1e-9  # of the fastest rate: so that a process without a steady state has responses, too
-KEPT = 1e-4  # of the largest direction: smaller ones add nothing
-SYMMETRIC = 1e-10  # relative asymmetry that is rounding
+# Shift of static responses relative to the fastest rate, for processes without a steady state.
+SHIFT = 1e-9
+# Relative size below which a direction of the snapshots is dropped.
+KEPT = 1e-4
+# Relative asymmetry that is attributed to rounding.
+SYMMETRIC = 1e-10
 
 
 def basis(
@@ -26,28 +29,30 @@ def basis(
     modes: int,
     rates: Sequence[float] = (),
 ) -> Array:
-    """Return columns V with V^T M V = I, zero on fixed coefficients, shape (n, r).
+    """Return an M-orthonormal basis V, V^T M V = I, zero on fixed coefficients, shape (n, r).
 
     Parameters
     ----------
     mass
-        M, shape (n, n).
+        Mass matrix M, shape (n, n).
     free
         Numbers of the coefficients that are not fixed.
     systems
-        The model for several values of the unknowns, the first the likeliest: each gives its
-        responses to constant channels.
+        Linear systems for several values of the unknowns, the first at the prior mean. The basis
+        contains the static responses of each.
     drives
         Lifting of boundary channels and of known boundary values, shape (n, channels + 1).
     modes
-        How many of the slowest eigenmodes of the first system are added.
+        Number of slowest eigenmodes of the first system to be added.
     rates
-        Responses to channels that grow with exp(rate t) are added.
+        Rates of the exponential inputs exp(rate t) whose responses are added.
     """
     M = sp.csc_array(mass[free][:, free])
     static, slowest = [], np.zeros((len(free), 0))
     for system in systems:
         K = sp.csc_array(system.K[free][:, free])
+        # A small multiple of M makes K + rate M regular: a process with insulated boundaries has no
+        # steady state, and its static response would be infinite.
         shift = SHIFT * float(abs(K).sum(axis=1).max() / M.sum(axis=1).max())
         loads = np.column_stack([system.E, system.f]) - system.K @ drives
         for rate in (shift, *rates):
@@ -64,7 +69,7 @@ def basis(
 
 
 def _modes(K: sp.csc_array, M: sp.csc_array, count: int, shift: float) -> Array:
-    """Return the slowest modes; of an unsymmetric K real and imaginary parts."""
+    """Return the slowest eigenmodes; real and imaginary parts for a nonsymmetric K."""
     n = K.shape[0]
     start, count = np.ones(n), min(count, n - 2)
     if count < 1:  # the static responses are all there is
@@ -77,7 +82,7 @@ def _modes(K: sp.csc_array, M: sp.csc_array, count: int, shift: float) -> Array:
 
 
 def _orthonormal(columns: Array, M: sp.csc_array) -> Array:
-    """Return the leading directions of some columns, orthonormal in M."""
+    """Return the dominant directions of columns, orthonormal in M."""
     if not columns.shape[1]:
         return columns
     weights, axes = np.linalg.eigh(columns.T @ (M @ columns))

@@ -1,4 +1,4 @@
-"""Where a controller gets state and unknown numbers from."""
+"""Estimators of state and unknown numbers for a controller."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ __all__ = ["Estimator", "Known", "Learned"]
 
 
 class Estimator(Protocol):
-    """Anything that turns samples into state and unknown numbers of a reduced model.
+    """Protocol of estimators of the state and the unknown numbers of a reduced model.
 
-    Between two samples the inputs are held: a sample at t brings the inputs that were applied since
-    the one before.
+    Inputs are held between samples: a sample at t contains the inputs applied since the previous
+    one.
     """
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
-        """Take a sample: measurements of the sensors, shape (sensors,), NaN where missing."""
+        """Process a sample: measurements of the sensors, shape (sensors,), NaN where missing."""
 
     def dump(self) -> bytes:
-        """Return its state."""
+        """Return the state as bytes."""
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
-        """Continue from what `dump` returned; `where` names it in messages."""
+        """Restore a state returned by `dump`; `where` names it in messages."""
 
 
 class Learned:
-    """An identifier with a fixed model beside it, to which control falls back.
+    """An identifier with a nominal model in parallel, as a fallback for the controller.
 
     Parameters
     ----------
     identifier
-        What learns, built with `hold=True`; its own model has any size.
+        The identifier, built with `hold=True`; its model may have any size.
     nominal
-        The fixed model with its filter, which runs beside at every sample.
+        Kalman filter of the nominal model, updated with every sample.
     trust
-        When the estimate is handed over.
+        Conditions for using the estimate.
 
     Attributes
     ----------
     estimate
-        The identifier's last estimate.
+        Last estimate of the identifier.
     """
 
     def __init__(self, identifier: Identifier, nominal: Kalman, trust: Trust | None = None) -> None:
@@ -87,6 +87,8 @@ class Learned:
         self.estimate = estimate = identifier.step(t, z, inputs)  # a bad sample changes nothing
         if isinstance(z, Mapping):  # with what is withheld, perhaps
             z = {name: z[name] for name in model.sensors.names if name in z}
+        # The nominal filter runs at every sample, trusted or not, so that a fallback starts from a
+        # converged state.
         nominal = self.nominal.step(t, z, inputs)
         doubt = self.trust.doubt(estimate, model)
         self._good = 0 if doubt else min(self._good + 1, self.trust.patience)

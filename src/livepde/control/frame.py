@@ -1,4 +1,4 @@
-"""What a reduced model is made from: the full model, a basis, and where it is linearised."""
+"""Galerkin reduction of a full model: basis, linearisation point, projected systems."""
 
 from __future__ import annotations
 
@@ -17,26 +17,28 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.result import unknown_of
 
-__all__ = ["Frame", "likely"]
+__all__ = ["GalerkinReduction", "likely"]
 
-LIKELY = 0.95  # probability of the range of an unknown number over which responses are taken
-LINEAR = 1e-8  # relative error of a system that should be linear in the unknown numbers
+# Probability of the interval of an unknown number whose ends define the responses in the basis.
+LIKELY = 0.95
+# Relative nonlinearity in the unknown numbers that is attributed to rounding.
+LINEAR = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """What a reduced model was made from.
+class GalerkinReduction:
+    """Data of a Galerkin reduction: full model, basis and linearisation point.
 
     Attributes
     ----------
     model
         The full model.
     outputs, sensors
-        What is controlled, and what is measured, bound to the full model.
+        Controlled and measured quantities, as observations bound to the full model.
     V, test
         Basis, shape (n, r), and V^T M, shape (r, n).
     u, q, inputs
-        Where it is linearised: state, parameter, and each channel.
+        Linearisation point: state, parameter, and value of each channel.
     """
 
     model: Model
@@ -50,22 +52,22 @@ class Frame:
 
     @property
     def rows(self) -> list[int]:
-        """Which coefficients of the parameter are unknown numbers."""
+        """Positions of the unknown numbers among the coefficients of the parameter."""
         return list(self.model.parameter_space.labels.values())
 
     @property
     def moves(self) -> bool:
-        """Whether the systems depend on where they are taken, beside the unknown numbers."""
+        """True if the systems depend on the linearisation point beyond the unknown numbers."""
         return bool(self.model.parameter_space.fields) or not self.model.affine
 
     @cached_property
     def linearisation(self) -> Linearisation:
-        """The linear systems of the full model."""
+        """Linearisation of the full model."""
         return Linearisation(self.model, self.u, self.inputs)
 
     @cached_property
     def boundary(self) -> tuple[Array, Array]:
-        """The lifting of boundary channels and values, as `Linearisation.boundary` has it."""
+        """Lifting of boundary channels and values, as in `Linearisation.boundary`."""
         return self.linearisation.boundary()
 
     def lift(self, x: Array, c: Array) -> Array:
@@ -75,8 +77,10 @@ class Frame:
         u: Array = fixed + self.V @ (x - self.test @ fixed)
         return u
 
-    def moved(self, u: Array | None, q: Array | None, inputs: Mapping[str, float] | None) -> Frame:
-        """Return the same, linearised elsewhere."""
+    def moved(
+        self, u: Array | None, q: Array | None, inputs: Mapping[str, float] | None
+    ) -> GalerkinReduction:
+        """Return the reduction with another linearisation point."""
         return replace(
             self,
             u=self.u if u is None else u,
@@ -85,7 +89,7 @@ class Frame:
         )
 
     def values(self) -> list[Array]:
-        """Return parameters between which systems are taken: the reference, one per number."""
+        """Return parameters at which systems are sampled: the reference, then one per number."""
         found, space = [self.q], self.model.parameter_space
         for label, k in space.labels.items():
             low, high = likely(space, label)
@@ -95,7 +99,7 @@ class Frame:
         return found
 
     def parts(self) -> Array:
-        """Return K, E and f side by side: the part without q and one for each unknown number.
+        """Return [K, E, f] as a constant part and a derivative by each unknown number.
 
         Shape (1 + m, r, r + channels + 1).
         """
@@ -112,7 +116,7 @@ class Frame:
         return np.array([constant, *slopes])
 
     def _projected(self, system: Linear) -> Array:
-        """Return K, E and f on the basis side by side, shape (r, r + channels + 1)."""
+        """Return [K, E, f] projected on the basis, shape (r, r + channels + 1)."""
         W, known = self.boundary
         fixed = np.column_stack([W, known])
         K: Array = self.V.T @ (system.K @ self.V)
@@ -120,7 +124,7 @@ class Frame:
         return np.column_stack([K, driven + K @ (self.test @ fixed)])
 
     def check(self) -> None:
-        """Raise `ModelError` where the model is not linear in its unknown numbers."""
+        """Raise `ModelError` if the model is not linear in its unknown numbers."""
         values = self.values()
         systems = [self._projected(self.linearisation.at(q)) for q in values]
         both = self.q + 0.5 * sum((q - self.q for q in values[1:]), np.zeros_like(self.q))
@@ -136,11 +140,12 @@ class Frame:
             )
 
     def output(self, observed: Observed) -> Output:
-        """Return what an observation shows of the coordinates."""
+        """Return the output equation of an observation in reduced coordinates."""
         moment = self.linearisation.moment
         W, known = self.boundary
         y = observed.predict(self.u, self.q, moment)
         H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
+        # The lifted state is W c + known + V (x - V^T M (W c + known)), which is affine in x and c.
         C = H @ self.V
         D = H @ W - C @ (self.test @ W)
         d = y - H @ self.u + H @ known - C @ (self.test @ known)

@@ -1,4 +1,4 @@
-"""What a controller is to reach, what it is asked at a sample, and what it answers."""
+"""Control objective, preview data at a sample, and decision of a controller."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _finite(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Goal:
-    """What is paid for, and what must not happen.
+    """Control objective: weights, prices and limits.
 
     The cost of a sample is the sum of track (y - reference)^2 + penalty (units beyond a limit) over
     outputs, and of move (v - v before)^2 + price v over controls.
@@ -38,16 +38,16 @@ class Goal:
     Parameters
     ----------
     track
-        Output -> weight of its error.
+        Mapping from output to the weight of its error.
     move
-        Control -> weight of its change from sample to sample; > 0.
+        Mapping from control to the weight of its change between samples; > 0.
     inputs
-        Control -> (least, largest) value that the actuator takes; never left.
+        Mapping from control to the (least, largest) value of the actuator; never exceeded.
     limits
-        Output -> (least, largest) value; `MPC` keeps them, `LQ` does not know them. They may change
-        with time: `Loop.step`.
+        Mapping from output to its (least, largest) value; enforced by `MPC`, ignored by `LQ`. They
+        may change with time: `Loop.step`.
     price
-        Control -> what a unit of it costs in a sample; `LQ` does not know it.
+        Mapping from control to the cost of one unit of it in a sample; ignored by `LQ`.
     penalty
         Cost of one unit beyond a limit in one sample, in `MPC`; default a hundred times the sum of
         the weights of errors, or 100 without.
@@ -93,7 +93,7 @@ class Goal:
         return 100.0 * (sum(self.track.values()) or 1.0) if self.penalty is None else self.penalty
 
     def check(self, model: ReducedModel) -> None:
-        """Raise `ConfigurationError` where it names what the model does not have."""
+        """Raise `ConfigurationError` if it names quantities that the model does not have."""
         for what, names, known in (
             ("track", self.track, model.outputs.names),
             ("limits", self.limits, model.outputs.names),
@@ -122,15 +122,15 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What is known of the future at a sample.
+    """Preview data at a sample: references, disturbances and limits over the horizon.
 
     Attributes
     ----------
     reference
-        Of the tracked outputs, in the order of `Goal.track`, at the end of each coming period,
-        shape (horizon, tracked).
+        References of the tracked outputs, in the order of `Goal.track`, at the end of each coming
+        period, shape (horizon, tracked).
     disturbances
-        In the order of `ReducedModel.disturbances`, over each coming period, shape
+        Disturbances, in the order of `ReducedModel.disturbances`, over each coming period, shape
         (horizon, disturbances).
     low, high
         Limits of the outputs in the order of `Goal.limits` at the end of each coming period, shapes
@@ -145,16 +145,16 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """What a controller sets.
+    """Decision of a controller: control inputs, status and memory.
 
     Attributes
     ----------
     inputs
-        In the order of `ReducedModel.controls`, shape (controls,).
+        Control inputs, in the order of `ReducedModel.controls`, shape (controls,).
     status
-        "ok", or what went wrong and what was done instead.
+        "ok", or a description of the failure and of the fallback action.
     memory
-        What it wants to be given at the next sample: where an optimisation begins, say.
+        State of the controller for the next sample, such as the initial guess of an optimisation.
     """
 
     inputs: Array
@@ -163,45 +163,45 @@ class Decision:
 
 
 class Controller(Protocol):
-    """A controller: frozen; what it remembers goes through `Decision.memory`."""
+    """Protocol of controllers: frozen objects whose state is in `Decision.memory`."""
 
     @property
     def model(self) -> ReducedModel:
-        """The reduced model that it acts on."""
+        """Reduced model of the controller."""
 
     @property
     def goal(self) -> Goal:
-        """What it is to reach."""
+        """Control objective."""
 
     @property
     def period(self) -> float:
-        """Time between two samples."""
+        """Sampling period."""
 
     @property
     def horizon(self) -> int:
-        """Number of periods that it looks ahead."""
+        """Prediction horizon in periods."""
 
     def start(self) -> Array:
-        """Return the memory before the first sample, of the shape that it keeps."""
+        """Return the initial memory; its shape never changes."""
 
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
-        """Return what to set from now on.
+        """Return the control inputs for the coming period.
 
         Parameters
         ----------
         known
-            State and unknown numbers now.
+            Present state and unknown numbers.
         plan
-            References and disturbances to come.
+            Future references and disturbances.
         before
-            What was applied up to now, shape (controls,).
+            Inputs applied in the past period, shape (controls,).
         memory
-            What it left at the sample before.
+            Memory of the previous decision.
         """
 
 
 def check(controller: Controller) -> None:
-    """Raise `ConfigurationError` where a controller's numbers make no sense."""
+    """Raise `ConfigurationError` if the numbers of a controller are invalid."""
     controller.goal.check(controller.model)
     what = type(controller).__name__
     if not (np.isfinite(controller.period) and controller.period > 0):

@@ -1,4 +1,4 @@
-"""A model with given unknown numbers, and its Kalman filter."""
+"""Kalman filter of a reduced model with given unknown numbers."""
 
 from __future__ import annotations
 
@@ -18,32 +18,35 @@ from livepde.samples import labelled, number, readings
 
 __all__ = ["Kalman"]
 
-FLOOR = 1e-6  # process noise of each coordinate, relative to the largest
-SAME = 1e-6  # relative difference of two times that is rounding
+# Standard deviation of the isotropic process noise, relative to that of the channels.
+FLOOR = 1e-6
+# Relative difference of two sampling intervals that is attributed to rounding.
+SAME = 1e-6
 
 
 class Kalman:
-    """The state of a reduced model with given unknown numbers, from the sensors.
+    """Kalman filter for the state of a reduced model with given unknown numbers.
 
-    Process noise enters as noise of the channels: what the surroundings and the actuator do that
-    nobody measures. Of sensors that are not linear it takes the derivative at the estimate.
+    Process noise enters through the channels: unmeasured disturbances and actuator errors.
+    Nonlinear sensors are linearised at the estimate.
 
     Parameters
     ----------
     model
-        With the noise of its sensors.
+        Reduced model; the noise of its sensors must be known.
     period
-        Usual time between two samples.
+        Usual sampling period.
     drive
-        Channel -> standard deviation of its noise, held over a period, in its unit.
+        Mapping from channel to the standard deviation of its noise, held over a period, in its
+        unit.
     offset
-        Channel -> standard deviation by which an unknown constant that is added to it may change
-        in a period. With it outputs that are measured have no lasting error, although the model is
-        wrong: the usual way to offset-free control.
+        Mapping from channel to the standard deviation, per period, of the random walk of an unknown
+        constant added to it. Such a disturbance model gives offset-free control of measured outputs
+        in spite of model errors.
     q
         Unknown numbers by label; default the prior.
     x
-        State at the start, shape (r,); default that about which the model was reduced.
+        Initial state, shape (r,); default the linearisation point of the reduction.
     """
 
     def __init__(
@@ -90,19 +93,21 @@ class Kalman:
 
     @property
     def q(self) -> Array:
-        """The unknown numbers, shape (m,)."""
+        """Unknown numbers of the model, shape (m,)."""
         return self._q
 
     def set(self, q: Mapping[str, float]) -> None:
-        """Take other unknown numbers; those that are not named are the prior's."""
+        """Change the unknown numbers; those that are not named are set to the prior."""
         self._q = self.model.given(q)
         self._usual = self._over(self.period)
 
     def _over(self, h: float) -> tuple[Discrete, Array, Array]:
-        """Return the step over a time h, that of state and offset, and the noise gained in it."""
+        """Return model, transition matrix of state and offset, and process noise over a time h."""
         move = self.model.matrices(self._q, h)
         driven = move.B * self.drive
         gained = driven @ driven.T
+        # A small isotropic noise keeps the covariance regular: the channels drive fewer directions
+        # than there are coordinates.
         floor = FLOOR**2 * float(np.trace(gained))
         gained = gained + floor * np.eye(len(gained))
         noise: Array = block_diag(gained, np.diag(self._walk**2 * (h / self.period)))
@@ -112,9 +117,9 @@ class Kalman:
         return move, A, noise
 
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
-        """Take a sample, as an `Estimator` does; the first one describes the start.
+        """Process a sample, as in `Estimator.step`; the first one defines the initial time.
 
-        A sample that is late or early is stepped to as long as it took.
+        Early and late samples are predicted over their actual interval.
 
         Raises
         ------
@@ -162,12 +167,12 @@ class Kalman:
         )
 
     def dump(self) -> bytes:
-        """Return the state."""
+        """Return the state as bytes."""
         leaves = {"x": self._x, "P": self._P, "q": self._q, "t": self._t}
         return packed({"kind": "kalman"}, leaves)
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
-        """Continue from what `dump` returned."""
+        """Restore a state returned by `dump`."""
         header, leaves = unpacked(content, where)
         if header.get("kind") != "kalman" or leaves["x"].shape != self._x.shape:
             raise RunError(f"{where} is of another reduced model: build it as it was then.")

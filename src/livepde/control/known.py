@@ -1,4 +1,4 @@
-"""What an estimator hands to a controller."""
+"""Knowledge handed from an estimator to a controller."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ Source: TypeAlias = Literal["estimate", "fallback"]
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """State and unknown numbers of a reduced model at one time.
+    """Estimated state and unknown numbers of a reduced model at one time.
 
     Attributes
     ----------
     x, q
         Coordinates of the state, shape (r,), and unknown numbers, shape (m,).
     factor
-        Square root of the covariance of q, shape (m, k); no columns: q counts as known.
+        Square root of the covariance of q, shape (m, k); without columns q counts as exact.
     offset
-        What is added to each channel by something that nobody measures, shape (channels,); None:
-        nothing. It acts on the state.
+        Estimated unmeasured disturbance added to each channel, shape (channels,); None: zero. It
+        acts on the state equation.
     model
-        The reduced model about the estimate, where it depends on where it is taken: unknown fields,
-        models that are not affine in u. None: that of the controller. Its basis is that of the
-        controller's; a controller takes its own outputs.
+        Reduced model relinearised at the estimate, for unknown fields and models that are not
+        affine in u. None: the model of the controller. Its basis is that of the controller's model;
+        a controller uses its own outputs.
     source, why
-        "estimate", or "fallback" and why the estimate is not trusted.
+        "estimate", or "fallback" with the reason why the estimate is not trusted.
     """
 
     x: Array
@@ -50,14 +50,14 @@ class Known:
         return np.asarray(np.linalg.norm(self.factor, axis=1))
 
     def scenarios(self, kappa: float, most: int) -> Array:
-        """Return q, and q +- kappa deviations along the leading directions, shape (k, m).
+        """Return q, and q +- kappa standard deviations along principal directions, shape (k, m).
 
         Parameters
         ----------
         kappa
-            Number of deviations.
+            Number of standard deviations.
         most
-            Directions at most.
+            Maximum number of directions.
         """
         axes, sizes, _ = np.linalg.svd(self.factor, full_matrices=False)
         shifts = kappa * (axes * sizes).T[:most]

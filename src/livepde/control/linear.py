@@ -1,4 +1,4 @@
-"""A model as a linear system in its free coefficients, for one value of the unknown numbers."""
+"""Linear state-space form of a model in its free coefficients, for given unknown numbers."""
 
 from __future__ import annotations
 
@@ -16,18 +16,20 @@ from livepde.model import Model
 
 __all__ = ["Linear", "Linearisation"]
 
-SAME = 1e-9  # relative difference that is rounding
-LATER = 12345.6789  # a time at which a model that reads the clock is another one
+# Relative difference that is attributed to rounding.
+SAME = 1e-9
+# Arbitrary time at which a model is evaluated to detect an explicit dependence on time.
+LATER = 12345.6789
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """M u' = -K u + E c + f for the channels c.
+    """Linear system M u' = -K u + E c + f for the channels c.
 
     Attributes
     ----------
     K, E, f
-        Shapes (n, n), (n, channels) and (n,); rows of fixed coefficients mean nothing.
+        Shapes (n, n), (n, channels) and (n,); rows of fixed coefficients are undefined.
     """
 
     K: sp.csr_array
@@ -37,14 +39,14 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Linear systems of a model, about a state and inputs: exact where it is affine in both.
+    """Linearisation of a model at a state and inputs; exact if it is affine in both.
 
     Attributes
     ----------
     model
         The process.
     u, inputs
-        Where it is linearised: coefficients, shape (n,), and a value for each channel.
+        Linearisation point: coefficients, shape (n,), and a value for each channel.
     """
 
     model: Model
@@ -53,7 +55,7 @@ class Linearisation:
 
     @cached_property
     def moment(self) -> Moment:
-        """The inputs at time zero."""
+        """Time zero with the inputs of the linearisation point."""
         return self._moment(0.0, {})
 
     def _moment(self, t: float, change: Mapping[str, float]) -> Moment:
@@ -77,6 +79,8 @@ class Linearisation:
         """Return the system for physical coefficients q, shape (m,)."""
         K, known = self.slope(q, self.moment), self.residual(self.u, q, self.moment)
         columns = [
+            # The model is affine in its channels (see `check`): one difference gives the exact
+            # column.
             known - self.residual(self.u, q, self._moment(0.0, {name: 1.0}))
             for name in self.model.channels
         ]
@@ -87,7 +91,7 @@ class Linearisation:
     def boundary(self) -> tuple[Array, Array]:
         """Return the lifting of boundary channels, (n, channels), and of known values, (n,).
 
-        Coefficients that are not fixed are zero.
+        They are zero at free coefficients.
         """
         model, zero = self.model, np.zeros(self.model.X.dim)
         off = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
@@ -99,8 +103,9 @@ class Linearisation:
         return np.column_stack(columns) if columns else np.zeros((len(zero), 0)), known
 
     def check(self, q: Array) -> None:
-        """Raise `ModelError` where no linear system with constant coefficients stands for it."""
+        """Raise `ModelError` if the model has no linear system with constant coefficients."""
         model, free = self.model, self.model.X.free
+        # An explicit dependence on time is detected by evaluation at an arbitrary other time.
         steady = self.residual(self.u, q, self.moment)
         later = self.residual(self.u, q, self._moment(LATER, {}))
         moved = model.impose(self.u, self._moment(LATER, {})) - model.impose(self.u, self.moment)
@@ -109,6 +114,8 @@ class Linearisation:
                 "reduce: the model reads the time. Make what changes with time an input channel, "
                 "so that a controller can be given its forecast."
             )
+        # A random change of all channels at once detects products of channels with the state, and
+        # of channels with each other.
         rng = np.random.default_rng(0)
         change = dict(zip(model.channels, rng.standard_normal(len(model.channels)), strict=True))
         there = self._moment(0.0, change)

@@ -1,4 +1,4 @@
-"""A control loop: one call for every sample."""
+"""Closed control loop with one call for each sample."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ Future: TypeAlias = Mapping[str, ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Action:
-    """What to set from now on, and on what grounds.
+    """Control action of a sample: inputs to apply, with the estimate behind them.
 
     Attributes
     ----------
     t
         Time of the sample.
     inputs
-        Control -> value to apply until the next sample.
+        Mapping from control to the value to apply until the next sample.
     known
-        State and unknown numbers on which it was decided.
+        State and unknown numbers used by the controller.
     outputs
-        Output -> its estimated value now.
+        Mapping from output to its present estimated value.
     status
-        "ok", or what went wrong in the controller and what was done instead.
+        "ok", or a description of the controller's failure and of the fallback action.
     estimate
-        Of the identifier; None with another estimator.
+        Estimate of the identifier; None with another estimator.
     """
 
     t: float
@@ -57,36 +57,37 @@ class Action:
 
     @property
     def source(self) -> str:
-        """Whether the estimate or the fallback was used: "estimate", "fallback"."""
+        """Source of the state: "estimate" or "fallback"."""
         return self.known.source
 
     @property
     def why(self) -> str:
-        """Why the estimate is not trusted; empty if it is."""
+        """Reason why the estimate is not trusted; empty if it is."""
         return self.known.why
 
 
 class Loop:
-    """An estimator and a controller, one call per sample.
+    """Control loop of an estimator and a controller.
 
     Parameters
     ----------
     estimator
-        An `Identifier`, beside which a nominal model is run for the fallback; or any `Estimator`.
+        An `Identifier`, with a nominal model in parallel as a fallback; or any `Estimator`.
     controller
-        `LQ`, `MPC`, or one of your own.
+        `LQ`, `MPC`, or any `Controller`.
     trust
-        When the estimate of an identifier is used.
+        Conditions for using the estimate of an identifier.
     drive
-        Channel -> standard deviation of its noise, for the filter of the nominal model; default a
-        tenth of the range of each control.
+        Mapping from channel to the standard deviation of its noise, for the filter of the nominal
+        model; default a tenth of the range of each control.
     before
-        Control -> what was applied before the first sample; default the lower end of its range.
+        Mapping from control to the value applied before the first sample; default the lower end of
+        its range.
 
     Raises
     ------
     ConfigurationError
-        Parts that do not fit together.
+        Estimator and controller do not fit together.
     """
 
     def __init__(
@@ -139,29 +140,30 @@ class Loop:
         forecast: Future | None = None,
         limits: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
     ) -> Action:
-        """Take a sample and return what to set until the next one.
+        """Process a sample and return the inputs to apply until the next one.
 
         Parameters
         ----------
         t, z
             As for `Identifier.step`: measurements of the sensors; by name with inputs among them.
         inputs
-            Measured disturbances; and what a control really applied since the sample before, where
-            that is not what was asked for. NaN is missing: a disturbance holds its last value, a
-            control what was asked for.
+            Measured disturbances, and actually applied controls if they differ from the requested
+            ones. NaN means missing: a disturbance holds its last value, a control the requested
+            one.
         reference
-            Tracked output -> a number, or its values at the end of each coming period.
+            Mapping from tracked output to a number, or to values at the end of each coming period.
         forecast
-            Disturbance -> a number, or its values over each coming period; default what it is now.
+            Mapping from disturbance to a number, or to values over each coming period; default the
+            present value.
         limits
-            Output -> (least, largest), each a number or its values at the end of each coming
-            period; default those of the goal.
+            Mapping from output to (least, largest), each a number or values at the end of each
+            coming period; default those of the goal.
 
         Raises
         ------
         SampleError
-            A reference is missing, something is named that does not exist, or a limit is given
-            where the goal has none.
+            A reference is missing, an unknown name is used, or a limit is given where the goal has
+            none.
         """
         controller, model = self.controller, self.controller.model
         z = labelled(z)
@@ -184,6 +186,8 @@ class Loop:
         channels = dict(zip(model.controls, applied.tolist(), strict=True))
         channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
         plan = self._plan(reference or {}, forecast or {}, now, limits or {})
+        # All arguments are validated before the estimator is stepped, so that an invalid sample
+        # changes nothing.
         known = self.estimator.step(t, z, channels)
         self._before, self._disturbances = applied, now  # should the controller raise
         decision = self._possible(controller.decide(known, plan, applied, self._memory), applied)
@@ -199,7 +203,7 @@ class Loop:
         )
 
     def _possible(self, decision: Decision, applied: Array) -> Decision:
-        """Return a decision that the actuators can follow, whatever the controller says."""
+        """Return a decision within the actuator ranges, whatever the controller returned."""
         model, found = self.controller.model, np.asarray(decision.inputs, dtype=float)
         if found.shape != applied.shape:
             raise ConfigurationError(
@@ -222,7 +226,7 @@ class Loop:
         now: Array,
         limits: Mapping[str, tuple[ArrayLike, ArrayLike]],
     ) -> Plan:
-        """Return what is known of the future, checked."""
+        """Return validated preview data over the horizon."""
         goal, model, count = self.controller.goal, self.controller.model, self.controller.horizon
         for name, ends in _mapping(limits, "limits").items():
             if not isinstance(ends, tuple | list) or len(ends) != 2:
@@ -251,7 +255,7 @@ class Loop:
         )
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state to a file, from which `load` continues with bit-identical numbers."""
+        """Write the state to a file; `load` continues from it with bit-identical numbers."""
         leaves = {
             "estimator": np.frombuffer(self.estimator.dump(), dtype=np.uint8),
             "before": self._before,
@@ -261,12 +265,12 @@ class Loop:
         checkpoint.write(path, checkpoint.packed({"kind": "loop"}, leaves))
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Continue from a saved state; the loop must be built as the one that was saved.
+        """Restore a saved state; the loop must be built as the saved one was.
 
         Raises
         ------
         RunError
-            The file is damaged, or of another loop.
+            The file is damaged, or belongs to another loop.
         """
         where = str(path)
         header, leaves = checkpoint.unpacked(checkpoint.read(path), where)

@@ -1,4 +1,4 @@
-"""A linear-quadratic controller on the reduced model."""
+"""Linear-quadratic controller on a reduced model."""
 
 from __future__ import annotations
 
@@ -16,25 +16,26 @@ from livepde.linalg import Array
 
 __all__ = ["LQ"]
 
-TINY = 1e-10  # weight of what costs nothing, relative to the largest: the equation has a root
+# Weight of states that no tracked output sees, relative to the trace of the weight matrix.
+TINY = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
 class LQ:
-    """The stationary linear-quadratic controller about the steady state that meets the reference.
+    """Stationary linear-quadratic controller about the steady state that meets the reference.
 
-    Changes of the controls are weighed, so that it acts on (x, v before). The target (x, v) is the
-    steady state of the model with the unknown numbers of now, the disturbances of now and the
-    present reference, as near to it as the actuators allow. What comes out is clipped to their
-    ranges. It knows neither limits of outputs nor the future. The gain is kept while the unknown
-    numbers stay what they are.
+    The cost weighs changes of the controls, so the feedback acts on (x, previous v). The target (x,
+    v) is the steady state of the model at the present unknown numbers and disturbances that is
+    closest to the reference within the actuator ranges. The inputs are clipped to these ranges.
+    Output limits and previews are ignored. The gain is reused while the unknown numbers do not
+    change.
 
     Parameters
     ----------
     model, goal
-        Reduced model, and what is to be reached.
+        Reduced model, and control objective.
     period
-        Time between two samples.
+        Sampling period.
     """
 
     model: ReducedModel
@@ -50,12 +51,12 @@ class LQ:
             )
 
     def start(self) -> Array:
-        """Return the memory before the first sample: unknown numbers and their gain, NaN as yet."""
+        """Return the initial memory: unknown numbers and their gain, NaN until computed."""
         count = len(self.model.controls)
         return np.full(len(self.model.unknowns) + count * (self.model.size + count), np.nan)
 
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
-        """Return what to set from now on; as for `Controller`."""
+        """Return the control inputs for the coming period; see `Controller.decide`."""
         low, high = self.goal.range(self.model)
         model = known.model or self.model
         step = model.matrices(known.q, self.period).with_offset(known.offset)
@@ -84,7 +85,7 @@ class LQ:
         return controls, others, rows, np.array(list(track.values()))
 
     def gain(self, step: Discrete) -> Array:
-        """Return the gain from (x, v before) to minus the change of v, (controls, r + controls)."""
+        """Return the Riccati feedback gain from (x, previous v) to minus the change of v."""
         controls, _, rows, weights = self._parts()
         r, count = len(step.A), len(controls)
         B = step.B[:, controls]
@@ -92,6 +93,8 @@ class LQ:
         B = np.vstack([B, np.eye(count)])
         C = np.hstack([self.model.outputs.C[rows], self.model.outputs.D[np.ix_(rows, controls)]])
         Q = C.T @ (weights[:, None] * C)
+        # A state that no tracked output sees has zero weight: without a small one the Riccati
+        # equation may have no stabilising solution.
         Q += TINY * np.trace(Q) * np.eye(len(Q))
         R = np.diag([self.goal.move[name] for name in self.model.controls])
         P = solve_discrete_are(A, B, Q, R)
@@ -99,7 +102,7 @@ class LQ:
         return found
 
     def target(self, step: Discrete, reference: Array, disturbances: Array) -> tuple[Array, Array]:
-        """Return the steady state (x, v) that comes nearest to the reference within the ranges."""
+        """Return the steady state (x, v) that is closest to the reference within the ranges."""
         controls, others, rows, weights = self._parts()
         model, low, high = self.model, *self.goal.range(self.model)
         r = len(step.A)

@@ -20,36 +20,38 @@ from livepde.linalg import Array
 __all__ = ["MPC", "packages", "quiet"]
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
-FARTHEST = 0.9  # of the way from the estimate to a bound that a scenario goes
-FAR = 1e12  # stands for a limit that is infinite for a while
+# Largest distance of a scenario from the estimate, as a share of the distance to the bound.
+FARTHEST = 0.9
+# Finite substitute of a limit that is temporarily infinite: Ipopt needs finite parameters.
+FAR = 1e12
 SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 @dataclass(frozen=True, eq=False)
 class MPC:
-    """do-mpc's multi-stage controller: limits are kept for the estimate and for what it may be.
+    """Multi-stage (scenario) model predictive control with do-mpc: robust to parameter uncertainty.
 
-    At each sample the unknown numbers are set to the estimate and to `kappa` standard deviations to
-    both sides along the leading directions of their covariance, where there is a transform of its
-    latent values: half or twice as much, not nothing; one sequence of inputs begins in
-    the same way for all of them. With a better estimate they come together, and it acts less
-    cautiously. Ranges of actuators are never left; limits of outputs are kept where that is
-    possible, and what lies beyond costs the penalty of the goal.
+    At each sample, scenarios of the unknown numbers are the estimate and points `kappa` standard
+    deviations to both sides along the leading directions of their covariance (in latent values for
+    transformed unknowns: half or twice the estimate, never zero). The first input is common to all
+    scenarios. With a better estimate the scenarios contract, and the control becomes less cautious.
+    Actuator ranges are never exceeded; output limits are soft constraints with the penalty of the
+    goal.
 
-    If Ipopt finds no solution the inputs are held, and the action says so.
+    If Ipopt finds no solution, the inputs are held, and the status of the action reports it.
 
     Parameters
     ----------
     model, goal
-        Reduced model, and what is to be reached.
+        Reduced model, and control objective.
     period
-        Time between two samples.
+        Sampling period.
     horizon
-        Number of periods that it looks ahead.
+        Prediction horizon in periods.
     kappa
-        Standard deviations between the scenarios; 0 takes the estimate for the truth.
+        Distance of the scenarios in standard deviations; 0: certainty equivalence.
     directions
-        Directions of the covariance that are looked at: two scenarios for each.
+        Number of covariance directions with two scenarios each.
 
     Raises
     ------
@@ -80,11 +82,11 @@ class MPC:
         return 1 + 2 * most
 
     def start(self) -> Array:
-        """Return the memory before the first sample: where the optimisation begins."""
+        """Return the initial memory: the starting point of the optimisation."""
         return np.zeros(int(self.problem.opt_x_num.master.shape[0]))
 
     def _process(self) -> Any:
-        """Return the model in do-mpc's words: cost, and how far it is beyond each limit."""
+        """Return the model in do-mpc's form: dynamics, cost, and excess over each limit."""
         do_mpc, casadi = packages()
         model, goal, r = self.model, self.goal, self.model.size
         process = do_mpc.model.Model("discrete")
@@ -125,7 +127,7 @@ class MPC:
 
     @cached_property
     def problem(self) -> Any:
-        """do-mpc's object, without a state: all that changes is set at each sample."""
+        """Optimal control problem of do-mpc; all changing data are set at each sample."""
         do_mpc, casadi = packages()
         model, goal, process = self.model, self.goal, self._process()
         mpc = do_mpc.controller.MPC(process)
@@ -139,7 +141,7 @@ class MPC:
         width = np.where(np.isfinite(high - low), high - low, 1.0)
         mpc.scaling["_x", "x"] = 1.0 / np.abs(model.outputs.C).max()
         mpc.scaling["_u", "v"] = width
-        # do-mpc weighs the changes of scaled inputs.
+        # do-mpc applies its weights to changes of scaled inputs, so they are rescaled.
         mpc.set_rterm(v=np.array([goal.move[name] for name in model.controls]) * width**2)
         mpc.bounds["lower", "_u", "v"] = low
         mpc.bounds["upper", "_u", "v"] = high
@@ -162,11 +164,14 @@ class MPC:
         return mpc
 
     def decide(self, known: Known, plan: Plan, before: Array, memory: Array) -> Decision:
-        """Return what to set from now on; as for `Controller`."""
+        """Return the control inputs for the coming period; see `Controller.decide`."""
         mpc, model = self.problem, known.model or self.model
         found = known.scenarios(self.kappa, (self.scenarios - 1) // 2)
         found = np.array([model.shifted(known.q, one - known.q) for one in found])
+        # The optimisation problem has a fixed number of scenarios; unused ones repeat the estimate.
         q = np.vstack([found, np.tile(known.q, (self.scenarios - len(found), 1))])
+        # A scenario on a bound can make the model degenerate (zero diffusivity), so scenarios stop
+        # short of the bounds.
         q = np.clip(
             q, *(known.q + FARTHEST * (end - known.q) for end in (model.lower, model.upper))
         )
@@ -199,7 +204,7 @@ class MPC:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silence what do-mpc warns of itself: packages it can do without, and CasADi's changes."""
+    """Suppress warnings of do-mpc about optional packages and of CasADi about its changes."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The (ONNX|approximateMPC) feature", UserWarning)
         warnings.filterwarnings("ignore", "\\s*casadi", FutureWarning)
@@ -212,7 +217,7 @@ def packages() -> tuple[Any, Any]:
     Raises
     ------
     ConfigurationError
-        They are not installed.
+        One of them is not installed.
     """
     try:
         with quiet():

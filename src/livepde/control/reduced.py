@@ -1,4 +1,4 @@
-"""A model in a few coordinates that keeps its unknown numbers as parameters."""
+"""Reduced-order models that keep the unknown numbers as parameters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from livepde.control.affine import Discrete, Output
 from livepde.control.basis import basis
-from livepde.control.frame import Frame, likely
+from livepde.control.frame import GalerkinReduction, likely
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
@@ -22,32 +22,33 @@ from livepde.stepping import Advance, Alexander2, simulate
 
 __all__ = ["ReducedModel", "reduce"]
 
-FINER = 8  # steps of the full model between two samples, where it is compared
+# Substeps of the full model per sample in `error`, so that its own time error is small.
+FINER = 8
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedModel:
-    """x' = -K(q) x + E(q) c + f(q) with K, E and f affine in the unknown numbers q.
+    """Reduced model x' = -K(q) x + E(q) c + f(q), affine in the unknown numbers q.
 
-    x = V^T M u are the coordinates of the state on a basis V that is orthonormal in the mass M,
-    boundary values included: so no derivative of a boundary channel enters. Made by `reduce`.
+    The coordinates x = V^T M u refer to a basis V that is orthonormal in the mass M. They include
+    boundary values, so that no time derivative of a boundary channel occurs. Made by `reduce`.
 
     Attributes
     ----------
     unknowns, channels, controls
-        Labels of the unknown numbers q (m), names of all channels c, and of those that a controller
-        sets; the others are disturbances.
+        Labels of the unknown numbers q (m), names of all channels c, and names of the channels set
+        by a controller; the others are disturbances.
     K, E, f
-        The part without q and one for each unknown number, shapes (1 + m, r, r),
-        (1 + m, r, channels) and (1 + m, r).
+        Constant part and derivative by each unknown number, shapes (1 + m, r, r), (1 + m, r,
+        channels) and (1 + m, r).
     outputs, sensors
-        What is controlled, and what is measured.
+        Output equations of the controlled and of the measured quantities.
     prior, std
-        Of the unknown numbers, shapes (m,).
+        Prior means and standard deviations of the unknown numbers, shapes (m,).
     lower, upper
-        Their bounds, shapes (m,).
+        Bounds of the unknown numbers, shapes (m,).
     frame
-        What it was made from.
+        Galerkin reduction from which it was made.
     """
 
     unknowns: tuple[str, ...]
@@ -62,11 +63,11 @@ class ReducedModel:
     std: Array
     lower: Array
     upper: Array
-    frame: Frame
+    frame: GalerkinReduction
 
     @classmethod
-    def of(cls, frame: Frame, controls: tuple[str, ...]) -> ReducedModel:
-        """Return the reduced model of a frame."""
+    def of(cls, frame: GalerkinReduction, controls: tuple[str, ...]) -> ReducedModel:
+        """Return the reduced model of a reduction."""
         parts, r = frame.parts(), frame.V.shape[1]
         space = frame.model.parameter_space
         unknowns = [unknown_of(space, label) for label in space.labels]
@@ -100,11 +101,11 @@ class ReducedModel:
 
     @property
     def disturbances(self) -> tuple[str, ...]:
-        """Channels that a controller does not set."""
+        """Channels that are not set by a controller."""
         return tuple(name for name in self.channels if name not in self.controls)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Return where some channels stand among all of them."""
+        """Return the positions of channels among all of them."""
         return [self.channels.index(name) for name in names]
 
     def values(self, inputs: Mapping[str, float]) -> Array:
@@ -123,7 +124,7 @@ class ReducedModel:
         return K, E, f
 
     def matrices(self, q: Array, h: float) -> Discrete:
-        """Return what becomes of the state in a time h in which channels are held: exact in time.
+        """Return the exact discretisation over a time h in which channels are held.
 
         Parameters
         ----------
@@ -132,6 +133,8 @@ class ReducedModel:
         """
         K, E, f = self.system(q)
         r, columns = self.size, np.column_stack([E, f])
+        # Van Loan's method: one exponential of the augmented matrix gives A, B and f together, also
+        # for singular K.
         whole = np.zeros((r + columns.shape[1], r + columns.shape[1]))
         whole[:r, :r], whole[:r, r:] = -h * K, h * columns
         moved = np.asarray(expm(whole))[:r]
@@ -149,12 +152,12 @@ class ReducedModel:
         return x
 
     def lift(self, x: Array, inputs: Mapping[str, float]) -> Array:
-        """Return the state of the full model with the coordinates x, shape (n,)."""
+        """Return the state of the full model for coordinates x, shape (n,)."""
         return self.frame.lift(x, self.values(inputs))
 
     @property
     def start(self) -> Array:
-        """Coordinates of the state that it was made about, shape (r,)."""
+        """Coordinates of the linearisation point, shape (r,)."""
         return self.project(self.frame.u)
 
     def numbers(self, q: Array) -> Array:
@@ -162,7 +165,7 @@ class ReducedModel:
         return np.asarray(q[self.frame.rows])
 
     def given(self, q: Mapping[str, float] | None) -> Array:
-        """Return unknown numbers by label, the others at the prior, shape (m,)."""
+        """Return unknown numbers by label; others are set to the prior, shape (m,)."""
         numbers = self.prior.copy()
         for label, value in (q or {}).items():
             if label not in self.unknowns:
@@ -179,7 +182,7 @@ class ReducedModel:
         return numbers
 
     def shifted(self, q: Array, shift: Array) -> Array:
-        """Return unknown numbers moved by so much to first order, but in latent values, (m,)."""
+        """Return unknown numbers shifted in latent values, to first order by `shift`, (m,)."""
         space = self.frame.model.parameter_space
         moved = [
             unknown_of(space, label).map.shifted(value, abs(by), np.sign(by))
@@ -188,12 +191,15 @@ class ReducedModel:
         return np.array(moved, dtype=float)
 
     def seen(self, x: Array, q: Array, inputs: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return what the sensors show, (sensors,), and its derivative in x, (sensors, r).
+        """Return predicted readings, (sensors,), and their derivative in x, (sensors, r).
 
-        Of sensors that are not linear in the state, or see unknown numbers, at x and q.
+        Sensors that are nonlinear in the state, or depend on unknown numbers, are linearised at x
+        and q.
         """
         frame, c = self.frame, self.values(inputs)
         observed = frame.sensors
+        # Linear sensors have a constant output equation; all others need the lifted state of the
+        # full model.
         if type(observed) is Observed and observed.linear:
             return self.sensors(x, c), self.sensors.C
         full, moment = frame.q.copy(), Moment(0.0, Inputs(inputs))
@@ -208,9 +214,9 @@ class ReducedModel:
         q: Array | None = None,
         inputs: Mapping[str, float] | None = None,
     ) -> ReducedModel:
-        """Return the same on the same basis, linearised about another state.
+        """Return the model on the same basis, linearised at another point.
 
-        For a model that is not affine in u, or has unknown fields. A loop does it by itself.
+        For models that are not affine in u, or have unknown fields. A loop does this automatically.
 
         Parameters
         ----------
@@ -237,17 +243,17 @@ class ReducedModel:
     def error(
         self, q: Mapping[str, float] | None = None, *, h: float, samples: int = 100
     ) -> dict[str, float]:
-        """Return how much it misses of the full model: for each output the largest over all times.
+        """Return the relative model reduction error of each output, the largest over all times.
 
-        Each control in turn makes a step of size 1 and holds it; the difference is relative to the
-        largest response of that output to any of them.
+        The error is that of the response to a unit step of each control in turn, relative to the
+        largest response of that output to any control.
 
         Parameters
         ----------
         q
             Unknown numbers by label; default the prior.
         h, samples
-            Time between samples, and how many are taken.
+            Sampling period, and number of samples.
         """
         if not h > 0.0 or samples < 1:
             raise ConfigurationError(
@@ -261,6 +267,8 @@ class ReducedModel:
         model, times = frame.model, (h * np.arange(samples + 1)).tolist()
         for control in self.controls:
             inputs = dict(frame.inputs) | {control: frame.inputs[control] + 1.0}
+            # The boundary values of the initial state must be those after the step of the control,
+            # since the reduced coordinates include them.
             u0 = model.impose(frame.u, Moment(0.0, Inputs(inputs)))
             states = simulate(
                 model,
@@ -284,7 +292,7 @@ class ReducedModel:
 
 
 def _known(what: str, inputs: Mapping[str, float] | None, channels: Sequence[str]) -> None:
-    """Refuse inputs that are no channels, or no numbers."""
+    """Raise an error for inputs that are not channels or not numbers."""
     for name, value in (inputs or {}).items():
         if name not in channels:
             raise ConfigurationError(
@@ -297,7 +305,7 @@ def _known(what: str, inputs: Mapping[str, float] | None, channels: Sequence[str
 
 
 def _end(unknown: Any, side: int) -> float:
-    """Return a bound of an unknown; the logarithm has none below zero."""
+    """Return a bound of an unknown; the logarithm implies a lower bound of zero."""
     bound = float(unknown.bounds[side])
     return max(bound, 0.0) if unknown.transform == "log" and not side else bound
 
@@ -314,38 +322,38 @@ def reduce(
     q: Any = None,
     inputs: Mapping[str, float] | None = None,
 ) -> ReducedModel:
-    """Return a model in a few coordinates, in which the unknown numbers stay parameters.
+    """Return a reduced-order model that keeps the unknown numbers as parameters.
 
-    The basis holds the static responses to all channels, with the unknown numbers at the prior and
-    at the ends of its 95 % interval, so that steady states are exact there; and the slowest
-    eigenmodes. The projection is Galerkin's.
+    The basis contains the static responses to all channels, with the unknown numbers at the prior
+    and at the ends of its 95 % interval, so that steady states are exact there, and the slowest
+    eigenmodes. The projection is a Galerkin projection.
 
     Parameters
     ----------
     model
-        The process, linear in its unknown numbers and its input channels. Where it is not affine
-        in u it is linearised.
+        The process, linear in its unknown numbers and its input channels. It is linearised if it is
+        not affine in u.
     outputs
-        What is controlled or held within limits: any observation.
+        Observation of the controlled or limited quantities.
     controls
-        The channels that a controller sets. All others are disturbances.
+        Channels set by a controller. All others are disturbances.
     sensors
-        What is measured; default `outputs`.
+        Observation of the measured quantities; default `outputs`.
     modes
-        Eigenmodes beside the static responses.
+        Number of eigenmodes in addition to the static responses.
     rates
-        Responses at these rates, one over a time, are exact, too: take 1/period where an output
-        lies where a control acts, so that it answers at once.
+        Rates (reciprocal times) at which responses are also exact: take 1/period if an output lies
+        where a control acts, so that it responds at once.
     u, q, inputs
-        Where to linearise, as for `Identifier` u0 and q0: default zero, the prior, and zero. Of an
-        unknown field q is its value; see `ReducedModel.about`.
+        Linearisation point, as u0 and q0 of `Identifier`: default zero, the prior, and zero. The
+        value of an unknown field is taken from q; see `ReducedModel.about`.
 
     Raises
     ------
     ModelError
-        The model reads the time, or is not linear in what it has to be.
+        The model depends on time, or is not linear in unknown numbers or channels.
     ConfigurationError
-        A control that is no channel of the model.
+        A control is not a channel of the model.
     """
     unknown = [name for name in controls if name not in model.channels]
     if isinstance(controls, str) or unknown or not 0 < len(controls) == len(set(controls)):
@@ -366,7 +374,7 @@ def reduce(
         raise ConfigurationError("reduce: u is not finite; give the state where it is linearised.")
     spaces = (model.state_space, model.X, model.parameter_space)
     seen = outputs.bind(*spaces)
-    frame = Frame(
+    frame = GalerkinReduction(
         model,
         seen,
         seen if sensors is None else sensors.bind(*spaces),

@@ -1,4 +1,4 @@
-"""Whether an estimate is good enough to act on, and what is done if not."""
+"""Trust in an estimate: tests that decide between the estimate and the nominal model."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ __all__ = ["Trust"]
 
 @dataclass(frozen=True)
 class Trust:
-    """When an estimate is handed to the controller; otherwise the fixed model acts.
+    """Conditions for using an estimate in control; otherwise the nominal model is used.
 
     *The rule*: while any of these tests fails, and until `patience` samples in a row have passed
-    them, the controller gets state and unknown numbers from the nominal model, with the unknown
-    numbers at the prior and its own filter, exactly as if nothing were learned.
+    them, the controller gets state and unknown numbers from the nominal model, which has the
+    unknown numbers at the prior and a filter of its own, exactly as without learning.
 
     - The step of the identifier was taken (status ok).
     - The model explains the data: the mean square of the normalised innovations is at most
       `misfit`.
-    - Each unknown number is known: its standard deviation is at most `spread` of its value; of one
-      that may be negative, of the prior's deviation where that is larger.
+    - Each unknown number is well determined: its standard deviation is at most `spread` times its
+      value or, if it may be negative, times the prior standard deviation where that is larger.
     - Each lies inside of its bounds, not at one.
 
     Parameters
     ----------
     spread
-        Largest deviation of an unknown number, relative to its value.
+        Largest standard deviation of an unknown number, relative to its value.
     misfit
-        Largest innovation ratio, 1 where model and noise are right (note "innovation_ratio").
+        Largest innovation ratio, which is 1 if model and noise are correct (note
+        "innovation_ratio").
     patience
-        Samples in a row that have to pass before the estimate is used.
+        Number of consecutive samples that must pass before the estimate is used.
     """
 
     spread: float = 0.3
@@ -55,7 +56,7 @@ class Trust:
             )
 
     def doubt(self, estimate: Estimate, model: ReducedModel) -> str:
-        """Return why an estimate is not trusted; empty if it is."""
+        """Return the reason why an estimate is not trusted; empty if it is."""
         if not estimate.status.ok:
             return f"the step failed ({estimate.status})"
         misfit = estimate.notes.get("innovation_ratio", 1.0)

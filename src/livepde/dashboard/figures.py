@@ -206,7 +206,7 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
 def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
     """Draw the share of the prior deviation that is left of each unknown."""
     known = dict(reversed(open_shares(data, at).items()))
-    figure = empty("prior deviation left [%]", height=max(170, 90 + 26 * len(known)))
+    figure = empty("prior standard deviation left [%]", height=max(170, 90 + 26 * len(known)))
     shares = [100.0 * left for left in known.values()]
     colours = [
         PALETTE[2] if share <= 100 * SURE else PALETTE[1] if share > 100 * FLAT else PALETTE[0]

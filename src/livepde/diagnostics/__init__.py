@@ -1,4 +1,4 @@
-"""Checks that a user can run on objects of his own, and the paper's theory made computable."""
+"""Checks for user-defined objects, and computable quantities of the paper's theory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The errors e, r, p of a twin experiment along a run, the paper's conditions and error bounds."""
+"""Errors e, r, p of a twin experiment along a run, with the paper's conditions and bounds."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ from livepde.streams import Twin
 __all__ = ["Errors", "TwinTracker", "bounds", "conditions"]
 
 Data = Literal["exact", "noisy", "smoothed"]
-ROUNDING = 1e-9  # of an inequality between norms, relative
-# Section -> the paper's labels of a bound on mu, of a stronger one, and of a bound on nu.
+# Relative violation of an inequality between norms that is attributed to rounding.
+ROUNDING = 1e-9
+# For each section the paper's labels of the bound on mu, of a stronger one, and of the bound on nu.
 CONDITIONS: dict[Data, tuple[str, str, str]] = {
     "exact": ("cond:mu_1", "cond:mu02", "cond:nu"),
     "noisy": ("ass:mu_nu, mu", "ass:mu_noisy", "ass:mu_nu, nu"),
@@ -44,7 +45,7 @@ UNUSED = (
 
 @dataclass(frozen=True)
 class Errors:
-    """The norms of one moment of a twin experiment.
+    """Error norms of a twin experiment at one sample.
 
     Attributes
     ----------
@@ -53,16 +54,16 @@ class Errors:
     e
         ||q - q*||_Q, gain-scaled.
     r, p, d, r_alpha
-        Norms of R(u - u*), P(u - u*), u_alpha - R u* and R u - u_alpha. With a `Subdomain` these
-        are integrals of u - u* over omega (r) and over the rest (p).
+        Norms of R(u - u*), P(u - u*), u_alpha - R u* and R u - u_alpha. With a `Subdomain` they are
+        integrals of u - u* over omega (r) and over its complement (p).
     Pu
         ||P u*||_V^.
     rate
-        ||d~||_X, the rate of d since the sample before; 0 at the first.
+        ||d~||_X, the rate of change of d since the previous sample; 0 at the first.
     theta
-        What the damping rule gives for r_alpha.
+        Value of the damping rule for r_alpha.
     u_alpha
-        ||u_alpha||_X, to which floors are relative.
+        ||u_alpha||_X, the reference of relative floors.
     """
 
     t: float
@@ -80,7 +81,7 @@ class Errors:
     def energy(self) -> float:
         """||e||_Q^2 + ||r||_X^2, which never grows with exact data of all of u (align:neplusnr).
 
-        With data on a part it does not grow as long as mu is at least the bound of cond:mu_1.
+        With partial data it does not grow as long as mu is at least the bound of cond:mu_1.
         """
         return self.e**2 + self.r.X**2
 
@@ -98,25 +99,26 @@ class Errors:
 
 
 class TwinTracker:
-    """Follows the errors of a run against its twin; gives nothing back to the estimator.
+    """Tracker of the errors of a run against its twin; no feedback to the estimator.
 
     Parameters
     ----------
     twin
         The truth.
     spaces
-        Norms; by `Spaces.of(model, observed, law)` those of the law's operators.
+        Spaces that define the norms; `Spaces.of(model, observed, law)` for those of the law's
+        operators.
     gain
-        That of the law: ||e||_Q^2 is divided by it.
+        Gain of the law; ||e||_Q^2 is divided by it.
     damping
         The law's rule, for theta.
     reconstruct
-        z -> u_alpha as the law takes it; default that of the observation.
+        Function z -> u_alpha as used by the law; default that of the observation.
 
     Raises
     ------
     ConfigurationError
-        An unknown moves, or the model is not linear in what is estimated.
+        An unknown has an evolution, or the model is not linear in the latent coefficients.
 
     Examples
     --------
@@ -156,7 +158,7 @@ class TwinTracker:
         self._last: tuple[float, Array] | None = None
 
     def add(self, estimate: Estimate, z: Any) -> Errors:
-        """Compare one estimate with the truth.
+        """Compare one estimate with the truth and record the errors.
 
         Parameters
         ----------
@@ -172,7 +174,8 @@ class TwinTracker:
         else:
             u_alpha = spaces.observed.reconstruct(z, boundary=boundary).u
         error = estimate.u - exact
-        # Dirichlet values agree, so the error lies in the tangent space.
+        # Estimate and truth have the same Dirichlet values, so the error lies in the tangent space.
+        # The data error d is defined for the free coefficients, hence without the boundary values.
         d = u_alpha - split.R @ (exact - boundary)
         residual = split.R @ error - d
         seen, hidden = spaces.observed_part, spaces.hidden_part
@@ -220,7 +223,7 @@ def _integral(errors: Sequence[Errors], get: Callable[[Errors], float]) -> float
 def _asked(
     data: Data, c: Constants, sigma: float
 ) -> tuple[Callable[[Errors, float], float], Callable[[Errors], float]]:
-    """Return the least theta, for a constant c_1, and the least nu that a section asks for."""
+    """Return the least theta, for a constant c_1, and the least nu required by a section."""
 
     def theta(item: Errors, c1: float) -> float:
         if data == "exact":
@@ -247,16 +250,16 @@ def conditions(
     c1: float = 0.0,
     floor: float = 0.0,
 ) -> CheckReport:
-    """Say at what share of the samples the paper's conditions on mu, nu and d hold.
+    """Report the share of samples at which the paper's conditions on mu, nu and d hold.
 
     These are the conditions of the propositions on the errors (`bounds`). That q converges needs
     more: persistence of excitation (asspof, `Excitation`) and the link conditions (cond:link,
     `link`). Those fail for every data error d that does not vanish: theta tends to zero with
     r_alpha, ||p||_V^ + ||d||_V~ does not.
 
-    With data on a subdomain all of them are said of a p without flux D grad p through the boundary
-    of omega, as in the paper's V^. A continuous discrete u has one: it acts on r at the nodes
-    there, nu times that of u in addition, and a mu for which the conditions just hold need not
+    With data on a subdomain all conditions assume a p without flux D grad p through the boundary of
+    omega, as in the paper's V^. A continuous discrete u has such a flux: it acts on r at the nodes
+    there, in addition to nu times that of u, and a mu that just satisfies the conditions need not
     suffice.
 
     Parameters
@@ -269,12 +272,12 @@ def conditions(
         Which section: "exact" (cond:mu_1, cond:mu02, cond:nu), "noisy" (ass:mu_nu, ass:mu_noisy,
         (cond_d)) or "smoothed" (ass:mu_nu_smooth, cond:mu_smooth_2).
     nu, sigma
-        Those of the law.
+        Coefficients of the law.
     c1
-        Of the stronger bound on mu for the convergence of the state.
+        Constant of the stronger bound on mu for the convergence of the state.
     floor
-        Of the damping rule: where ||r_alpha||_X is below this share of ||u_alpha||_X it counts as
-        zero, and a bound on mu as fulfilled (mu r/||r|| is any vector up to mu there).
+        Floor of the damping rule: where ||r_alpha||_X is below this share of ||u_alpha||_X it
+        counts as zero, and a bound on mu as satisfied (mu r/||r|| is any vector up to mu there).
     """
     n = len(errors)
     if not n:
@@ -363,7 +366,7 @@ def bounds(
     Returns
     -------
     CheckReport
-        One line each; whether their hypotheses hold is told by `conditions`.
+        One line for each bound; their hypotheses are checked by `conditions`.
     """
     kept = [item for item in errors if item.t < until or item is errors[0]]
     if not kept:

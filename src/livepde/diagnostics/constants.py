@@ -1,4 +1,4 @@
-"""The norms and constants of the theory, for a discretised model (Assumption ass:equation)."""
+"""Norms and constants of the theory for a discretised model (Assumption ass:equation)."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ __all__ = ["Part", "Spaces", "constants"]
 
 Pair: TypeAlias = tuple[sp.csr_array, sp.csr_array]
 
-LARGEST_DENSE_BASIS = 2000  # unknowns, where R is not a selection
-LARGEST_TRACE = 2e7  # m n^2 up to which the bound of A(v) is computed over all of Q
+# Largest number of unknowns for a dense basis, needed if R is not a selection.
+LARGEST_DENSE_BASIS = 2000
+# Largest m n^2 up to which the bound of A(v) is computed over all of Q.
+LARGEST_TRACE = 2e7
 NONLINEAR = (
     "The constants are those of C(q, u) = A(u) q + B(u) (ass:equation). This model is not linear "
     "in what is estimated (a transform, or a form nonlinear in q): the paper's theory is silent."
@@ -35,14 +37,14 @@ NONLINEAR = (
 
 @dataclass(frozen=True, eq=False)
 class Spaces:
-    """The spaces V~, VX~ of the observed part and V^, VX^ of the unobserved one.
+    """Spaces V~, VX~ of the observed part and V^, VX^ of the unobserved part.
 
     Parameters
     ----------
     model, observed
-        The process, and what is seen of it (`identifier.observed`).
+        The process, and its bound observation (`identifier.observed`).
     M_op, N_op
-        Integrands (u, v, x) of M and N, (MN1) and (MN2), as the law has them.
+        Integrands (u, v, x) of M and N, (MN1) and (MN2), as in the law.
     VX, V
         Integrands of other squared norms for both parts; default those of M and N themselves, for
         which c_M = C_M = c_N = C_N = 1.
@@ -78,21 +80,21 @@ class Spaces:
 
     @cached_property
     def split(self) -> Split:
-        """R, P and G^+ with all sensors present."""
+        """Projections R, P and G^+ with all sensors present."""
         return self.observed.split()
 
     @cached_property
     def observed_part(self) -> Part:
-        """V~ and VX~: functions on omega, or the range of R."""
+        """Spaces V~ and VX~: functions on omega, or the range of R."""
         return self._parts[0]
 
     @cached_property
     def hidden_part(self) -> Part:
-        """V^ and VX^: functions outside of omega, or the range of P."""
+        """Spaces V^ and VX^: functions outside of omega, or the range of P."""
         return self._parts[1]
 
     def images(self, jacobian: Callable[[IntArray | None], sp.csr_array]) -> tuple[Images, Images]:
-        """Return what C' makes of the two parts, for `Part.lipschitz`.
+        """Return the images of the two parts under C', for `Part.lipschitz`.
 
         Parameters
         ----------
@@ -110,7 +112,7 @@ class Spaces:
         return seen, [(inside, sp.csr_array(J @ self._unseen)), outside]
 
     def observed_A(self, w: Array, moment: Moment = START, q: Array | None = None) -> sp.csr_array:
-        """Return A(w), over omega where there is one: dual vectors of X in columns, shape (n, m).
+        """Return A(w) over omega, if it is a subdomain: dual vectors in columns, shape (n, m).
 
         Parameters
         ----------
@@ -155,7 +157,7 @@ class Spaces:
     def _projected(
         self, M: sp.csr_array, N: sp.csr_array, VX: Pair, V: tuple[Any, Any]
     ) -> tuple[Part, Part]:
-        """Return the ranges of R and P, for sensors without a subdomain."""
+        """Return the parts as ranges of R and P, for sensors without a subdomain."""
         X = self.model.X
         seen, hidden = self.bases
         free = sp.diags_array(X.free)
@@ -168,7 +170,7 @@ class Spaces:
     def _integrated(
         self, M: sp.csr_array, N: sp.csr_array, VX: Pair, V: tuple[Any, Any]
     ) -> tuple[Part, Part]:
-        """Return the functions on omega and those on the rest; both own its boundary."""
+        """Return the parts as functions on omega and on its complement; both own the interface."""
         X, regions = self.model.X, self._regions or ()
         inside, outside = self._masses
         masses = self._divided(inside, outside)
@@ -187,7 +189,7 @@ class Spaces:
 
     @cached_property
     def _regions(self) -> tuple[IntArray, IntArray] | None:
-        """The elements of omega and the others; None: there is no subdomain."""
+        """Elements of omega and the other elements; None without a subdomain."""
         omega = self.split.omega
         if omega is None:
             return None
@@ -201,7 +203,7 @@ class Spaces:
 
     @cached_property
     def _unseen(self) -> sp.csr_array:
-        """P on the free coefficients: components without a sensor, within omega too."""
+        """P on the free coefficients: components without a sensor, also within omega."""
         return sp.csr_array(self.split.P @ sp.diags_array(self.model.X.free))
 
     def _divided(self, inside: sp.csr_array, outside: sp.csr_array) -> Pair:
@@ -210,7 +212,7 @@ class Spaces:
         return sp.csr_array(R.T @ inside @ R), sp.csr_array(P.T @ inside @ P + outside)
 
     def _on(self, mass: sp.csr_array) -> HilbertSpace:
-        """Return X with a mass matrix that does not see all coefficients."""
+        """Return X with a mass matrix that is singular: it vanishes on some coefficients."""
         unseen = (mass.diagonal() <= 0.0) | (self.model.X.free == 0.0)
         return HilbertSpace(mass, "X", np.flatnonzero(unseen))
 
@@ -233,7 +235,8 @@ class Spaces:
         free = np.flatnonzero(X.free)
         left, sizes, _ = np.linalg.svd(R.toarray()[np.ix_(free, free)])
         rank = int((sizes > 1e-10).sum())
-        # R is a projection: its range is spanned by `left`, that of I - R by its own singular ones.
+        # The projection R has `left` as a basis of its range; that of I - R has its own singular
+        # vectors.
         rest, rest_sizes, _ = np.linalg.svd((np.eye(X.dim) - R.toarray())[np.ix_(free, free)])
         hidden_rank = int((rest_sizes > 1e-10).sum())
         whole = np.zeros((X.dim, rank + hidden_rank))
@@ -276,12 +279,12 @@ def constants(
     states
         Coefficients of states along the run, at least one.
     gain
-        That of the law: it divides the inner product of Q, so C_A grows with its square root.
+        Gain of the law: it divides the inner product of Q, so C_A grows with its square root.
 
     Raises
     ------
     ConfigurationError
-        No state is given, or C is not linear in the (latent) parameter.
+        No state is given, or C is not linear in the latent parameter.
     """
     if not len(states):
         raise ConfigurationError("constants: give at least one state.")
@@ -335,7 +338,7 @@ def constants(
 
 
 def _norm_of_A(model: Model, u: Array, moment: Moment) -> tuple[float, Array]:
-    """Return ||A(u)||_{Q -> X} and the q that attains it."""
+    """Return ||A(u)||_{Q -> X} and the q at which it is attained."""
     A, Q = model.A(u, moment), model.Q
     free = np.flatnonzero(Q.free)
 
@@ -360,7 +363,7 @@ def _norm_of_A(model: Model, u: Array, moment: Moment) -> tuple[float, Array]:
 
 
 def _trilinear(model: Model, u: Array, moment: Moment) -> tuple[float, bool]:
-    """Return K of `constants`, and whether it is a bound (else it comes from sampling)."""
+    """Return K of `constants`, and True if it is a bound (False: a value from sampling)."""
     n, free = model.X.dim, np.flatnonzero(model.X.free)
     free_q = np.flatnonzero(model.Q.free)
 
@@ -385,7 +388,8 @@ def _trilinear(model: Model, u: Array, moment: Moment) -> tuple[float, bool]:
         for _ in range(4):
             size, q = _norm_of_A(model, v / model.X.norm(v), moment)
             best = max(best, size)
-            # One power step for v; the next norm of A sees how good it is.
+            # A few power iterations for v alternate with the exact maximisation over q. They need
+            # not converge, since every norm of A is a lower bound of K.
             image = slope(q)
             for _ in range(3):
                 v = model.X.riesz(image.T @ model.X.riesz(image @ v))

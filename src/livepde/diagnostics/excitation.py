@@ -1,4 +1,4 @@
-"""The windowed excitation Gramian (Assumption asspof): which modes of q the data have pinned."""
+"""Windowed excitation Gramian (Assumption asspof): modes of q determined by the data."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from livepde.spaces import HilbertSpace
 
 __all__ = ["Excitation", "ExcitationState", "Spectrum"]
 
-ENTRIES = 5_000_000  # numbers of a block of states
-DENSE = 1000  # parameters up to which the sum over windows is kept as a matrix
+# Number of entries of a block of states, which bounds the size of temporary arrays.
+ENTRIES = 5_000_000
+# Number of parameters up to which the Gramian is stored as a matrix.
+DENSE = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +31,12 @@ class Spectrum:
     Attributes
     ----------
     strength
-        ||integral of R A(w) phi_k||_X for Q-normal modes phi_k, descending; the last one is the
+        ||integral of R A(w) phi_k||_X for Q-normal modes phi_k, descending; the last is the
         epsilon_0 of asspof.
     modes
-        The phi_k as columns, shape (m, count), in the gain-scaled inner product of Q.
+        Modes phi_k as columns, shape (m, count), normalised in the gain-scaled inner product of Q.
     windows
-        Over how many windows the squares were summed.
+        Number of windows over which the squares were summed.
     """
 
     strength: Array
@@ -43,11 +45,11 @@ class Spectrum:
 
     @property
     def epsilon(self) -> float:
-        """The epsilon_0 of asspof; for a field it tends to zero with the mesh."""
+        """Constant epsilon_0 of asspof; for a field it tends to zero with the mesh size."""
         return float(self.strength[-1]) if len(self.strength) else 0.0
 
     def pinned(self, share: float = 1e-2) -> int:
-        """Return how many modes are excited at least `share` as much as the strongest one."""
+        """Return the number of modes with at least `share` of the strongest excitation."""
         if not len(self.strength) or self.strength[0] <= 0:
             return 0
         return int((self.strength >= share * self.strength[0]).sum())
@@ -56,11 +58,11 @@ class Spectrum:
         """Return 2 gamma_0 ||d~||_X / epsilon for each mode, as in th:parameter_noisesmooth.
 
         The theorem bounds the error of q by it in the limit only under the link conditions
-        (cond:link, see `link`), which no data error meets that does not vanish. Without them it is
-        a scale, and no bound.
+        (cond:link, see `link`), which do not hold for a data error that does not vanish. Without
+        them it is a scale, not a bound.
 
-        A mode whose bound exceeds its size in Q (1: the prior deviation, for gain 1) is not pinned
-        by data whose error changes at that rate.
+        A mode whose bound exceeds its size in Q (1: the prior standard deviation, for gain 1) is
+        not determined by data whose error changes at that rate.
         """
         tiny = np.finfo(float).tiny
         bounds: Array = 2.0 * window * rate / np.maximum(self.strength, tiny)
@@ -69,24 +71,24 @@ class Spectrum:
 
 @dataclass(frozen=True, eq=False)
 class ExcitationState:
-    """A plain value: what `Excitation` has accumulated.
+    """State of `Excitation`: accumulated integrals, as a plain value.
 
     Attributes
     ----------
     t
         Time of the last sample; NaN before the first.
     begun
-        Where the open window begins.
+        Start time of the open window.
     last
-        A(w) at t, of latent coefficients, dual vectors of X in columns, shape (n, m).
+        A(w) at t for latent coefficients, dual vectors of X in columns, shape (n, m).
     integral
-        Over the open window.
+        Integral over the open window.
     latest
         Integral over the last whole window, None before.
     gram
         Sum over whole windows of their Gramians, shape (m, m); None beyond 1000 parameters.
     windows
-        How many.
+        Number of whole windows.
     """
 
     t: float = np.nan
@@ -100,11 +102,11 @@ class ExcitationState:
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """Accumulates integral over [t, t + gamma_0] of R A(w) d tau along a run, window by window.
+    """Accumulator of the integrals of R A(w) over windows [t, t + gamma_0] of a run.
 
-    Of a `Subdomain` R A(w) is A(w) on omega.
+    For a `Subdomain`, R A(w) is A(w) on omega.
 
-    w = u_alpha + P u is what the law itself knows, so this needs no truth. The windows are
+    The argument w = u_alpha + P u is known to the law, so no truth is needed. The windows are
     disjoint; a window ends at the first sample at or after its length.
 
     Parameters
@@ -112,10 +114,10 @@ class Excitation:
     spaces
         Model and projections.
     window
-        gamma_0, in the unit of time. Contributions that cancel within a window do not count, so
-        take it shorter than the periods of the excitation.
+        Length gamma_0, in the unit of time. Contributions that cancel within a window do not count,
+        so it should be shorter than the periods of the excitation.
     gain
-        That of the law.
+        Gain of the law.
 
     Examples
     --------
@@ -159,12 +161,12 @@ class Excitation:
         Parameters
         ----------
         w
-            u_alpha + P u, or the estimate u where they hardly differ; shape (n,).
+            State u_alpha + P u, or the estimate u if they hardly differ; shape (n,).
         inputs
             Input channels at t.
         q
-            Estimate of the parameter, shape (m,), by default the prior mean: at which A is taken
-            of a model that is not linear in what is estimated (a transform, say).
+            Estimate of the parameter, shape (m,), default the prior mean: the linearisation point
+            of A for a model that is nonlinear in the latent coefficients (with a transform).
         """
         model, moment = self.spaces.model, Moment(t, Inputs(inputs or {}))
         at = None
@@ -194,9 +196,10 @@ class Excitation:
         return back
 
     def spectrum(self, state: ExcitationState, *, latest: bool = False) -> Spectrum:
-        """Return the spectrum of all whole windows so far, or of the latest.
+        """Return the spectrum of all whole windows so far, or of the latest one.
 
-        All modes up to 1000 parameters; beyond, the 20 strongest of the latest window by Lanczos.
+        All modes are computed up to 1000 parameters; beyond, the 20 strongest of the latest window
+        by Lanczos.
 
         Raises
         ------

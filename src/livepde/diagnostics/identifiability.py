@@ -1,8 +1,8 @@
-"""What a belief knows more than the prior: what is pinned, flat, traded off, at a bound.
+"""Identifiability from a belief: unknowns that are determined, correlated, or at a bound.
 
-Prior and posterior are compared in the reduced coordinates of the law, in which the prior is
-N(0, I): there the covariance itself is the posterior-to-prior ratio, its eigenvalues do not depend
-on units, and the root of one is the share of the prior deviation that is left.
+Prior and posterior are compared in the reduced coordinates of the law, in which the prior is N(0,
+I): there the covariance itself is the posterior-to-prior ratio, its eigenvalues do not depend on
+units, and the square root of one is the remaining share of the prior standard deviation.
 """
 
 from __future__ import annotations
@@ -20,28 +20,32 @@ from livepde.verdict import FLAT
 
 __all__ = ["FLAT", "Direction", "Identifiability", "Known", "identifiability"]
 
-PINNED = 0.1  # of the prior deviation left, at most
-TRADED = 0.9  # correlation from which two unknowns are one
-WEIGHT = 0.3  # least weight in a combination of length one that is named
+# Largest remaining share of the prior standard deviation of a well-determined unknown.
+PINNED = 0.1
+# Correlation from which only a combination of two unknowns is determined.
+TRADED = 0.9
+# Smallest coefficient in a unit vector with which an unknown is listed in a combination.
+WEIGHT = 0.3
 
 
 @dataclass(frozen=True)
 class Known:
-    """How well one unknown is known.
+    """Information gain about one unknown.
 
     Attributes
     ----------
     name
         Label of a number, or name of a field.
     left
-        Share of its prior deviation that is left; of a field root mean square over its modes.
+        Remaining share of the prior standard deviation; for a field the root mean square over its
+        modes.
     modes
-        Of a field how many combinations of its modes are pinned, and flat, and how many modes it
-        has; of a number nothing.
+        For a field the numbers of pinned and of flat combinations of its modes, and the number of
+        modes; empty for a number.
     bound
         The bound at which a number lies, NaN for none.
     moves
-        True if it changes by itself: then it is never known for good.
+        True if it has an evolution: its uncertainty then grows again.
     """
 
     name: str
@@ -52,7 +56,7 @@ class Known:
 
     @property
     def verdict(self) -> str:
-        """In one word: "at its bound", "pinned", "flat" or "partly"."""
+        """Verdict in one word: "at its bound", "pinned", "flat" or "partly"."""
         if np.isfinite(self.bound):
             return "at its bound"
         if self.left <= PINNED:
@@ -62,7 +66,7 @@ class Known:
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of numbers, in prior deviations, and the share of its deviation left."""
+    """Combination of numbers in prior standard deviations, and its remaining share."""
 
     weights: Mapping[str, float]
     left: float
@@ -74,17 +78,17 @@ class Direction:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What a belief knows more than the prior.
+    """Information gain of a belief over the prior.
 
     Attributes
     ----------
     unknowns
         One item for each number and field.
     pairs
-        Two names and their correlation, if beyond 0.9: only a combination of both is known. Of a
-        number and a field its multiple correlation with the modes.
+        Two names and their correlation, if beyond 0.9: only a combination of both is determined.
+        For a number and a field, the multiple correlation with the modes.
     directions
-        Leading combinations of three or more numbers that are pinned while none of them is.
+        Leading combinations of three or more numbers that are pinned although no single number is.
     """
 
     unknowns: tuple[Known, ...]
@@ -93,7 +97,7 @@ class Identifiability:
 
     @property
     def sentences(self) -> list[str]:
-        """What is traded off, and how many modes of each field are known."""
+        """Sentences on correlated unknowns and on the determined modes of each field."""
         found = [
             f"{a} and {b} are traded off against each other (correlation {r:+.2f}): the data tell "
             "a combination of them, not each alone."
@@ -119,7 +123,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     Parameters
     ----------
     belief
-        In latent coefficients: `Identifier.latent_belief()`.
+        Belief in latent coefficients: `Identifier.latent_belief()`.
 
     Raises
     ------
@@ -162,6 +166,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
         for label, row in zip(labels, numbers, strict=True)
     ]
     pairs = _pairs(labels, numbers)
+    # Coordinates of the posterior in the prior modes, where the prior covariance is the identity.
     reduced = prior.T @ model.Q.dual(posterior)
     for name in space.fields:
         item = latent.parts[name]
@@ -181,7 +186,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
 
 
 def _bound(model: Model, belief: Belief, label: str) -> float:
-    """Return the bound at which a number lies, NaN for none."""
+    """Return the bound at which a number lies; NaN for none."""
     k = model.parameter_space.labels[label]
     value = model.latent.value(belief.q)[k]
     ends = [end[k] for end in model.latent.limits if end[k] == value]
@@ -189,7 +194,7 @@ def _bound(model: Model, belief: Belief, label: str) -> float:
 
 
 def _pairs(labels: list[str], factor: Array) -> list[tuple[str, str, float]]:
-    """Return pairs of numbers that are correlated beyond `TRADED`."""
+    """Return pairs of numbers with a correlation beyond `TRADED`."""
     unit = factor / np.linalg.norm(factor, axis=1)[:, None]
     r = unit @ unit.T
     found = np.argwhere(np.triu(np.abs(r) > TRADED, 1))
@@ -198,6 +203,7 @@ def _pairs(labels: list[str], factor: Array) -> list[tuple[str, str, float]]:
 
 def _explained(row: Array, block: Array) -> float:
     """Return the multiple correlation of a number with the modes of a field."""
+    # The best linear prediction of the number by the field is a projection of its row.
     fit = np.linalg.lstsq(block.T, row, rcond=1e-10)[0]
     return float(np.linalg.norm(fit @ block) / np.linalg.norm(row))
 
@@ -205,7 +211,7 @@ def _explained(row: Array, block: Array) -> float:
 def _directions(
     unknowns: list[Known], labels: list[str], factor: Array, belief: Belief
 ) -> list[Direction]:
-    """Return pinned combinations of three or more numbers that are not pinned themselves."""
+    """Return pinned combinations of three or more numbers that are not pinned individually."""
     vectors, sizes, _ = np.linalg.svd(factor, full_matrices=False)
     known = dict(zip(labels, unknowns, strict=False))
     found = []

@@ -1,4 +1,4 @@
-"""The contract of an update law: streaming, saving and recovering rest on it."""
+"""Contract test of an update law, on which streaming, saving and recovery rely."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ def check_law(
 ) -> CheckReport:
     """Check an update law on a few samples of a problem.
 
-    It is deterministic; its state is a value of arrays and numbers that no step changes in place;
-    a run continued from a saved state gives bit-identical numbers; estimates are finite and within
-    their bounds; missing samples are no error; a step that fails keeps the state and the stream
-    goes on.
+    The law must be deterministic; its state must be a value of arrays and numbers that no step
+    changes in place; a run continued from a saved state must give bit-identical numbers; estimates
+    must be finite and within their bounds; missing samples must not be errors; a failed step must
+    keep the state and leave the stream usable.
 
     Parameters
     ----------
     law
         The law.
     build
-        Function that returns a fresh identifier with the law it is given.
+        Function that returns a new identifier with the law passed to it.
     samples
         At least four items of a stream: (t, z), (t, z, inputs), or `Sample`.
 
@@ -133,7 +133,7 @@ def _step(identifier: Identifier, item: Sample) -> Estimate:
 
 
 def _count(name: str, count: Callable[[], int], remedy: str) -> CheckLine:
-    """Return a line that holds if nothing was counted; a law of the user's may raise anything."""
+    """Return a line that holds if the count is zero; an exception of the law fails it."""
     try:
         return CheckLine.at_most(name, count(), 0, remedy)
     except Exception as error:  # noqa: BLE001  the report says it, and goes on to the next line
@@ -141,7 +141,7 @@ def _count(name: str, count: Callable[[], int], remedy: str) -> CheckLine:
 
 
 def _numbers(estimate: Estimate) -> Array:
-    """Return everything that a law believes, in one vector."""
+    """Return all numbers of the belief of a law, in one vector."""
     belief = estimate.belief
     parts = [belief.q, belief.u]
     parts += [factor for factor in (belief.q_factor, belief.u_factor) if factor is not None]
@@ -165,7 +165,7 @@ def _outside(identifier: Identifier, estimates: list[Estimate]) -> int:
 def _restarted(
     law: AnyLaw, build: Callable[[AnyLaw], Identifier], items: list[Sample], middle: int
 ) -> list[Estimate]:
-    """Return the estimates after a break, from an identifier that loaded the state saved there."""
+    """Return the estimates after a restart from a state saved in the middle."""
     first, second = build(law), build(law)
     for item in items[:middle]:
         _step(first, item)
@@ -196,7 +196,7 @@ def _without(
 
 @dataclass(frozen=True)
 class _Wrapped(Law[Any, Any]):
-    """A law that behaves as another; what is asked of it differs in the subclasses."""
+    """Law that delegates to another one; subclasses add the instrumentation."""
 
     law: AnyLaw
 
@@ -224,7 +224,7 @@ class _Wrapped(Law[Any, Any]):
 
 @dataclass(frozen=True)
 class _Watched(_Wrapped):
-    """Counts states that are not plain values, and arguments changed in place."""
+    """Counter of states that are not plain values, and of arguments changed in place."""
 
     violations: list[str] = field(default_factory=list)
 
@@ -252,7 +252,7 @@ def _violations(
 
 @dataclass(frozen=True)
 class _FragileScheme(Scheme):
-    """Takes one substep and fails from then on, while armed."""
+    """Time scheme that fails after one substep, while armed."""
 
     order: ClassVar[int] = 2  # whatever the scheme: stages are solved to the end
 
@@ -269,7 +269,7 @@ class _FragileScheme(Scheme):
 
 @dataclass(frozen=True)
 class _Fragile(_Wrapped):
-    """Solves with a scheme that fails in the middle of a step, while `calls` holds "armed"."""
+    """Law with a scheme that fails in the middle of a step, while `calls` holds "armed"."""
 
     dt_max: float
     calls: list[str] = field(default_factory=list)
@@ -286,7 +286,7 @@ class _Fragile(_Wrapped):
 def _failing(
     law: AnyLaw, build: Callable[[AnyLaw], Identifier], items: list[Sample], middle: int
 ) -> int:
-    """Provoke a failure after the first of two substeps; return what was not as it must be."""
+    """Provoke a failure after the first of two substeps; return the number of violations."""
     shortest = float(np.diff([item.t for item in items]).min())
     fragile = _Fragile(law, dt_max=0.5 * shortest)
     identifier = build(fragile)

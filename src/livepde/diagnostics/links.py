@@ -1,4 +1,4 @@
-"""The link conditions (cond:link) and the interpolation inequality (interpol) along a run."""
+"""Link conditions (cond:link) and interpolation inequality (interpol) along a run."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from livepde.linalg import Array
 
 __all__ = ["Interpolation", "Link", "interpolation", "link"]
 
-STEADY = 1.5  # growth of the constant from the first to the second half that still counts as none
+# Growth of the constant from the first to the second half of a run that counts as none.
+STEADY = 1.5
 
 
 @dataclass(frozen=True)
 class Link:
-    """One link condition with its fitted exponent.
+    """A link condition with its fitted exponent.
 
     Attributes
     ----------
@@ -27,7 +28,7 @@ class Link:
     constant
         C_lambda or C_kappa, the largest value over all windows.
     first, second
-        The same over the first and the second half of the windows.
+        The constant over the first and over the second half of the windows.
     """
 
     exponent: float
@@ -37,7 +38,7 @@ class Link:
 
     @property
     def holds(self) -> bool:
-        """True if the constant does not grow along the run, as far as it goes."""
+        """True if the constant does not grow along the run, over its length."""
         return bool(np.isfinite(self.constant) and self.second <= STEADY * self.first)
 
     def __str__(self) -> str:
@@ -56,8 +57,8 @@ def link(
 ) -> Link:
     """Fit one link condition.
 
-    Both are hypotheses of the theorems on the convergence of q. With a data error that does not
-    vanish that of lambda fails: theta tends to zero with r, x does not.
+    Both conditions are hypotheses of the theorems on the convergence of q. That of lambda fails for
+    a data error that does not vanish: theta tends to zero with r, but x does not.
 
     C >= (integral over [t, t + gamma_0] of (x^a/theta)^(1/(a - 1)))^((a - 1)/a), and
     C >= sup x/theta for a = 1. For lambda x = ||p||_V^ (with noise + ||d||_V~), which needs the
@@ -66,13 +67,13 @@ def link(
     Parameters
     ----------
     times, x, theta
-        Along the run, shapes (samples,); theta = mu ||r||_VX~^2/||r||_V~, the paper's.
+        Values along the run, shapes (samples,); theta = mu ||r||_VX~^2/||r||_V~ as in the paper.
     window
         gamma_0.
     exponent
-        Instead of the fit.
+        Given exponent, instead of the fitted one.
     start
-        T_lambda or T_kappa: earlier times do not count.
+        T_lambda or T_kappa: earlier times are ignored.
 
     Examples
     --------
@@ -92,10 +93,11 @@ def link(
     a = _slope(x, theta) if exponent is None else exponent
     if not a >= 1:
         raise ConfigurationError(f"link: the exponent must be at least 1; got {a}.")
+    # Close to 1 the integral norm tends to the maximum norm, which is used instead.
     if a - 1 < 1e-2:
         values, at = x / theta, t
     else:
-        # Scaled by the largest value: with a near 1 the power 1/(a - 1) would overflow.
+        # The ratio is scaled by its largest value: for a near 1 the power 1/(a - 1) would overflow.
         quotient = x**a / theta
         scale = quotient.max()
         power = (quotient / scale) ** (1.0 / (a - 1.0))
@@ -123,7 +125,7 @@ def _slope(x: Array, theta: Array) -> float:
 
 @dataclass(frozen=True)
 class Interpolation:
-    """c_int ||r||_V~ ||r||_X <= ||r||_VX~^2 <= C_int ||r||_V~ ||r||_X (interpol), as measured."""
+    """Measured constants of c_int ||r||_V~ ||r||_X <= ||r||_VX~^2 <= C_int ||r||_V~ ||r||_X."""
 
     c_int: float
     C_int: float

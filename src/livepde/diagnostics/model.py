@@ -1,4 +1,4 @@
-"""Weak forms: linear where they must be, with the right derivatives, and a positive mass."""
+"""Check of weak forms: linearity, derivatives, assembly and mass."""
 
 from __future__ import annotations
 
@@ -19,12 +19,19 @@ from livepde.spaces import HilbertSpace
 
 __all__ = ["check_model"]
 
-ROUNDING = 1e-12  # of identities between sums of products
-LINEARITY = 1e-10  # of the integrand, which may hold functions such as exp
-STEPS = 0.5 ** np.arange(2, 22)  # of the Taylor tests
-FLOOR = 1e-11  # remainders below this share of the function are rounding
-LARGEST_INVERSE = 1e12  # of the equations of algebraic components, scaled to rows of size 1
-SLOWEST = 1.8  # rate of a remainder of second order
+# Relative error of identities between sums of products.
+ROUNDING = 1e-12
+# Relative nonlinearity of an integrand; functions such as exp have larger rounding errors.
+LINEARITY = 1e-10
+# Step sizes of the Taylor tests.
+STEPS = 0.5 ** np.arange(2, 22)
+# Remainders below this share of the function value are rounding errors.
+FLOOR = 1e-11
+# Largest norm of the inverse for algebraic components, with rows scaled to size 1: beyond, their
+# equations do not determine them.
+LARGEST_INVERSE = 1e12
+# Smallest accepted rate of a Taylor remainder, whose theoretical rate is 2.
+SLOWEST = 1.8
 
 
 def check_model(
@@ -39,25 +46,24 @@ def check_model(
 ) -> CheckReport:
     """Check a model's forms by random evaluations, at the scale where they will be used.
 
-    Linearity in q and in the test function v, transpose and adjoint
-    (A(u)* r, xi)_Q = <A(u) xi, r>, derivatives by Taylor tests (the remainder
-    f(u + s du) - f(u) - s f'(u) du falls like s^2, or vanishes for affine forms), the assembled
-    matrices against plain quadrature of the integrand, and the mass. Where components have no mass
-    term, that their equations determine them.
+    Linearity in q and in the test function v, transpose and adjoint (A(u)* r, xi)_Q = <A(u) xi, r>,
+    derivatives by Taylor tests (the remainder f(u + s du) - f(u) - s f'(u) du falls like s^2, or
+    vanishes for affine forms), the assembled matrices against plain quadrature of the integrand,
+    and the mass. Where components have no mass term, their equations must determine them.
 
     Parameters
     ----------
     model
         The model.
     q, u
-        A typical parameter (default the prior mean) and a typical state (default the model's
-        initial one, or zero): numbers, functions of x, or coefficients.
+        A typical parameter (default the prior mean) and a typical state (default the initial state
+        of the model, or zero): numbers, functions of x, or coefficients.
     spread
         Size of the random variations of u; default a tenth of the largest |u|, or 1 if u = 0.
     t, inputs
-        When; channels that are not given are 1.
+        Time and input channels; channels that are not given are 1.
     seed
-        Of the random vectors.
+        Seed of the random vectors.
 
     Returns
     -------
@@ -79,7 +85,7 @@ def check_model(
     ["B'(u): rate of the Taylor remainder"]
     """
     rng = np.random.default_rng(seed)
-    point = _Point.random(model, q, u, spread, t, inputs, rng)
+    point = _TestPoint.random(model, q, u, spread, t, inputs, rng)
     lines = [
         *_finite(model, point),
         *_linear(model, point),
@@ -93,8 +99,8 @@ def check_model(
 
 
 @dataclass(frozen=True, eq=False)
-class _Point:
-    """Where a model is checked: random functions of typical size, and directions du, dq."""
+class _TestPoint:
+    """Test point of a model: random functions of typical size, and directions du, dq."""
 
     moment: Moment
     q: Array
@@ -113,7 +119,7 @@ class _Point:
         t: float,
         inputs: Mapping[str, float] | None,
         rng: np.random.Generator,
-    ) -> _Point:
+    ) -> _TestPoint:
         unknown = set(inputs or {}) - set(model.channels)
         if unknown:
             raise ModelError(
@@ -139,7 +145,7 @@ class _Point:
 
 
 def _densities(form: Form, moment: Moment, **coefficients: Array) -> Array:
-    """Return the weighted integrand at all quadrature points: the form without any shortcut."""
+    """Return the weighted integrand at all quadrature points, by plain evaluation of the form."""
     found = []
     for term in (piece for whole in form.terms for _, piece in whole.pieces()):
         values = {key: local.values(coefficients[key]) for key, local in term.spaces.items()}
@@ -154,7 +160,7 @@ def _plain(form: Form | Composed) -> Form:
     return form.form if isinstance(form, Composed) else form
 
 
-def _finite(model: Model, at: _Point) -> list[CheckLine]:
+def _finite(model: Model, at: _TestPoint) -> list[CheckLine]:
     values = {
         "F": model.F(at.moment),
         "B(u)": model.B(at.u, at.moment),
@@ -172,7 +178,7 @@ def _finite(model: Model, at: _Point) -> list[CheckLine]:
     ]
 
 
-def _linear(model: Model, at: _Point) -> list[CheckLine]:
+def _linear(model: Model, at: _TestPoint) -> list[CheckLine]:
     lines = []
     in_v = "write each term as a factor times v or grad(v); a term without v belongs nowhere."
     in_q = "it seemed linear at moderate values; rescale q, or write its law without thresholds."
@@ -206,8 +212,8 @@ def _linear(model: Model, at: _Point) -> list[CheckLine]:
     return lines
 
 
-def _agreement(model: Model, at: _Point) -> list[CheckLine]:
-    """Compare what laws use (assembled, probed to be affine) with plain quadrature."""
+def _agreement(model: Model, at: _TestPoint) -> list[CheckLine]:
+    """Compare assembled matrices and shortcuts for affine forms with plain quadrature."""
     remedy = (
         "as assembled is not what its integrand gives: it is not linear in v or q, or it looks "
         "affine in u at moderate values and is not at the u given (a threshold far away: rescale)."
@@ -231,7 +237,7 @@ def _agreement(model: Model, at: _Point) -> list[CheckLine]:
     return lines
 
 
-def _adjoint(model: Model, at: _Point) -> list[CheckLine]:
+def _adjoint(model: Model, at: _TestPoint) -> list[CheckLine]:
     A = model.A(at.u, at.moment, at.q)
     transpose = model.form_A.matrix("q", "v", at.moment, u=at.u, q=at.q)
     star = A.adjoint(at.r)
@@ -254,7 +260,7 @@ def _adjoint(model: Model, at: _Point) -> list[CheckLine]:
     ]
 
 
-def _derivatives(model: Model, at: _Point) -> list[CheckLine]:
+def _derivatives(model: Model, at: _TestPoint) -> list[CheckLine]:
     A, B, moment = model.form_A, model.form_B, at.moment
     given = "dA" if any(_plain(A).derivatives) else ""
 
@@ -321,7 +327,7 @@ def _taylor(
     at: Array,
     along: Array,
 ) -> CheckLine:
-    """Return the rate of the Taylor remainder, or its size if it is all rounding."""
+    """Return the rate of the Taylor remainder, or its size if it is at rounding level."""
     remedy = (
         f"{given}= does not belong to {given[1]}: correct it, or leave it out and let a complex "
         "step take the derivative."
@@ -343,13 +349,14 @@ def _taylor(
     small = np.array(remainders[1:])
     above = small > FLOOR * size
     rates = np.log2(small[:-1] / np.maximum(small[1:], 1e-300))[above[:-1] & above[1:]]
-    # The smallest steps decide: a wrong slope of size s shows when the step is below s.
+    # The smallest steps decide: an error of size s in the derivative dominates the remainder only
+    # for steps below s.
     rate = float(np.median(rates[-3:])) if len(rates) else np.inf
     return CheckLine.at_least(f"{name}: rate of the Taylor remainder", rate, SLOWEST, remedy)
 
 
 def _mass(model: Model) -> list[CheckLine]:
-    """Check the mass, on the components that have one."""
+    """Check the mass matrix on the components with a mass term."""
     M, space = model.mass, model.X
     if len(model.algebraic):
         rest = np.setdiff1d(np.flatnonzero(model.X.free), model.algebraic)
@@ -363,8 +370,8 @@ def _mass(model: Model) -> list[CheckLine]:
     ]
 
 
-def _algebraic(model: Model, at: _Point) -> list[CheckLine]:
-    """Check that the equations of components without a mass determine them (index 1)."""
+def _algebraic(model: Model, at: _TestPoint) -> list[CheckLine]:
+    """Check that the equations of components without a mass term determine them (index 1)."""
     rows = model.algebraic
     if not len(rows):
         return []

@@ -1,4 +1,4 @@
-"""The observation operator and its projections, which must split the state as in the theory."""
+"""Check of an observation operator: derivatives, projections R and P, reconstruction."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ from livepde.observation import Observation, Observed, Split
 __all__ = ["check_observation"]
 
 ROUNDING = 1e-12
-STEP = 1e-5  # of central differences, relative
+# Relative step of central differences: the cube root of the rounding unit balances truncation and
+# rounding errors.
+STEP = 1e-5
 TAYLOR = 1e-6
-INVERSE = 1e-9  # G^+ of sensors that nearly repeat each other amplifies rounding
+# Tolerance for identities with G^+, which amplifies rounding for nearly redundant sensors.
+INVERSE = 1e-9
 
 
 def check_observation(
@@ -37,7 +40,7 @@ def check_observation(
 
     For linear sensors, with R = G^+ G and P = I - R: R and P are idempotent, R P = 0, P maps into
     the null space of G, G G^+ G = G, R is self-adjoint in the inner product in which G^+ is taken,
-    `reconstruct` returns R u from z = G u, and missing sensors shrink G and nothing else. For
+    `reconstruct` returns R u from z = G u, and missing sensors only remove rows of G. For
     `Transformed` sensors all this holds for their linear part G_0.
 
     Parameters
@@ -45,12 +48,12 @@ def check_observation(
     observed
         A bound observation (`identifier.observed`), or an observation and its model.
     seed
-        Of the random vectors and times.
+        Seed of the random vectors and times.
     at
         Size of the state at which the derivatives are compared with differences.
     inputs
-        Channel -> value, for sensors that read channels (default 1); positions of moving sensors
-        must lie in the mesh.
+        Mapping from channel to value, for sensors that read channels (default 1); positions of
+        moving sensors must lie in the mesh.
 
     Returns
     -------
@@ -115,7 +118,7 @@ def _taylor(
 ) -> list[CheckLine]:
     """Compare the derivatives with central differences of the readings.
 
-    Only sensors with a reading take part, and at least one must have one.
+    Only sensors with a reading are compared, and at least one must have a reading.
     """
     n, latent = observed.X.dim, Latent(observed.parameter)
     size = max(abs(at), 1e-300)
@@ -140,7 +143,7 @@ def _taylor(
             observed.predict(u + s * step[0], q + s * step[1], moment) for s in (STEP, -STEP)
         )
         error = ((more - less) / (2.0 * STEP) - exact)[seen]
-        # Differences cannot see what is far below the readings themselves.
+        # Differences cannot resolve changes far below the magnitude of the readings.
         size = max(largest(exact[seen]), 1e-4 * largest(z), 1e-300)
         return CheckLine.at_most(name, largest(error) / size, TAYLOR, text)
 

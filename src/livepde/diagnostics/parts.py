@@ -1,4 +1,4 @@
-"""One part of the state, observed or unobserved: its norms, and the extreme quotients of them."""
+"""Observed and unobserved part of the state: their norms, and extreme quotients of norms."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ __all__ = ["Border", "Images", "Part", "largest"]
 Map: TypeAlias = Callable[[Array], Array]
 Images: TypeAlias = Sequence[tuple[HilbertSpace, sp.csr_array]]  # regions of X, operators there
 
-DENSE = 400  # eigenproblems up to this size are solved densely, larger ones by Lanczos
+# Size up to which eigenproblems are solved densely; larger ones by Lanczos.
+DENSE = 400
 
 
 def _columns(apply: Map) -> Map:
-    """Return a linear map of vectors that takes matrices, too."""
+    """Return a linear map of vectors extended to matrices, column by column."""
 
     def mapped(x: Array) -> Array:
         if x.ndim == 1:
@@ -38,12 +39,13 @@ def _columns(apply: Map) -> Map:
 def largest(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> float:
     """Return the largest eigenvalue of top x = lambda bottom x, both symmetric, bottom > 0.
 
-    Dense for small problems, else Lanczos from a fixed start (the same number in every run).
+    A dense solver is used for small problems, else Lanczos from a fixed start vector, so that every
+    run gives the same number.
 
     Parameters
     ----------
     top, bottom, bottom_inverse
-        Functions of vectors and of matrices; the inverse is needed for Lanczos alone.
+        Functions of vectors and of matrices; the inverse is needed for Lanczos only.
     """
     if size == 0:
         return 0.0
@@ -70,20 +72,20 @@ def largest(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> flo
 
 
 def _root(x: Array, y: Array) -> float:
-    """Return the square root of a product that is negative by rounding at most."""
+    """Return the square root of a product that may be negative by rounding."""
     return float(np.sqrt(max(float(x @ y), 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Border:
-    """The boundary of omega, as the norms of one part of the state see it.
+    """Interface of omega in the norms of one part of the state.
 
     Attributes
     ----------
     space
         X on the part.
     tests
-        X on the functions that stay within the part: the tests of the law's own ||r||_V~.
+        X on the functions with support in the part: the test functions of the law's own ||r||_V~.
     smoothness
         Gram matrix of H^1 on the part, shape (n, n).
     """
@@ -102,7 +104,7 @@ class Border:
         return own, inner, splu(sp.csc_matrix(system)).solve
 
     def continued(self, dual: Array) -> Array:
-        """Return the smoothest function whose products with all tests are those of a functional."""
+        """Return the smoothest function whose products with all tests equal a functional."""
         own, inner, solve = self._system
         known = np.zeros((len(own) + len(inner), *dual.shape[1:]))
         known[len(own) :] = dual[inner]
@@ -114,33 +116,33 @@ class Border:
 class Part:
     """One part of the state, observed or unobserved, with its norms.
 
-    ||v||_VX^2 = (M v, v), and ||v||_V is the norm in X of the function M v, for M of (MN1)
-    ||D v'' - v|| over omega, unless other forms are given.
+    ||v||_VX^2 = (M v, v), and ||v||_V is the norm in X of the function M v, for M of (MN1) ||D v''
+    - v|| over omega, unless other forms are given.
 
-    Of a subdomain the functional M v has a second part: the flux D grad v through the boundary of
-    omega, which belongs to no function of X. An element of the paper's V~ has none. So the
-    constants are those of the discrete V~, where M v is tested with all functions of the part: what
-    has a flux has a norm there that grows with the mesh. The norm of a given v, as of an error r
-    or p, whose flux need not vanish, is that of the smoothest function that agrees with M v on all
-    tests within the part. The law's own norm (`stage_norms`) is that of the least such function,
-    which vanishes at the boundary of omega; both tend to the same.
+    On a subdomain the functional M v has a second part: the flux D grad v through the boundary of
+    omega, which is not represented by a function of X. An element of the paper's V~ has no flux.
+    Therefore the constants are those of the discrete V~, where M v is tested with all functions of
+    the part: the norm of a function with flux grows there with mesh refinement. The norm of a given
+    v, as of an error r or p, whose flux need not vanish, is that of the smoothest function that
+    agrees with M v on all tests within the part. The law's own norm (`stage_norms`) is that of the
+    least such function, which vanishes at the boundary of omega; both tend to the same.
 
     Parameters
     ----------
     space
-        X on this part: its Gram matrix integrated over the part.
+        X on this part, with the Gram matrix integrated over the part.
     basis
-        Of the part, on the free coefficients, shape (n, k).
+        Basis of the part, on the free coefficients, shape (n, k).
     rest
-        Of the other part, shape (n, l); without columns where the two are orthogonal in X.
+        Basis of the other part, shape (n, l); without columns if the two are orthogonal in X.
     operator
-        M, or N: coefficients -> dual vectors, shape (n, n).
+        Matrix of M, or N, from coefficients to dual vectors, shape (n, n).
     VX, V
-        Matrices of the squared norms; V None: that of M.
+        Matrices of the squared norms; V None: the norm of M.
     projection
-        R, or P, of sensors without a subdomain: what is measured of a state.
+        R, or P, for sensors without a subdomain: it maps a state to this part.
     border
-        Of a subdomain.
+        Interface of a subdomain.
     """
 
     def __init__(
@@ -177,7 +179,7 @@ class Part:
         return Norms(self._X(own), _root(own, self._VX @ own), V)
 
     def stage_norms(self, v: Array) -> Norms:
-        """Return the norms that a damping rule is given in the stage, as `norms` otherwise."""
+        """Return the norms used by a damping rule within a stage, in the order of `norms`."""
         own = self._own(v)
         if not self.size:
             return Norms()
@@ -194,7 +196,7 @@ class Part:
         return Norms(*(_root(np.ravel(a), np.ravel(b)) for a, b in pairs))
 
     def projected(self, dual: Array) -> Array:
-        """Return R* R of the functions that dual vectors are, shape (n,) or (n, k)."""
+        """Return R* R of the Riesz representatives of dual vectors, shape (n,) or (n, k)."""
         image = self._own(self.space.riesz(dual))
         if self._projection is None:
             return image
@@ -208,7 +210,7 @@ class Part:
         return _root(v, self.space.gram @ v)
 
     def _represented(self, dual: Array) -> Array:
-        """Return the function of X that a functional on the part is, without the flux."""
+        """Return the Riesz representative of a functional on the part, without the flux."""
         if self._border is None:
             return self.space.riesz(dual)
         return self._border.continued(dual)
@@ -220,22 +222,22 @@ class Part:
 
     @cached_property
     def gram_X(self) -> sp.csr_array:
-        """(v, w)_X on the basis."""
+        """Gram matrix of (v, w)_X on the basis."""
         return self._on_basis(self.space.gram)
 
     @cached_property
     def gram_VX(self) -> sp.csr_array:
-        """(v, w)_VX on the basis."""
+        """Gram matrix of (v, w)_VX on the basis."""
         return self._on_basis(self._VX)
 
     @cached_property
     def operator(self) -> sp.csr_array:
-        """The symmetric part of (M v, w)_X on the basis."""
+        """Symmetric part of (M v, w)_X on the basis."""
         image = sp.csr_array(self.basis.T @ (self._tested @ self.basis))
         return sp.csr_array(0.5 * (image + image.T))
 
     def image(self, x: Array) -> Array:
-        """Return the X-gram of M: x -> E^T M^T X^{-1} M E x."""
+        """Return the X-Gram product of M: x -> E^T M^T X^{-1} M E x."""
         dual = self._tested @ (self.basis @ x)
         result: Array = self.basis.T @ (self._tested.T @ self.space.riesz(dual))
         return result
@@ -249,7 +251,7 @@ class Part:
 
     @cached_property
     def schur(self) -> Map:
-        """S with x^T S x = min over the other part w of ||E x + w||_X^2; S^{-1} = E^T X^{-1} E."""
+        """Schur complement S of the other part: x^T S x = min over w of ||E x + w||_X^2."""
         if not self.rest.shape[1]:
             return lambda x: self.gram_X @ x
         other = HilbertSpace(sp.csr_array(self.rest.T @ self.space.gram @ self.rest))
@@ -267,20 +269,20 @@ class Part:
     # --- constants -------------------------------------------------------------------------------
 
     def embedding_V_VX(self) -> float:
-        """C with ||v||_VX <= C ||v||_V."""
+        """Constant C of ||v||_VX <= C ||v||_V."""
         top = largest(lambda x: self.gram_VX @ x, self.gram_V, self.inverse_V, self.size)
         return float(np.sqrt(top))
 
     def embedding_VX_X(self) -> float:
-        """C with ||v||_X <= C ||v||_VX."""
+        """Constant C of ||v||_X <= C ||v||_VX."""
         return float(np.sqrt(self._sparse(self.gram_X, self.gram_VX)))
 
     def coercivity(self) -> float:
-        """The c of (M v, v)_X >= c ||v||_VX^2; 1 if VX is the norm of M itself."""
+        """Constant c of (M v, v)_X >= c ||v||_VX^2; 1 if VX is the norm of M itself."""
         return 1.0 / self._sparse(self.gram_VX, self.operator) if self.size else 1.0
 
     def boundedness(self) -> float:
-        """The C of ||R M v||_X <= C ||v||_V; 1 if V is the norm of M itself."""
+        """Constant C of ||R M v||_X <= C ||v||_V; 1 if V is the norm of M itself."""
         if not self.size:
             return 1.0
         return float(np.sqrt(largest(self.image, self.gram_V, self.inverse_V, self.size)))
@@ -291,7 +293,7 @@ class Part:
         Parameters
         ----------
         images
-            X on the regions where J v lives, and J there: their squared norms add up.
+            Pairs of X and J on the regions of J v; the squared norms are summed.
         """
 
         def image(x: Array) -> Array:
@@ -305,7 +307,7 @@ class Part:
         return float(np.sqrt(largest(image, self.gram_V, self.inverse_V, self.size)))
 
     def ratio(self) -> float:
-        """A bound of ||v||_V ||v||_X / ||v||_VX^2, 1/c_int of (interpol).
+        """Upper bound of ||v||_V ||v||_X / ||v||_VX^2, which is 1/c_int of (interpol).
 
         By Kantorovich's inequality: with M x = lambda S x on this part the quotient is at most
         (a + b)/(2 sqrt(a b)) for the extreme lambdas a and b; the norm of X exceeds that of S by at
@@ -329,7 +331,7 @@ class Part:
         return float(bound / self.coercivity_reversed())
 
     def coercivity_reversed(self) -> float:
-        """The least ||v||_VX^2 / (M v, v)_X."""
+        """Least quotient ||v||_VX^2 / (M v, v)_X."""
         return 1.0 / self._sparse(self.operator, self.gram_VX)
 
     def _sparse(self, top: sp.csr_array, bottom: sp.csr_array) -> float:

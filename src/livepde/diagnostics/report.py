@@ -1,4 +1,4 @@
-"""What a check found, as a value and as a table."""
+"""Check reports: measured properties as values and as a table."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ __all__ = ["CheckLine", "CheckReport"]
 
 @dataclass(frozen=True)
 class CheckLine:
-    """One property that was measured.
+    """One measured property.
 
     Attributes
     ----------
     name
         The property, in words or as an equation.
     value, bound
-        What was measured and what it is compared with.
+        Measured value, and the bound that it is compared with.
     ok
         True if the property holds.
     remedy
-        What to do if it does not.
+        Advice if it does not hold.
     sense
-        How value and bound are compared, "<=" or ">=".
+        Comparison of value and bound, "<=" or ">=".
     """
 
     name: str
@@ -49,16 +49,16 @@ class CheckLine:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All properties of one object, one line each.
+    """Measured properties of one object.
 
     Attributes
     ----------
     name
-        What was checked.
+        Name of the object.
     lines
-        What was measured.
+        Measured properties.
     error
-        What `raise_if_failed` raises.
+        Exception class raised by `raise_if_failed`.
 
     Examples
     --------
@@ -79,16 +79,16 @@ class CheckReport:
 
     @property
     def failed(self) -> tuple[CheckLine, ...]:
-        """The lines that do not hold."""
+        """Lines of properties that do not hold."""
         return tuple(line for line in self.lines if not line.ok)
 
     def raise_if_failed(self) -> CheckReport:
-        """Return the report itself if all is well.
+        """Return the report if every property holds.
 
         Raises
         ------
         ConfigurationError
-            A property does not hold; the message says which, and the remedy.
+            A property does not hold; the message names it, and the remedy.
         """
         if not self.ok:
             raise self.error(
@@ -115,7 +115,7 @@ class CheckReport:
 
 
 def _number(value: float) -> str:
-    """Return counts and rates as they are, small and large numbers with their power of ten."""
+    """Return a number as text: counts and rates plainly, others in scientific notation."""
     if not np.isfinite(value):
         return str(value)
     if value == int(value) and abs(value) < 1e5:

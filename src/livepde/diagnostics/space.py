@@ -1,4 +1,4 @@
-"""A Hilbert space: a symmetric positive definite Gram matrix, and its Riesz map."""
+"""Check of a Hilbert space: symmetric positive definite Gram matrix, and Riesz map."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
     space
         The space, such as `model.X` or `model.Q`.
     seed
-        Of the random vectors.
+        Seed of the random vectors.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
 
 
 def definite(space: HilbertSpace) -> CheckLine:
-    """Return whether a space can be factorised and sees every element."""
+    """Return the line on positive definiteness: the Gram matrix can be factorised."""
     remedy = ""
     try:
         _ = space.factor
@@ -88,6 +88,6 @@ def relative(difference: sp.csr_array | Array, reference: sp.csr_array | Array) 
 
 
 def largest(matrix: sp.csr_array | Array) -> float:
-    """Return the largest entry in modulus; not a number if one is not finite."""
+    """Return the largest entry in modulus; NaN if one is not finite."""
     data = matrix.data if sp.issparse(matrix) else np.asarray(matrix)
     return float(np.abs(data).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""T*: until when noisy data may be believed, (cond_d) and (Tast); with truth, and online."""
+"""Stopping time T* for noisy data, (cond_d) and (Tast): with the truth, and online."""
 
 from __future__ import annotations
 
@@ -23,9 +23,13 @@ __all__ = [
     "stopping_time",
 ]
 
-MOST_SENSORS = 2000  # whose errors are added up one by one
-PROBES = 32  # random vectors in their place
-MOST_COLUMNS = 10_000  # sensors up to which G_alpha is written out
+# Number of sensors up to which the error norms are computed exactly, sensor by sensor.
+MOST_SENSORS = 2000
+# Number of random vectors beyond that: the relative standard error is at most sqrt(2/(4 PROBES)) =
+# 1/8.
+PROBES = 32
+# Number of sensors up to which the matrix of G_alpha is formed.
+MOST_COLUMNS = 10_000
 
 
 def stopping_time(errors: Sequence[Errors], c: Constants) -> float:
@@ -45,12 +49,12 @@ def noise_size(
     reconstruction: Array | sp.csr_array | None = None,
     u_alpha: Array | None = None,
 ) -> Norms:
-    """Return the root mean square of the data error d in X, VX~ and V~, from a noise level.
+    """Return the root mean square of the data error d in X, VX~ and V~ from a noise level.
 
-    d = G_alpha eta + (G_alpha G - R) u*: what is left of the noise, and what G_alpha takes from the
-    exact state. The second part is estimated by taking it from u_alpha once more. Of more than 2000
-    sensors the first is the mean over 32 fixed random vectors, with a relative standard error of
-    1/8 at most, and the smaller the more independent coefficients have a part in it.
+    d = G_alpha eta + (G_alpha G - R) u*: the propagated noise, and the regularisation error of the
+    exact state. The second part is estimated by applying G_alpha G - R to u_alpha. Beyond 2000
+    sensors the first is the mean over 32 fixed random vectors, with a relative standard error of at
+    most 1/8, which decreases with the number of independent coefficients that contribute.
 
     Parameters
     ----------
@@ -60,9 +64,9 @@ def noise_size(
         Standard deviation of each sensor, shape (sensors,); errors are independent.
     reconstruction
         Matrix of G_alpha, shape (n, sensors); default G^+. Raw nodal noise is about 1/h^2 times
-        larger in V~ than in X, so without smoothing T* comes at once.
+        larger in V~ than in X, so without smoothing T* is reached immediately.
     u_alpha
-        The sample as reconstructed, shape (n,); None: leave out the second part.
+        Reconstruction of the sample, shape (n,); None: omit the second part.
     """
     matrix = spaces.split.inverse if reconstruction is None else reconstruction
     if matrix.shape[1] != len(std):
@@ -87,10 +91,10 @@ def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Arr
     Parameters
     ----------
     observed
-        With its rule for reconstruction.
+        Bound observation with its reconstruction rule.
     alpha
-        Regularisation parameter where the rule has one; for the discrepancy principle, that of the
-        sample (`observed.reconstruct(z).alpha`), about which the map is linear.
+        Regularisation parameter if the rule has one; for the discrepancy principle that of the
+        sample (`observed.reconstruct(z).alpha`), at which the map is linearised.
     """
     rule = observed.observation.reconstruction
     if not rule.regularises:
@@ -111,16 +115,16 @@ def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Arr
 
 @dataclass(frozen=True)
 class StoppingState:
-    """What `OnlineStopping` knows.
+    """State of `OnlineStopping`.
 
     Attributes
     ----------
     t
         Time of the last sample.
     T
-        First sample at which the surrogate condition was violated; infinity if none yet.
+        Time of the first sample that violated the surrogate condition; infinity if none yet.
     margin
-        Of the last sample: right over left side of (cond_d); below 1 it is violated.
+        Ratio of right to left side of (cond_d) at the last sample; below 1 it is violated.
     """
 
     t: float = -np.inf
@@ -130,17 +134,17 @@ class StoppingState:
 
 @dataclass(frozen=True)
 class OnlineStopping:
-    """The surrogate of T* without truth.
+    """Online surrogate of T* without truth.
 
-    (cond_d) holds the unknown d and r. Here ||d||_V~ is its root mean square for the noise level
-    (`noise_size`), and the true residual is what is left of the observed one without the noise:
-    r_alpha = r - d, so for noise that the estimate does not follow yet
-    ||r||^2 = ||r_alpha||^2 - ||d||^2 in the mean, in X as in VX~.
+    (cond_d) contains the unknown d and r. Here ||d||_V~ is replaced by its root mean square for the
+    noise level (`noise_size`), and the true residual by the observed one minus the noise: r_alpha =
+    r - d, so for noise that the estimate does not follow yet ||r||^2 = ||r_alpha||^2 - ||d||^2 in
+    the mean, in X as in VX~.
 
     Parameters
     ----------
     constants
-        Of the model; only C_M/c_M enters.
+        Constants of the model; only C_M/c_M is used.
 
     Examples
     --------
@@ -157,12 +161,12 @@ class OnlineStopping:
         return StoppingState()
 
     def margin(self, r_alpha: Norms, d: Norms) -> float:
-        """Return c_M/(2 C_M) ||r||_VX~^2/(||r||_X ||d||_V~), with r estimated."""
+        """Return c_M/(2 C_M) ||r||_VX~^2/(||r||_X ||d||_V~), with estimated r."""
         VX = max(r_alpha.VX**2 - d.VX**2, 0.0)
         X = np.sqrt(max(r_alpha.X**2 - d.X**2, 0.0))
         if d.V == 0.0:
             return np.inf
-        # Without ||r||_X nothing of r is left above the noise.
+        # ||r||_X = 0 means that r does not exceed the noise.
         if X == 0.0:
             return 0.0
         c = self.constants

@@ -1,4 +1,4 @@
-"""What the theory says about a run: one page, with or without the truth."""
+"""Theory report of a run: the paper's quantities on one page, with or without the truth."""
 
 from __future__ import annotations
 
@@ -61,22 +61,25 @@ LINKED = (
     "(asspof) and the link conditions (cond:link). Those fail for every data error that does not "
     "vanish."
 )
-SNAPSHOTS = 6  # states at which C_A is taken
-SHOWN = 8  # modes
+# Number of states at which C_A is computed.
+SNAPSHOTS = 6
+# Number of modes in the table.
+SHOWN = 8
 NORMS = ("X", "VX", "V")
-MATRICES = 16  # of G_alpha kept, for different alpha
+# Number of cached matrices of G_alpha, one for each alpha.
+MATRICES = 16
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table: title, columns, rows; numbers stay numbers until they are shown."""
+    """Table of a report: title, columns, rows; numbers are formatted only for display."""
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
 
     def markdown(self) -> str:
-        """Return it as a Markdown table."""
+        """Return the table in Markdown."""
 
         def cells(row: Iterable[Any]) -> str:
             shown = (f"{c:.4g}" if isinstance(c, float) else str(c) for c in row)
@@ -89,19 +92,19 @@ class Sheet:
 
 @dataclass(frozen=True, eq=False)
 class TheoryReport:
-    """The page of `theory_report`.
+    """Theory report of a run, as returned by `theory_report`.
 
     Attributes
     ----------
     tables
-        What could be evaluated.
+        Quantities that could be evaluated.
     reports
-        Conditions and error bounds; with a truth only.
+        Conditions and error bounds; only with a truth.
     notes
-        What could not, and why.
+        Quantities that could not be evaluated, with reasons.
     constants, spectrum, stopping
-        The numbers behind the tables; None where they could not be computed. `stopping` is the
-        surrogate of T*, infinity if it has not passed.
+        The numbers behind the tables; None if they could not be computed. `stopping` is the
+        surrogate of T*, infinity if it was not reached.
     """
 
     tables: tuple[Sheet, ...]
@@ -112,7 +115,7 @@ class TheoryReport:
     stopping: float | None = None
 
     def markdown(self, title: str = "Theory") -> str:
-        """Return the page."""
+        """Return the report in Markdown."""
         parts = [f"# {title}", *(table.markdown() for table in self.tables)]
         parts += [f"```\n{report}\n```" for report in self.reports]
         parts += [f"> {note}" for note in self.notes]
@@ -121,7 +124,7 @@ class TheoryReport:
 
 @dataclass(frozen=True)
 class _Moment:
-    """What is known online at one sample."""
+    """Online quantities of one sample."""
 
     t: float
     r: Norms
@@ -130,17 +133,17 @@ class _Moment:
 
 
 class OnlineTracker:
-    """Follows a run without its truth: residual, theta, excitation, surrogate of T*.
+    """Tracker of a run without its truth: residual, theta, excitation, surrogate of T*.
 
     Parameters
     ----------
     identifier
-        Whose model, sensors and law are followed; it is not changed.
+        Identifier whose model, sensors and law are used; it is not changed.
     window
         gamma_0 of the excitation Gramian and the link conditions.
     noise
         Standard deviation of the sensors: one number, one each, or a function of z that returns
-        those; default what the observation says.
+        them; default that of the observation.
     """
 
     def __init__(self, identifier: Identifier, window: float, noise: Any = None) -> None:
@@ -163,7 +166,7 @@ class OnlineTracker:
         self._sizes: dict[int, Norms] = {}
 
     def add(self, estimate: Estimate, sample: Sample) -> None:
-        """Take one estimate; what failed or held no measurement counts for nothing."""
+        """Record one estimate; failed steps and samples without measurements are ignored."""
         model, observed = self.identifier.model, self.identifier.observed
         self.inputs |= _inputs_of(sample, model)
         z = _measured(sample, observed)
@@ -186,18 +189,20 @@ class OnlineTracker:
             theta = self.damping.theta(part.stage_norms(r).residual(size))
         d = self._noise_size(z, u_alpha, alpha)
         self.moments.append(_Moment(estimate.t, norms, theta, d))
-        # Only a law with a damping rule works with u_alpha + P u.
+        # Only a law with a damping rule uses u_alpha + P u.
         w = estimate.u if self.damping is None else estimate.u - r
         self.excited = self.excitation.add(self.excited, estimate.t, w, self.inputs, estimate.q)
         self.last = estimate
         if (len(self.moments) - 1) % self._every == 0:
             self.states.append(estimate.u)
             if len(self.states) > 2 * SNAPSHOTS:
+                # The length of the run is unknown: snapshots are thinned and their spacing doubled
+                # whenever there are too many, so that they always cover the whole run.
                 self.states = self.states[::2]
                 self._every *= 2
 
     def _reconstruct(self, z: Array, boundary: Array) -> tuple[Array, float]:
-        """Return u_alpha and alpha, as a law with a damping rule takes them; else G^+ z."""
+        """Return u_alpha and alpha as used by a law with a damping rule; else G^+ z."""
         observed = self.identifier.observed
         if self.damping is None:
             return observed.split(np.isfinite(z)).reconstruct(z, boundary), 0.0
@@ -205,12 +210,14 @@ class OnlineTracker:
         return found.u, found.alpha
 
     def _noise_size(self, z: Array, u_alpha: Array, alpha: float) -> Norms | None:
-        """Return the size of d, with G_alpha linearised about an alpha within a factor of 1.5."""
+        """Return the size of d, with G_alpha linearised at an alpha within a factor of 1.5."""
         if self.noise is None:
             return None
         observed, part = self.identifier.observed, self.spaces.observed_part
         given = self.noise(z) if callable(self.noise) else self.noise
         std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
+        # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
+        # every sample, and each matrix is dense.
         key = round(float(np.log2(alpha))) if alpha > 0 else 0
         if key not in self._matrices:
             if len(self._matrices) >= MATRICES:
@@ -279,12 +286,12 @@ def theory_report(
     noise: Any = None,
     twin: Twin | None = None,
 ) -> TheoryReport:
-    """Run an identifier and say what the paper's theory has to say about the run.
+    """Run an identifier and evaluate the quantities of the paper's theory along the run.
 
     Parameters
     ----------
     identifier
-        Fresh, as it was before its first sample.
+        New identifier, before its first sample.
     samples
         Items of a stream: `Sample`, (t, z) or (t, z, inputs).
     window
@@ -292,12 +299,13 @@ def theory_report(
     noise
         Standard deviation of the sensors, for the surrogate of T*; default that of the observation.
     twin
-        The truth, if there is one; its samples are taken then.
+        Twin with the truth, if available; its samples are then used.
 
     Returns
     -------
     TheoryReport
-        Tables and a Markdown page. What cannot be evaluated is said in a note, never guessed.
+        Tables and a Markdown page. Quantities that cannot be evaluated are listed in a note, never
+        guessed.
 
     Raises
     ------

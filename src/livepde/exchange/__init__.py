@@ -1,4 +1,4 @@
-"""livepde inside of other programs: co-simulation units (FMI), online learners."""
+"""Embedding in other programs: co-simulation units (FMI) and online learners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of a co-simulation unit: an identifier, and what goes in and came out last."""
+"""State of a co-simulation unit: an identifier with its present inputs and outputs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.errors import LivepdeError
-from livepde.exchange.process import REFUSED, WAITING, Process
+from livepde.exchange.process import REFUSED, WAITING, UnitProcess
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.records import STATUS_CODES
@@ -16,28 +16,29 @@ from livepde.samples import Sample
 
 __all__ = ["Component"]
 
-SAME = 1e-9  # of a period: a difference of times that is rounding
+# Difference of times that is attributed to rounding, relative to the period.
+SAME = 1e-9
 
 
 class Component:
-    """Takes one sample at each communication point; what cannot be used is a status.
+    """Co-simulation component: one sample per communication point; bad samples set a status.
 
     Parameters
     ----------
     process
-        What it runs.
+        UnitProcess that it runs.
 
     Attributes
     ----------
     inputs
-        The channels as they are now, NaN: missing.
+        Present values of the channels, NaN if missing.
     period
-        Seconds between samples: the first step in each period takes one. 0: every step.
+        Sampling period in seconds: the first step of each period takes a sample. 0: every step.
     outputs, status
-        What goes out, in the order of `Process.outputs`, and how the last step went.
+        Output values, in the order of `UnitProcess.outputs`, and status code of the last step.
     """
 
-    def __init__(self, process: Process) -> None:
+    def __init__(self, process: UnitProcess) -> None:
         self.process = process
         self.inputs = [math.nan] * len(process.inputs)
         self.outputs = process.unknown()
@@ -48,7 +49,7 @@ class Component:
         self._identifier: Identifier | None = None
 
     def take(self, seconds: float) -> str:
-        """Take what the inputs hold as the sample of a time; return what is to be told, or ''."""
+        """Take the present inputs as the sample of a time; return a message for the user, or ''."""
         if self.period > 0.0 and seconds < self._next:
             return ""
         process, t = self.process, seconds * self.process.second
@@ -64,6 +65,8 @@ class Component:
                 self._identifier = self._begun(np.array([t, *z.values()]))
             estimate = self._identifier.step(t, z)
             if self.period > 0.0:
+                # Sample times are multiples of the period, with a tolerance: rounding of
+                # communication times must neither skip nor repeat a sample.
                 self._next = self.period * (math.floor(seconds / self.period + SAME) + 1.0 - SAME)
         except LivepdeError as error:
             if math.isnan(self.outputs[0]):  # the first one: the next may begin
@@ -75,7 +78,7 @@ class Component:
         return "" if estimate.status.ok else f"t = {seconds:g} s: {estimate.status}"
 
     def dump(self) -> bytes:
-        """Return all that evolves, from which `restore` goes on with the same numbers."""
+        """Return the complete state; `restore` continues with identical numbers."""
         leaves = {"inputs": self.inputs, "outputs": self.outputs, "status": self.status}
         leaves |= {"period": self.period, "next": self._next}
         if self._identifier is not None:
@@ -84,7 +87,7 @@ class Component:
         return checkpoint.packed({}, leaves)
 
     def restore(self, content: bytes) -> None:
-        """Go on from what `dump` returned; raises `RunError` if it is of another unit."""
+        """Restore a state returned by `dump`; raise `RunError` if it is of another unit."""
         where = "the state of the unit"
         _, leaves = checkpoint.unpacked(content, where)
         self.inputs, self.outputs = leaves["inputs"].tolist(), leaves["outputs"].tolist()
@@ -100,7 +103,7 @@ class Component:
         self._identifier.restore(leaves["identifier"].tobytes(), where)
 
     def _begun(self, first: Array) -> Identifier:
-        """Return the identifier that begins with a first sample: its time, then the inputs."""
+        """Return the identifier started by a first sample: its time, then the inputs."""
         self._first = first
         names = [port.name for port in self.process.inputs]
         z = dict(zip(names, first[1:].tolist(), strict=True))

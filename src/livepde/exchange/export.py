@@ -1,4 +1,4 @@
-"""Write a co-simulation unit (FMU): the exporter's binaries around an identifier."""
+"""Export of an identifier as a co-simulation unit (FMU), with the exporter's binaries."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class {name}(IdentifierSlave, Fmi{fmi}Slave):
 
     fmi = {fmi}
 '''
-# For each instance pythonfmu 0.7 runs the script again and then gives back a reference to the
-# variables of its module that it never had; after some instances they would be gone.
+# For each instance pythonfmu 0.7 runs the script again and then releases a reference to the
+# module's variables that it does not own; after some instances they would be freed.
 KEPT = """
 
 import ctypes
@@ -70,28 +70,28 @@ def export_fmu(
     Parameters
     ----------
     source
-        A case, a case file, or 'file.py:function' or 'module:function' of your own that returns an
+        A case, a case file, or a user's 'file.py:function' or 'module:function' that returns an
         `Identifier` before its first sample.
     target
-        The file to write; default the name of the case in the current folder.
+        Path of the unit; default the name of the case in the current folder.
     fmi
         Version of the standard: 2 for FMI 2.0, 3 for FMI 3.0.
     allow_code
-        The case file may name code of its own, which becomes part of the unit.
+        True: the case file may refer to user code, which becomes part of the unit.
     force
-        Write over what is there.
+        True: overwrite an existing file.
 
     Returns
     -------
     Path
-        Of the unit.
+        Path of the unit.
 
     Raises
     ------
     ConfigurationError
-        The source does not fit together, or the exporter is missing.
+        The source is invalid, or the exporter is not installed.
     RunError
-        There is such a file already, or it cannot be written.
+        The file already exists, or cannot be written.
     """
     if not isinstance(source, Case):
         text = os.fspath(source)
@@ -100,7 +100,7 @@ def export_fmu(
 
 
 def is_code(source: str) -> bool:
-    """Return whether a text names a function, not a case file."""
+    """Return True if a text names a function, False if a case file."""
     return ":" in source and not source.endswith(".toml")
 
 
@@ -111,7 +111,7 @@ def write_unit(
     fmi: Literal[2, 3],
     force: bool,
 ) -> Path:
-    """Write a unit, and return its path; for the rest see `export_fmu`."""
+    """Write a unit, and return its path; for parameters see `export_fmu`."""
     if fmi not in EXPORTERS:
         raise ConfigurationError(f"fmi: got {fmi!r}; expected 2 (FMI 2.0) or 3 (FMI 3.0).")
     try:
@@ -135,7 +135,7 @@ def write_unit(
 
 
 def _built(builder: Any, recipe: Recipe, name: str, fmi: int, folder: Path) -> Path:
-    """Return the unit in a folder."""
+    """Return the path of the unit built in a folder."""
     if not name[0].isalpha():
         name = f"unit_{name}"
     script = SCRIPT.format(exporter=EXPORTERS[fmi], fmi=fmi, name=name)
@@ -146,7 +146,7 @@ def _built(builder: Any, recipe: Recipe, name: str, fmi: int, folder: Path) -> P
     for file, text in sorted(recipe.files.items()):
         (inside / file).write_bytes(text)
         content.update(file.encode() + text)
-    # A process that runs several units imports all of their scripts: names must differ.
+    # A program that runs several units imports all of their scripts, so their names must differ.
     module = f"livepde_unit_{content.hexdigest()[:16]}"
     (folder / f"{module}.py").write_text(script, encoding="utf-8")
     path = list(sys.path)

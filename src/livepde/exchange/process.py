@@ -1,4 +1,4 @@
-"""What a co-simulation unit runs: how its identifier begins, and what goes in and out."""
+"""Process behind a co-simulation unit: identifier, input and output channels."""
 
 from __future__ import annotations
 
@@ -28,18 +28,21 @@ __all__ = [
     "REFUSED",
     "STATUS",
     "WAITING",
-    "Experiment",
-    "Output",
+    "DataTimes",
+    "OutputVariable",
     "Port",
-    "Process",
+    "UnitProcess",
     "of_case",
     "of_code",
 ]
 
-PERIOD = "sample_period"  # the parameter of a unit
+# Name of the parameter of a unit.
+PERIOD = "sample_period"
 REFUSED, WAITING = -2, -1  # beside the indices of `STATUS_CODES`
-LARGEST = 1000  # vertices of a field that become outputs, one for each
-STEPS = {"degC": "K", "degF": "degR"}  # units of differences on scales with a zero of their own
+# Largest number of vertices of a field that become outputs, one for each vertex.
+LARGEST = 1000
+# Units of differences on temperature scales with an offset.
+STEPS = {"degC": "K", "degF": "degR"}
 STATUS = "How the last step went: {}, {} waits for a first sample, {} sample refused.".format(
     ", ".join(f"{k} {code}" for k, code in enumerate(STATUS_CODES)), WAITING, REFUSED
 )
@@ -47,12 +50,12 @@ STATUS = "How the last step went: {}, {} waits for a first sample, {} sample ref
 
 @dataclass(frozen=True)
 class Port:
-    """A channel as another program sees it: in the unit of its data.
+    """Input or output channel of a unit, in the unit of its data.
 
     Attributes
     ----------
     column
-        How values become those of the model.
+        Conversion of values to the unit of the model.
     """
 
     name: str
@@ -61,7 +64,7 @@ class Port:
     column: Column
 
     def taken(self, value: float, missing: frozenset[float]) -> float:
-        """Return a value in the unit of the model, NaN if it is missing or not valid."""
+        """Return a value in the unit of the model; NaN if it is missing or invalid."""
         given = number(value, f"input '{self.name}'")
         found = channel_value(self.column, {self.name: given}, missing)
         low, high = self.column.valid
@@ -73,8 +76,8 @@ class Port:
 
 
 @dataclass(frozen=True)
-class Output:
-    """A number that another program can read."""
+class OutputVariable:
+    """Description of an output variable."""
 
     name: str
     unit: str
@@ -82,8 +85,8 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Experiment:
-    """First and last time and the usual step of data, in seconds; None: not known."""
+class DataTimes:
+    """First and last time and usual step of the data, in seconds; None: unknown."""
 
     start: float
     stop: float | None = None
@@ -91,25 +94,25 @@ class Experiment:
 
 
 @dataclass(frozen=True, eq=False)
-class Process:
-    """An identifier for other programs.
+class UnitProcess:
+    """An identifier with the inputs and outputs of a co-simulation unit.
 
     Attributes
     ----------
     name, title
         A short name, and one line about it.
     inputs
-        Channels that come in at each communication point.
+        Input channels, read at each communication point.
     sensors
-        Channels of which the model's value goes out; withheld ones, too.
+        Sensor channels whose model values are outputs, including withheld ones.
     begin
-        Returns the identifier that begins with a first sample; raises `LivepdeError`.
+        Function that returns the identifier started by a first sample; it may raise `LivepdeError`.
     second
         One second in the model's unit of time.
     missing
-        Numbers that stand for a missing sample, beside NaN.
+        Numbers that denote a missing sample, in addition to NaN.
     covariance
-        Whether the law has standard deviations.
+        True if the law provides standard deviations.
     experiment
         Times of the case's own data, if it has any.
     """
@@ -123,17 +126,17 @@ class Process:
     second: float = 1.0
     missing: frozenset[float] = frozenset()
     covariance: bool = True
-    experiment: Experiment | None = None
+    experiment: DataTimes | None = None
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Unknown fields that go out: those that are not too large."""
+        """Unknown fields that are outputs: those that are not too large."""
         small = len(self.model.mesh.p[0]) <= LARGEST
         return tuple(self.model.parameter_space.fields) if small else ()
 
     @property
     def notes(self) -> list[str]:
-        """What the unit leaves out."""
+        """Messages about omitted outputs."""
         space, vertices = self.model.parameter_space, len(self.model.mesh.p[0])
         return [
             f"The field {name} is no output: it has {vertices} vertices, more than {LARGEST}."
@@ -141,15 +144,15 @@ class Process:
             if name not in self.fields
         ]
 
-    def outputs(self) -> list[Output]:
-        """Return what goes out beside the status, in the order of `shown`.
+    def outputs(self) -> list[OutputVariable]:
+        """Return descriptions of the outputs except the status, in the order of `shown`.
 
         Raises
         ------
         ConfigurationError
-            Two have the same name.
+            Two outputs have the same name.
         """
-        found = [Output("estimate_time", "s", "Time of the last sample that was used.")]
+        found = [OutputVariable("estimate_time", "s", "Time of the last sample that was used.")]
         space = self.model.parameter_space
         for label in space.labels:
             found += self._estimated(label, label)
@@ -158,7 +161,7 @@ class Process:
                 found += self._estimated(name, f"{name}[{k + 1}]")
         for port in self.sensors:
             text = f"The model's value of {port.name}."
-            found.append(Output(f"{port.name}_model", port.unit, text))
+            found.append(OutputVariable(f"{port.name}_model", port.unit, text))
         names = [port.name for port in self.inputs] + [item.name for item in found]
         names += ["status", "time", PERIOD]
         for name in names:
@@ -169,14 +172,16 @@ class Process:
                 )
         return found
 
-    def _estimated(self, label: str, name: str) -> Iterator[Output]:
+    def _estimated(self, label: str, name: str) -> Iterator[OutputVariable]:
         unit = unknown_of(self.model.parameter_space, label).unit
-        yield Output(name, unit, f"Estimate of {name}.")
+        yield OutputVariable(name, unit, f"Estimate of {name}.")
         if self.covariance:
-            yield Output(f"{name}_std", STEPS.get(unit, unit), f"Standard deviation of {name}.")
+            yield OutputVariable(
+                f"{name}_std", STEPS.get(unit, unit), f"Standard deviation of {name}."
+            )
 
     def unknown(self) -> list[float]:
-        """Return the outputs before the first sample: the prior, and NaN for what sensors show."""
+        """Return the outputs before the first sample: the prior, and NaN for model values."""
         model, space = self.model, self.model.parameter_space
         q = model.latent.value(model.initial_parameter())
         found = [math.nan]
@@ -208,8 +213,8 @@ class Process:
         return [value, std] if self.covariance else [value]
 
 
-def of_case(case: Case, origin: datetime | None = None) -> Process:
-    """Return what a case says.
+def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
+    """Return the process of a case.
 
     Parameters
     ----------
@@ -224,7 +229,7 @@ def of_case(case: Case, origin: datetime | None = None) -> Process:
         text = f"Channel of role {channel.role}, as column {columns} of the data."
         ports[name] = Port(name, unit, text, column)
     withheld = case.frame.roles("withheld")
-    return Process(
+    return UnitProcess(
         case.name,
         case.title,
         case.model,
@@ -237,13 +242,13 @@ def of_case(case: Case, origin: datetime | None = None) -> Process:
     )
 
 
-def of_code(name: str, build: Callable[[], Identifier]) -> Process:
-    """Return what a function builds: an identifier before its first sample.
+def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
+    """Return the process of a function that returns an identifier before its first sample.
 
     Raises
     ------
     ConfigurationError
-        It fails, or builds something else.
+        The function fails, or returns another type.
     """
     try:
         identifier = build()
@@ -261,7 +266,7 @@ def of_code(name: str, build: Callable[[], Identifier]) -> Process:
     inputs = [Port(c, "", "Input of model or sensors.", Column((c,))) for c in identifier.inputs]
     time_unit = identifier.model.time_unit
     second = conversion("s", time_unit, f"{name}: time_unit").factor if time_unit else 1.0
-    return Process(
+    return UnitProcess(
         name.rpartition(":")[2],
         f"Identifier of {name}",
         identifier.model,
@@ -270,7 +275,7 @@ def of_code(name: str, build: Callable[[], Identifier]) -> Process:
         lambda first: copy.deepcopy(identifier),
         second,
         covariance=_has_covariance(identifier.law),
-        experiment=Experiment(identifier.t / second),
+        experiment=DataTimes(identifier.t / second),
     )
 
 

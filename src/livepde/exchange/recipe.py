@@ -1,4 +1,4 @@
-"""What stands in a co-simulation unit: a case with what it names, or the name of a function."""
+"""Recipe of a co-simulation unit: a case with its files, or the name of a function."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from livepde.cases import Case, load
 from livepde.cases.code import load_code
 from livepde.errors import ConfigurationError
-from livepde.exchange.process import Experiment, Process, of_case, of_code
+from livepde.exchange.process import DataTimes, UnitProcess, of_case, of_code
 from livepde.streams import Table
 
 __all__ = ["Recipe", "opened", "recipe_of"]
@@ -25,25 +25,25 @@ FUNCTION = "() -> livepde.Identifier"
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """How to build a process somewhere else.
+    """Instructions and files to rebuild a process elsewhere.
 
     Attributes
     ----------
     process
-        As it is built here.
+        UnitProcess as built here.
     files
-        Name -> content of what has to be there.
+        Mapping from file name to content.
     """
 
-    process: Process
+    process: UnitProcess
     files: Mapping[str, bytes]
 
 
 def recipe_of(source: Case | str) -> Recipe:
     """Return the recipe of a case, or of a function 'file.py:function' or 'module:function'.
 
-    The case brings along the files it names: its mesh, and code of the user's own. Modules are
-    imported where the unit runs.
+    The files of a case, its mesh and user code, are included. Modules are imported where the unit
+    runs.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def _of_case(case: Case) -> Recipe:
     return Recipe(process, {**files, RECIPE: _json(inside)})
 
 
-def _dated(case: Case) -> tuple[datetime | None, Experiment | None]:
+def _dated(case: Case) -> tuple[datetime | None, DataTimes | None]:
     """Return the date of t = 0, and the times of the case's data, if it has any."""
     data = case.frame.spec.data
     if case.live or (data.file is None and data.reader is None):
@@ -94,11 +94,11 @@ def _dated(case: Case) -> tuple[datetime | None, Experiment | None]:
         return prepared.origin, None
     t = prepared.stream.t / case.clock.second
     step = float(np.median(np.diff(t))) if len(t) > 1 else None
-    return prepared.origin, Experiment(float(t[0]), float(t[-1]), step)
+    return prepared.origin, DataTimes(float(t[0]), float(t[-1]), step)
 
 
 def _moved(name: str, folder: Path, files: dict[str, bytes]) -> str:
-    """Return the name of code in the unit, where its file is taken along."""
+    """Return the name of user code within the unit, and add its file to `files`."""
     source, _, attribute = name.rpartition(":")
     return f"{_taken(folder / source, files)}:{attribute}" if source.endswith(".py") else name
 
@@ -114,8 +114,8 @@ def _json(content: Mapping[str, Any]) -> bytes:
     return json.dumps(content, indent=1).encode()
 
 
-def opened(folder: Path) -> Process:
-    """Return the process of a unit from the folder with its files."""
+def opened(folder: Path) -> UnitProcess:
+    """Return the process of a unit from the folder of its files."""
     recipe = json.loads((folder / RECIPE).read_text(encoding="utf-8"))
     if "function" in recipe:
         name = recipe["function"]
@@ -123,5 +123,5 @@ def opened(folder: Path) -> Process:
     case = load(folder / CASE, allow_code=recipe["allow_code"], settings=recipe["settings"])
     origin = None if recipe["origin"] is None else datetime.fromisoformat(recipe["origin"])
     given = recipe["experiment"]
-    experiment = None if given is None else Experiment(**given)
+    experiment = None if given is None else DataTimes(**given)
     return replace(of_case(case, origin), name=recipe["name"], experiment=experiment)

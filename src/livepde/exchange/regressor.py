@@ -1,4 +1,4 @@
-"""An identifier as an online learner: features in, what the sensors show out."""
+"""Online-learner interface of an identifier: features as inputs, sensor readings as targets."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ __all__ = ["OnlineRegressor", "river_regressor"]
 
 
 class OnlineRegressor:
-    """Learns and predicts one sample at a time, by the names that online learners use.
+    """Online regressor with the verbs of river, learning and predicting one sample at a time.
 
     A sample has features x, a mapping with the time and the inputs by their names, and a target y:
-    what the sensors show, a number if there is one sensor, else a mapping from sensor to number.
-    Missing features hold their last value, missing targets (None, NaN) are not learned from.
+    the sensor reading, or a mapping from sensor to reading if there are several. Missing features
+    hold their last value; missing targets (None, NaN) are ignored.
 
     Parameters
     ----------
     identifier
-        Where learning begins; it stays as it is.
+        Initial identifier; it is copied, not changed.
     time
-        The feature that is the time.
+        Name of the feature that is the time.
 
     Attributes
     ----------
     current
-        The identifier that learns.
+        Present identifier.
     estimate
-        Of the last sample that was learned; None before.
+        Estimate of the last sample learned; None before.
     """
 
     def __init__(self, identifier: Identifier, time: str = "t") -> None:
@@ -42,26 +42,26 @@ class OnlineRegressor:
         self.estimate: Estimate | None = None
 
     def learn_one(self, x: Mapping[str, Any], y: Any) -> None:
-        """Take one sample; how it went says `estimate.status`.
+        """Learn from one sample; `estimate.status` tells if the step succeeded.
 
         Raises
         ------
         DataError
-            A sample that cannot be used, as `Identifier.step` says.
+            The sample is invalid, as for `Identifier.step`.
         """
         t, inputs = self._features(x)
         targets = dict(y or {}) if isinstance(y, Mapping | None) else {self._only(): y}
         self.estimate = self.current.step(t, targets, inputs)
 
     def predict_one(self, x: Mapping[str, Any]) -> Any:
-        """Return what the sensors will show, in the form of y; nothing is learned.
+        """Return predicted readings in the form of y, without learning.
 
-        None if there is no prediction: the step to that time fails.
+        The prediction is None if the step to that time fails.
 
         Raises
         ------
         DataError
-            Features that cannot be used, as `Identifier.forecast` says.
+            The features are invalid, as for `Identifier.forecast`.
         """
         t, inputs = self._features(x)
         found = self.current.forecast(t, inputs)
@@ -84,14 +84,14 @@ class OnlineRegressor:
 
 
 def river_regressor(identifier: Identifier, time: str = "t") -> Any:
-    """Return an `OnlineRegressor` that is a regressor of river, for its metrics and evaluations.
+    """Return an `OnlineRegressor` that is also a river regressor, for river's evaluation tools.
 
-    With several sensors it is one for several targets.
+    With several sensors it is a multi-target regressor.
 
     Raises
     ------
     ConfigurationError
-        River is missing.
+        River is not installed.
     """
     try:
         from river import base

@@ -1,4 +1,4 @@
-"""A process behind the interface of the exporters: one class for FMI 2.0 and 3.0."""
+"""Slave class of the exporters (pythonfmu) for FMI 2.0 and 3.0."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from xml.etree.ElementTree import Element, SubElement
 from livepde import __version__
 from livepde.cases.units import in_si
 from livepde.exchange.component import Component
-from livepde.exchange.process import PERIOD, STATUS, Output, Process
+from livepde.exchange.process import PERIOD, STATUS, OutputVariable, UnitProcess
 from livepde.exchange.recipe import opened
 
 __all__ = ["FOLDER", "IdentifierSlave"]
 
-FOLDER = "process"  # of the resources
+# Name of the folder within the resources of the unit.
+FOLDER = "process"
 
 if not sys.orig_argv:
-    # In a program that is no Python the exporters end the interpreter from a thread of their own;
-    # its last collection of cycles has crashed there, which depends on what lies where in memory.
-    # The program ends or goes on: nothing is lost.
+    # In a host program other than Python the exporters finalise the interpreter from a thread of
+    # their own. Its final garbage collection has crashed there, depending on the memory layout.
+    # Without that collection nothing is lost, since the memory is released anyway.
     atexit.register(gc.freeze)
 
 
 class IdentifierSlave:
-    """What a unit does; its class has `Fmi2Slave` or `Fmi3Slave` as second base.
+    """Co-simulation slave; its class has `Fmi2Slave` or `Fmi3Slave` as second base.
 
     Attributes
     ----------
@@ -55,32 +56,32 @@ class IdentifierSlave:
         self._register(process)
 
     def _kit(self, name: str) -> Any:
-        """Return something of the exporter: DefaultExperiment, or {}Status as Fmi2Status."""
+        """Return a class of the exporter: DefaultExperiment, or {}Status as Fmi2Status."""
         exporter = "pythonfmu" if self.fmi == 2 else "pythonfmu3"
         module = f"{exporter}.enums" if name == "{}Status" else exporter
         return getattr(importlib.import_module(module), name.format(f"Fmi{self.fmi}"))
 
-    def _register(self, process: Process) -> None:
+    def _register(self, process: UnitProcess) -> None:
         causality, variability = self._kit("{}Causality"), self._kit("{}Variability")
         real, whole = (("Real", "Integer"), ("Float64", "Int32"))[self.fmi - 2]
 
-        def add(kind: str, item: Output, cause: Any, get: Any, **more: Any) -> None:
+        def add(kind: str, item: OutputVariable, cause: Any, get: Any, **more: Any) -> None:
             about = {"description": item.text, "causality": cause, "getter": get, **more}
             about.setdefault("variability", variability.discrete)
             self.register_variable(self._kit(kind)(item.name, **about), nested=False)
             self._units[item.name] = item.unit
 
         if self.fmi == 3:
-            time = Output("time", "s", "Time.")
+            time = OutputVariable("time", "s", "Time.")
             add(real, time, causality.independent, float, variability=variability.continuous)
         for k, port in enumerate(process.inputs):
             put = partial(self._put, k)
-            item = Output(port.name, port.unit, port.text)
+            item = OutputVariable(port.name, port.unit, port.text)
             add(real, item, causality.input, partial(self._input, k), setter=put)
         for k, item in enumerate(process.outputs()):
             add(real, item, causality.output, partial(self._output, k))
-        add(whole, Output("status", "", STATUS), causality.output, self._status)
-        item = Output(PERIOD, "s", "Time between samples; 0: every step takes one.")
+        add(whole, OutputVariable("status", "", STATUS), causality.output, self._status)
+        item = OutputVariable(PERIOD, "s", "Time between samples; 0: every step takes one.")
         about = {"setter": self._set_period, "variability": variability.fixed}
         add(real, item, causality.parameter, self._period, **about)
 
@@ -103,7 +104,7 @@ class IdentifierSlave:
         return self.component.status
 
     def to_xml(self, *options: Any) -> Element:
-        """Return the description of the unit, with what the exporter leaves out."""
+        """Return the model description, with elements that the exporter omits."""
         root: Element = super().to_xml(*options)  # type: ignore[misc]
         root.set("variableNamingConvention", "flat")
         root.set("generationTool", f"livepde {__version__} by {root.get('generationTool')}")
@@ -125,7 +126,7 @@ class IdentifierSlave:
         return root
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Take the inputs as the sample of the current time; what is wrong is a status."""
+        """Take the inputs as the sample of the current time; errors set the status output."""
         told = self.component.take(current_time)
         if told:
             self.log(told, self._kit("{}Status").warning)
@@ -147,7 +148,7 @@ class IdentifierSlave:
 
 
 def _definitions(units: Iterable[str]) -> Element:
-    """Return what units of measurement are in those of the SI, where they have any there."""
+    """Return the definitions of units of measurement in SI base units, where they exist."""
     found = Element("UnitDefinitions")
     for name in sorted(units):
         unit, si = SubElement(found, "Unit", name=name), in_si(name)

@@ -19,8 +19,10 @@ from livepde.linalg import Array, IntArray
 
 __all__ = ["ElementProducts", "ElementTensor"]
 
-EXACT = 1e-13  # what combinations may leave of an element's tensor, relative to it
-BLOCK = 8_000  # elements that are multiplied at once
+# Relative error of an element tensor in the common basis: rounding level.
+EXACT = 1e-13
+# Number of elements multiplied at once, which bounds the size of temporary arrays.
+BLOCK = 8_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,8 @@ def _combined(parts: Iterable[tuple[slice, Array]]) -> tuple[Array, Array]:
     for _, local in parts:
         shape, flat = local.shape[:-1], local.reshape(-1, local.shape[-1])
         basis = basis if basis.size else np.zeros((len(flat), 0))
+        # Only tensors outside of the present span extend the basis. Their leading singular vectors
+        # are added, so the basis stays as small as possible.
         left = flat - basis @ (basis.T @ flat)
         size = np.linalg.norm(flat, axis=0)
         missed = np.linalg.norm(left, axis=0) > EXACT * size

@@ -32,7 +32,9 @@ __all__ = [
     "line",
 ]
 
-WITHIN = 10.0  # prior standard deviations: by chance it is passed once in 1e23 cases
+# Half width of the default trust region in prior standard deviations: a Gaussian value exceeds it
+# with a probability of 2e-23.
+WITHIN = 10.0
 
 Integrand: TypeAlias = Callable[..., Any]
 """A weak form's integrand; see `Model` for the arguments."""

@@ -42,10 +42,18 @@ __all__ = ["Form", "FormMatrices", "Tensor"]
 
 Tensor: TypeAlias = sp.csr_array | ElementTensor
 
-STEP = 1e-30  # of the complex step: far below rounding, far above underflow
-SMALL = 1e-3  # share of a component's largest value or prior deviation: less is no scale
-SHIFT = 1e-3  # of a central difference of fourth order, relative: its errors are about 1e-13
-LARGEST_TENSOR = 5_000_000  # products of local functions up to which a trilinear form is sparse
+# Complex step. Its square is below rounding of any value, and no difference is formed that could
+# cancel digits.
+STEP = 1e-30
+# Relative magnitude, compared with the largest value or the prior standard deviation of a
+# component, below which a value does not define the scale of a difference.
+SMALL = 1e-3
+# Relative step of a central difference of fourth order: its truncation and rounding errors are
+# about 1e-13.
+SHIFT = 1e-3
+# Number of products of local functions up to which a trilinear form is stored as a sparse matrix.
+# Beyond, element tensors need less memory.
+LARGEST_TENSOR = 5_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,6 +371,8 @@ class Form(FormMatrices):
             if not others:
                 return self._constant(rows, cols)
             if len(others) == 1:
+                # A constant trilinear form needs no quadrature in a step: its matrix is linear in
+                # the third coefficients.
                 tensor = self._tensor(rows, cols, others[0])
                 if tensor is not None:
                     product: Array = tensor @ coefficients[others[0]]

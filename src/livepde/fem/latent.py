@@ -223,6 +223,7 @@ class Latent:
         """Return the expected latent coefficients after a time h."""
         if not self.generator.nnz:
             return a
+        # Evolutions are linear about the prior mean, so the difference from it is propagated.
         change = a - self.prior
         for p in self.parts.values():
             parts = change[p.part].reshape(p.evolution.copies, p.size)

@@ -21,8 +21,11 @@ from livepde.linalg import Array, IntArray
 
 __all__ = ["Measure"]
 
-KEPT = 300_000  # quadrature points up to which what is evaluated on them is kept
-PIECE = 30_000  # quadrature points of a piece of a larger measure
+# Number of quadrature points up to which shape functions evaluated on them are cached.
+KEPT = 300_000
+# Number of quadrature points of a piece of a larger measure, which bounds the size of temporary
+# arrays.
+PIECE = 30_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +119,8 @@ class Measure:
     def _empty_mapping(self) -> Any:
         """Return a copy of scikit-fem's mapping for all cells with empty caches."""
         mapping = copy(self.mesh._mapping())
+        # scikit-fem caches Jacobians of all cells on the mapping of the mesh, where they would stay
+        # for the lifetime of the mesh.
         for name in [name for name in vars(mapping) if name.startswith("_")]:
             delattr(mapping, name)
         return mapping

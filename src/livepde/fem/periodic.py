@@ -17,7 +17,8 @@ from livepde.linalg import IntArray
 
 __all__ = ["tied"]
 
-SLACK = 1e-6  # of the size of the mesh: how far apart two coefficients may be to count as one
+# Distance of two coefficients that count as the same place, relative to the size of the mesh.
+SLACK = 1e-6
 
 
 def tied(field: Field, block: Any) -> IntArray | None:
@@ -45,7 +46,9 @@ def tied(field: Field, block: Any) -> IntArray | None:
     pairs = [_matched(field, block, *pair) for pair in field.periodic]
     i, j = (np.concatenate(side) for side in zip(*pairs, strict=True))
     graph = sp.csr_array((np.ones(len(i)), (i, j)), shape=(count, count))
+    # Chains of ties, as at the corners of a doubly periodic rectangle, form one coefficient each.
     _, labels = connected_components(graph, directed=False)
+    # Coefficients are numbered by first occurrence, which keeps the bandwidth of the mesh.
     _, first, renumbered = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))
     tie: IntArray = rank[renumbered]

@@ -52,6 +52,8 @@ def _digest(*arrays: Any) -> bytes:
     digest = blake2b()
     for array in arrays:
         digest.update(f"{array.dtype}{array.shape}{array.strides}".encode())
+        # A broadcast array has the stride zero: its first column represents it, and the large array
+        # is never formed.
         repeated = array[:, :1] if array.ndim == 2 and array.strides[1] == 0 else array
         digest.update(np.ascontiguousarray(repeated).data)
     return digest.digest()
@@ -83,6 +85,8 @@ class Scatter:
         keep
             Cache the positions of this term's entries, for repeated assembly.
         """
+        # Elements share positions: np.add.at sums repeated ones, which `data[at] += local` would
+        # not.
         np.add.at(data, self._at(term, at, keep).ravel(), local.ravel())
 
     def places(self, term: int) -> IntArray:

@@ -18,8 +18,11 @@ from livepde.linalg import Array, Pattern, analyse
 __all__ = ["Sobolev"]
 
 SMOOTH = (ElementLineHermite, ElementQuadBFS, ElementTriArgyris)  # of class C^1
-SPACING = 2.0  # of the quadrature points in log b: leaves 2 exp(-2 pi^2 / SPACING) = 1e-4
-REACH = 50.0  # quadrature points beyond the spectrum, a factor on each side
+# Spacing of the quadrature points in log b. The trapezoidal rule has the error 2 exp(-2 pi^2 /
+# SPACING) = 1e-4, since the integrand is analytic in a strip.
+SPACING = 2.0
+# Factor by which the quadrature points extend beyond the spectrum on each side.
+REACH = 50.0
 
 
 @dataclass(frozen=True)

@@ -183,6 +183,7 @@ def _parts(density: Array, axes: tuple[int, ...]) -> Iterator[tuple[tuple[int, .
     density = density.reshape((1,) * (len(axes) + 2 - density.ndim) + density.shape)
     density = np.broadcast_to(density, axes + density.shape[len(axes) :])
     for index in np.ndindex(axes):
+        # Most components of a density are exactly zero, since a form uses few derivatives.
         if density[index].any():
             yield index, density[index]
 

@@ -49,6 +49,8 @@ class Transform(ABC):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             latent = self.inverse(q)
             moved = latent + z * std / self.slope(latent)
+            # A value at an end of the range has an infinite latent value: its quantiles are the
+            # ends themselves.
             moved = np.where(np.isfinite(moved), moved, np.copysign(np.inf, z))
             return np.where(np.isnan(std), np.nan, self.value(moved))
 
@@ -98,6 +100,7 @@ class Logit(Transform):
     upper: float
 
     def _share(self, latent: Array) -> Array:
+        # The logistic function by tanh does not overflow for large negative arguments.
         return np.asarray(0.5 * (1.0 + np.tanh(0.5 * latent)))
 
     def value(self, latent: Array) -> Array:
@@ -113,6 +116,7 @@ class Logit(Transform):
 
     def inverse(self, q: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
+            # Two logarithms, since the quotient could overflow close to a bound.
             return np.asarray(np.log(q - self.lower) - np.log(self.upper - q))
 
 

@@ -10,7 +10,8 @@ import numpy as np
 __all__ = ["upwind"]
 
 SERIES = (1 / 3, -1 / 45, 2 / 945, -1 / 4725, 2 / 93555, -1382 / 638512875)
-SMALL = 0.01  # square of the Peclet number below which the series is exact to rounding
+# Square of the Peclet number below which the truncated series is exact to rounding.
+SMALL = 0.01
 
 
 def upwind(b: Any, kappa: Any, h: Any) -> Any:

@@ -16,7 +16,8 @@ from livepde.linalg.types import Array, IntArray
 
 __all__ = ["BandedSolver"]
 
-FEW = 300  # entries of a triangle up to which copying it takes longer than it saves
+# Number of entries of a triangle up to which copying it costs more than the faster solve saves.
+FEW = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,7 @@ class BandedSolver:
     def order(self) -> IntArray:
         """Reverse Cuthill-McKee order of the unknowns; the natural one if its band is no wider."""
         structure = self.pattern.matrix(np.ones(self.pattern.nnz))
+        # The pattern is symmetrised, as the algorithm needs an undirected graph.
         found: IntArray = reverse_cuthill_mckee(structure + structure.T, symmetric_mode=True)
         rows, cols, place = self.pattern.rows, self.pattern.indices, np.argsort(found)
         natural = np.abs(rows - cols).max(initial=0)

@@ -45,6 +45,8 @@ class BlockFactor:
         if count > 1 and not math.isfinite(b.sum()):  # one block has no neighbours to disturb
             bad = np.union1d(bad, np.flatnonzero(~np.isfinite(b).all(axis=(0, 2))))
         if len(bad):
+            # A NaN would spread to the neighbouring blocks in the band solve (0 * NaN = NaN): bad
+            # blocks are solved with zeros and marked afterwards.
             b[:, bad] = 0.0
         x = b if self.solver.natural else np.take(b, self.solver.order, axis=2)
         x = self.triangles(x.reshape(columns, count * n).T).T.reshape(b.shape)
@@ -80,6 +82,8 @@ class BandedBlocks:
         middle, bad = lower + upper, NONE
         if not math.isfinite(storage.sum()):
             bad = np.flatnonzero(~np.isfinite(storage).all(axis=1))
+            # A block that is not finite is replaced by the identity, so that the others can be
+            # factorised.
             storage[bad] = 0.0
             storage.reshape(blocks, n, height)[bad, :, middle] = 1.0
         banded = storage.reshape(blocks * n, height).T

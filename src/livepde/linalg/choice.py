@@ -32,8 +32,10 @@ from livepde.linalg.superlu import SuperLUSolver
 
 __all__ = ["Choice", "analyse", "choose"]
 
-WIDEST_BAND = 48  # of banded LU
-SMALL = 150  # up to here SuperLU is as fast as any
+# Largest half bandwidth of banded LU; the limits are those of the table above.
+WIDEST_BAND = 48
+# Half bandwidth up to which no installed package is faster than SuperLU.
+SMALL = 150
 WIDEST_SUPERLU = 500
 WIDEST_FACTOR = 2500
 

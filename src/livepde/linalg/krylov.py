@@ -60,8 +60,7 @@ def conjugate_gradients(
                 "The matrix is not positive definite to working precision: check the signs of the "
                 "forms, or take a smaller time step."
             )
-        # Converged right-hand sides are frozen, so that a column gets no other rounding from the
-        # number of columns solved with it.
+        # Converged right-hand sides are frozen, since their search directions may be zero.
         step = _ratio(new * active, curvature)
         x += step * p
         r -= step * Kp

@@ -17,7 +17,8 @@ from livepde.linalg.types import Array
 
 __all__ = ["MultigridSolver", "approximate_inverse"]
 
-TOLERANCE = 1e-10  # residual relative to the right-hand side
+# Residual of a solve relative to the right-hand side.
+TOLERANCE = 1e-10
 ITERATIONS = 200
 REMEDY = (
     "multigrid serves scalar second-order equations; install CHOLMOD or Pardiso (pip install "

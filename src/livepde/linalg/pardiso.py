@@ -19,7 +19,9 @@ __all__ = ["PardisoSolver"]
 
 POSITIVE_DEFINITE, GENERAL = 2, 11  # Pardiso's types of a matrix
 FACTORISE, REFACTORISE, SOLVE = 12, 22, 33  # its phases
-REPRODUCIBLE = 2  # MKL_CBWR_AUTO: the last digit does not follow where arrays lie in memory
+# The value of MKL_CBWR_AUTO: results do not depend on the alignment of arrays in memory, so that
+# runs are reproducible to the last digit.
+REPRODUCIBLE = 2
 
 
 @dataclass(frozen=True, eq=False)

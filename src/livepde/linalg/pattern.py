@@ -12,7 +12,8 @@ from livepde.linalg.types import Array, IntArray, Sparse
 
 __all__ = ["Pattern", "compact", "sandwich"]
 
-DENSE = 10_000  # entries up to which a dense product is faster than a sparse one
+# Number of entries up to which a dense product is faster than a sparse one.
+DENSE = 10_000
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,8 @@ SYMMETRIC: dict[str, Any] = {
     "diag_pivot_thresh": 0.0,
     "options": {"SymmetricMode": True},
 }
-STABLE = 1e-10  # backward error of a factor whose pivots have not grown, and far more
+# Bound on the backward error of a test solve. A factor without pivot growth is far below it.
+STABLE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)

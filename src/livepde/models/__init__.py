@@ -1,4 +1,4 @@
-"""Ready-made equations: each a function that returns a `Model`, and an entry of `EQUATIONS`."""
+"""Predefined equations: functions that return a `Model`, each with an entry in `EQUATIONS`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Advection and diffusion along a column: heat or a solute carried by a flow."""
+"""Advection-diffusion along a column: heat or a solute carried by a flow."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def advection_diffusion(
 ) -> Model:
     """Return u_t + w u_z - div((kappa + dispersivity |w|) grad u) = source, along z = x[0].
 
-    The velocity is w = ratio (v + K dH/L): a flux v, one that Darcy's law gives from the measured
-    head difference dH, or the sum of both. Heat in a stream bed (Stallman 1965), or a solute.
+    The velocity is w = ratio (v + K dH/L): a flux v, the Darcy flux of a measured head difference
+    dH, or the sum of both. Examples are heat in a stream bed (Stallman 1965) and solutes.
 
     Parameters
     ----------
@@ -41,23 +41,25 @@ def advection_diffusion(
     kappa
         Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`.
     dirichlet
-        Boundary -> number, function g(x, t), or `Channel`. No diffusive flux where none is given.
+        Mapping from boundary to number, function g(x, t), or `Channel`. Other boundaries have no
+        diffusive flux.
     v
-        Flux in m/s, positive along z; one that changes has an `evolution`. In a column the same
-        water passes all layers: a number.
+        Flux in m/s, positive along z; a time-dependent one has an `evolution`. It is a number,
+        since the same water passes all layers of a column.
     K
         Hydraulic conductivity in m/s. dH in m is the input channel "dH".
     dispersivity
-        In m.
+        Dispersivity in m.
     source
-        Gained in unit/s, as in `heat`.
+        Source in unit/s, as in `heat`.
     L
-        Length in m over which the head falls by dH.
+        Length in m of the head drop dH.
     ratio
-        Of the velocity to the flux: for heat the volumetric heat capacity of water over that of the
+        Ratio of velocity to flux: for heat the volumetric heat capacity of water over that of the
         saturated bed (about 1.5), for a solute 1/porosity.
     stabilise
-        Add the diffusion of `livepde.fem.upwind`, for flows with |w| h > 2 kappa over a cell.
+        True: add the artificial diffusion of `livepde.fem.upwind`, for flows with a cell Peclet
+        number |w| h/(2 kappa) above 1.
     element
         Element of the state; default of first order.
     unit
@@ -66,7 +68,7 @@ def advection_diffusion(
     Raises
     ------
     ModelError
-        Neither v nor K, or a length or ratio that is not positive.
+        Neither v nor K is given, or a length or ratio is not positive.
 
     Examples
     --------
@@ -96,6 +98,7 @@ def advection_diffusion(
         w = velocity(q, x)
         spread = q.kappa
         if dispersivity is not None:
+            # `absolute` instead of abs: complex steps must differentiate the term by w.
             spread = spread + q.dispersivity * absolute(w)
         moved = spread * dot(grad(u), grad(test)) + w * grad(u)[0] * test
         if stabilise:  # along the flow only

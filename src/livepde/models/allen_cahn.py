@@ -27,17 +27,16 @@ def allen_cahn(
     Parameters
     ----------
     mesh
-        Any mesh. A front is about 4 (2 D/r)^(1/2) wide and wants some cells across.
+        Any mesh. A front is about 4 (2 D/r)^(1/2) wide and must be resolved by several cells.
     D
         Diffusivity: unknown or a number.
     r
         Rate of reaction: unknown or a number.
     u0
-        Unknown initial state, usually a `Field` on the same mesh; None leaves it to the
-        `Identifier`.
+        Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
     dirichlet
-        Boundary -> number, function g(x, t), or `Channel`, {} for no flux everywhere; None:
-        periodic from side to side.
+        Mapping from boundary to number, function g(x, t), or `Channel`, {} for no flux everywhere;
+        None: periodic.
     element
         Element of the state; default cubic Hermite on a line, else first order.
     """

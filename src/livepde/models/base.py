@@ -1,4 +1,4 @@
-"""What a ready-made equation is, for programs, case files and `livepde init`."""
+"""Descriptions of predefined equations, for programs, case files and `livepde init`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ __all__ = ["Equation", "Fluxes", "Option", "Quantity", "Variable", "by_name", "c
 
 @dataclass(frozen=True)
 class Variable:
-    """An unknown, the state, or an input.
+    """Unknown, state, or input of an equation.
 
     Attributes
     ----------
     unit, text
-        Its unit, and what it is.
+        Unit and meaning.
     optional
         Whether it may be left out.
     transform
@@ -36,7 +36,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Option:
-    """A known number of an equation; `default` None means that it must be given.
+    """Known number of an equation; `default` None means that it is required.
 
     An option whose default is text or a boolean, or that has `choices`, takes such a value.
     """
@@ -48,7 +48,7 @@ class Option:
 
     @property
     def kind(self) -> type[float] | type[str] | type[bool]:
-        """What it takes."""
+        """Type of its value."""
         if isinstance(self.default, bool):
             return bool
         return str if self.choices or isinstance(self.default, str) else float
@@ -56,16 +56,17 @@ class Option:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something that is measured and is not simply the state at a point.
+    """Measured quantity other than the state at a point.
 
     Attributes
     ----------
     text
-        What it is.
+        Meaning of the quantity.
     at
-        (left end, right end) of the mesh -> where the state enters.
+        Function (left end, right end) of the mesh -> position at which the state is read.
     direct
-        Options -> the part (q, x) that depends on the parameter directly, linear in q.
+        Function of the options that returns the direct dependence on the parameter, (q, x), linear
+        in q.
     """
 
     text: str
@@ -74,13 +75,13 @@ class Quantity:
 
 
 class Fluxes(NamedTuple):
-    """Units of what a case may let pass through boundaries and gain inside.
+    """Units of boundary fluxes and sources in a case.
 
     Attributes
     ----------
     flux, transfer, source
-        Of D u_n, of the coefficient of an exchange h (ambient - u), and of what is gained for each
-        unit of volume and time.
+        Units of D u_n, of the coefficient h of an exchange h (ambient - u), and of a source per
+        volume and time.
     """
 
     flux: str
@@ -90,7 +91,7 @@ class Fluxes(NamedTuple):
 
 @dataclass(frozen=True)
 class Equation:
-    """A PDE with a name, and what a case file may say about it.
+    """Named PDE, with the entries that a case file may contain.
 
     Attributes
     ----------
@@ -99,13 +100,13 @@ class Equation:
     state
         Unit and meaning of u.
     unknowns, inputs, options
-        By name.
+        Mappings from name to description.
     build
-        (mesh, unknowns, dirichlet, **options) -> `Model`.
+        Function (mesh, unknowns, dirichlet, **options) -> `Model`.
     quantities
         Measured quantities besides the state itself.
     element
-        mesh -> element of the state, and of an unknown field.
+        Function mesh -> element of the state, and of unknown fields.
     fluxes
         Units of fluxes and sources (`livepde.models.with_conditions`); None: it takes none.
     spacing
@@ -143,9 +144,9 @@ class Equation:
 
 
 def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
-    """Return the `build` of a function that takes unknowns, `dirichlet` and options by name.
+    """Return the `build` of a function with unknowns, `dirichlet` and options as keywords.
 
-    Without boundary values `dirichlet` is None: what the function takes by default.
+    Without boundary values `dirichlet` is None, the default of the function.
     """
 
     def build(

@@ -1,4 +1,4 @@
-"""A particle of a battery's electrode: spherical diffusion of lithium."""
+"""Spherical diffusion of lithium in a particle of a battery electrode."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ def battery_particle(
     c_max: float,
     element: Any = None,
 ) -> Model:
-    """Return r^2 c_t = (D(c) r^2 c_r)_r in a sphere that a current I(t) empties or fills.
+    """Return r^2 c_t = (D(c) r^2 c_r)_r in a sphere that is charged by a current I(t).
 
-    The single-particle model of an electrode: all of its particles are one, and the current is
-    spread over their surface,
+    This is the single-particle model of an electrode: all of its particles are represented by one,
+    and the current is distributed evenly over their surface,
 
         -D(c) c_r = I/(F area)  at the surface,      D(c) = D exp(slope (c/c_max - 1/2)).
 
-    I > 0 takes lithium out, as a discharge does with the negative electrode. The concentration at
-    the surface is the state at the right end of the mesh; a voltage is a function of it, see
+    I > 0 extracts lithium, as in the negative electrode during discharge. The concentration at the
+    surface is the state at the right end of the mesh; a voltage is a function of it, see
     `livepde.Calibrated`.
 
     Parameters
     ----------
     mesh
-        Radius in m, from 0 ("left") to the surface ("right"); cells of the size sqrt(D h) there
-        for time steps h.
+        Radius in m, from 0 ("left") to the surface ("right"), with cells of size sqrt(D h) at the
+        surface for time steps h.
     D
         Diffusivity of lithium at half filling in m^2/s; positive: transform="log".
     slope
-        How the logarithm of the diffusivity grows with the filling; default 0, D is constant.
+        Derivative of the logarithm of the diffusivity by the filling; default 0, a constant D.
     area
         Surface of all particles in m^2: 3/R times their volume.
     c_max
@@ -80,7 +80,8 @@ def battery_particle(
     R = float(mesh.p.max())
     unknowns = {"D": D} if slope is None else {"D": D, "slope": slope}
 
-    # Weights are (r/R)^2, so that they are of order one; of order four they are exact.
+    # The weights (r/R)^2 are of order one, which keeps the matrices well scaled. Quadrature of
+    # order four is exact for them with elements of first order.
     def diffusion(q: Any, c: Any, v: Any, x: Place) -> Any:
         mobility = q.D if slope is None else q.D * exp(q.slope * (c / c_max - 0.5))
         return mobility * (x[0] / R) ** 2 * dot(grad(c), grad(v))

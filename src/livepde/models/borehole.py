@@ -1,4 +1,4 @@
-"""The thermal response test with the borehole's inside: fluid, pipes, grout, casing, ground."""
+"""Thermal response test with a resolved borehole: fluid, pipes, grout, casing, ground."""
 
 from __future__ import annotations
 
@@ -34,22 +34,24 @@ def grouted_borehole(
 ) -> Model:
     """Return conduction from the fluid of a heated borehole into the ground around it.
 
-    The pipes of a U-tube are one pipe of an equivalent radius r_p,
+    The pipes of a U-tube are represented by one pipe of an equivalent radius r_p,
 
         fluid    C_f T_t = Q/H - (T - T(r_p))/R_p                       R_p = share R_b
         grout    C_g r T_t = (k_g r T_r)_r,       r_p < r < r_b         ln(r_b/r_p)/(2 pi k_g) =
         ground   rho_c r T_t = (k r T_r)_r,       r_b < r                        (1 - share) R_b
 
-    and T = T0 at the right end. The state at the left end of the mesh is the fluid: a sensor there
-    sees its temperature. On a mesh of a plane, radius times height, heat flows along the borehole,
-    too: the bottom is the plane of its end, where the ground is at T0, and the top that of its
-    middle. The power is spread evenly, and the mean over "left" is the temperature of the fluid.
+    and T = T0 at the right end. The state at the left end of the mesh is the temperature of the
+    fluid, for sensors there. On a two-dimensional mesh, radius times height, heat also flows along
+    the borehole: the bottom is the plane of its end, where the ground is at T0, and the top that of
+    its middle. The power is distributed evenly, and the mean over "left" is the temperature of the
+    fluid.
 
-    All unknowns are positive: give them transform="log", and the share "logit".
+    All unknowns are positive: use transform="log", and "logit" for the share.
 
-    So that the capacity of the ground may be unknown, radii there are counted by the heat they
-    hold: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x the capacity is
-    known, and k appears as k (rho_c/rho_0) r^2/x. The right end in r moves with rho_c.
+    The capacity of the ground may be unknown because radii there are replaced by a coordinate that
+    measures the heat content: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x
+    the capacity is known, and k appears as k (rho_c/rho_0) r^2/x. The right end in r moves with
+    rho_c.
 
     Parameters
     ----------
@@ -64,15 +66,15 @@ def grouted_borehole(
     R_b
         Resistance between fluid and wall of the borehole in m K/W.
     share
-        Part of R_b that the pipes make: film and wall. The rest is the grout.
+        Share of the pipes (film and wall) in R_b. The rest is the grout.
     H
         Length of the borehole in m.
     r_p, r_b
-        Radius of the pipes, as one, and of the borehole in m. Two pipes of diameter d, s apart from
-        axis to axis, are one of radius sqrt(d s/2) (Gu and O'Neal 1998).
+        Equivalent radius of the pipes, and radius of the borehole in m. Two pipes of diameter d
+        with axes at a distance s have the equivalent radius sqrt(d s/2) (Gu and O'Neal 1998).
     C_f, C_p, C_c
-        Heat capacities of the fluid with what else is within r_p, of the walls of the pipes, and of
-        a casing at r_b, for each metre of the borehole, in J/(m K).
+        Heat capacities per metre of borehole, in J/(m K), of the fluid with everything else within
+        r_p, of the walls of the pipes, and of a casing at r_b.
     C_g
         Volumetric heat capacity of the grout in J/(m^3 K).
     T0
@@ -85,13 +87,13 @@ def grouted_borehole(
     Raises
     ------
     ModelError
-        The radii do not lie inside of the mesh in this order, or rho_c is not a `Scalar`.
+        The radii are not inside of the mesh in this order, or rho_c is not a `Scalar`.
     """
     if not isinstance(rho_c, Scalar):
         raise ModelError("grouted_borehole: rho_c must be one number, a Scalar.")
     layered = _layered(mesh, r_p, r_b)
     thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), rho_c.prior
-    # Of order four: the weight r and the elements of first order are integrated exactly.
+    # Quadrature of order four integrates the weight r with elements of first order exactly.
     cold = {name: T0 for name in ("right", "end") if name in layered.boundaries}
     state = Field(layered, linear(layered), dirichlet=cold, unit="degC", quadrature=4)
 
@@ -102,6 +104,7 @@ def grouted_borehole(
         return around / (2 * pi * (1 - q.share) * q.R_b) * x[0] * dot(grad(u), grad(v))
 
     def ground(q: Any, u: Any, v: Any, x: Place) -> Any:
+        # The weak form in the coordinate x of constant heat content, see above.
         more, radial = q.rho_c / rho_0, _outwards(u, v)
         square = r_b**2 + (x[0] ** 2 - r_b**2) / more
         along = dot(grad(u), grad(v)) - radial
@@ -125,12 +128,12 @@ def grouted_borehole(
 
 
 def _outwards(u: Any, v: Any) -> Any:
-    """Return u_r v_r."""
+    """Return the radial part u_r v_r of the gradient product."""
     return grad(u)[0] * grad(v)[0]
 
 
 def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
-    """Return the mesh with nodes at both radii and names for what lies between them.
+    """Return the mesh with nodes at both radii and names for its layers.
 
     Subdomains "pipes", "grout" and "ground", the facets "wall" at r_b, and in a plane "end", the
     bottom of the ground.
@@ -138,6 +141,8 @@ def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
     points = mesh.p.copy()
     radii = points[0]
     first, last = float(radii.min()), float(radii.max())
+    # The nearest nodes are moved onto the radii, so that layers end at nodes: a coefficient that
+    # jumps inside of a cell would cost an order of convergence.
     inner, wall = (float(radii[np.abs(radii - r).argmin()]) for r in (r_p, r_b))
     if not first < r_p < r_b < last or not first < inner < wall < last:
         raise ModelError(

@@ -27,17 +27,16 @@ def burgers(
     Parameters
     ----------
     mesh
-        `livepde.interval(...)` or `livepde.line(...)`. A shock is about 4 nu/(a jump) wide and
-        wants some cells of the default element across.
+        `livepde.interval(...)` or `livepde.line(...)`. A shock is about 4 nu/(a jump) wide and must
+        be resolved by several cells of the default element.
     nu
         Viscosity: unknown or a number.
     advection
         The coefficient a: unknown or a number.
     u0
-        Unknown initial state, usually a `Field` on the same mesh; None leaves it to the
-        `Identifier`.
+        Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
     dirichlet
-        Boundary -> number, function g(x, t), or `Channel`; None: periodic.
+        Mapping from boundary to number, function g(x, t), or `Channel`; None: periodic.
     element
         Element of the state; default cubic Hermite.
     """

@@ -1,4 +1,4 @@
-"""What the equations of nonlinear waves have in common: coefficients, sides, where u begins."""
+"""Common parts of nonlinear wave equations: coefficients, boundaries, initial state."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ SIDES = (("left", "right"), ("bottom", "top"), ("front", "back"))
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Coefficients of an equation by name, each of them known or unknown."""
+    """Coefficients of an equation by name, known or unknown."""
 
     given: Mapping[str, Number]
 
     @property
     def unknown(self) -> dict[str, Unknown]:
-        """Those that are unknown."""
+        """The unknown coefficients."""
         return {k: v for k, v in self.given.items() if not isinstance(v, int | float)}
 
     def __call__(self, q: Any, name: str) -> Any:
-        """Return a coefficient as a form sees it."""
+        """Return the value of a coefficient within a form."""
         value = self.given[name]
         return float(value) if isinstance(value, int | float) else getattr(q, name)
 
 
 def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: str = "") -> Field:
-    """Return the state: periodic from side to side, or with Dirichlet values."""
+    """Return the field of the state: periodic, or with Dirichlet values."""
     if dirichlet is not None:
         return Field(mesh, element, dirichlet=dict(dirichlet), unit=unit)
     pairs = [pair for pair in SIDES if set(pair) <= set(mesh.boundaries or {})]
@@ -46,7 +46,8 @@ def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: st
 def beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
     """Return an unknown initial state by name, and the form `initial` of a model.
 
-    A field takes over the state's sides: periodic, or zero where the state is held at zero.
+    A field inherits the boundaries of the state: periodic, or zero where the state is fixed at
+    zero.
     """
     if u0 is None:
         return {}, None

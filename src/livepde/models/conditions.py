@@ -1,7 +1,7 @@
-"""Fluxes through boundaries and sources in regions, added to a process: known, measured or unknown.
+"""Boundary fluxes and sources added to a process: known, measured or unknown.
 
-In the weak form of M u_t - div(D grad u) = f a flux J into the domain is the boundary integral of
-J v: it is given in the unit of D u_n.
+In the weak form of M u_t - div(D grad u) = f, a flux J into the domain is the boundary integral of
+J v, in the unit of D u_n.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Amount: TypeAlias = "float | Channel | str"
 
 @dataclass(frozen=True)
 class Flux:
-    """Flux into the domain through a boundary: D u_n = value.
+    """Neumann condition, a flux into the domain through a boundary: D u_n = value.
 
     Attributes
     ----------
     value
-        In the unit of D u_n, W/m^2 for heat conduction.
+        Flux in the unit of D u_n, W/m^2 for heat conduction.
     """
 
     value: Amount
@@ -37,12 +37,12 @@ class Flux:
 
 @dataclass(frozen=True)
 class Exchange:
-    """Exchange with surroundings through a boundary (Newton, Robin): D u_n = h (ambient - u).
+    """Robin (Newton) condition, exchange through a boundary: D u_n = h (ambient - u).
 
     Attributes
     ----------
     coefficient
-        h, the transfer coefficient: W/(m^2 K) for heat conduction.
+        Transfer coefficient h: W/(m^2 K) for heat conduction.
     ambient
         Value of u outside.
     """
@@ -56,12 +56,12 @@ Condition: TypeAlias = Flux | Exchange
 
 @dataclass(frozen=True)
 class Source:
-    """What is gained in a part of the domain, for each unit of volume and time.
+    """Source in a part of the domain, per volume and time.
 
     Attributes
     ----------
     value
-        In the unit of the equation, W/m^3 for heat conduction.
+        Source density in the unit of the equation, W/m^3 for heat conduction.
     over
         Predicate on x or name of a subdomain of the mesh; None for all of the domain.
     """
@@ -76,28 +76,27 @@ def with_conditions(
     sources: Mapping[str, Source] | None = None,
     unknowns: Mapping[str, Unknown] | None = None,
 ) -> Model:
-    """Return a process with fluxes through boundaries and with sources.
+    """Return a process with added boundary fluxes and sources.
 
     Parameters
     ----------
     model
-        A process of one component whose unknowns have names.
+        Process with one component and named unknowns.
     boundary
-        Name of a boundary -> what passes through it, one or more.
+        Mapping from boundary to one or more conditions.
     sources
-        Name, for messages -> source.
+        Mapping from name, for messages, to source.
     unknowns
-        The unknowns that these name, beside those of the model.
+        Unknowns named by these conditions, in addition to those of the model.
 
     Raises
     ------
     ModelError
-        A boundary that the mesh does not have or whose value is given, or an unknown that no
-        condition names.
+        A boundary does not exist or has a Dirichlet value, or no condition names an unknown.
 
     Examples
     --------
-    Inverse heat conduction, a conductivity and the heat flux J(t) into the hot face:
+    Inverse heat conduction with an unknown conductivity and heat flux J(t) into the hot face:
 
     >>> import livepde as lp
     >>> from livepde.models import Flux, conduction, with_conditions
@@ -131,7 +130,7 @@ def _everywhere(x: Place) -> float:
 
 
 class _Terms:
-    """Terms of A, with unknowns, and of B, without."""
+    """Additional terms of A, which contain unknowns, and of B, which do not."""
 
     def __init__(self, unknowns: tuple[str, ...]) -> None:
         self.unknowns = unknowns
@@ -148,9 +147,11 @@ class _Terms:
         self._add(where, lambda q, u, v, x: -amount(q, x) * inside(x) * v, value)
 
     def exchanged(self, condition: Exchange, boundary: str) -> None:
-        """Add an exchange; as two terms, since what depends on u should read no input."""
+        """Add an exchange as two terms, so that the term in u reads no input."""
         h, ambient = self._amount(condition.coefficient), self._amount(condition.ambient)
         given = condition.coefficient, condition.ambient
+        # A term in u that reads an input would make the matrix of a stage depend on time, and
+        # prevent the reuse of its factor.
         self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, given[0])
         self._add(boundary, lambda q, u, v, x: -h(q, x) * ambient(q, x) * v, *given)
 
@@ -192,7 +193,7 @@ def _check_boundary(model: Model, name: str) -> None:
 
 
 def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[Any], Any]]:
-    """Return the subdomain of a source, None for all, and where in it the source is."""
+    """Return the subdomain of a source, None for all, and its indicator function."""
     if over is None:
         return None, _everywhere
     if isinstance(over, str):

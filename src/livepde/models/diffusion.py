@@ -1,4 +1,4 @@
-"""Heat conduction, or any diffusion, with side loss, heat transfer at boundaries and sources."""
+"""Heat conduction or diffusion with side loss, heat transfer at boundaries and sources."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def heat(
 ) -> Model:
     """Return u_t - div(alpha grad u) + loss (u - ambient) = source in any dimension.
 
-    At boundaries without a value -alpha u_n = transfer (u - ambient): Robin (Newton's law of
-    cooling). What is left out is zero: without `transfer` these boundaries are insulated.
+    Boundaries without a value have a Robin condition, -alpha u_n = transfer (u - ambient) (Newton's
+    law of cooling). Omitted terms are zero: without `transfer` these boundaries are insulated.
 
     Parameters
     ----------
@@ -37,16 +37,18 @@ def heat(
         Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
     alpha
         Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`. The flux alpha u_n
-        is continuous between layers: their heat capacities are equal (else: `conduction`).
+        is continuous between layers, so all layers have the same heat capacity (else:
+        `conduction`).
     dirichlet
         Boundary -> number, function g(x, t), or `Channel`.
     loss
-        Rate of exchange with the surroundings all along, in 1/s: a rod without insulation.
+        Rate of exchange with the surroundings over the whole domain, in 1/s, as for a rod without
+        insulation.
     transfer
         Heat-transfer coefficient over volumetric heat capacity, in m/s.
     source
-        Heat gained, in K/s. With `evolution=MeanReverting(...)` it stands for whatever the equation
-        leaves out: rain, evaporation, flow from the side.
+        Heat source, in K/s. With `evolution=MeanReverting(...)` it represents all unmodelled
+        effects: rain, evaporation, lateral flow.
     element
         Element of the state; default of first order.
     unit
@@ -59,7 +61,7 @@ def heat(
     Raises
     ------
     ModelError
-        `transfer` without a boundary that is free for it.
+        `transfer` is given, but every boundary has a value.
 
     Examples
     --------
@@ -97,12 +99,12 @@ def conduction(
     C
         Volumetric heat capacity in J/(m^3 K): a number, or a function of x.
     loss, transfer, source
-        In W/(m^3 K), W/(m^2 K) and W/m^3.
+        Loss rate, transfer coefficient and source, in W/(m^3 K), W/(m^2 K) and W/m^3.
 
     Raises
     ------
     ModelError
-        C is not positive, or `transfer` without a boundary that is free for it.
+        C is not positive, or `transfer` is given, but every boundary has a value.
 
     Examples
     --------
@@ -156,7 +158,7 @@ def _model(
 
 
 def _exchange(coefficient: str) -> list[Any]:
-    """Return coefficient (u - ambient) v, as two terms: what depends on u reads no input."""
+    """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
     return [
         lambda q, u, v, x: getattr(q, coefficient) * u * v,
         lambda q, u, v, x: -getattr(q, coefficient) * x.inputs[AMBIENT] * v,

@@ -1,4 +1,4 @@
-"""Populations that spread and grow: Fisher-KPP, and porous Fisher where the crowd moves faster."""
+"""Population dynamics with diffusion and growth: Fisher-KPP, and porous Fisher."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def fisher_kpp(
     D, r
         Diffusivity in mm^2/d and growth rate in 1/d: numbers, by region, or fields.
     dirichlet
-        Boundary -> number, function g(x, t), or `Channel`. Nothing crosses the others.
+        Mapping from boundary to number, function g(x, t), or `Channel`. The other boundaries have
+        no flux.
     K
         Carrying capacity, the density at which growth ends, in the unit of u.
     element
@@ -71,7 +72,7 @@ def porous_fisher(
 ) -> Model:
     """Return u_t = div(D (u/K)^m grad u) + r u (1 - u/K): Gurney and Nisbet (1975).
 
-    Where u falls below zero, which only errors of discretisation do, the diffusivity is zero.
+    The diffusivity is zero where u is negative, which can happen by discretisation errors only.
 
     Parameters
     ----------
@@ -83,8 +84,8 @@ def porous_fisher(
     Raises
     ------
     ModelError
-        m below 1: the derivative of the diffusivity at u = 0 is not finite; K that is no positive
-        number.
+        m is below 1, when the derivative of the diffusivity at u = 0 is infinite; or K is not
+        positive.
     """
     _check("porous_fisher", K)
     if not (np.isfinite(m) and m >= 1):
@@ -93,6 +94,7 @@ def porous_fisher(
     return Model(
         _state(mesh, dirichlet, element, unit),
         {"D": D, "r": r},
+        # `positive` keeps the equation parabolic where discretisation errors make u negative.
         A=lambda q, u, v, x: (
             q.D * positive(u / K) ** m * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v
         ),
@@ -107,7 +109,7 @@ def _check(name: str, K: float) -> None:
 
 def _state(mesh: Any, dirichlet: Mapping[str, Any] | None, element: Any, unit: str) -> Field:
     element = element or linear(mesh)
-    # u^2 v is integrated exactly.
+    # This order integrates u^2 v exactly.
     order = 3 * int(element.maxdeg)
     return Field(mesh, element, dirichlet=dict(dirichlet or {}), unit=unit, quadrature=order)
 

@@ -1,4 +1,4 @@
-"""Groundwater flow: a confined aquifer in plan view, and the radial flow of a pumping test."""
+"""Groundwater flow: confined aquifers in plan view, and radial flow of pumping tests."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ __all__ = ["GROUNDWATER", "PUMPING_TEST", "groundwater", "pumping_test", "well"]
 
 
 def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any = None) -> Model:
-    """Return Ss r s_t - (k r s_r)_r = 0 for the drawdown s around a well that is pumped at Q(t).
+    """Return Ss r s_t - (k r s_r)_r = 0 for the drawdown s around a well pumped at Q(t).
 
-    At the wall of the well -2 pi r b k s_r = Q, far away s = 0. With a well of small radius this is
-    the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)) for a constant rate, but Q may
-    change: steps, recovery. Both unknowns are positive: give them transform="log".
+    At the wall of the well -2 pi r b k s_r = Q, and s = 0 at the far end. For a small well radius
+    and a constant rate this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)); Q
+    may also change (step tests, recovery). Both unknowns are positive: use transform="log".
 
     Parameters
     ----------
     mesh
-        Radius in m, from the wall ("left") to where the test is not felt ("right"), a few times
-        sqrt(4 k t/Ss); best graded: `livepde.interval(0.1, 5000.0, 80, geometric=True)`.
+        Radius in m, from the wall ("left") to beyond the influence of the test ("right"), a few
+        times sqrt(4 k t/Ss); best graded: `livepde.interval(0.1, 5000.0, 80, geometric=True)`.
     k
         Hydraulic conductivity in m/s.
     Ss
         Specific storage in 1/m.
     b
-        Thickness of the aquifer in m; with 1 m the unknowns are transmissivity and storativity.
+        Thickness of the aquifer in m; for 1 m the unknowns are transmissivity and storativity.
 
     Notes
     -----
-    The rate in m^3/s, positive when water is taken out, is the input channel "Q".
+    The rate in m^3/s, positive for extraction, is the input channel "Q".
 
     Raises
     ------
@@ -47,7 +47,7 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
     """
     if not b > 0:
         raise ModelError(f"pumping_test: b, the thickness, must be positive; got {b}.")
-    # Of order four: the weight r and the elements of first order are integrated exactly.
+    # Quadrature of order four integrates the weight r with elements of first order exactly.
     state = Field(mesh, element or linear(mesh), dirichlet={"right": 0.0}, unit="m", quadrature=4)
     return Model(
         state,
@@ -75,9 +75,9 @@ def groundwater(
 ) -> Model:
     """Return S h_t - div(T grad h) = recharge - sum of Q_w delta_w for the head h of an aquifer.
 
-    Divided by S, so that the storativity may be unknown, too. Each well is a smooth, round source
-    (see `well`): beyond its radius the head is that of a point source, within it is not; so place
-    no sensor there. Give T and S transform="log": both are positive.
+    The equation is divided by S, so that the storativity may be unknown, too. Each well is a
+    smooth, round source (see `well`): the head equals that of a point source only beyond its
+    radius, so place no sensor within it. T and S are positive: use transform="log".
 
     Parameters
     ----------
@@ -86,26 +86,26 @@ def groundwater(
     T
         Transmissivity in m^2/s: a number, by region, or a `Field`.
     S
-        Storativity, without unit: a number or a `Field`. By region it would break the balance of
-        water where S jumps.
+        Storativity, dimensionless: a number or a `Field`. A `Piecewise` would violate the water
+        balance where S jumps.
     dirichlet
-        Boundary -> head in m: a number, a function g(x, t), or `Channel`. No flow where none is
-        given.
+        Mapping from boundary to head in m: a number, a function g(x, t), or `Channel`. Other
+        boundaries have no flow.
     wells
-        Name -> (x, y). The name is the input channel of the rate in m^3/s, positive when water is
-        taken out.
+        Mapping from name to (x, y). The name is the input channel of the rate in m^3/s, positive
+        for extraction.
     radius
         Radius of the wells' sources in m: at least the diameter of the cells around them.
     recharge
-        Water gained from above, in m/s.
+        Recharge from above, in m/s.
     element
         Element of the state; default of first order.
 
     Raises
     ------
     ModelError
-        A well outside of the mesh or in cells wider than its radius, or S of a kind that is not
-        possible.
+        A well is outside of the mesh or in cells wider than its radius, or S has an unsupported
+        type.
 
     Examples
     --------
@@ -117,6 +117,7 @@ def groundwater(
     ('Q',)
     """
     sources = {name: _place(mesh, name, at, radius) for name, at in (wells or {}).items()}
+    # The term grad(1/S) would be a delta function at the jumps of S.
     if not hasattr(S, "mesh") and hasattr(S, "regions"):
         raise ModelError("groundwater: S by region is not possible; take a number or a Field.")
     varies = isinstance(S, Field)
@@ -133,7 +134,7 @@ def groundwater(
             rate = rate + x.inputs[name] * well(x, at, radius)
         return rate / q.S * v
 
-    # Of order four: the wells' sources are of that degree.
+    # The well sources are polynomials of degree four.
     state = Field(
         mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit="m", quadrature=4
     )
@@ -146,7 +147,7 @@ def well(x: Place, at: Sequence[float], radius: float) -> Array:
     Parameters
     ----------
     x
-        Where the form is evaluated.
+        Argument x of the form.
     at
         Position (x, y) of the well in m.
     radius

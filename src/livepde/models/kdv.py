@@ -1,4 +1,4 @@
-"""Korteweg-de Vries: u_t + a u u_x + b u_xxx = 0 on a ring."""
+"""Korteweg-de Vries equation: u_t + a u u_x + b u_xxx = 0, periodic."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ __all__ = ["KDV", "kdv"]
 
 
 def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = None) -> Model:
-    """Return u_t + a u u_x + b u_xxx = 0 on a ring (Korteweg and de Vries).
+    """Return the Korteweg-de Vries equation u_t + a u u_x + b u_xxx = 0 on a periodic interval.
 
-    The weak form is -b (u_xx, v_x), for elements of class C^1: cubic Hermite. Take the scheme
-    `Alexander2`, which hardly damps what the grid resolves; implicit Euler damps solitons.
+    The weak form -b (u_xx, v_x) needs elements of class C^1: cubic Hermite. Use the scheme
+    `Alexander2`, which hardly damps resolved waves; implicit Euler damps solitons.
 
     Parameters
     ----------
     mesh
-        `livepde.interval(...)`, whose ends are one point of the ring.
+        `livepde.interval(...)`, with its ends identified.
     advection, dispersion
         The coefficients a and b: unknown or numbers.
     u0
-        Unknown initial state, usually a `Field` on the same mesh; None leaves it to the
-        `Identifier`.
+        Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
     """
     u = state(mesh, smooth(mesh), None)
     c = Coefficients({"advection": advection, "dispersion": dispersion})
     begun, initial = beginning(u0, u)
+    # Integration by parts is applied once to the third derivative, so that second derivatives of u
+    # remain: hence C^1 elements.
     return Model(
         u,
         {**c.unknown, **begun},

@@ -1,4 +1,4 @@
-"""Kuramoto-Sivashinsky: u_t + a u u_x + b u_xx + c u_xxxx = 0 on a ring."""
+"""Kuramoto-Sivashinsky equation: u_t + a u u_x + b u_xx + c u_xxxx = 0, periodic."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ def kuramoto_sivashinsky(
     damping: Number,
     u0: Unknown | None = None,
 ) -> Model:
-    """Return u_t + a u u_x + b u_xx + c u_xxxx = 0 on a ring (Kuramoto and Sivashinsky).
+    """Return u_t + a u u_x + b u_xx + c u_xxxx = 0 on a periodic interval.
 
-    Waves longer than 2 pi (c/b)^(1/2) grow, shorter ones decay: chaos, in which two states part
-    quickly. Sensors have to keep the state, so observe several points, and often.
+    Waves longer than 2 pi (c/b)^(1/2) grow, shorter ones decay. The dynamics are chaotic, and state
+    errors grow quickly, so the state must be observed at several points and at short intervals.
 
     Parameters
     ----------
     mesh
-        `livepde.interval(...)`, whose ends are one point of the ring.
+        `livepde.interval(...)`, with its ends identified.
     advection, instability, damping
         The coefficients a, b and c: unknown or numbers.
     u0
-        Unknown initial state; None leaves it to the `Identifier`.
+        Unknown initial state; None: given to the `Identifier`.
     """
     u = state(mesh, smooth(mesh), None)
     c = Coefficients({"advection": advection, "instability": instability, "damping": damping})

@@ -1,4 +1,4 @@
-"""A borehole heat exchanger in homogeneous ground: the thermal response test."""
+"""Thermal response test of a borehole heat exchanger in homogeneous ground."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ def borehole(
     T0: float,
     element: Any = None,
 ) -> Model:
-    """Return rho_c r T_t - (k r T_r)_r = 0 around a borehole that gives off the power Q(t).
+    """Return rho_c r T_t - (k r T_r)_r = 0 around a borehole heated by the power Q(t).
 
-    At the wall -2 pi r k H T_r = Q, far away T = T0. The mean temperature of the fluid is
+    At the wall -2 pi r k H T_r = Q, and T = T0 at the far end. The mean temperature of the fluid is
     T(wall) + R_b Q/H: observe it with `Points({"T": r_wall}, direct={"T": fluid(H)})`.
 
     Parameters
     ----------
     mesh
-        Radius in m, from the wall ("left") to where the test is not felt ("right"); best graded:
-        `livepde.interval(r_wall, r_far, 40, geometric=True)`.
+        Radius in m, from the wall ("left") to beyond the influence of the test ("right"); best
+        graded: `livepde.interval(r_wall, r_far, 40, geometric=True)`.
     k
         Conductivity of the ground in W/(m K).
     R_b
-        Resistance between fluid and wall in m K/W. It does not enter the PDE, only the sensor.
+        Resistance between fluid and wall in m K/W. It enters the sensor only, not the PDE.
     H
         Length of the borehole in m.
     rho_c
@@ -47,7 +47,7 @@ def borehole(
 
     The power in W is the input channel "Q".
     """
-    # Of order four: the weight r and the elements of first order are integrated exactly.
+    # Quadrature of order four integrates the weight r with elements of first order exactly.
     state = Field(mesh, element or linear(mesh), dirichlet={"right": T0}, unit="degC", quadrature=4)
     if isinstance(rho_c, int | float):
         return Model(
@@ -59,7 +59,7 @@ def borehole(
             inputs=["Q"],
             time_unit="s",
         )
-    # The mass term has no unknowns: the equation is divided by the heat capacity.
+    # The mass term must not contain unknowns, so the equation is divided by the heat capacity.
     return Model(
         state,
         {"k": k, "R_b": R_b, "rho_c": rho_c},
@@ -74,14 +74,14 @@ def borehole(
 
 
 def fluid(H: float) -> Callable[[Any, Place], Any]:
-    """Return what the fluid sees beside T(wall): R_b Q/H."""
+    """Return the direct part of a fluid temperature sensor, R_b Q/H in addition to T(wall)."""
     return lambda q, x: q.R_b * x.inputs["Q"] / H
 
 
 def _build(
     mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
 ) -> Model:
-    """Return the process of a case; an unknown heat capacity stands in the place of the option."""
+    """Return the process of a case; an unknown heat capacity replaces the option."""
     known = {name: value for name, value in options.items() if name not in unknowns}
     return closed(borehole, "is heated by the input Q, with T0 far away")(
         mesh, unknowns, dirichlet, **known

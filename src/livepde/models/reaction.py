@@ -1,4 +1,4 @@
-"""The paper's example: an unknown reaction coefficient (section 4)."""
+"""The paper's example: diffusion with an unknown reaction coefficient (section 4)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def reaction_diffusion(
     f: Source = 0.0,
     element: Any = None,
 ) -> Model:
-    """Return u_t - div(D grad u) + q u = f with unknown q, without units.
+    """Return u_t - div(D grad u) + q u = f with unknown q, dimensionless.
 
     Parameters
     ----------
@@ -30,7 +30,8 @@ def reaction_diffusion(
     q
         Reaction coefficient, usually a `Field`.
     dirichlet
-        Boundary -> number, function g(x, t), or `Channel`; default zero on all of it.
+        Mapping from boundary to number, function g(x, t), or `Channel`; default zero on all
+        boundaries.
     D
         Diffusivity: a number or a function of x.
     f

@@ -1,4 +1,4 @@
-"""Tracer in a column of soil: advection and dispersion, with and without immobile water."""
+"""Tracer transport in a soil column: advection and dispersion, with or without immobile water."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def advection_dispersion(
     element: Any = None,
     unit: str = "",
 ) -> Model:
-    """Return R c_t = D c_xx - v c_x - decay c in a column that is fed on the left.
+    """Return R c_t = D c_xx - v c_x - decay c in a column with inflow on the left.
 
-    The inflow is the channel "c_in". With inlet = "flux" the tracer that flows in is what comes
-    with the water, v c - D c_x = v c_in (third type; c is the concentration in the column); with
-    "fixed" c = c_in there (first type). On the right the tracer leaves with the water, c_x = 0:
-    end the mesh where the front does not get to, and the column is half-infinite as in the
-    analytic solutions (Toride, Leij, van Genuchten 1999, CXTFIT 2.1, USDA Research Report 137).
+    The inflow concentration is the channel "c_in". With inlet = "flux" the tracer enters with the
+    water, v c - D c_x = v c_in (third type; c is the concentration in the column); with "fixed" c =
+    c_in (first type). On the right the tracer leaves with the water, c_x = 0: if the front does not
+    reach this end, the column is semi-infinite as in the analytic solutions (Toride, Leij, van
+    Genuchten 1999, CXTFIT 2.1, USDA Research Report 137).
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def advection_dispersion(
     Raises
     ------
     ModelError
-        R below 1, or an unknown inlet.
+        R is below 1, or the inlet is unknown.
     """
     _check("advection_dispersion", inlet, R)
     state = _column(mesh, inlet, element, unit)
@@ -90,7 +90,7 @@ def mobile_immobile(
     element: Any = None,
     unit: str = "",
 ) -> Model:
-    """Return dispersion in mobile water c that exchanges its tracer with immobile water s.
+    """Return dispersion in mobile water c with first-order exchange with immobile water s.
 
         phi c_t = phi D c_xx - v c_x - omega (c - s)
         (1 - phi) s_t = omega (c - s)
@@ -105,16 +105,16 @@ def mobile_immobile(
     D
         Coefficient of dispersion in the mobile water, cm^2/h.
     v
-        Mean pore velocity in cm/h: flux by all of the water. The mobile water moves at v/phi.
+        Mean pore velocity in cm/h: flux over total water content. The mobile water moves at v/phi.
     phi
-        Share of the water that moves, inside of (0, 1): a `Scalar` with transform="logit".
+        Mobile share of the water, in (0, 1): a `Scalar` with transform="logit".
     omega
         Rate of exchange in 1/h.
 
     Raises
     ------
     ModelError
-        An unknown inlet.
+        The inlet is unknown.
     """
     _check("mobile_immobile", inlet)
 
@@ -149,7 +149,7 @@ def _column(mesh: Any, inlet: str, element: Any, unit: str) -> Field:
 
 
 def _ends(velocity: Any, solute: Any, inlet: str) -> list[On]:
-    """Return what the water carries in on the left and out on the right."""
+    """Return the boundary terms of inflow on the left and outflow on the right."""
     out = On("right", lambda q, u, w, x: velocity(q) * solute(u) * solute(w))
     into = On("left", lambda q, u, w, x: -velocity(q) * x.inputs["c_in"] * solute(w))
     return [out, into] if inlet == "flux" else [out]

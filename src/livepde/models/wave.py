@@ -1,4 +1,4 @@
-"""Waves with damping: w_tt + d w_t = div(c^2 grad w), as a system of first order in time."""
+"""Damped wave equation w_tt + d w_t = div(c^2 grad w), as a first-order system in time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def wave(
 
         w_t = p,    p_t + d p - div(c^2 grad w) = f.
 
-    Take the scheme `Alexander2`: implicit Euler damps waves strongly.
+    Use the scheme `Alexander2`: implicit Euler damps waves strongly.
 
     Parameters
     ----------
@@ -38,12 +38,12 @@ def wave(
     c2
         Squared speed in m^2/s^2: a `Scalar`, a `Piecewise`, or a `Field`.
     d
-        Damping in 1/s: known, or an unknown.
+        Damping in 1/s: a number or an unknown.
     dirichlet
-        Boundary -> value of w: a number, a function g(x, t), or a `Channel`. Boundaries without one
-        reflect with a free end.
+        Mapping from boundary to the value of w: a number, a function g(x, t), or a `Channel`. Other
+        boundaries are free ends.
     velocity
-        Boundary -> value of p where w moves, the time derivative of w there.
+        Mapping from boundary to the value of p where w changes in time: its time derivative.
     f
         Force per mass: a number or f(x, t).
     element
@@ -52,7 +52,7 @@ def wave(
     Raises
     ------
     ModelError
-        A boundary value of w may move, but its velocity is not given.
+        A boundary value of w may change in time, but its velocity is not given.
 
     Examples
     --------
@@ -77,6 +77,7 @@ def wave(
     def stiffness(q: Any, u: Any, v: Any, x: Any) -> Any:
         return q.c2 * dot(grad(u.w), grad(v.p))
 
+    # First-order form: implicit one-step schemes and the laws need a single time derivative.
     return Model(
         {
             "w": Field(mesh, element, dirichlet=held, unit="m"),

@@ -1,4 +1,4 @@
-"""What the sensors see of the state."""
+"""Observation operators: sensors and their reconstructions."""
 
 from __future__ import annotations
 

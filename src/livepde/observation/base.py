@@ -1,4 +1,4 @@
-"""Observations G: X -> Z, and sensors bound to a state space."""
+"""Observation operators G: X -> Z, and sensors bound to a state space."""
 
 from __future__ import annotations
 
@@ -26,34 +26,39 @@ from livepde.spaces import HilbertSpace
 __all__ = ["Observation", "Observed", "numbers"]
 
 Direct = Callable[[Any, Place], Any]
-STEP = 1e-30  # of the complex step
-DEPENDENT = 1e-12  # eigenvalues of G G* below this share of the largest count as zero
-ROUNDING = 1e-14  # entries of G below this share of the largest of their row count as zero
-LARGEST_PROJECTION = 100_000_000  # entries of R
-LARGEST_MEMO = 64  # splits kept for different patterns of missing samples
+# Complex step: exact to rounding, as in `livepde.fem.forms`.
+STEP = 1e-30
+# Eigenvalues of G G* below this share of the largest count as zero: redundant sensors.
+DEPENDENT = 1e-12
+# Entries of G below this share of the largest in their row are rounding errors of shape functions.
+ROUNDING = 1e-14
+# Largest number of entries of R, which is dense on the support of the sensors (800 MB).
+LARGEST_PROJECTION = 100_000_000
+# Number of cached splits, one for each pattern of missing sensors.
+LARGEST_MEMO = 64
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Observation:
-    """What the sensors see of the state: z = G u (+ a part that depends on q directly).
+    """Abstract observation operator: z = G u, plus a direct part D q.
 
-    Subclasses say what G is (`matrix`); sensors that are not linear in the state return a bound
-    object of their own (`bind`).
+    Subclasses define G by `matrix`; sensors that are nonlinear in the state return their own bound
+    object from `bind`.
 
     Parameters
     ----------
     of
-        The component that the sensors see of a state that has several.
+        Component of the state that is observed, if there are several.
     inputs
-        Channels of the stream that the sensors themselves read, beside those of the model.
+        Channels of the stream read by the sensors, in addition to those of the model.
     noise
         Standard deviation of the measurement noise, in the unit of z: one number, or one for each
-        sensor. None: not known.
+        sensor. None: unknown.
     unit
         Unit of the measured values.
     reconstruction
-        How the gradient law finds the observed part of the state: `Pseudoinverse`, G^+, or
-        `Tikhonov`, G_alpha (section 3.2).
+        Reconstruction of the observed part of the state in the gradient law: `Pseudoinverse`, G^+,
+        or `Tikhonov`, G_alpha (section 3.2).
     """
 
     of: str = ""
@@ -70,16 +75,16 @@ class Observation:
         )
 
     def _sees_all(self, remedy: str) -> None:
-        """Refuse `of` where it would say nothing."""
+        """Raise an error if `of` is given but has no effect."""
         if self.of:
             raise ObservationError(f"{type(self).__name__}: of='{self.of}' says nothing; {remedy}")
 
     def _reads(self, channels: Iterable[str]) -> None:
-        """Put channels in front of `inputs`, each once."""
+        """Prepend channels to `inputs`, each once."""
         object.__setattr__(self, "inputs", tuple(dict.fromkeys([*channels, *self.inputs])))
 
     def _shows(self, base: Observation) -> None:
-        """Take over the channels of a base whose readings are changed; refuse noise of its own."""
+        """Take over the channels of a base observation, and refuse that it has its own noise."""
         if base.noise is not None:
             raise ObservationError(
                 f"{type(self).__name__}: give noise= to it and not to its base: it is that of the "
@@ -93,31 +98,31 @@ class Observation:
 
     @property
     def directs(self) -> Mapping[str, Direct]:
-        """Sensor name -> what it sees of the parameter directly, linear in q."""
+        """Direct dependence on the parameter, linear in q, by sensor name."""
         return {}
 
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
-        """Unknowns of the sensors themselves, which an identifier adds to those of the model."""
+        """Unknowns of the sensors, added by an identifier to those of the model."""
         return {}
 
     @property
     def optional(self) -> frozenset[str]:
-        """Those of `inputs` that may be missing: then the sensors that need them read nothing."""
+        """Names of `inputs` that may be missing: sensors that need them then have no reading."""
         return frozenset()
 
     @property
     def nodal(self) -> bool:
-        """True if G^+ is taken in coefficients, false if in the inner product of X."""
+        """True if G^+ is taken in coefficients, False if in the inner product of X."""
         return False
 
     def region(self, state: FunctionSpace) -> Mask | None:
-        """Return which elements of the mesh lie in the part that is observed; None: not known."""
+        """Return a mask of the observed elements of the mesh; None if undefined."""
         return None
 
     @property
     def portable(self) -> bool:
-        """True if the readings mean the same on every mesh, false if they are coefficients."""
+        """True if readings have the same meaning on every mesh, False if they are coefficients."""
         return False
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
@@ -126,10 +131,10 @@ class Observation:
 
 
 class Observed:
-    """An observation bound to a state space: what the sensors read, with its derivative.
+    """An observation bound to a state space: predicted readings and their derivatives.
 
-    Sensors of other kinds than z = G u + D q override `predict`, `jacobian` and `linear`, and
-    `available` if they have no reading at times.
+    Sensors other than z = G u + D q override `predict`, `jacobian` and `linear`, and `available` if
+    readings may be missing.
     """
 
     def __init__(
@@ -158,12 +163,12 @@ class Observed:
 
     @property
     def nodal(self) -> bool:
-        """True if G^+ is taken in coefficients, false if in the inner product of X."""
+        """True if G^+ is taken in coefficients, False if in the inner product of X."""
         return self.observation.nodal
 
     @cached_property
     def noise(self) -> Array | None:
-        """Standard deviation of each sensor, shape (sensors,), or None if it is not known."""
+        """Noise standard deviation of each sensor, shape (sensors,); None if unknown."""
         given = self.observation.noise
         if given is None:
             return None
@@ -186,9 +191,9 @@ class Observed:
 
     @cached_property
     def G(self) -> sp.csr_array:
-        """The constant matrix of the linear part, shape (sensors, n).
+        """Constant matrix of the linear part, shape (sensors, n).
 
-        Raises `ObservationError` if the sensors have none.
+        It raises `ObservationError` if the sensors have none.
         """
         G = sp.csr_array(self.observation.matrix(self.state), copy=True).astype(float)
         if G.shape[1] != self.X.dim:
@@ -198,7 +203,7 @@ class Observed:
         if not np.isfinite(G.data).all():
             raise ObservationError("The observation matrix holds values that are not finite.")
         # Shape functions evaluated at a node leave entries of 1e-17: a sensor on the Dirichlet
-        # boundary would seem to see something.
+        # boundary would seem to depend on free coefficients.
         largest = abs(G).max(axis=1).toarray().ravel()
         G.data[np.abs(G.data) <= ROUNDING * np.repeat(largest, np.diff(G.indptr))] = 0.0
         G.eliminate_zeros()
@@ -206,19 +211,19 @@ class Observed:
 
     @cached_property
     def _shown(self) -> IntArray | None:
-        """Which coefficient each sensor shows, if every one shows one as it is."""
+        """Coefficient read by each sensor, if every sensor reads a single coefficient."""
         return self.G.indices if is_selection(self.G) else None
 
     @property
     def linear(self) -> bool:
-        """True if z = G u, or `linearised` makes it so: what projections and the gradient law need.
+        """True if z = G u, possibly after `linearised`, as projections and the gradient law need.
 
-        False for sensors that see the parameter.
+        It is False for sensors that depend on the parameter.
         """
         return not self.observation.directs
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        """Return what the sensors read, G u + D q, shape (sensors,); NaN: no reading.
+        """Return the predicted readings, G u + D q, shape (sensors,); NaN: no reading.
 
         Parameters
         ----------
@@ -234,12 +239,13 @@ class Observed:
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
         """Return the derivatives of `predict` in u and q, shapes (sensors, n) and (sensors, m).
 
-        The second is None if the sensors see no parameter. Rows without a reading are zero.
+        The second is None if the sensors do not depend on the parameter. Rows without a reading are
+        zero.
         """
         return self.G, self._direct(moment)
 
     def available(self, moment: Moment) -> Array:
-        """Return which sensors have a reading, shape (sensors,); samples of others are not used."""
+        """Return the mask of sensors with a reading, shape (sensors,); other values are ignored."""
         return np.ones(self.size, dtype=bool)
 
     def _direct(self, moment: Moment) -> Array | None:
@@ -263,13 +269,13 @@ class Observed:
         return matrix
 
     def linearised(self, z: Array, u: Array) -> Array:
-        """Return z as linear sensors would have shown it, by one Newton step from the state u."""
+        """Return readings of equivalent linear sensors, by one Newton step from the state u."""
         return z
 
     def split(self, present: Array | None = None) -> Split:
         """Return R, P and G^+ for the sensors present (default all).
 
-        Sensors that repeat others are allowed: they are averaged, as by the Moore-Penrose inverse.
+        Redundant sensors are allowed: the Moore-Penrose inverse averages them.
         """
         asked = np.ones(self.size, dtype=bool) if present is None else present
         return self._splits.get(asked.tobytes(), lambda: self._split(asked))
@@ -289,12 +295,11 @@ class Observed:
         z
             Measurements, shape (sensors,), NaN where missing.
         delta
-            Noise level ||z^delta - z||_Z; default what the rule for alpha or `noise` says.
+            Noise level ||z^delta - z||_Z; default given by the rule for alpha or by `noise`.
         boundary
-            A coefficient vector that holds the Dirichlet values and is zero elsewhere; default
-            zero.
+            Coefficient vector with the Dirichlet values, zero elsewhere; default zero.
         present
-            Which sensors take part; default those with a value.
+            Mask of the sensors used; default those with a value.
 
         Raises
         ------
@@ -322,6 +327,8 @@ class Observed:
         tangent = sp.csr_array(G @ sp.diags_array(self.X.free))
         tangent.eliminate_zeros()
         if self.observation.nodal and is_selection(tangent):
+            # Sensors that read single coefficients need no linear algebra: R is diagonal with zeros
+            # and ones, and G^+ is G^T.
             inverse, V = sp.csr_array(tangent.T), None
             R = sp.csr_array(inverse @ tangent)
             omega = self._observed_elements(tangent.indices)
@@ -336,10 +343,11 @@ class Observed:
             rows = tangent.toarray()
             representers = rows.T if self.observation.nodal else self.X.riesz(rows.T)
             values, vectors = np.linalg.eigh(rows @ representers)
+            # Redundant sensors give zero eigenvalues of G G*, which the pseudoinverse omits.
             kept = values > DEPENDENT * max(values.max(initial=0.0), 1e-300)
             C = vectors[:, kept] / np.sqrt(values[kept])
-            # V W is idempotent to rounding only if W V = I to rounding. C alone does not give that
-            # when sensors nearly repeat each other. Sparse W keeps R as narrow as G is.
+            # V W is idempotent to rounding only if W V = I to rounding. C alone does not ensure
+            # that for nearly redundant sensors. A sparse W keeps R as narrow as G.
             V = representers @ C
             W = sp.csr_array(C.T) @ tangent
             W = sp.csr_array(np.linalg.inv(W @ V)) @ W
@@ -351,10 +359,10 @@ class Observed:
         return Split(R, P, inverse, present, G, V, omega)
 
     def _observed_elements(self, observed: IntArray) -> IntArray | None:
-        """Return the elements on which the observed coefficients give the state; None: all.
+        """Return the elements on which observed coefficients determine the state; None: all.
 
-        Of a state with several components those on which they give every component of which they
-        show anything. Dirichlet coefficients are known.
+        For several components these are the elements on which every observed component is
+        determined. Dirichlet coefficients are known.
         """
         known = self.X.free == 0.0
         known[observed] = True
@@ -372,7 +380,7 @@ class Observed:
 
 
 def numbers(parameter: FunctionSpace, q: Array) -> Any:
-    """Return the parameter as functions of sensors see it: numbers, arrays, mappings by name."""
+    """Return the parameter in the form of sensor functions: numbers, arrays, mappings by name."""
     seen: dict[str, Any] = {}
     for name in parameter.blocks:
         part = q[parameter.part(name)]

@@ -1,4 +1,4 @@
-"""Observations made of others: sensors of several kinds, and what instruments make of readings."""
+"""Composed observations: several kinds of sensors, and calibrated instruments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Calibrated", "CalibratedObserved", "Combined", "CombinedObserved"]
 
 @dataclass(frozen=True, eq=False)
 class Combined(Observation):
-    """Sensors of several kinds, one after the other.
+    """Sensors of several kinds, concatenated.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def _all_unknowns(parts: Sequence[Observation]) -> dict[str, Unknown]:
 
 
 class CombinedObserved(Observed):
-    """The bound observation: everything of the parts, stacked."""
+    """Bound `Combined` observation: stacked readings, matrices and noise of its parts."""
 
     observation: Combined
 
@@ -154,7 +154,7 @@ Calibration = Callable[[Array, Any, Place], Any]
 
 @dataclass(frozen=True, eq=False)
 class Calibrated(Observation):
-    """What instruments with unknown gain, offset or contact resistance show of what they see.
+    """Instruments with unknown gain, offset or contact resistance: a function of base readings.
 
         z = function(y, q, x),      y = readings of `base`
 
@@ -163,7 +163,7 @@ class Calibrated(Observation):
     Parameters
     ----------
     base
-        The sensors: any observation, also one of several kinds. Its own `noise` is not used.
+        The underlying sensors: any observation, also a `Combined` one. Its own `noise` is not used.
     function
         (y, q, x) with y of shape (sensors,), the numbers among the unknowns q (q.gain; one for each
         region or name: q.k[1], q.offset["T_10"]), and x for x.t and x.inputs["Q"]; returns readings
@@ -201,7 +201,7 @@ class Calibrated(Observation):
 
 
 class CalibratedObserved(Observed):
-    """The bound observation: the chain rule."""
+    """Bound `Calibrated` observation: derivatives by the chain rule."""
 
     observation: Calibrated
 
@@ -258,7 +258,7 @@ class CalibratedObserved(Observed):
         seen = self.base.available(moment)
         if seen.all():
             return seen
-        # What is made of a missing reading is missing, too.
+        # A function of a missing reading is missing, too.
         z = self._read(np.where(seen, 1.0, np.nan), self.parameter.prior, moment)
         return np.asarray(np.logical_and(seen, np.logical_not(np.isnan(z))))
 

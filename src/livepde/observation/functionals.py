@@ -1,4 +1,4 @@
-"""Readings that are integrals of a form: a flux through a boundary, a weighted mass, an energy."""
+"""Integral observations: fluxes through boundaries, weighted masses, energies."""
 
 from __future__ import annotations
 
@@ -22,15 +22,16 @@ STATE, PARAMETER = "u_", "q_"  # in front of the names of unknowns in the joint 
 
 @dataclass(frozen=True, eq=False)
 class Functionals(Observation):
-    """Integrals, z_k = integral of g_k(q, u, x), for any g that a weak form may hold.
+    """Integral observations, z_k = integral of g_k(q, u, x), for any integrand g of a weak form.
 
     The derivatives in u and q are taken by a complex step, as for `Model`: exact for analytic g.
 
     Parameters
     ----------
     integrands
-        Sensor name -> g(q, u, x), integrated over the mesh, or `On(name, g)` for a boundary or a
-        subdomain. All that forms may read is there: grad(u), x.normal, x.t, x.inputs.
+        Mapping from sensor name to g(q, u, x), integrated over the mesh, or to `On(name, g)` for a
+        boundary or a subdomain. The arguments are those of weak forms: grad(u), x.normal, x.t,
+        x.inputs.
     order
         Quadrature order; default that of the state, exact for products of u with fields of q.
 
@@ -64,7 +65,7 @@ class Functionals(Observation):
 
 
 class FunctionalsObserved(Observed):
-    """The bound observation: each functional is a form in (u, q) jointly, and w = 1."""
+    """Bound `Functionals`: each is a form in (u, q) jointly, tested with w = 1."""
 
     observation: Functionals
 
@@ -76,6 +77,8 @@ class FunctionalsObserved(Observed):
         parameter: FunctionSpace,
     ) -> None:
         super().__init__(observation, state, X, parameter)
+        # State and parameter form one nonlinear argument, so that one complex step differentiates
+        # with respect to both.
         unknowns = {STATE + name: unknown for name, unknown in state.unknowns.items()}
         unknowns |= {PARAMETER + name: unknown for name, unknown in parameter.unknowns.items()}
         spaces = {"w": FunctionSpace.of(Scalar(), "w"), "uq": FunctionSpace(unknowns, False)}
@@ -129,6 +132,6 @@ def _quadrature(field: Field) -> int:
 
 
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
-    """Return state or parameter as forms see it."""
+    """Return state or parameter in the form of weak-form arguments."""
     jets = {name: getattr(uq, prefix + name) for name in space.unknowns}
     return next(iter(jets.values())) if space.single else Named(**jets)

@@ -1,4 +1,4 @@
-"""Sensors that move: a probe that is lowered, a float, a scanner."""
+"""Moving sensors: lowered probes, floats, scanners."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Moving", "MovingObserved"]
 
 @dataclass(frozen=True, eq=False)
 class Moving(Observation):
-    """Point sensors whose positions arrive with the stream, z_k(t) = u(x_k(t), t).
+    """Point sensors with positions from the stream, z_k(t) = u(x_k(t), t).
 
     While its position is missing or outside of the mesh, a sensor has no reading: its prediction is
     NaN and its sample is not used. Positions are not held from one sample to the next.
@@ -27,8 +27,8 @@ class Moving(Observation):
     Parameters
     ----------
     positions
-        Sensor name -> channel of its position; in more than one dimension one channel for each
-        coordinate.
+        Mapping from sensor name to the channel of its position; in more than one dimension to one
+        channel for each coordinate.
 
     Examples
     --------
@@ -67,7 +67,7 @@ class Moving(Observation):
 
 
 class MovingObserved(Observed):
-    """The bound observation: G moves with the moment."""
+    """Bound `Moving` sensors: G depends on the moment."""
 
     observation: Moving
 
@@ -87,8 +87,8 @@ class MovingObserved(Observed):
                     f"Moving: sensor '{name}' has position channels {list(channels)}; the mesh "
                     f"has {dimension} coordinates."
                 )
-        # G at the last positions. Copies of an identifier share it, maybe in threads: the three are
-        # read once and replaced as a whole, so that they fit together.
+        # G at the last positions. Copies of an identifier share it, possibly in several threads:
+        # the three values are read and replaced as one tuple, so that they are always consistent.
         self._last: tuple[bytes, sp.csr_array, Array] | None = None
 
     def _names(self) -> tuple[str, ...]:
@@ -111,7 +111,7 @@ class MovingObserved(Observed):
         return self._at(moment)[1]
 
     def _at(self, moment: Moment) -> tuple[sp.csr_array, Array]:
-        """Return G at a moment, and which sensors are in the mesh."""
+        """Return G at a moment, and the mask of sensors inside of the mesh."""
         given = dict(moment.inputs)
         points = np.array(
             [[given.get(name, np.nan) for name in names] for names in self.observation.channels]
@@ -128,6 +128,7 @@ class MovingObserved(Observed):
                     (np.ones(len(rows)), (rows, np.arange(len(rows)))), (len(points), len(rows))
                 )
                 G = sp.csr_array(place @ values)
+            # Callers share the cached mask, so it must not be changed in place.
             seen.setflags(write=False)
             self._last = last = (key, G, seen)
         return last[1], last[2]

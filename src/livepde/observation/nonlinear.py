@@ -1,10 +1,10 @@
-"""Nonlinear observations, z = g(G_0 u): radiation, thermistors, anything a sensor does to a value.
+"""Nonlinear observations z = g(G_0 u): radiation, thermistors, any pointwise sensor function.
 
 The paper takes G linear "for simplicity of exposition. Most of what follows can be carried over to
-the case of nonlinear observations" (section 2). Here is how: with the derivative
-G'(u) = diag(g'(G_0 u)) G_0, the null space of G'(u) is that of G_0 wherever g' does not vanish, so
-R and P are those of G_0 and do not move; and the observed part of the state is a step of Newton's
-method from the last estimate u^,
+the case of nonlinear observations" (section 2). It is done as follows: with the derivative G'(u) =
+diag(g'(G_0 u)) G_0, the null space of G'(u) is that of G_0 wherever g' does not vanish, so R and P
+are those of G_0 and do not move; and the observed part of the state is a step of Newton's method
+from the last estimate u^,
 
     u_alpha = R u^ - G'(u^)^+ (G(u^) - z) = G_0^+ (y - (g(y) - z)/g'(y)),    y = G_0 u^,
 
@@ -38,10 +38,10 @@ Reading = Callable[[Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class Transformed(Observation):
-    """Sensors that show a function of what they see, z_k = g_k((G_0 u)_k).
+    """Sensors with a pointwise nonlinear characteristic, z_k = g_k((G_0 u)_k).
 
-    g need not be monotone, but a sensor with g' = 0 at the estimate says nothing there, and counts
-    as missing in `GradientLaw`.
+    The function g need not be monotone, but a sensor with g' = 0 at the estimate carries no
+    information there, and counts as missing in `GradientLaw`.
 
     Parameters
     ----------
@@ -54,12 +54,12 @@ class Transformed(Observation):
     iterations
         Newton steps of `GradientLaw` from the last estimate.
     reach
-        None of them is longer in y = G_0 u; for strongly curved g far from the truth.
+        Maximum length of a Newton step in y = G_0 u, for strongly curved g far from the truth.
 
     Notes
     -----
-    `noise` is that of the readings z. A `reconstruction` by a noise level sees the linearised data
-    y + (z - g(y))/g'(y), whose noise is larger by 1/g'(y).
+    `noise` is that of the readings z. A `reconstruction` by a noise level acts on the linearised
+    data y + (z - g(y))/g'(y), whose noise is larger by 1/g'(y).
 
     Examples
     --------
@@ -134,7 +134,7 @@ class Transformed(Observation):
 
 
 class TransformedObserved(Observed):
-    """The bound observation: G is the linear part G_0; the readings and their slope know g."""
+    """Bound `Transformed` sensors: G is the linear part G_0; readings and derivatives use g."""
 
     observation: Transformed
 
@@ -153,5 +153,6 @@ class TransformedObserved(Observed):
             for _ in range(sensors.iterations):
                 step = (z - sensors.read(y)) / sensors.slope(y)
                 step[np.isinf(step)] = np.nan  # an insensitive sensor says nothing
+                # A step of Newton's method may be huge where g' is small: `reach` limits it.
                 y = y + np.clip(step, -sensors.reach, sensors.reach)
         return y

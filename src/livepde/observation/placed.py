@@ -16,13 +16,16 @@ from livepde.spaces import HilbertSpace
 
 __all__ = ["POSITION", "PlacedObserved", "shift_names"]
 
-POSITION = "position"  # name of the unknown: one number for each sensor and coordinate
+# Name of the unknown: one number for each sensor and coordinate.
+POSITION = "position"
 AXES = "xyz"
-NEAR = 1e-6  # deviations from the end of the mesh within which a sensor lies on it
+# Distance from the end of the mesh, in standard deviations of the position, within which a sensor
+# lies on the end.
+NEAR = 1e-6
 
 
 def shift_names(sensor: str, dimension: int) -> list[str]:
-    """Return the names of the shifts of a sensor: its own in 1D, else one for each coordinate.
+    """Return the names of a sensor's shifts: its own in 1D, else one for each coordinate.
 
     >>> shift_names("T", 2)
     ['T.x', 'T.y']
@@ -32,20 +35,20 @@ def shift_names(sensor: str, dimension: int) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class _Shift:
-    """How one sensor sees the state if it is shifted along one coordinate by d.
+    """Effect of shifting one sensor along one coordinate by d: a quadratic interpolant.
 
-    The quadratic through the values at -a, 0 and b, about a standard deviation to each side: at a
-    node of linear elements u has no derivative, and this is what a shift of that size does. On the
-    end of the mesh a or b is 0, and it is the straight line to the other side.
+    The quadratic interpolates the values at -a, 0 and b, about a standard deviation to each side. A
+    derivative is not used because u has none at a node of linear elements. At the end of the mesh a
+    or b is 0, and the interpolant is the straight line to the other side.
 
     Attributes
     ----------
     sensor, column
-        Which sensor, and where the shift stands in q.
+        Number of the sensor, and position of the shift in q.
     below, above
-        a and b.
+        Distances a and b.
     low, high
-        Differences of u there to u at 0, shape (1, n).
+        Rows that evaluate the differences of u there to u at 0, shape (1, n).
     """
 
     sensor: int
@@ -56,7 +59,7 @@ class _Shift:
     high: sp.csr_array
 
     def weights(self, d: float) -> tuple[float, float]:
-        """Return how much of both differences is added at a shift d."""
+        """Return the interpolation weights of both differences at a shift d."""
         a, b = self.below, self.above
         if a == 0.0 or b == 0.0:
             return (-d / a, 0.0) if b == 0.0 else (0.0, d / b)
@@ -70,7 +73,7 @@ class _Shift:
         return (2.0 * d - b) / (a * (a + b)), (2.0 * d + a) / (b * (a + b))
 
     def change(self, weights: tuple[float, float]) -> sp.csr_array:
-        """Return the differences with these weights, shape (1, n)."""
+        """Return the weighted sum of the differences, shape (1, n)."""
         return sp.csr_array(weights[0] * self.low + weights[1] * self.high)
 
 
@@ -117,6 +120,8 @@ class PlacedObserved(Observed):
                         "model.with_unknowns(observation.unknowns)."
                     )
                 start = at[sensor]
+                # The interpolation points lie a standard deviation away, where the shift is
+                # expected, and are moved into the mesh at its boundary.
                 low, high = (_reached(block, start, axis, step) for step in (-std, std))
                 below, above = float(start[axis] - low[axis]), float(high[axis] - start[axis])
                 ends = (difference(low, start), difference(high, start))
@@ -149,9 +154,9 @@ class PlacedObserved(Observed):
 
 
 def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
-    """Return start + step along an axis, or the point nearest to it on the way that is in the mesh.
+    """Return start + step along an axis, or the last point on the way that is in the mesh.
 
-    Less than `NEAR` of the step is none: the sensor lies on the end of the mesh.
+    A distance below `NEAR` of the step counts as zero: the sensor lies on the end of the mesh.
     """
     least, most = 0.0, 1.0
 

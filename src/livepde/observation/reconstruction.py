@@ -1,8 +1,8 @@
-"""From measurements back to the observed part of the state: G^+, and G_alpha (section 3.2).
+"""Reconstruction of the observed part of the state: G^+, and G_alpha (section 3.2).
 
-With noisy data G^+ z is not defined, or not stable, where the range of G is not closed; and where
-it is, its noise still enters the law through B(w), which takes two derivatives. The paper replaces
-it by u_alpha = G_alpha z. Here G_alpha minimises
+With noisy data G^+ z is undefined or unstable if the range of G is not closed. Even if it is
+closed, the noise enters the law through B(w), which takes two derivatives. The paper replaces it by
+u_alpha = G_alpha z. Here G_alpha minimises
 
     ||G v - z||_Z^2 + alpha |v|^2        over v in N(G)^perp,
 
@@ -42,13 +42,15 @@ __all__ = [
 ]
 
 SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
-ROOT = 1e-10  # relative accuracy of that alpha
-MOST_SENSORS = 10_000  # of a dense decomposition
+# Relative accuracy of alpha in the discrepancy principle.
+ROOT = 1e-10
+# Largest number of sensors for a dense eigendecomposition.
+MOST_SENSORS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstructed:
-    """The observed part of the state, and how it was found.
+    """Reconstruction of the observed part of the state, with its regularisation data.
 
     Attributes
     ----------
@@ -59,7 +61,7 @@ class Reconstructed:
     misfit
         ||G u_alpha - z||_Z.
     delta
-        Noise level ||z^delta - z||_Z it was found with, or None if it is not known.
+        Noise level ||z^delta - z||_Z used, or None if unknown.
     """
 
     u: Array
@@ -69,7 +71,7 @@ class Reconstructed:
 
 
 class Alpha(ABC):
-    """A rule for alpha."""
+    """Abstract parameter choice rule for alpha."""
 
     @abstractmethod
     def choose(self, misfit: Callable[[float], float], delta: float, scale: float) -> float:
@@ -78,17 +80,17 @@ class Alpha(ABC):
         Parameters
         ----------
         misfit
-            alpha -> ||G u_alpha - z||_Z, not decreasing.
+            Function alpha -> ||G u_alpha - z||_Z, nondecreasing.
         delta
             Noise level of the sample in Z.
         scale
-            An alpha that weighs both terms alike.
+            Value of alpha at which both terms have equal weight.
         """
 
     @property
     @abstractmethod
     def given(self) -> tuple[float | None, float | None]:
-        """Noise level in Z, and relative to ||z||_Z; None if the observation has to say it."""
+        """Noise level in Z, and relative to ||z||_Z; None if the observation must supply it."""
 
 
 def _check(owner: str, **values: float | None) -> None:
@@ -99,14 +101,14 @@ def _check(owner: str, **values: float | None) -> None:
 
 @dataclass(frozen=True)
 class Apriori(Alpha):
-    """An a priori choice, alpha = factor · delta^power.
+    """A priori parameter choice, alpha = factor · delta^power.
 
-    Regularisation theory wants alpha -> 0 and delta^2/alpha -> 0: 0 < power < 2.
+    Regularisation theory requires alpha -> 0 and delta^2/alpha -> 0: 0 < power < 2.
 
     Parameters
     ----------
     power, factor
-        Of the rule.
+        Exponent and factor of the rule.
     delta, level
         Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default what `noise` of the
         observation says.
@@ -135,16 +137,16 @@ class Apriori(Alpha):
 
 @dataclass(frozen=True)
 class Discrepancy(Alpha):
-    """The discrepancy principle: alpha with ||G u_alpha - z||_Z = tau · delta, for each sample.
+    """Discrepancy principle: alpha with ||G u_alpha - z||_Z = tau · delta, for each sample.
 
-    One scalar equation for each sample; G is factorised once for each set of present sensors. Where
-    no alpha reaches tau · delta because repeated sensors disagree by more, alpha is the smallest
-    the search knows; where every alpha stays below it, the largest.
+    One scalar equation is solved for each sample; G is factorised once for each set of present
+    sensors. If no alpha attains tau · delta because redundant sensors disagree by more, alpha is
+    the lower end of the search interval; if every misfit is below it, the upper end.
 
     Parameters
     ----------
     tau
-        > 1 in theory: then alpha is never chosen smaller than the noise allows.
+        > 1 in theory, so that alpha is never chosen too small for the noise.
     delta, level
         Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default what `noise` of the
         observation says.
@@ -175,7 +177,7 @@ class Discrepancy(Alpha):
 
 
 class BoundSensors(Protocol):
-    """Sensors bound to a state space, as reconstructions see them: `livepde.observation.Observed`.
+    """Protocol of sensors bound to a state space, for reconstructions; see `Observed`.
 
     Attributes
     ----------
@@ -193,12 +195,12 @@ class BoundSensors(Protocol):
 
     @property
     def noise(self) -> Array | None:
-        """Standard deviation of each sensor, shape (sensors,), or None if it is not known."""
+        """Noise standard deviation of each sensor, shape (sensors,); None if unknown."""
         ...
 
     @property
     def nodal(self) -> bool:
-        """True if G^+ is taken in coefficients, false if in the inner product of X."""
+        """True if G^+ is taken in coefficients, False if in the inner product of X."""
         ...
 
     def split(self, present: Array | None = None) -> Split:
@@ -207,25 +209,25 @@ class BoundSensors(Protocol):
 
 
 class Reconstructor(ABC):
-    """G_alpha for one set of present sensors, factorised."""
+    """Factorised G_alpha for one set of present sensors."""
 
     @abstractmethod
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
-        """Return u_alpha.
+        """Return the reconstruction u_alpha.
 
         Parameters
         ----------
         z
-            Measurements, shape (sensors,); those not present take no part.
+            Measurements, shape (sensors,); those of absent sensors are ignored.
         boundary
-            A coefficient vector that holds the Dirichlet values and is zero elsewhere.
+            Coefficient vector with the Dirichlet values, zero elsewhere.
         delta
-            Noise level ||z^delta - z||_Z; default what the rule or the observation says.
+            Noise level ||z^delta - z||_Z; default that of the rule or the observation.
         """
 
 
 class Reconstruction(ABC):
-    """How the observed part of the state is found from measurements."""
+    """Abstract method to reconstruct the observed part of the state from measurements."""
 
     @property
     def regularises(self) -> bool:
@@ -234,12 +236,12 @@ class Reconstruction(ABC):
 
     @abstractmethod
     def prepare(self, observed: BoundSensors, present: Array) -> Reconstructor:
-        """Return what is computed once for a set of present sensors."""
+        """Return the reconstructor of a set of present sensors."""
 
 
 @dataclass(frozen=True)
 class Pseudoinverse(Reconstruction):
-    """The Moore-Penrose inverse G^+: for exact data, and where averaging over time is enough."""
+    """Moore-Penrose inverse G^+: for exact data, and where averaging over time is enough."""
 
     @property
     def regularises(self) -> bool:
@@ -262,15 +264,15 @@ class _Inverse(Reconstructor):
 
 @dataclass(frozen=True)
 class Tikhonov(Reconstruction):
-    """G_alpha by Tikhonov and Phillips: Z -> N(G)^perp (section 3.2).
+    """Tikhonov-Phillips regularisation G_alpha: Z -> N(G)^perp (section 3.2).
 
-    What ||.||_Z is depends on the observation. For a `Subdomain` it is the inner product of X on
-    omega, the paper's Z = L2(omega): ||z||_Z = ||G^+ z||_X. Else it is Euclidean, with every sensor
+    The norm ||.||_Z depends on the observation. For a `Subdomain` it is that of X on omega, the
+    paper's Z = L2(omega): ||z||_Z = ||G^+ z||_X. Otherwise it is Euclidean, with every sensor
     weighted by 1/noise^2 if its noise is known; delta is then the root of the number of sensors.
 
-    Costs one dense generalised eigendecomposition for each set of present sensors, of the size of
-    the smaller of their number and N(G)^perp, and one product with a matrix of that size for each
-    sample: meant for up to a few thousand sensors, and refused beyond 10 000.
+    The cost is one dense generalised eigendecomposition for each set of present sensors, of the
+    size of the smaller of their number and N(G)^perp, and one product with a matrix of that size
+    for each sample: intended for up to a few thousand sensors, and refused beyond 10 000.
 
     Parameters
     ----------
@@ -322,11 +324,11 @@ class Tikhonov(Reconstruction):
 
 
 class Spectral(Reconstructor):
-    """The minimiser for every alpha at once.
+    """Simultaneous diagonalisation of fit and penalty: minimisers for every alpha.
 
     Both quadratic forms are diagonal in one basis phi of N(G)^perp, s for ||G v||_Z^2 and k for
-    |v|^2, scaled so that s + rho k = 1. That stays accurate where s is tiny (G with a range that is
-    not closed) as well as where k is zero (what |.| does not see).
+    |v|^2, scaled so that s + rho k = 1. This is accurate for tiny s (G with a range that is not
+    closed) as well as for k = 0 (the null space of |.|).
     """
 
     def __init__(self, config: Tikhonov, observed: BoundSensors, present: Array) -> None:
@@ -352,8 +354,10 @@ class Spectral(Reconstructor):
         cost = (cost + cost.T) / 2
         self.rho = float(np.trace(fit) / (np.trace(cost) or 1.0))
         s, phi = sl.eigh(fit, fit + self.rho * cost)
+        # s is a divisor below, and rounding may make it zero or negative.
         self.s = np.clip(s, np.finfo(float).tiny, 1.0)
-        # What |.| does not see must not be seen by rounding: alpha may be large.
+        # In the null space of |.| k must be exactly zero, since alpha k would amplify rounding
+        # errors for large alpha.
         rest = 1.0 - s
         self.k = np.where(rest > 10 * len(s) * np.finfo(float).eps, rest, 0.0) / self.rho
         self.phi = basis @ phi
@@ -368,6 +372,8 @@ class Spectral(Reconstructor):
         beta = self.fitted @ known
         shift = boundary @ self.pulled
         scaled = self.root @ known
+        # The part of the data outside of the range of G, where redundant sensors disagree, cannot
+        # be fitted by any alpha.
         outside = scaled - self.image @ (self.image.T @ scaled)
         rest = float(outside @ outside)
 
@@ -409,7 +415,7 @@ def weights(observed: BoundSensors, present: Array) -> sp.csr_array:
 
 
 def noise_level(observed: BoundSensors, present: Array, gram: sp.csr_array) -> float | None:
-    """Return delta, the root mean square of ||noise||_Z, or None if the noise is not known."""
+    """Return delta, the root mean square of ||noise||_Z; None if the noise is unknown."""
     if observed.noise is None:
         return None
     return float(np.sqrt(gram.diagonal() @ observed.noise[present] ** 2))
@@ -420,7 +426,7 @@ def _norm(z: Array, gram: sp.csr_array) -> float:
 
 
 class _Inside:
-    """The part of the mesh a penalty is integrated over."""
+    """Part of the mesh over which a penalty is integrated."""
 
     def __init__(self, observed: BoundSensors, basis: Array) -> None:
         self.space: FunctionSpace = observed.state
@@ -450,12 +456,12 @@ class _Inside:
 
     @cached_property
     def bends(self) -> bool:
-        """True if the element has second derivatives."""
+        """True if the element provides second derivatives."""
         return self.block.bends
 
     @cached_property
     def inner(self) -> Any:
-        """Coefficients of which every element is inside, and that no boundary of the mesh holds."""
+        """Mask of coefficients with all elements inside, without those on the mesh boundary."""
         touched = np.zeros(self.block.size, dtype=bool)
         if self.cells is not None:
             touched[self.block.element_dofs[:, ~self.cells]] = True
@@ -486,7 +492,8 @@ def penalty_matrix(norm: str | Integrand, observed: BoundSensors, basis: Array) 
         raise ObservationError(
             "Tikhonov: norm 'V' knows scalar states with gradients; give a form (u, v, x) instead."
         ) from error
-    # Diagonal lumping: row sums vanish at the vertices of quadratic elements.
+    # Diagonal lumping, since the row sums of the mass matrix vanish at the vertices of quadratic
+    # elements.
     lumped = mass.diagonal() * (mass.sum() / (mass.diagonal().sum() or 1.0))
     rows = inside.inner & (lumped > 0)
     scale = np.where(rows, 1.0 / np.where(rows, lumped, 1.0), 0.0)

@@ -27,17 +27,18 @@ class Points(Observation):
     Parameters
     ----------
     points
-        Positions: a sequence, or a mapping from sensor name to position. In 1D numbers, else
+        Positions: a sequence, or a mapping from sensor name to position. Numbers in 1D, else
         sequences of d coordinates.
     direct
-        Sensor name -> (q, x) for sensors that see a parameter directly, linear in q:
-        z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b * x.inputs["Q"] / H}.
+        Mapping from sensor name to a function (q, x) for a direct dependence on the parameter,
+        linear in q: z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b *
+        x.inputs["Q"] / H}.
 
     position_std
-        Standard deviation of where the sensors really are, along each coordinate: one number for
-        all, or sensor name -> number for some, which have it in common. Their shifts are unknowns
-        then, estimated with the rest: `position[NAME]`, in more than one dimension
-        `position[NAME.x]` and so on.
+        Standard deviation of the true positions, along each coordinate: one number for all sensors,
+        or a mapping from sensor name to number for some, with one common value. The shifts are then
+        additional unknowns: `position[NAME]`, in more than one dimension `position[NAME.x]` and so
+        on.
 
     Examples
     --------
@@ -127,8 +128,8 @@ class Averages(Observation):
     Parameters
     ----------
     regions
-        Sensor name -> name of a subdomain or boundary of the mesh, or a predicate on x, evaluated
-        at the quadrature points of the mesh.
+        Mapping from sensor name to the name of a subdomain or boundary of the mesh, or to a
+        predicate on x, evaluated at the quadrature points of the mesh.
 
     Examples
     --------
@@ -190,17 +191,17 @@ class Averages(Observation):
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals(Observation):
-    """Integrals along straight lines, z_k = integral of u from a_k to b_k: a beam, a fibre.
+    """Integrals along straight lines, z_k = integral of u from a_k to b_k: beams, fibres.
 
-    Exact up to rounding for functions of the elements: the line is cut where it crosses from cell
-    to cell, and Gauss points are taken in between.
+    Exact to rounding for finite element functions: the line is cut at cell boundaries, and Gauss
+    points are used in between.
 
     Parameters
     ----------
     lines
-        Sensor name -> (start, end); in 1D numbers, else sequences of d coordinates.
+        Mapping from sensor name to (start, end); numbers in 1D, else sequences of d coordinates.
     mean
-        Divide by the length.
+        True: divide by the length.
 
     Examples
     --------
@@ -237,6 +238,8 @@ class LineIntegrals(Observation):
         length = float(np.linalg.norm(b - a))
         if not length > 0:
             raise ObservationError(f"LineIntegrals: line '{name}' has no length.")
+        # This number of Gauss points is exact for the degree of the element on each straight
+        # segment.
         nodes, weights = np.polynomial.legendre.leggauss(int(block.field.element.maxdeg) // 2 + 1)
         cuts = _cuts(mesh, a, b)
         width = np.diff(cuts)[:, None]
@@ -247,9 +250,9 @@ class LineIntegrals(Observation):
 
 
 def _cuts(mesh: Any, a: Array, b: Array) -> Array:
-    """Return where a line crosses facets, as increasing shares of its length from 0 to 1.
+    """Return the intersections of a line with facets, as increasing fractions of its length.
 
-    A crossing of the bounding box of a facet counts, too: one cut more does no harm.
+    A crossing of the bounding box of a facet counts, too: additional cuts are harmless.
     """
     corners = mesh.p[:, mesh.facets].transpose(2, 0, 1)  # (facets, d, vertices)
     d = len(a)
@@ -266,6 +269,7 @@ def _cuts(mesh: Any, a: Array, b: Array) -> Array:
         s = np.einsum("fd,fd->f", normals, corners[:, :, 0] - a) / across
     s, corners = s[np.isfinite(s)], corners[np.isfinite(s)]
     points = a + s[:, None] * (b - a)
+    # A line along a facet or through a vertex must not miss its cut by rounding.
     slack = 1e-9 * (mesh.p.max() - mesh.p.min())
     low, high = corners.min(axis=2) - slack, corners.max(axis=2) + slack
     hit = s[np.all((points >= low) & (points <= high), axis=1) & (s > 0) & (s < 1)]
@@ -274,7 +278,7 @@ def _cuts(mesh: Any, a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Matrix(Observation):
-    """Any linear observation, given by its matrix G on the coefficients of the state.
+    """Linear observation given by its matrix G on the coefficients of the state.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The splitting of the state into its observed and its unobserved part."""
+"""Orthogonal splitting of the state into its observed and its unobserved part."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ __all__ = ["Split", "is_selection"]
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """The projections R = G^+ G on N(G)^perp and P = I - R on N(G), and G^+ itself.
+    """Projections R = G^+ G on N(G)^perp and P = I - R on N(G), and G^+ itself.
 
     Attributes
     ----------
     R, P
-        Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, so
-        they belong to P.
+        Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, and
+        belong to P.
     inverse
         G^+ on the present sensors, shape (n, present).
     present
-        Which sensors take part, shape (sensors,).
+        Mask of the sensors used, shape (sensors,).
     G
-        Their rows of G, shape (present, n).
+        Rows of G of these sensors, shape (present, n).
     vectors
-        A basis of N(G)^perp, shape (n, k); None if `inverse` is one.
+        Basis of N(G)^perp, shape (n, k); None if the columns of `inverse` are one.
     omega
-        Elements on which the data give the state, of sensors that read it on a subdomain: there the
+        Elements on which the data determine the state, for sensors on a subdomain: there the
         paper's chi_omega is one, and integrals over Omega are split into those over `omega`, with
-        the data, and those over the other elements, with the estimate. None: all elements, where R
-        and P alone split the state.
+        the data, and those over the other elements, with the estimate. None: all elements, with the
+        state split by R and P alone.
     """
 
     R: sp.csr_array
@@ -47,12 +47,12 @@ class Split:
 
     @property
     def basis(self) -> Array:
-        """A basis of N(G)^perp, shape (n, k)."""
+        """Basis of N(G)^perp, shape (n, k)."""
         return self.inverse.toarray() if self.vectors is None else self.vectors
 
     @cached_property
     def _diagonal(self) -> Array | None:
-        """Diagonal of R if that is all of it."""
+        """Diagonal of R if R is diagonal, else None."""
         alone = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
         return self.R.diagonal() if alone else None
 
@@ -63,7 +63,7 @@ class Split:
 
     @cached_property
     def _selected(self) -> IntArray | None:
-        """Which coefficient each present sensor shows, if every one shows one as it is."""
+        """Coefficient read by each present sensor, if each reads a single one; else None."""
         selects = self.vectors is None and is_selection(sp.csr_array(self.inverse.T))
         return sp.csr_array(self.inverse.T).indices if selects else None
 
@@ -78,10 +78,9 @@ class Split:
         Parameters
         ----------
         z
-            Measurements, shape (sensors,); missing ones (NaN) take no part.
+            Measurements, shape (sensors,); missing ones (NaN) are ignored.
         boundary
-            A coefficient vector that holds the Dirichlet values and is zero elsewhere. None: all of
-            it is zero.
+            Coefficient vector with the Dirichlet values, zero elsewhere; None: zero.
         """
         known = z if self._complete else z[self.present]
         if boundary is not None and boundary.any():
@@ -95,6 +94,6 @@ class Split:
 
 
 def is_selection(G: sp.csr_array) -> bool:
-    """Return true if every row picks one coefficient, and no two the same."""
+    """Return True if every row selects one coefficient, and no two rows the same."""
     one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
     return one_each and len(np.unique(G.indices)) == len(G.indices)

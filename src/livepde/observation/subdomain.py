@@ -1,4 +1,4 @@
-"""The paper's observation: the state on a subdomain omega, or on all of it."""
+"""Observation of the state on a subdomain omega, or on the whole domain, as in the paper."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from livepde.observation.base import Observation
 
 __all__ = ["Full", "Subdomain"]
 
-INTERIOR = 3  # quadrature order of the points at which omega is asked: all inside of the element
+# Quadrature order of the points at which the predicate is evaluated. All are inside of the element,
+# so that its boundary nodes do not decide.
+INTERIOR = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Subdomain(Observation):
-    """The state on omega, z = u|_omega (obsdiff), with omega as a union of elements.
+    """Observation of the state on omega, z = u|_omega (obsdiff), a union of elements.
 
-    An element belongs to omega if the predicate holds at its inner quadrature points; z holds the
-    free coefficients of these elements in their order (for Hermite elements values and slopes), so
-    those of the nodes on the closed ends of omega, too. The coefficients on the Dirichlet boundary
-    are known and not part of z.
+    An element belongs to omega if the predicate holds at its inner quadrature points. The data z
+    are the free coefficients of these elements in their order (values and slopes for Hermite
+    elements), including those of nodes on the boundary of omega. Coefficients on the Dirichlet
+    boundary are known and not part of z.
 
-    An element that omega cuts is left out whole. Give the mesh nodes at the ends of omega where
-    that strip matters: `interval(0, 1, 30, through=(0.3, 0.87))`.
+    Elements cut by the boundary of omega are excluded. If that strip matters, place mesh nodes at
+    the ends of omega: `interval(0, 1, 30, through=(0.3, 0.87))`.
 
     Parameters
     ----------
@@ -83,6 +85,6 @@ def _everywhere(x: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Full(Subdomain):
-    """The whole state, omega = Omega: P is zero except on the Dirichlet boundary."""
+    """Observation of the whole state, omega = Omega: P is zero except on the Dirichlet boundary."""
 
     omega: Predicate = _everywhere

@@ -1,4 +1,4 @@
-"""One identification on several processes: PETSc and MPI behind the protocol of `livepde.linalg`.
+"""Identification on several processes: PETSc and MPI behind the protocol of `livepde.linalg`.
 
 Nothing here starts MPI when it is imported; `petsc()` does.
 """

@@ -1,4 +1,4 @@
-"""The engine that PETSc is behind, and how a program comes to have it."""
+"""PETSc engine, and the context manager that activates it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["PetscEngine", "petsc"]
 
 
 class PetscEngine:
-    """Solves on all ranks of a team; a `livepde.linalg.Engine`.
+    """Engine that solves on all ranks of a team; a `livepde.linalg.Engine`.
 
     Attributes
     ----------
@@ -32,10 +32,10 @@ class PetscEngine:
     def build(
         self, function: Callable[..., Model], *args: Any, known: Model | None = None
     ) -> Model:
-        """Return the model `function(*args)`, which other ranks may build, too.
+        """Return the model `function(*args)`; the other ranks may build it, too.
 
-        Then they evaluate its forms with rank 0, each on its own cells. The function has to be one
-        that the other ranks can import, and the arguments are sent to them.
+        The other ranks then evaluate its forms together with rank 0, each on its own cells. They
+        must be able to import the function, and the arguments are sent to them.
 
         Parameters
         ----------
@@ -47,7 +47,7 @@ class PetscEngine:
         return model
 
     def shared(self, model: Model) -> Handle | None:
-        """Return a model as all ranks share it; None: they cannot build it."""
+        """Return the handle of a shared model; None if the other ranks cannot build it."""
         if id(model) not in self._recipes:
             return None
         if id(model) not in self._models:
@@ -57,11 +57,11 @@ class PetscEngine:
 
     @property
     def reason(self) -> str:
-        """Why it serves."""
+        """Reason of its choice, for `livepde.linalg.Choice`."""
         return f"PETSc on {self.team.size} rank{'s' * (self.team.size > 1)}"
 
     def solver(self, pattern: Pattern, *, symmetric: bool) -> Solver | None:
-        """Return PETSc's solver; None if it has none for matrices that are not symmetric."""
+        """Return PETSc's solver; None if it has none for nonsymmetric matrices."""
         if not symmetric and direct() is None:
             return None
         return PetscSolver(self.team, pattern, symmetric)
@@ -69,13 +69,13 @@ class PetscEngine:
 
 @contextmanager
 def petsc() -> Iterator[PetscEngine | None]:
-    """Let PETSc solve what is large, on all processes that mpirun has started.
+    """Solve large systems by PETSc on all processes started by mpirun.
 
     Yields
     ------
     engine
-        On rank 0, where the program goes on. On every other rank None, when rank 0 has left the
-        block: there is nothing left to do then.
+        The engine on rank 0, where the program runs. None on every other rank, after rank 0 has
+        left the block.
 
     Examples
     --------

@@ -1,8 +1,8 @@
-"""Who owns what of a model: cells by PETSc's partitioner, and coefficients with them.
+"""Domain decomposition of a model: cells by PETSc's partitioner, and their coefficients.
 
-A coefficient belongs to the lowest rank that owns a cell it has a shape function on. A rank
-evaluates forms on every cell that touches a coefficient of its own, one layer beyond its cells, so
-that the rows it owns are complete without any exchange of matrix entries.
+A coefficient belongs to the lowest rank that owns a cell in the support of its shape function. A
+rank evaluates forms on every cell with a coefficient of its own, one overlap layer beyond its
+cells, so that its matrix rows are complete without any exchange of matrix entries.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ PARTITIONERS = ("ptscotch", "parmetis")
 
 @dataclass(frozen=True, eq=False)
 class Share:
-    """The coefficients of one space, u or q, as the ranks share them.
+    """Distribution of the coefficients of one space, u or q, over the ranks.
 
     Attributes
     ----------
     number
-        PETSc's number of each coefficient, shape (n,): those of a rank follow each other.
+        PETSc's number of each coefficient, shape (n,): those of one rank are contiguous.
     rows
-        The coefficients that this rank owns, in that order.
+        Coefficients owned by this rank, in that order.
     reach
-        All coefficients on its cells, ascending.
+        All coefficients on its cells, in ascending order.
     sizes, reaches
-        Of every rank: how many it owns; the coefficients that it reaches, on rank 0.
+        Number of owned coefficients of every rank; on rank 0 also the reached coefficients of every
+        rank.
     order
-        The coefficients of all ranks in PETSc's order, shape (n,).
+        Coefficients of all ranks in PETSc's order, shape (n,).
     """
 
     number: IntArray
@@ -54,18 +55,18 @@ class Share:
 
 
 class SharedModel:
-    """A model that every rank has built, and which cells and coefficients are whose.
+    """A model built on every rank, with the distribution of cells and coefficients.
 
-    Rank 0 gives its own; the others call `build(*args)`, and keep the forms on their cells only.
+    Rank 0 passes its model; the others call `build(*args)`, and keep only the forms on their cells.
 
     Attributes
     ----------
     u, q
-        The coefficients.
+        Distributions of the coefficients of state and parameter.
     cells
-        Every cell with a coefficient that this rank owns.
+        Cells with a coefficient owned by this rank.
     A, B
-        The forms on these cells.
+        Forms on these cells.
     """
 
     def __init__(self, team: Team, build: Any, args: tuple[Any, ...], model: Model | None) -> None:
@@ -85,7 +86,7 @@ class SharedModel:
         self.A, self.B = model.form_A.on(self.cells), model.form_B.on(self.cells)
 
     def close(self) -> None:
-        """Nothing of PETSc is held."""
+        """Do nothing: no PETSc object is held."""
 
     def _share(self, owner: IntArray, dofs: IntArray) -> Share:
         team = self.team
@@ -100,7 +101,8 @@ class SharedModel:
 
 
 def _lowest(dofs: IntArray, owner: IntArray, size: int, ranks: int) -> IntArray:
-    """Return the lowest rank on whose cells each coefficient is."""
+    """Return the lowest rank with each coefficient on its cells."""
+    # Written from the highest rank to the lowest, so that the lowest remains.
     found = np.full(size, ranks - 1)
     for rank in range(ranks - 1, -1, -1):
         found[dofs[:, owner == rank]] = rank
@@ -108,13 +110,15 @@ def _lowest(dofs: IntArray, owner: IntArray, size: int, ranks: int) -> IntArray:
 
 
 def _cell_owners(team: Team, mesh: Any) -> IntArray:
-    """Return the rank of each cell: equal shares with little in common, by PETSc's partitioner."""
+    """Return the owner rank of each cell by PETSc's partitioner: equal, compact shares."""
     from petsc4py import PETSc
 
     owner = np.zeros(mesh.nelements, dtype=np.int32)
     if team.size == 1:
         return owner
     corners = mesh.t[: mesh.elem.refdom.nnodes].T
+    # Only rank 0 passes cells to PETSc: every rank has the whole mesh, and the cells would be
+    # counted several times.
     cells = corners if team.rank == 0 else corners[:0]
     points = mesh.p.T if team.rank == 0 else mesh.p.T[:0]
     plex = PETSc.DMPlex().createFromCellList(

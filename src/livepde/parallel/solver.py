@@ -1,8 +1,8 @@
-"""Matrices whose rows belong to ranks, solved by PETSc.
+"""Distributed matrices solved by PETSc.
 
-Symmetric positive definite ones by conjugate gradients and algebraic multigrid (GAMG), others by
-sparse LU (MUMPS or SuperLU_DIST, as PETSc was built). Each rank owns a strip of rows in the order
-of Cuthill and McKee, so that strips touch their neighbours only.
+Symmetric positive definite matrices are solved by conjugate gradients and algebraic multigrid
+(GAMG), others by sparse LU (MUMPS or SuperLU_DIST, as available in PETSc). Each rank owns a strip
+of rows in Cuthill-McKee order, so that strips are coupled to their neighbours only.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from livepde.parallel.team import Handle, Team
 
 __all__ = ["PetscFactor", "PetscSolver", "direct", "krylov", "owned"]
 
-TOLERANCE = 1e-10  # residual relative to the right-hand side
+# Residual relative to the right-hand side.
+TOLERANCE = 1e-10
 ITERATIONS = 200
 DIRECT = ("mumps", "superlu_dist")
 REMEDY = (
@@ -31,19 +32,19 @@ REMEDY = (
 
 
 def direct() -> str | None:
-    """Return the parallel sparse LU that PETSc was built with, if there is one."""
+    """Return the parallel sparse LU available in PETSc, or None."""
     from petsc4py import PETSc
 
     return next((name for name in DIRECT if PETSc.Sys.hasExternalPackage(name)), None)
 
 
 def owned(comm: Any, size: int, csr: tuple[IntArray, IntArray, Array], columns: int) -> Any:
-    """Return a PETSc matrix from the rows of this rank: sorted, columns numbered by all ranks.
+    """Return a PETSc matrix from the rows of this rank, with sorted global column numbers.
 
     Parameters
     ----------
     size, columns
-        Rows and columns that this rank owns.
+        Number of rows and columns owned by this rank.
     """
     from petsc4py import PETSc
 
@@ -56,7 +57,7 @@ def owned(comm: Any, size: int, csr: tuple[IntArray, IntArray, Array], columns: 
 
 
 def krylov(matrix: Any, symmetric: bool) -> Any:
-    """Return PETSc's solver of a matrix, set up; raises `LinearAlgebraError` on every rank."""
+    """Return PETSc's solver of a matrix, set up; raise `LinearAlgebraError` on every rank."""
     from petsc4py import PETSc
 
     ksp = PETSc.KSP().create(matrix.getComm())
@@ -90,7 +91,7 @@ def krylov(matrix: Any, symmetric: bool) -> Any:
 
 
 def _serves(ksp: Any, matrix: Any) -> bool:
-    """Return whether a factor gives finite numbers: a zero pivot shows in a solve only."""
+    """Return True if a test solve is finite: a zero pivot shows in a solve only."""
     x, b = matrix.createVecs()
     b.set(1.0)
     ksp.solve(b, x)
@@ -101,7 +102,7 @@ def _serves(ksp: Any, matrix: Any) -> bool:
 
 
 class _Pattern:
-    """A rank's rows of a pattern."""
+    """Rows of a pattern owned by a rank."""
 
     def __init__(
         self,
@@ -121,11 +122,11 @@ class _Pattern:
         team.scatter(indices, self.indices)
 
     def close(self) -> None:
-        """Nothing of PETSc is held."""
+        """Do nothing: no PETSc object is held."""
 
 
 class _Factor:
-    """A rank's part of a matrix and its solver."""
+    """Local part of a distributed matrix and its solver."""
 
     def __init__(self, team: Team, pattern: int, data: list[Array] | None) -> None:
         self.team = team
@@ -139,12 +140,12 @@ class _Factor:
         self.right, self.left = self.matrix.createVecs()
 
     def close(self) -> None:
-        """Free what PETSc holds, on all ranks at once."""
+        """Free the PETSc objects, collectively on all ranks."""
         for item in (self.ksp, self.matrix, self.right, self.left):
             item.destroy()
 
     def solve(self, many: int, once: bool, pieces: list[Array] | None) -> list[Array] | None:
-        """Solve, or apply the preconditioner `once`, for each column."""
+        """Solve, or apply the preconditioner once if `once`, for each column."""
         b = np.empty((self.pattern.size, many))
         self.team.scatter(pieces, b)
         for k in range(many):
@@ -168,7 +169,7 @@ class _Factor:
 
 @dataclass(frozen=True, eq=False)
 class PetscFactor:
-    """A matrix in PETSc."""
+    """Factor of a matrix in PETSc."""
 
     solver: PetscSolver
     shared: Handle
@@ -178,13 +179,13 @@ class PetscFactor:
         return self.solver.through(self.shared, b, once=False)
 
     def precondition(self, b: Array) -> Array:
-        """Return an approximate solution: one cycle of multigrid, or the solution by LU."""
+        """Return an approximate solution: one multigrid cycle, or the solution by LU."""
         return self.solver.through(self.shared, b, once=True)
 
 
 @dataclass(frozen=True, eq=False)
 class PetscSolver:
-    """PETSc on all ranks of a team, bound to a pattern; a `livepde.linalg.Solver`."""
+    """PETSc solver on all ranks of a team for one pattern; a `livepde.linalg.Solver`."""
 
     team: Team
     pattern: Pattern
@@ -192,23 +193,23 @@ class PetscSolver:
 
     @property
     def name(self) -> str:
-        """How the engine introduces itself."""
+        """Name of the solver for messages."""
         what = "conjugate gradients, GAMG" if self.symmetric else f"LU ({direct()})"
         return f"PETSc: {what}"
 
     @property
     def definite(self) -> bool:
-        """True if conjugate gradients solve."""
+        """True if conjugate gradients are used."""
         return self.symmetric
 
     @property
     def price(self) -> float:
-        """About how many solves a factorisation costs."""
+        """Approximate cost of a factorisation in solves."""
         return 1.0 if self.symmetric else 20.0
 
     @cached_property
     def _order(self) -> tuple[IntArray, IntArray]:
-        """The order of the rows, and where each strip begins."""
+        """Order of the rows, and start of each rank's strip."""
         order = BandedSolver(self.pattern).order
         entries = np.cumsum(np.diff(self.pattern.indptr)[order])
         shares = entries[-1] * np.arange(1, self.team.size) / self.team.size
@@ -216,7 +217,7 @@ class PetscSolver:
 
     @cached_property
     def _spread(self) -> tuple[Handle, IntArray, IntArray]:
-        """The shared pattern, which data stand where in it, and where those of a rank begin."""
+        """Shared pattern, permutation of the data, and start of each rank's data."""
         order, bounds = self._order
         pattern = self.pattern
         numbers = np.arange(pattern.nnz)
@@ -235,7 +236,7 @@ class PetscSolver:
         return [values[a:b] for a, b in pairwise(starts)]
 
     def factorise(self, data: Array) -> PetscFactor:
-        """Factorise, or build the hierarchy; raises `LinearAlgebraError`."""
+        """Factorise, or set up multigrid; raise `LinearAlgebraError` on failure."""
         if not np.isfinite(data).all():
             raise LinearAlgebraError("The matrix holds values that are not finite.")
         pattern, where, starts = self._spread
@@ -243,7 +244,7 @@ class PetscSolver:
         return PetscFactor(self, self.team.share(_Factor, pattern.key, here=(pieces,)))
 
     def through(self, factor: Handle, b: Array, once: bool) -> Array:
-        """Send right-hand sides of shape (n,) or (n, k) through a factor."""
+        """Apply a factor to right-hand sides of shape (n,) or (n, k)."""
         order, bounds = self._order
         columns = b.reshape(len(b), -1)
         pieces = self._cut(columns[order], bounds)

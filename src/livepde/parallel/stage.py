@@ -1,13 +1,13 @@
-"""The coupled stage of the gradient law on many ranks: what each of them does.
+"""Coupled stage of the gradient law on many ranks: local computations of each rank.
 
-All of the state is observed, so that A and B see the data w alone. A rank evaluates them on its
-cells and one layer beyond, and so has its rows of the equation's terms and of the Jacobian
+All of the state is observed, so that A and B depend on the data w alone. A rank evaluates them on
+its cells and one overlap layer, which gives its rows of the equation's terms and of the Jacobian
 
     K = [[S, A], [-A^T, H]],    S = M/h + theta M_op
 
-complete. What crosses ranks are values of u and q on the layer, inner products, and what PETSc's
-products and multigrid exchange. K is solved by GMRES, preconditioned as in
-`livepde.laws.coupled.blocks`: a cycle of multigrid (GAMG) for S and one for C = H + A^T D^{-1} A.
+completely. Ranks exchange values of u and q on the layer, inner products, and the messages of
+PETSc's products and multigrid. K is solved by GMRES, preconditioned as in
+`livepde.laws.coupled.blocks`: a multigrid cycle (GAMG) for S and one for C = H + A^T D^{-1} A.
 """
 
 from __future__ import annotations
@@ -28,25 +28,29 @@ from livepde.parallel.team import Team
 
 __all__ = ["SharedEquation", "SharedJacobian", "SharedStage"]
 
-TOLERANCE = 1e-2  # of the residual, in the norm of Newton's: it goes on from there
-ITERATIONS = 60  # each keeps a vector
-MORE = 2  # times as many iterations as with new multigrid hierarchies: then they are made again
+# Residual of GMRES in the norm of Newton's residual. Newton's method corrects the rest (inexact
+# Newton method).
+TOLERANCE = 1e-2
+# Maximum number of iterations, each of which stores a vector.
+ITERATIONS = 60
+# Hierarchies are rebuilt when GMRES needs this multiple of the iterations with new ones.
+MORE = 2
 REMEDY = "take a smaller gain or a smaller time step."
 
 
 class SharedStage:
-    """A rank's part of a stage: forms on its cells, and its rows of what is constant.
+    """Local part of a stage: forms on the cells of a rank, and rows of constant matrices.
 
     Parameters
     ----------
     model
         Key of the `SharedModel`.
     free_u, free_q
-        Ones at free coefficients, shapes (n,) and (m,).
+        Masks of free coefficients, shapes (n,) and (m,).
     dual_weights
-        Of the squared dual norms of a residual, zero at fixed coefficients, shape (n + m,).
+        Weights of the squared dual norms of a residual, zero at fixed coefficients, shape (n + m,).
     rows
-        Of each rank: its rows of M, R^T M_op R and G_Q; on rank 0.
+        For each rank its rows of M, R^T M_op R and G_Q; on rank 0 only.
     """
 
     def __init__(
@@ -74,28 +78,28 @@ class SharedStage:
         self.hierarchies: _Hierarchies | None = None
 
     def close(self) -> None:
-        """Free what PETSc holds."""
+        """Free the PETSc objects."""
         self.renew()
 
     def prepare(self) -> None:
-        """Lay out the blocks of K."""
+        """Set up the blocks of K."""
         for block in self.blocks.values():
             block.data({})
 
     def renew(self) -> None:
-        """Let the next solve make new hierarchies."""
+        """Discard the multigrid hierarchies, so that the next solve builds new ones."""
         if self.hierarchies is not None:
             self.hierarchies.close()
         self.hierarchies = None
 
     def spread(self, values: Array) -> tuple[Array, Array]:
-        """Return u and q with all coefficients, zero where this rank does not reach."""
+        """Return u and q with all coefficients, zero outside of the reach of this rank."""
         many = len(self.u.reach)
         return _spread(values[:many], self.u), _spread(values[many:], self.q)
 
     @cached_property
     def blocks(self) -> dict[str, _Block]:
-        """The four blocks of K, and what they are made of."""
+        """The four blocks of K, as sums of their parts."""
         u, q, A = self.u, self.q, self.A
         ones_u, ones_q = np.ones(u.dim), np.ones(q.dim)
         free_u, free_q = self.free_u, self.free_q
@@ -114,7 +118,7 @@ class SharedStage:
 
 
 class _Block:
-    """The rows that this rank owns of a block, as a sum of matrices of fixed pattern."""
+    """Rows of a block owned by this rank, as a sum of matrices of fixed pattern."""
 
     def __init__(self, rows: Share, cols: Share) -> None:
         self.rows = rows
@@ -122,7 +126,7 @@ class _Block:
         self._parts: dict[str, tuple[IntArray, IntArray, sp.csr_array]] = {}
 
     def add(self, name: str, rows: IntArray, cols: IntArray, left: Array, right: Array) -> None:
-        """Add diag(left) X diag(right), X given by its entries; those of other rows are left."""
+        """Add diag(left) X diag(right), X given by its entries; drop entries of other rows."""
         place = np.full(self.rows.dim, -1)
         place[self.rows.rows] = np.arange(len(self.rows.rows))
         at = np.flatnonzero(place[rows] >= 0)
@@ -147,7 +151,7 @@ class _Block:
         return pattern, maps
 
     def data(self, parts: dict[str, Array]) -> Array:
-        """Return the entries that belong to these data of its parts."""
+        """Return the entries of the block for given data of its parts."""
         pattern, maps = self._built
         total = np.zeros(pattern.nnz)
         for name, values in parts.items():
@@ -166,23 +170,23 @@ def _entries(pattern: Pattern) -> tuple[IntArray, IntArray]:
 
 
 def _own(matrix: sp.csr_array, rows: Share) -> tuple[IntArray, IntArray]:
-    """Return the entries of a matrix that holds this rank's rows only, in the order of its data."""
+    """Return the entries of a matrix of this rank's rows only, in the order of its data."""
     return np.repeat(rows.rows, np.diff(matrix.indptr)), matrix.indices
 
 
 class SharedEquation:
-    """A rank's rows of the equation of one stage, term by term.
+    """Rows of the equation of one stage owned by a rank, term by term.
 
     Parameters
     ----------
     stage
         Key of the `SharedStage`.
     h, t, inputs
-        Length and time of the step, and the input channels then.
+        Length of the step, time at its end, and input channels at that time.
     scale
-        Weight of G_Q.
+        Factor of G_Q.
     known
-        Of each rank: w, c_u and c_q where it reaches; on rank 0.
+        For each rank w, c_u and c_q in its reach; on rank 0 only.
     """
 
     def __init__(
@@ -207,7 +211,7 @@ class SharedEquation:
         self.c_u, self.c_q = self.stage.spread(got[len(u.reach) :])
 
     def close(self) -> None:
-        """Nothing of PETSc is held."""
+        """Do nothing: no PETSc object is held."""
 
     @cached_property
     def _linear_A(self) -> sp.csr_array:
@@ -220,7 +224,7 @@ class SharedEquation:
         return self.stage.A.matrix("v", "q", self.moment, u=self.w, q=q)
 
     def flux(self) -> list[Array] | None:
-        """Return B(w), of each rank its rows."""
+        """Return B(w), the rows of each rank."""
         u = self.stage.u
         return self.team.gather(self.stage.B.vector("v", self.moment, u=self.w)[u.rows], u.sizes)
 
@@ -230,7 +234,7 @@ class SharedEquation:
         Parameters
         ----------
         values
-            Of each rank: u and q where it reaches; on rank 0.
+            For each rank u and q in its reach; on rank 0 only.
         """
         stage = self.stage
         got = np.empty(len(stage.u.reach) + len(stage.q.reach))
@@ -252,27 +256,27 @@ class SharedEquation:
 
 
 def _spread(values: Array, share: Share) -> Array:
-    """Return a vector of all coefficients, zero where this rank does not reach."""
+    """Return a vector of all coefficients, zero outside of the reach of this rank."""
     whole = np.zeros(share.dim)
     whole[share.reach] = values
     return whole
 
 
 class SharedJacobian:
-    """A rank's rows of K at a point.
+    """Rows of the Jacobian K owned by a rank.
 
     Parameters
     ----------
     equation
         Key of the `SharedEquation`.
     theta
-        Of the damping.
+        Damping coefficient.
     scales
-        Dual norms that residuals of the two lines are relative to.
+        Dual norms by which the residuals of the two equations are scaled.
     values
-        Of each rank: u and q where it reaches; on rank 0.
+        For each rank u and q in its reach; on rank 0 only.
     border
-        Of each rank: its rows of b and a where b a^T is added to S; on rank 0.
+        For each rank its rows of b and a, for the rank-one term b a^T of S; on rank 0 only.
     """
 
     def __init__(
@@ -325,13 +329,13 @@ class SharedJacobian:
         return column, row
 
     def close(self) -> None:
-        """Free what PETSc holds, on all ranks at once."""
+        """Free the PETSc objects, collectively on all ranks."""
         vectors = (self.u, self.v, self.q, self.p, self.column, self.row)
         for item in (self.S, self.A, self.Back, self.G, *vectors):
             item.destroy()
 
     def schur(self) -> Any:
-        """Return C."""
+        """Return the approximate Schur complement C."""
         from petsc4py import PETSc
 
         scaled = self.A.copy()
@@ -345,14 +349,14 @@ class SharedJacobian:
         return C
 
     def split(self, values: Array) -> tuple[Any, Any]:
-        """Return the rows of u and of q as vectors."""
+        """Return the rows of u and of q as PETSc vectors."""
         n = len(self.stage.u.rows)
         self.u.setArray(values[:n])
         self.q.setArray(values[n:])
         return self.u, self.q
 
     def mult(self, matrix: Any, x: Any, y: Any) -> None:
-        """Set y = D K x with the weights D of the rows; PETSc calls this."""
+        """Set y = D K x with the row weights D; called by PETSc."""
         u, q = self.split(x.getArray(readonly=True))
         self.S.mult(u, self.v)
         self.A.multAdd(q, self.v, self.v)
@@ -363,7 +367,7 @@ class SharedJacobian:
         y.setArray(self.weights * np.concatenate(parts))
 
     def solve(self, pieces: list[Array] | None) -> list[Array] | None:
-        """Return the rows of each rank of x with K x = b, to the tolerance."""
+        """Return x with K x = b to the tolerance, the rows of each rank."""
         stage = self.stage
         mine = np.empty(len(stage.u.rows) + len(stage.q.rows))
         self.team.scatter(pieces, mine)
@@ -374,13 +378,14 @@ class SharedJacobian:
             count = self._gmres(mine)
         if count is None:
             raise LinearAlgebraError(f"{ITERATIONS} iterations of GMRES did not suffice: {REMEDY}")
-        # Their rows are those of the identity: what is not exactly so, no residual would ever see.
+        # Rows of fixed coefficients are rows of the identity. Their solution is set exactly, since
+        # the weighted residual does not contain them.
         known = np.concatenate([stage.free_u[stage.u.rows], stage.free_q[stage.q.rows]]) == 0.0
         self.found[known] = mine[known]
         return self.team.gather(self.found, stage.u.sizes + stage.q.sizes)
 
     def _gmres(self, mine: Array) -> int | None:
-        """Solve with the hierarchies at hand; return the number of iterations, None: too many."""
+        """Solve with the present hierarchies; return the number of iterations, None: too many."""
         from petsc4py import PETSc
 
         stage = self.stage
@@ -414,12 +419,12 @@ class SharedJacobian:
 
 
 class _Hierarchies:
-    """Multigrid for S and for C of a point, kept while they serve.
+    """Multigrid hierarchies for S and C, reused while they converge well.
 
     Attributes
     ----------
     first
-        Iterations of the first solve with them.
+        Number of iterations of the first solve with them.
     """
 
     def __init__(self, at: SharedJacobian) -> None:
@@ -439,14 +444,14 @@ class _Hierarchies:
         return pc
 
     def close(self) -> None:
-        """Free what PETSc holds."""
+        """Free the PETSc objects."""
         for item in (self.state, self.metric, self.S, self.C):
             item.destroy()
 
 
 @dataclass(frozen=True, eq=False)
 class _Preconditioner:
-    """The block triangle of S and C, an approximate inverse of K; PETSc calls it."""
+    """Block-triangular preconditioner from S and C for K; called by PETSc."""
 
     at: SharedJacobian
     hierarchies: _Hierarchies

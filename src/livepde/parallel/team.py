@@ -1,11 +1,11 @@
-"""Processes of MPI as a team: rank 0 leads, the others carry out with it what it calls.
+"""Team of MPI processes: rank 0 leads, the other ranks execute its calls.
 
-Only rank 0 runs the program: it reads data, keeps the journal, prints. What is shared are objects
-of which every rank holds a part; a call of one of their methods is broadcast, and all ranks run it
-together. So control flow cannot diverge: there is only one.
+Only rank 0 runs the program: it reads data, keeps the journal, prints. Every rank holds a part of
+each shared object; a method call is broadcast, and all ranks execute it together. Control flow
+cannot diverge, because there is only one.
 
-Arguments of a call are broadcast. What only rank 0 has (`here`: large arrays, which the method
-scatters itself) others see as None.
+Arguments of a call are broadcast. Arguments in `here` stay on rank 0 (large arrays, which the
+method scatters itself); the other ranks get None.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ MISSING = (
 
 
 class Team:
-    """The ranks of a communicator.
+    """Ranks of a communicator, led by rank 0.
 
     Attributes
     ----------
     rank, size
-        As of MPI.
+        Rank and size as in MPI.
     sent
-        Bytes and messages between rank 0 and the others so far, as this rank counts them.
+        Bytes and messages between rank 0 and the others so far, as counted by this rank.
     """
 
     def __init__(self, comm: Any) -> None:
@@ -54,7 +54,7 @@ class Team:
     # --- the leader ------------------------------------------------------------------------------
 
     def share(self, kind: Callable[..., Any], *sent: Any, here: tuple[Any, ...] = ()) -> Handle:
-        """Make `kind(team, *sent, *here)` on every rank; only rank 0 calls this."""
+        """Create `kind(team, *sent, *here)` on every rank; only rank 0 calls this."""
         self._count += 1
         return Handle(self, self._count, self._call(self._count, kind, sent, here))
 
@@ -63,15 +63,15 @@ class Team:
         return self._call(key, method, sent, here)
 
     def leave(self, key: int) -> None:
-        """Take note that an object is no longer needed: it goes with the next call."""
+        """Mark an object as no longer needed; it is freed with the next call."""
         self._left.append(key)
 
     def part(self, key: int) -> Any:
-        """Return this rank's part of a shared object."""
+        """Return the local part of a shared object."""
         return self._objects[key]
 
     def stop(self) -> None:
-        """Send the other ranks home."""
+        """End the service of the other ranks."""
         self.comm.bcast(None)
 
     def _call(self, key: int, what: Any, sent: tuple[Any, ...], here: tuple[Any, ...]) -> Any:
@@ -83,9 +83,10 @@ class Team:
     # --- the others ------------------------------------------------------------------------------
 
     def serve(self) -> None:
-        """Carry out what rank 0 calls until it has done: what every other rank does.
+        """Execute the calls of rank 0 until it stops: the main loop of every other rank.
 
-        Signals are left to rank 0: it ends the run in order, and then these ranks.
+        Signals are ignored here: rank 0 handles them, ends the run in order, and then stops these
+        ranks.
         """
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
@@ -108,7 +109,7 @@ class Team:
     # --- arrays between rank 0 and the others ----------------------------------------------------
 
     def scatter(self, pieces: list[Array] | list[IntArray] | None, mine: Any) -> None:
-        """Fill the array `mine` of every rank with its piece of what rank 0 has."""
+        """Fill the array `mine` of every rank with its piece of the arrays on rank 0."""
         requests = []
         if pieces is not None:
             for rank, piece in enumerate(pieces):
@@ -123,7 +124,7 @@ class Team:
             request.Wait()
 
     def gather(self, mine: Array, sizes: IntArray) -> list[Array] | None:
-        """Return the arrays of all ranks, of these lengths, on rank 0."""
+        """Return the arrays of all ranks, with given lengths, on rank 0."""
         if self.rank:
             self.comm.Send(np.ascontiguousarray(mine), dest=0)
             return None
@@ -140,7 +141,7 @@ class Team:
 
 
 class Handle:
-    """What rank 0 holds of a shared object."""
+    """Reference to a shared object, held by rank 0."""
 
     def __init__(self, team: Team, key: int, local: Any) -> None:
         self.team = team
@@ -148,7 +149,7 @@ class Handle:
         self.local = local
 
     def __call__(self, method: str, *sent: Any, here: tuple[Any, ...] = ()) -> Any:
-        """Call a method on every rank, and return what it gives on rank 0."""
+        """Call a method on every rank, and return its result on rank 0."""
         return self.team.call(self.key, method, sent, here)
 
     def __del__(self) -> None:
@@ -156,9 +157,9 @@ class Handle:
 
 
 class _AllOrNone:
-    """A failure within ends the processes of all ranks: the others wait for this one.
+    """Context that aborts all ranks on an exception, since the others would wait forever.
 
-    `LinearAlgebraError` is raised by all ranks alike, and passes.
+    `LinearAlgebraError` is raised by all ranks alike, and is passed on.
     """
 
     def __init__(self, comm: Any) -> None:
@@ -187,12 +188,12 @@ class _AllOrNone:
 
 
 def world() -> Team:
-    """Return all processes that mpirun has started, as a team; starts MPI and PETSc.
+    """Return all processes started by mpirun as a team; starts MPI and PETSc.
 
     Raises
     ------
     ConfigurationError
-        petsc4py or mpi4py is missing.
+        petsc4py or mpi4py is not installed.
     """
     try:
         import petsc4py

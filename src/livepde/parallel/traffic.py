@@ -1,4 +1,4 @@
-"""What crosses between ranks: counted by the team and by PETSc."""
+"""Message counts between ranks, from the team and from PETSc."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ __all__ = ["Traffic", "TrafficLog"]
 
 @dataclass(frozen=True)
 class Traffic:
-    """Sums over all ranks.
+    """Message counts, summed over all ranks.
 
     Attributes
     ----------
     messages, size
-        Within PETSc: messages from rank to rank, and their bytes.
+        Messages between ranks within PETSc, and their bytes.
     reductions
-        Operations of all ranks together, such as an inner product.
+        Collective operations, such as inner products.
     led_messages, led_size
-        Between rank 0 and the others: vectors that are cut and put together.
+        Messages between rank 0 and the others, and their bytes: scattered and gathered vectors.
     """
 
     messages: float
@@ -33,13 +33,13 @@ class Traffic:
     led_size: float
 
     def since(self, before: Traffic) -> Traffic:
-        """Return what came after another count."""
+        """Return the difference to an earlier count."""
         mine, theirs = vars(self), vars(before)
         return Traffic(**{name: mine[name] - theirs[name] for name in mine})
 
 
 class TrafficLog:
-    """PETSc's log of messages, from its making on; shared by all ranks."""
+    """PETSc's message log since construction; shared by all ranks."""
 
     def __init__(self, team: Team) -> None:
         from petsc4py import PETSc
@@ -48,10 +48,10 @@ class TrafficLog:
         PETSc.Log.begin()
 
     def close(self) -> None:
-        """The log goes on: PETSc has one for all."""
+        """Do nothing: PETSc has a single log, which continues."""
 
     def read(self, folder: str) -> Traffic:
-        """Return the counts so far, on rank 0 what all ranks have sent."""
+        """Return the counts so far; on rank 0 the sum over all ranks."""
         from petsc4py import PETSc
 
         path = Path(folder) / "log.txt"
@@ -70,14 +70,14 @@ class TrafficLog:
 
 
 def traffic(log: object) -> Traffic:
-    """Return what a shared log has counted; only rank 0 calls this."""
+    """Return the counts of a shared log; only rank 0 calls this."""
     with tempfile.TemporaryDirectory() as folder:
         found: Traffic = log("read", folder)  # type: ignore[operator]
     return found
 
 
 def _last(text: str, name: str) -> float:
-    """Return the last number of a line of PETSc's summary; of Reductions the first."""
+    """Return the last number in a line of PETSc's summary; for Reductions the first."""
     line = re.search(rf"^MPI {name}[^:]*:(.*)$", text, flags=re.MULTILINE)
     if line is None:
         return 0.0

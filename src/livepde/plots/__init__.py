@@ -1,7 +1,8 @@
-"""Figures of a run's dataset; the only room that knows Matplotlib.
+"""Figures of a run's dataset; the only subpackage that imports Matplotlib.
 
-It takes datasets as `Result.to_xarray()` gives them, and arrays. Matplotlib is loaded when a figure
-is drawn, not before, and without pyplot: figures are objects to save, no global state is touched.
+The input is a dataset as returned by `Result.to_xarray()`, or arrays. Matplotlib is imported when a
+figure is drawn, not before, and without pyplot: figures are objects to save, and no global state is
+changed.
 """
 
 from __future__ import annotations

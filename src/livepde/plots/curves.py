@@ -1,4 +1,4 @@
-"""Figures of one kind each: profiles of a field, histories, ensembles, closed loops."""
+"""Elementary figures: field profiles, time histories, ensembles, closed loops."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ MARKERS = "osD^vP*X"
 
 
 def _snapshots(data: xr.Dataset, times: Sequence[float] | int) -> list[int]:
-    """Return indices of the snapshots nearest to the times, or of some, most of them early.
+    """Return indices of the snapshots nearest to given times, or of a number of them.
 
-    An estimate changes most at the start, so the spread is quadratic.
+    Their spacing is quadratic, because an estimate changes most at the start.
     """
     available = data["snapshot"].values
     if not len(available):
@@ -47,7 +47,7 @@ def profiles(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a field on an interval at several times; the last one with its 95 % band.
+    """Draw profiles of a field on an interval at several times; the last with its 95 % band.
 
     Parameters
     ----------
@@ -56,21 +56,21 @@ def profiles(
     name
         Field to draw: a parameter or the state.
     times
-        Times to draw (the nearest snapshots), or how many.
+        Times to draw (nearest snapshots), or their number.
     exact
         Exact values at the vertices, drawn as plain lines: shape (vertices,), or (times, vertices)
         for one line each.
     observed
-        Interval omega that is observed, shaded.
+        Observed interval omega, shaded.
     markers
-        Mark the vertices, as the paper does.
+        True: mark the vertices, as in the paper.
     legend
         Put a legend beside the panel.
 
     Raises
     ------
     ConfigurationError
-        No such field, more than one space dimension, or Matplotlib is not installed.
+        The field does not exist, has more than one space dimension, or Matplotlib is not installed.
     """
     if name not in data or data[name].dims != ("snapshot", "vertex"):
         fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
@@ -122,16 +122,16 @@ def history(
     levels: Mapping[str, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw numbers over time, such as the error of several runs.
+    """Draw time series, such as the errors of several runs.
 
     Parameters
     ----------
     series
-        Label -> (times, values).
+        Mapping from label to (times, values).
     levels
         Label -> constant to compare with, drawn dashed.
     log
-        Logarithmic scale of the values.
+        True: logarithmic scale of the values.
     """
     ax = panel(ax)
     for k, (label, (t, values)) in enumerate(series.items()):
@@ -146,14 +146,14 @@ def history(
 
 
 def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "") -> Figure:
-    """Draw closed loops: a column for each run, a row for each quantity, with common axes.
+    """Draw closed-loop runs: a column for each run, a row for each quantity, common axes.
 
     Parameters
     ----------
     runs
-        Name -> dataset with the quantities over `time`, and where there are such, what each should
-        be (`_reference`), its limits (`_low`, `_high`), what it is (`_truth`), its deviation
-        (`_std`). With the attribute `held` values are held from sample to sample.
+        Mapping from name to a dataset with the quantities over `time` and, if available, their
+        references (`_reference`), limits (`_low`, `_high`), true values (`_truth`) and standard
+        deviations (`_std`). With the attribute `held`, values are held between samples.
     rows
         Names of the quantities.
 
@@ -208,7 +208,7 @@ def ensemble(
     legend: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw several runs over time: each one thin, their mean thick with its least value marked.
+    """Draw an ensemble over time: thin lines for runs, a thick mean with its minimum marked.
 
     Parameters
     ----------

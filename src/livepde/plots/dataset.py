@@ -1,4 +1,4 @@
-"""What a figure of a run's dataset shows: unknowns, intervals, units; without Matplotlib."""
+"""Contents of figures from a run's dataset: unknowns, intervals, units; without Matplotlib."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ __all__ = [
 ]
 
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
-MOST_LINES = 7  # in one panel; more sensors are drawn as one line with their range
-CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))  # span from which, factor, unit
+# Largest number of lines in a panel; more sensors are drawn as one line with their range.
+MOST_LINES = 7
+# Time span from which a unit of the time axis is used, its length in seconds, its name.
+CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
 
 
 def scalars(data: xr.Dataset) -> list[str]:
@@ -37,7 +39,8 @@ def scalars(data: xr.Dataset) -> list[str]:
 def note(data: xr.Dataset, name: str) -> Array | None:
     """Return a note of the law over time, shape (samples,); None if the run has none.
 
-    A note whose name is that of an unknown, say, is kept under another one: see `Layout.dataset`.
+    A note whose name clashes with that of a variable is stored under another one: see
+    `Layout.dataset`.
     """
     key = f"{NOTE}{name}" if f"{NOTE}{name}" in data else name
     about = (str(data.attrs.get(kind, "")) for kind in ("fields", "state"))
@@ -49,7 +52,7 @@ def note(data: xr.Dataset, name: str) -> Array | None:
 
 
 def groups(data: xr.Dataset) -> dict[str, list[str]]:
-    """Return unknown -> labels of its numbers: one, or one for each region."""
+    """Return a mapping from unknown to the labels of its numbers: one, or one per region."""
     found: dict[str, list[str]] = {}
     for label in scalars(data):
         found.setdefault(label.partition("[")[0], []).append(label)
@@ -57,10 +60,10 @@ def groups(data: xr.Dataset) -> dict[str, list[str]]:
 
 
 def interval_95(data: xr.Dataset, name: str) -> tuple[Array, Array]:
-    """Return the ends of the 95 % interval of a variable that has a deviation.
+    """Return the ends of the 95 % interval of a variable with a standard deviation.
 
-    Those of the dataset, which are mapped through a transform and lie within bounds; where it has
-    none, the value and 1.96 deviations.
+    The ends stored in the dataset are mapped through a transform and lie within bounds; without
+    them the interval is the value +- 1.96 standard deviations.
     """
     if f"{name}_low" in data:
         return data[f"{name}_low"].values, data[f"{name}_high"].values
@@ -76,7 +79,7 @@ def labelled(name: str, unit: str) -> str:
 
 
 def time_scale(data: xr.Dataset) -> tuple[float, str]:
-    """Return factor and unit in which times are shown: a month in seconds tells nobody anything."""
+    """Return factor and unit of the time axis: days or hours for long runs in seconds."""
     unit = str(data["time"].attrs.get("units", ""))
     if unit in ("s", "second", "seconds") and data.sizes["time"]:
         span = float(data["time"][-1] - data["time"][0])
@@ -87,7 +90,7 @@ def time_scale(data: xr.Dataset) -> tuple[float, str]:
 
 
 def scored_from(data: xr.Dataset) -> int:
-    """Return the first sample that was assimilated: what comes before is not scored."""
+    """Return the index of the first assimilated sample; earlier ones are not scored."""
     start = data.attrs.get("assimilate_from")
     if start is None:
         return 0

@@ -1,4 +1,4 @@
-"""A whole run in one figure: unknowns, fields, innovations, withheld channels."""
+"""Overview figure of a run: unknowns, fields, innovations, withheld channels."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
     Parameters
     ----------
     data
-        As `Result.to_xarray()` gives it.
+        Dataset as returned by `Result.to_xarray()`.
     title
-        Above all panels.
+        Title above all panels.
     times
-        Times at which fields are drawn, or how many (one space dimension; maps show the last).
+        Times at which fields are drawn, or their number (one space dimension; maps show the last).
 
     Raises
     ------
@@ -75,11 +75,11 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
 
 
 def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
-    """Draw one unknown over time with its 95 % band; its regions together."""
+    """Draw one unknown over time with its 95 % band; all its regions in one panel."""
     factor, clock = time_scale(data)
     t = data["time"].values / factor
     unit = str(data[labels[0]].attrs.get("units", ""))
-    # The prior's band would flatten everything that follows.
+    # The wide band of the prior would determine the scale and hide all later values.
     late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
     for k, label in enumerate(labels):
@@ -110,7 +110,7 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
 
 
 def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
-    """Mark samples whose step failed."""
+    """Mark samples with a failed step."""
     failed = data["time"].values[data["status"].values != 0] / time_scale(data)[0]
     if len(failed):
         ax.plot(
@@ -124,7 +124,7 @@ def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
 
 
 def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
-    """Draw a line at each alarm of the test for jumps."""
+    """Draw a line at each alarm of the jump test."""
     alarms = note(data, "jump")
     if alarms is None:
         return
@@ -137,7 +137,7 @@ def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
 
 
 def _field_panels(data: xr.Dataset, name: str, times: Sequence[float] | int) -> list[Any]:
-    """Return what draws a field: profiles, maps, or its range over time in three dimensions."""
+    """Return functions that draw a field: profiles, maps, or its range over time in 3D."""
     if "y" not in data.coords:
 
         def profile(ax: Axes) -> Axes:
@@ -195,7 +195,7 @@ def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 
 
 def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, ax: Axes) -> Axes:
-    """Draw measured minus expected of each channel, with its root mean square error."""
+    """Draw measured minus predicted values of each channel, with the root mean square error."""
     factor, clock = time_scale(data)
     t = data["time"].values / factor
     errors = data[variable].transpose("time", dimension).values

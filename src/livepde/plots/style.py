@@ -1,4 +1,4 @@
-"""Empty figures, colours and the finish of a panel: all figures look alike."""
+"""Common style of figures: empty figures, colours, grids and legends."""
 
 from __future__ import annotations
 
@@ -23,16 +23,18 @@ __all__ = [
     "shades_of",
 ]
 
-# Okabe and Ito (2008): told apart with every common kind of colour blindness. Yellow is left out:
-# it cannot be seen on white.
+# Palette of Okabe and Ito (2008), distinguishable with all common kinds of colour blindness. Yellow
+# is omitted, because it is invisible on white.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#7f7f7f"
-MOST_POINTS = 20_000  # for which a free place for the legend is looked for
-PANEL = (5.4, 3.4)  # inches
+# Number of points up to which Matplotlib searches a free place for the legend.
+MOST_POINTS = 20_000
+# Width and height of a panel in inches.
+PANEL = (5.4, 3.4)
 
 
 def figure_class() -> type[Figure]:
-    """Return Matplotlib's class of figures; raises `ConfigurationError` without Matplotlib."""
+    """Return Matplotlib's figure class; raise `ConfigurationError` without Matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -55,7 +57,7 @@ def figure(rows: int = 1, columns: int = 1, title: str = "") -> tuple[Figure, li
 
 
 def empty(rows: int, columns: int, title: str) -> Figure:
-    """Return a figure of the size of so many panels, and without any."""
+    """Return an empty figure with the size of a number of panels."""
     size = (PANEL[0] * columns, PANEL[1] * rows)
     drawn = figure_class()(figsize=size, layout="constrained")
     if title:
@@ -64,19 +66,19 @@ def empty(rows: int, columns: int, title: str) -> Figure:
 
 
 def panel(ax: Axes | None) -> Axes:
-    """Return where to draw: what is given, or the panel of a new figure."""
+    """Return the given axes, or the axes of a new figure."""
     return figure()[1][0] if ax is None else ax
 
 
 def finish(ax: Axes, *, legend: bool = True, outside: bool = False) -> Axes:
-    """Add grid and legend to a panel that is drawn."""
+    """Add grid and legend to a finished panel."""
     ax.grid(True, alpha=0.3, linewidth=0.6)
     ax.spines[["top", "right"]].set_visible(False)
     if legend and ax.get_legend_handles_labels()[0]:
         if outside:
             ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="small", frameon=False)
         else:
-            # "best" compares with every point drawn: too slow on long runs.
+            # loc="best" tests every point drawn, which is too slow for long runs.
             points = sum(np.size(line.get_xdata()) for line in ax.lines)
             place: Any = "best" if points <= MOST_POINTS else "upper right"
             ax.legend(loc=place, fontsize="small", framealpha=0.85, edgecolor="none")
@@ -84,7 +86,7 @@ def finish(ax: Axes, *, legend: bool = True, outside: bool = False) -> Axes:
 
 
 def shades_of(count: int) -> list[Any]:
-    """Return colours for a sequence in time, early to late: viridis without its yellow."""
+    """Return colours for a sequence in time, early to late: viridis without its yellow end."""
     import matplotlib as mpl
 
     shades: list[Any] = list(mpl.colormaps["viridis"](np.linspace(0.0, 0.88, max(count, 2))))

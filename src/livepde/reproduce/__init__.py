@@ -1,7 +1,7 @@
-"""Published and stated experiments, each with the numbers it must show.
+"""Published and stated experiments, each with its expected numbers.
 
-One file for each experiment, its expected numbers at the end; `livepde reproduce NAME` runs them,
-and so do the tests.
+There is one file for each experiment, with its expected numbers at the end. The command `livepde
+reproduce NAME` and the tests run them.
 """
 
 from __future__ import annotations

@@ -1,21 +1,21 @@
-"""Boiger and Kaltenbacher (2016): both figures of section 4; the second for the excited twin, too.
+"""Boiger and Kaltenbacher (2016): both figures of section 4, the second also for the excited twin.
 
 First figure: partial exact data, t = 0, 6, 15, 30, 45, 60; q left, u right. Second figure: 1, 5 and
 10 % noise to t = 75; above q at several times, below ||e||_Q^2 + ||r||_X^2 over time.
 
-The paper says "Gaussian noise with different noise levels", constant mu and nu found by hindsight,
-and no more: neither where the noise enters, nor the scale of the inner product of Q (our `gain`),
-nor where its data come from. The first figure rests on a gain of 100 and on data of the same
+The paper states "Gaussian noise with different noise levels" and constant mu and nu found by
+hindsight. It states neither how the noise enters, nor the scale of the inner product of Q (our
+`gain`), nor the origin of its data. The first figure rests on a gain of 100 and on data of the same
 discretisation ("discrete"): with gain 1 the error of q is 0.84, and data of the exact u* hide q
-(`livepde reproduce seed`). All settings that the paper does name are its own (`livepde.paper`).
-The second figure is run with two noise models, both of relative size E ||d||_Z = level ||z||_Z
-in every sample and independent from sample to sample:
+(`livepde reproduce seed`). All settings stated in the paper are used (`livepde.paper`). The second
+figure is run with two noise models, both of relative size E ||d||_Z = level ||z||_Z in every sample
+and independent from sample to sample:
 
     nodal     independent in every coefficient, values and slopes (`RelativeNoise`), alpha = 0
     band      a random combination of sin(k pi x), k <= 4, independent coefficients of equal size
 
-mu and gain are of the paper's hindsight kind: picked by looking at runs whose truth is known
-(`experiments/` holds such searches). An estimator cannot do that.
+As in the paper, mu and gain are chosen by hindsight, from runs with known truth (`experiments/`
+holds such searches). An estimator cannot do that.
 """
 
 from __future__ import annotations
@@ -44,9 +44,11 @@ __all__ = ["BOIGER2016", "Ensemble", "NoisyTwin"]
 LEVELS = (0.01, 0.05, 0.10)
 SEEDS = (0, 1, 2, 3, 4)
 END = 75.0
-BAND = 4  # modes of the band-limited noise
+# Number of modes of the band-limited noise.
+BAND = 4
 SHOWN = (0.0, 6.0, 15.0, 30.0, 45.0, 75.0)
-NUS = (0.0, 0.01, 0.1)  # of the first figure; the paper varies nu between 0.1 and 1000
+# Values of nu in the first figure; the paper varies nu between 0.1 and 1000.
+NUS = (0.0, 0.01, 0.1)
 FIRST = paper.law(100.0, ResidualDamping(1.0))
 NOISY = paper.law(100.0, ConstantDamping(mu=1.0))
 STIFF = paper.law(100.0, ConstantDamping(mu=10.0))
@@ -59,14 +61,14 @@ Runs = dict[tuple[str, float], "Ensemble"]
 
 @dataclass(frozen=True)
 class Variant:
-    """Noise and law of some rows; the levels 1, 5, 10 % are multiplied by `share`."""
+    """Noise and law of several table rows; the levels 1, 5, 10 % are multiplied by `share`."""
 
     noise: Kind
     law: AnyLaw
     share: float = 1.0
 
 
-# What the paper's example is run with. The last one finds the level at which q* can be learned.
+# Variants of the paper's example. The last one determines the level at which q* can be learned.
 PAPER = {
     "nodal, mu = 1": Variant("nodal", NOISY),
     "band, mu = 1": Variant("band", NOISY),
@@ -77,14 +79,14 @@ PAPER = {
 
 @dataclass(frozen=True, eq=False)
 class NoisyTwin:
-    """A twin whose exact data are computed once, for many noises.
+    """Twin with exact data computed once, for many noise realisations.
 
     Parameters
     ----------
     twin
         The experiment without noise.
     start
-        u*(x, 0), which the paper's runs start from.
+        Initial state u*(x, 0) of the paper's runs.
     """
 
     twin: Twin
@@ -117,14 +119,15 @@ class NoisyTwin:
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """Runs of one law on the same exact data with several noises.
+    """Runs of one law on the same exact data with several noise realisations.
 
     Attributes
     ----------
     times
         Shape (samples,).
     energy
-        ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the gain: shape (seeds, samples).
+        Energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the gain: shape (seeds,
+        samples).
     error
         Relative L2 error of q, shape (seeds, samples).
     size
@@ -132,7 +135,7 @@ class Ensemble:
     result
         The run of the first seed.
     failed
-        Samples whose step failed, over all seeds.
+        Number of samples with a failed step, over all seeds.
     """
 
     times: Array
@@ -144,7 +147,7 @@ class Ensemble:
 
     @property
     def turning(self) -> Array:
-        """Time at which each run's energy is smallest, shape (seeds,)."""
+        """Time of the smallest energy of each run, shape (seeds,)."""
         times: Array = self.times[self.energy.argmin(axis=1)]
         return times
 
@@ -266,7 +269,7 @@ COLUMNS = [
 
 
 def row(kind: str, level: float, runs: Ensemble) -> list[Any]:
-    """Return one row of a table of noisy runs: means over the seeds, +- their deviations."""
+    """Return one row of a table of noisy runs: means over the seeds +- standard deviations."""
     error, ends = runs.error.mean(axis=0), runs.error[:, -1]
     best = int(error.argmin())
     return [
@@ -294,9 +297,9 @@ def paper_noise(
     Returns
     -------
     runs, table
-        For every variant.
+        Runs and table of every variant.
     alone
-        Level -> size of q^ at the end that the same band noise makes where q* = 0, over ||q*||.
+        For each level the final size of q^ over ||q*|| for q* = 0 with the same band noise.
     """
     case, nothing = paper_case(), paper_case(0.0)
     runs: Runs = {
@@ -336,8 +339,8 @@ def _table(title: str, runs: Runs) -> Table:
 def semiconvergence(runs: Runs, levels: Sequence[float]) -> list[Check]:
     """Return the checks of the excited twin's second figure, for three levels.
 
-    A run that fluctuates about a floor has a least value, too. So "it rises again" is the mean of
-    the last third of the time over the least mean, asked of the highest level alone.
+    A run that fluctuates about a floor has a least value, too. So semiconvergence is measured by
+    the mean over the last third of the time relative to the least mean, for the highest level only.
     """
     band = [runs["band, mu = 1", level] for level in levels]
     turning = [float(found.turning.mean()) for found in band]
@@ -431,7 +434,7 @@ def first_checks(runs: dict[float, Track]) -> list[Check]:
 
 
 def _hidden(runs: Runs, alone: dict[float, float]) -> list[Check]:
-    """Return the checks of the paper's example: the noise hides q*, a hundredth of it does not."""
+    """Return the checks of the paper's example: the noise hides q*, 1 % of it does not."""
     worst, least = LEVELS[-1], LEVELS[0] * PAPER["band, c1 = 1"].share
 
     def error(name: str, level: float) -> float:
@@ -569,9 +572,9 @@ BOIGER2016 = Experiment(
     conduct=run,
 )
 
-# What it must show.
-# First figure: nu -> relative errors of q and of u at t = 60. The dense implementation in
-# reference.py gives the same, Setting(..., gain=100, c1=1, nu=nu) with the space of `seed`.
+# Expected results. First figure: for each nu the relative errors of q and of u at t = 60. The dense
+# implementation in reference.py gives the same, Setting(..., gain=100, c1=1, nu=nu) with the space
+# of `seed`.
 FIGURE1 = {0.0: (0.1333, 2.45e-4), 0.01: (0.534, 6.54e-3), 0.1: (3.08, 0.0463)}
 EARLIER = 5.0  # how much earlier the least error comes at the next noise level, mean of five seeds
 FALLEN = 0.3  # 1 %: the error at the end over that at the start

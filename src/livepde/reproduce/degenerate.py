@@ -1,4 +1,4 @@
-"""Section 4.1 beyond D = 1: D that varies, vanishes on a part, and is negative on a part.
+"""Section 4.1 beyond D = 1: D that varies, vanishes on a part, or is negative on a part.
 
     u_t - (D u_x)_x + q u = f on (0, 1),   u = 0 at the ends,   z = u on omega = (0.3, 1)
 
@@ -10,10 +10,10 @@ with q* and u* of the excited twin, Q = H^1, q^(0) = 0 and the operators M and N
   the unobserved part grow, the faster the shorter they are. So it cannot be simulated, and the data
   come from the manufactured state u*, which a discrete source makes an exact discrete solution.
 
-Each is run with nu = 0, 0.1 and 2. nu P N P u draws P u to zero and not to P u*, so p grows with nu
-where D >= 0: there the dynamics damp p by themselves. The error of q does not follow p: for the
-varying D nu = 0.1 improves it and nu = 2 spoils it; where D vanishes nu = 2 is the best of the
-three. For D < 0 only nu P N P u holds p, and for nu > 1 only, since N has |D|.
+Each is run with nu = 0, 0.1 and 2. The term nu P N P u attracts P u to zero and not to P u*, so p
+grows with nu where D >= 0: there the dynamics themselves damp p. The error of q does not follow p:
+for the varying D, nu = 0.1 improves it and nu = 2 worsens it; where D vanishes nu = 2 is the best
+of the three. For D < 0 only nu P N P u bounds p, and only for nu > 1, since N has |D|.
 """
 
 from __future__ import annotations
@@ -43,17 +43,18 @@ __all__ = ["DEGENERATE"]
 
 CELLS = 20
 OMEGA = 0.3
-FAILED = 1e3  # size of p at which a run is stopped: u* is of size 1
+# Size of p at which a run is stopped; u* is of size 1.
+FAILED = 1e3
 
 
 def omega(x: Any) -> Any:
-    """The observed part."""
+    """Observed part of the domain, as a predicate."""
     return x[0] > OMEGA - 1e-9
 
 
 @dataclass(frozen=True)
-class Process:
-    """A diffusivity, and the steps and gains it is run with."""
+class DiffusionCase:
+    """Diffusivity, with time step and gain of its runs."""
 
     D: Callable[[Any], Any]
     h: float
@@ -63,19 +64,19 @@ class Process:
 
 
 PROCESSES = {
-    "varying": Process(lambda x: 1 + 0.8 * np.sin(2 * np.pi * x[0]), 0.02, 500, 1e3, 10.0),
-    "degenerate": Process(lambda x: 2 * np.maximum(x[0] - 0.5, 0.0), 0.02, 500, 1e3, 10.0),
-    # Steps so small that implicit Euler resolves the growth of every mode (h lambda < 1/2): with
-    # larger ones it would damp what grows.
-    "antidiffusion": Process(
+    "varying": DiffusionCase(lambda x: 1 + 0.8 * np.sin(2 * np.pi * x[0]), 0.02, 500, 1e3, 10.0),
+    "degenerate": DiffusionCase(lambda x: 2 * np.maximum(x[0] - 0.5, 0.0), 0.02, 500, 1e3, 10.0),
+    # The steps are so small that implicit Euler resolves the growth of every mode (h lambda < 1/2):
+    # with larger steps it would damp growing modes.
+    "antidiffusion": DiffusionCase(
         lambda x: np.where(x[0] < OMEGA, -0.05, 1.0), 0.002, 1500, 100.0, 1000.0
     ),
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """One run: times, relative errors of q, ||p||_X, ||e||_Q^2/gain + ||r||_X^2, and its end."""
+class DiffusionRun:
+    """One run: times, relative errors of q, ||p||_X, ||e||_Q^2/gain + ||r||_X^2, final estimate."""
 
     result: Result
     times: Array
@@ -86,11 +87,11 @@ class Course:
 
     @property
     def failed(self) -> bool:
-        """True if a step failed or p left every bound."""
+        """True if a step failed or p grew beyond the limit."""
         return not self.last.status.ok or bool(self.hidden[-1] > FAILED)
 
 
-def build(process: Process) -> tuple[Manufactured, Subdomain]:
+def build(process: DiffusionCase) -> tuple[Manufactured, Subdomain]:
     """Return model and observation."""
     mesh = interval(0, 1, CELLS)
     element = linear(mesh)
@@ -106,8 +107,10 @@ def build(process: Process) -> tuple[Manufactured, Subdomain]:
     return model, Subdomain(omega)
 
 
-def identify(process: Process, nu: float, what: str = "", progress: bool = False) -> Course:
-    """Run the paper's method with one nu; stop when p has left every bound."""
+def identify(
+    process: DiffusionCase, nu: float, what: str = "", progress: bool = False
+) -> DiffusionRun:
+    """Run the paper's method with one nu; stop when p exceeds the limit."""
     model, sensors = build(process)
     times = process.h * np.arange(process.steps + 1)
     twin = Twin(
@@ -139,7 +142,7 @@ def identify(process: Process, nu: float, what: str = "", progress: bool = False
         if not estimate.status.ok or p > FAILED:
             break
     times, errors, hidden, energy = np.array(rows).T
-    return Course(result, times, errors, hidden, energy, estimate)
+    return DiffusionRun(result, times, errors, hidden, energy, estimate)
 
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
@@ -210,7 +213,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     )
 
 
-def _figure(courses: dict[tuple[str, float], Course]) -> Any:
+def _figure(courses: dict[tuple[str, float], DiffusionRun]) -> Any:
     """Draw ||p|| over time of all runs."""
     drawn, axes = plots.figure()
     series = {f"{n}, nu = {nu:g}": (c.times, c.hidden) for (n, nu), c in courses.items()}
@@ -225,9 +228,9 @@ DEGENERATE = Experiment(
     conduct=run,
 )
 
-# What it must show: (D, nu) -> relative L2 error of q at the end, bounds on |p|. "varying" was also
-# measured with the dense implementation in reference.py, its error against the interpolant of q*:
-# 0.1963 with nu = 0, 0.1160 with nu = 0.1.
+# Expected results: for each (D, nu) the relative L2 error of q at the end, and bounds on |p|.
+# "varying" was also measured with the dense implementation in reference.py, its error against the
+# interpolant of q*: 0.1963 with nu = 0, 0.1160 with nu = 0.1.
 NUS = (0.0, 0.1, 2.0)
 NU = 2.0
 EXPECTED = {

@@ -6,23 +6,22 @@
     u* = 2 + x_1 (1 + t/2) + (1 + t)/2 times the product of sin(pi x_k),   g = u*
 
 with Q = H^2 and a correlation length of 0.2, so s = 2 > d/2 for d <= 3; q^(0) = 0. u* is linear in
-t, so implicit Euler makes no error in time, and what is left is that of the mesh. The errors are
-those against the formulas, in L^2.
+t, so implicit Euler makes no error in time, and only the spatial error remains. Errors are measured
+against the formulas, in L^2.
 
 Data of the same discretisation ("discrete") leave the errors of the elements in u: of order 2 with
 first order elements, 3 with second order ones, 4 with Bogner-Fox-Schmit. Cubic Hermite elements on
-a line are so accurate that u does not get there until t = 1.5: on 16 cells its error is 1.7e-5
-where theirs is 3e-7. What is left then is r, which is not zero as long as q still moves: at t = 6
-it is gone, and so it is at t = 1.5 with a gain of 1e7. A second table shows both.
+a line are so accurate that u does not reach their accuracy until t = 1.5: on 16 cells the error of
+u is 1.7e-5, that of the elements 3e-7. The difference is r, which is not zero as long as q still
+changes: it vanishes at t = 6, or at t = 1.5 with a gain of 1e7. A second table shows both.
 
-The error of q is more than that of the elements, too, and stays: q is seen through the integrals of
-q u v, and no v has values on the boundary, so that parts of q next to it are not seen (A(u) e is
-1e-7 of A(u) q* for the error e on 16 cells at t = 3) and extended smoothly, as outside of omega.
+The error of q also exceeds that of the elements, permanently: q is observed through the integrals
+of q u v, and every v vanishes on the boundary, so that parts of q next to it are unobserved (A(u) e
+is 1e-7 of A(u) q* for the error e on 16 cells at t = 3) and extended smoothly, as outside of omega.
 
-Data of the exact u* ("analytic") go through B(w), which takes two derivatives of them: that costs q
-one order of convergence with first order elements, and their constant is large; elements of class
-C^1 do better: "the required regularity on arguments of the operators M, N" made the paper choose
-them.
+Data of the exact u* ("analytic") enter B(w), which takes two derivatives of them: this costs q one
+order of convergence with first order elements, with a large constant. Elements of class C^1 do
+better: the paper chose them for "the required regularity on arguments of the operators M, N".
 """
 
 from __future__ import annotations
@@ -80,7 +79,7 @@ def u_true(x: Any, t: float) -> Any:
 
 
 def source(d: int) -> Callable[[Any, float], Any]:
-    """Return the f that makes u* the solution for q*, in d dimensions."""
+    """Return the source f for which u* is the solution with q*, in d dimensions."""
 
     def f(place: Any, t: float) -> Any:
         x = np.array([place[k] for k in range(d)])
@@ -91,33 +90,33 @@ def source(d: int) -> Callable[[Any, float], Any]:
 
 
 def ball(x: Any) -> Any:
-    """A ball about the centre."""
+    """Observed ball about the centre, as a predicate."""
     return sum((x[k] - 0.5) ** 2 for k in range(len(x))) < 0.4**2
 
 
 def corner(x: Any) -> Any:
-    """An L-shape: the square without one of its corners."""
+    """Observed L-shape, as a predicate: the square without one of its corners."""
     return (x[0] < 0.6) | (x[1] < 0.6)
 
 
 @dataclass(frozen=True)
-class Setting:
-    """Meshes and elements of one family, and the orders of u and q that discrete data must show.
+class MeshFamily:
+    """Family of meshes and elements, with the expected orders of u and q for discrete data.
 
     Attributes
     ----------
     d
-        Dimension.
+        Space dimension.
     mesh
-        Cells per side -> mesh.
+        Function from cells per side to the mesh.
     cells
         Cells per side, from coarse to fine.
     state, parameter
-        Mesh -> element.
+        Functions from the mesh to the elements of state and parameter.
     u_order, q_order
-        Expected orders less 0.4; None: not checked.
+        Expected orders minus 0.4; None: not checked.
     omega
-        Where u is observed; default everywhere.
+        Predicate of the observed part; default the whole domain.
     """
 
     d: int
@@ -147,30 +146,30 @@ def _tets(n: int) -> Any:
 
 
 SETTINGS = {
-    "1D Hermite": Setting(1, _line, (4, 8, 16), smooth, smooth, None, 1.6),
-    "2D P1": Setting(2, _triangles, (4, 8, 16)),
-    "2D P2, q P1": Setting(2, _triangles, (4, 8), quadratic, linear, 2.6, 1.6),
-    "2D Bogner-Fox-Schmit": Setting(2, _quads, (2, 4, 8), smooth, smooth, 3.3, 1.6),
-    "2D P1, ball": Setting(2, _triangles, (8, 16), q_order=None, omega=ball),
-    "2D P1, L-shape": Setting(2, _triangles, (8, 16), q_order=None, omega=corner),
-    "3D P1": Setting(3, _tets, (3, 6)),
+    "1D Hermite": MeshFamily(1, _line, (4, 8, 16), smooth, smooth, None, 1.6),
+    "2D P1": MeshFamily(2, _triangles, (4, 8, 16)),
+    "2D P2, q P1": MeshFamily(2, _triangles, (4, 8), quadratic, linear, 2.6, 1.6),
+    "2D Bogner-Fox-Schmit": MeshFamily(2, _quads, (2, 4, 8), smooth, smooth, 3.3, 1.6),
+    "2D P1, ball": MeshFamily(2, _triangles, (8, 16), q_order=None, omega=ball),
+    "2D P1, L-shape": MeshFamily(2, _triangles, (8, 16), q_order=None, omega=corner),
+    "3D P1": MeshFamily(3, _tets, (3, 6)),
 }
 
 
 @dataclass(frozen=True)
-class Errors:
+class MeshErrors:
     """Relative L2 errors of one run against the formulas.
 
     Attributes
     ----------
     n, m
-        Unknowns of state and parameter.
+        Numbers of unknowns of state and parameter.
     u, q, everywhere
-        Errors of u, of q on omega, and of q on all of Omega.
+        Relative errors of u, of q on omega, and of q on all of Omega.
     elements
-        Error of the projection of u* onto the elements.
+        Projection error of u* onto the elements.
     failed
-        Steps that failed.
+        Number of failed steps.
     """
 
     n: int
@@ -182,7 +181,7 @@ class Errors:
     failed: int
 
 
-def build(setting: Setting, cells: int) -> tuple[Model, Observation]:
+def build(setting: MeshFamily, cells: int) -> tuple[Model, Observation]:
     """Return model and observation."""
     mesh = setting.mesh(cells)
     model = Model(
@@ -196,7 +195,7 @@ def build(setting: Setting, cells: int) -> tuple[Model, Observation]:
 
 
 def identify(
-    setting: Setting,
+    setting: MeshFamily,
     cells: int,
     truth: Truth = "discrete",
     what: str = "",
@@ -204,7 +203,7 @@ def identify(
     *,
     gain: float = GAIN,
     end: float = END,
-) -> Errors:
+) -> MeshErrors:
     """Run the paper's method on one mesh."""
     times = STEP * np.arange(round(end / STEP) + 1)
     model, sensors = build(setting, cells)
@@ -223,7 +222,7 @@ def identify(
     found = track(identifier, twin, what, progress)
     q, u = next(iter(model.parameter_space.fields.values())), model.state_block
     exact = partial(u_true, t=end)
-    return Errors(
+    return MeshErrors(
         model.X.dim,
         model.Q.dim,
         distance(u, found.last.u, exact),
@@ -248,7 +247,7 @@ def order(cells: Sequence[int], errors: Sequence[float]) -> float:
 
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
-    """Run all settings on all of their meshes."""
+    """Run all families on all of their meshes."""
     errors = {
         name: [
             identify(setting, n, truth, f"{name}, {n} cells", progress)  # type: ignore[arg-type]
@@ -312,8 +311,8 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     )
 
 
-def _in_time(first: Errors, progress: bool) -> tuple[Table, list[Check]]:
-    """Return the errors of the finest mesh on a line for longer runs and a higher gain."""
+def _in_time(first: MeshErrors, progress: bool) -> tuple[Table, list[Check]]:
+    """Return table and checks of the finest line mesh for longer runs and a higher gain."""
     setting = SETTINGS["1D Hermite"]
     runs = {(GAIN, END): first}
     for gain, end in ((GAIN, 2 * END), (GAIN, SETTLED), (100 * GAIN, END)):
@@ -336,7 +335,7 @@ def _in_time(first: Errors, progress: bool) -> tuple[Table, list[Check]]:
     ]
 
 
-def _figure(errors: dict[str, list[Errors]]) -> Any:
+def _figure(errors: dict[str, list[MeshErrors]]) -> Any:
     """Draw the errors of q over the cells per side."""
     drawn, axes = plots.figure()
     for name, group in errors.items():
@@ -354,10 +353,11 @@ DIMENSIONS = Experiment(
     conduct=run,
 )
 
-# What it must show: error of q on omega on the finest mesh; orders of q with analytic data.
+# Expected results: error of q on omega on the finest mesh; orders of q with analytic data.
 EXPECTED = {"2D P1": 0.002, "2D P1, ball": 0.004, "2D P1, L-shape": 0.004, "3D P1": 0.03}
 ANALYTIC = {"1D Hermite": 1.6, "2D P1": 0.8, "2D Bogner-Fox-Schmit": 1.6, "3D P1": 0.8}
-# In time: error of u over that of the elements, cubic ones on a line; measured 55, 1.11, 1.004.
+# In time: error of u over the projection error of cubic elements on a line; measured 55, 1.11,
+# 1.004.
 SETTLED = 6.0
 UNSETTLED = 50.0
 OF_ELEMENTS = 1.15

@@ -1,9 +1,9 @@
-"""The law beside an independent implementation of the method of Boiger and Kaltenbacher (2016).
+"""Comparison of the law with an independent implementation of Boiger and Kaltenbacher (2016).
 
-`livepde.reproduce.reference` states the method in NumPy, with elements, matrices and a solver of
-its own. Both get the same data here: the same basis functions, loads F_k and measurements, omega a
-union of elements, and no division of a step, for which the data say nothing. So what differs is
-the law: how each step is solved, strictly (`livepde.paper.STRICT`) or as by default.
+`livepde.reproduce.reference` implements the method in NumPy, with its own elements, matrices and
+solver. Both get the same data here: the same basis functions, loads F_k and measurements, omega a
+union of elements, and undivided steps. So differences are due to the law alone: to the solution of
+each step, strict (`livepde.paper.STRICT`) or by default.
 
 Then follow the statements on nu and on the norms of the unobserved part, mesh by mesh, and the
 energy ||e||_Q^2 / gain + ||r||_X^2, which never grows with full, exact data.
@@ -42,20 +42,20 @@ from livepde.reproduce.reference_settings import FULL, PAPER, SETTINGS, TWIN
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.stepping import Advance, Newton
 
-__all__ = ["EXACT", "Agreement", "Course", "Samples", "compare", "follow", "growth", "law"]
+__all__ = ["EXACT", "Agreement", "LawRun", "Samples", "compare", "follow", "growth", "law"]
 
 
 class Loaded(Model):
-    """A model with given loads at the times k h.
+    """Model with prescribed loads at the times k h.
 
     Parameters
     ----------
     loads
-        Coefficients in X*, a row for each time, shape (samples, n).
+        Dual vectors in X*, a row for each time, shape (samples, n).
     h
         Step.
     forms
-        As for `Model`, without f.
+        Forms as for `Model`, without f.
     """
 
     def __init__(self, loads: Array, h: float, **forms: Any) -> None:
@@ -71,7 +71,7 @@ class Loaded(Model):
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """The data of a setting, as the reference makes them; rows are free and fixed coefficients.
+    """Data of a setting from the reference; array rows are free and fixed coefficients.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Samples:
     times
         k h, shape (samples,).
     q_true, U_true
-        Coefficients of q*, and of the true states in rows.
+        Coefficients of q*, and of the true states, one per row.
     z
         Measurements: coefficients on omega, shape (samples, sensors).
     loads
@@ -107,12 +107,12 @@ class Samples:
         return cls(at, times, q, U, data[:, at.observed], F)
 
     def q(self, coefficients: Array) -> Array:
-        """Return values at the quadrature points, along the last axis."""
+        """Return the values of a parameter at the quadrature points, along the last axis."""
         values: Array = coefficients[..., self.at.Q.free] @ self.at.xi.T
         return values
 
     def u(self, coefficients: Array) -> Array:
-        """Return the same of a state."""
+        """Return the values of a state at the quadrature points, along the last axis."""
         values: Array = coefficients[..., self.at.X.free] @ self.at.v.T
         return values
 
@@ -150,8 +150,8 @@ class Samples:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """A run of the law: estimates after each sample, and which samples have status ok.
+class LawRun:
+    """Run of the law: estimates after each sample, and mask of samples with status ok.
 
     Attributes
     ----------
@@ -182,7 +182,7 @@ def law(setting: Setting, newton: Newton) -> GradientLaw:
     )
 
 
-def follow(samples: Samples, law: GradientLaw, halvings: int = 0) -> Course:
+def follow(samples: Samples, law: GradientLaw, halvings: int = 0) -> LawRun:
     """Run a law on the samples of a setting, from q0 and the true initial state."""
     model, observation = samples.build()
     q0 = samples.at.Q.extend(samples.at.Q.interpolate(samples.at.setting.q0))
@@ -191,7 +191,7 @@ def follow(samples: Samples, law: GradientLaw, halvings: int = 0) -> Course:
     pairs = zip(samples.times, samples.z, strict=True)
     estimates = [identifier.step(t, z) for t, z in pairs]
     Q, U, ok = zip(*((e.q, e.u, e.status.ok) for e in estimates), strict=True)
-    return Course(np.array(Q), np.array(U), np.array(ok))
+    return LawRun(np.array(Q), np.array(U), np.array(ok))
 
 
 # --- beside the reference ------------------------------------------------------------------------
@@ -199,7 +199,7 @@ def follow(samples: Samples, law: GradientLaw, halvings: int = 0) -> Course:
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """The law beside the reference in one setting.
+    """Differences between the law and the reference in one setting.
 
     Attributes
     ----------
@@ -215,8 +215,8 @@ class Agreement:
     """
 
     samples: Samples
-    strict: Course
-    default: Course
+    strict: LawRun
+    default: LawRun
     of_strict: tuple[float, float]
     of_default: tuple[float, float]
     residual: float
@@ -228,7 +228,7 @@ class Agreement:
 
     @property
     def apart(self) -> float:
-        """Largest |q - q_strict| by default over samples with status ok, in the unit of q."""
+        """Largest |q - q_strict| of the default run, over samples with status ok."""
         ok, q = self.default.ok & self.strict.ok, self.samples.q
         return float(np.abs(q(self.default.Q[ok] - self.strict.Q[ok])).max())
 
@@ -248,7 +248,7 @@ def compare(setting: Setting) -> Agreement:
     scale_q = _largest(samples.q(found.Q), samples.q(found.q_true))
     scale_u = _largest(samples.u(found.U), samples.u(found.U_true))
 
-    def differences(run: Course) -> tuple[float, float]:
+    def differences(run: LawRun) -> tuple[float, float]:
         ok = run.ok
         of_q, of_u = samples.q(run.Q - found.Q)[ok], samples.u(run.U - found.U)[ok]
         return _largest(of_q) / scale_q, _largest(of_u) / scale_u
@@ -261,7 +261,7 @@ def _largest(*values: Array) -> float:
     return max(float(np.abs(part).max()) for part in values)
 
 
-def errors(samples: Samples, course: Course) -> tuple[float, float]:
+def errors(samples: Samples, course: LawRun) -> tuple[float, float]:
     """Return the relative L2 errors of q and u at the end."""
     at = samples.at
     pairs = (
@@ -282,7 +282,7 @@ def agreements(names: Iterable[str], progress: bool = False) -> dict[str, Agreem
 
 
 def agreement_table(found: Mapping[str, Agreement]) -> Table:
-    """Return the differences, a row for each setting."""
+    """Return the table of differences, a row for each setting."""
     return Table(
         "largest differences from the reference, relative to |q|, |u|: strict, and by default",
         ["setting", "q strict", "u strict", "q", "u", "failed"],
@@ -294,7 +294,7 @@ def agreement_table(found: Mapping[str, Agreement]) -> Table:
 
 
 def agreement_checks(found: Mapping[str, Agreement]) -> list[Check]:
-    """Return checks of the differences, and of what follows from the same runs."""
+    """Return checks of the differences, and of consequences of the same runs."""
     checks = [
         Check(f"difference, {name}, {how}", max(differences), bound, "<=")
         for name, item in found.items()
@@ -330,14 +330,14 @@ def agreement_checks(found: Mapping[str, Agreement]) -> list[Check]:
 
 @dataclass(frozen=True, eq=False)
 class OnMesh:
-    """The paper's example on one mesh.
+    """Results of the paper's example on one mesh.
 
     Attributes
     ----------
     kind, nodes
-        Which mesh.
+        Kind of elements, and number of nodes.
     errors
-        nu -> relative L2 errors of q and u at the end, strict solves.
+        For each nu the relative L2 errors of q and u at the end, strict solves.
     hidden
         ||P u*||_V^ at the start.
     lipschitz
@@ -352,7 +352,7 @@ class OnMesh:
 
     @classmethod
     def of(cls, kind: str, nodes: int) -> OnMesh:
-        """Return all of it."""
+        """Return all results on one mesh."""
         mesh = fitted(nodes, PAPER.omega) if kind == FITTED else np.linspace(0, 1, nodes)
         setting = replace(PAPER, nodes=mesh, cut=False)
         samples = Samples.of(setting)
@@ -369,7 +369,7 @@ class OnMesh:
 
 
 def mesh_table(meshes: Sequence[OnMesh]) -> Table:
-    """Return errors and norms, a row for each mesh."""
+    """Return the table of errors and norms, a row for each mesh."""
     of_nu = [f"{what}, {nu:g}" for nu in NU for what in ("q", "u")]
     return Table(
         "errors of q and, in %, of u by nu; |P u*| in V^; L_C (gain 100, c1 = 1)",
@@ -395,7 +395,7 @@ def _percent(errors: tuple[float, float]) -> tuple[float, float]:
 
 
 def mesh_checks(meshes: Sequence[OnMesh]) -> list[Check]:
-    """Return checks of errors that do not depend on the mesh, and of norms that do not."""
+    """Return checks that errors and norms do not depend on the mesh."""
     checks = []
     for mesh in meshes:
         where = f"{mesh.kind} mesh, {mesh.nodes} nodes"
@@ -419,7 +419,7 @@ def mesh_checks(meshes: Sequence[OnMesh]) -> list[Check]:
 # --- energy --------------------------------------------------------------------------------------
 
 
-def growth(samples: Samples, course: Course) -> float:
+def growth(samples: Samples, course: LawRun) -> float:
     """Return the largest growth of the energy in a step, relative to the energy at the start."""
     at = samples.at
     e = (course.Q - samples.q_true)[:, at.Q.free]
@@ -432,7 +432,7 @@ def growth(samples: Samples, course: Course) -> float:
 
 
 def rules(samples: Samples) -> dict[str, Damping]:
-    """Return damping rules of every kind; bounds of the theory with the constants of the model."""
+    """Return damping rules of every kind, with bounds from the constants of the model."""
     model, observation = samples.build()
     observed = observation.bind(model.state_space, model.X, model.parameter_space)
     MN = diffusion_operator(1.0)
@@ -448,7 +448,7 @@ def rules(samples: Samples) -> dict[str, Damping]:
 
 
 def energies(progress: bool = False) -> list[tuple[str, str, float, float]]:
-    """Return (setting, rule, growth with strict solves, growth as a user gets it)."""
+    """Return (setting, rule, growth with strict solves, growth with default solves)."""
     found = []
     for name, setting in ENERGIES.items():
         samples = Samples.of(setting)
@@ -529,7 +529,7 @@ EXACT = Experiment(
     conduct=run,
 )
 
-# What it must show. Differences of q and u from the reference, relative to the largest |q|, |u|.
+# Expected results. Differences of q and u from the reference, relative to the largest |q|, |u|.
 STRICT, DEFAULT = 1e-6, 1e-3
 APART = 0.01  # |q - strict| by default with 0.1 % data error, whatever the unit of u; q* is 2
 DRAWN = ("partial", "partial, nu = 0.01", "scaled, S = 1e3, error 0.1 %")

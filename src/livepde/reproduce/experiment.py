@@ -1,4 +1,4 @@
-"""What an experiment is, and the one loop all of them share."""
+"""Experiments of the command line, and their common run loop."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Experiment:
     Attributes
     ----------
     name
-        As the command line calls it.
+        Name on the command line.
     summary
         One sentence.
     truths
-        Kinds of truth it can run with (see `Twin`), the default first.
+        Supported kinds of truth (see `Twin`), the default first.
     conduct
-        (truth, progress) -> outcome.
+        Function (truth, progress) -> outcome.
     """
 
     name: str
@@ -45,9 +45,9 @@ class Experiment:
         Parameters
         ----------
         truth
-            Where the data come from; default the first of `truths`.
+            Origin of the data; default the first of `truths`.
         progress
-            Show a bar for every run.
+            True: show a progress bar for every run.
 
         Raises
         ------
@@ -65,7 +65,7 @@ class Experiment:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A run beside its truth.
+    """Run with the errors against its truth.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Track:
     u_error
         Relative error of the state in X at the end.
     divided
-        Samples whose step had to be divided. A divided step has another truncation error than the
+        Number of samples with a divided step. A divided step has another truncation error than the
         truth, which is enough to hide a parameter as small as the paper's.
     """
 

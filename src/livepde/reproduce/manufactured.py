@@ -1,4 +1,4 @@
-"""A model whose source makes a given state the exact solution of the discrete process."""
+"""Manufactured solutions: a source that makes a given state the exact discrete solution."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ __all__ = ["Manufactured"]
 class Manufactured(Model):
     """A model with a discrete source, F_k = M (U_k - U_{k-1})/h + B(U_k) + A(U_k) q*.
 
-    U_k are the coefficients of u*(t_k), so implicit Euler with step h has exactly U as solution
-    for q = q*, whether the process is well posed or not: with D < 0 one cannot simulate it, but it
+    U_k are the coefficients of u*(t_k), so that implicit Euler with step h has exactly U as
+    solution for q = q*, even if the process is ill-posed: with D < 0 it cannot be simulated, but it
     can be observed.
 
     Parameters
@@ -26,9 +26,9 @@ class Manufactured(Model):
     q_true, u_true
         The exact parameter and state, functions of x and of (x, t).
     h
-        Step of the estimator.
+        Time step of the estimator.
     forms
-        As for `Model`, without f.
+        Forms as for `Model`, without f.
     """
 
     def __init__(

@@ -63,12 +63,12 @@ TOLERANCE = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class LineSpace:
-    """Finite elements on a mesh of (0, 1).
+    """Finite element space on a mesh of (0, 1).
 
     Parameters
     ----------
     nodes
-        Increasing, from 0 to 1: x_1, ..., x_N of section 4.
+        Increasing coordinates from 0 to 1: x_1, ..., x_N of section 4.
     kind
         "P1"; "hermite": cubic, with the dofs [value, slope] node by node; "constant": one number.
     ends
@@ -199,7 +199,7 @@ class Discretisation:
     X, Q
         Spaces of state and parameter.
     x, weights, inside
-        Quadrature points and weights, and which of the points lie in omega.
+        Quadrature points and weights, and mask of the points in omega.
     v, xi
         Basis functions of X and Q at the points.
     M, M_in, B_in, B_out, M_op, N_op, G_Q
@@ -264,7 +264,7 @@ class Discretisation:
         return float(sizes[0] / (sum(sizes[1:]) or 1.0))
 
     def relative_Q(self, *terms: Array) -> float:
-        """Return the same for functionals on Q."""
+        """Return the norm of the sum of functionals on Q, relative to the sum of their norms."""
         sizes = [np.linalg.norm(self._Q @ term) for term in (sum(terms), *terms)]
         return float(sizes[0] / (sum(sizes[1:]) or 1.0))
 
@@ -320,7 +320,7 @@ class Step:
     def q(self, r: Array) -> Array:
         """Return the solution q of the equation of q, which is linear, for a given r.
 
-        The equation of u with this q inserted has a scaling that does not depend on the gain.
+        The equation of u with this q inserted has a scaling independent of the gain.
         """
         return self.q_old / (1 + self.at.setting.sigma * self.at.setting.h) + self._dq @ r
 
@@ -368,8 +368,8 @@ class Step:
     def newton(self, r: Array, theta: float | None = None) -> Array:
         """Solve the equation of u with q(r) by damped Newton, for theta(r) or a given theta.
 
-        It ends where no part of a Newton step decreases the residual any more: it is solved to
-        rounding then, or stuck, and the caller has to look.
+        The iteration ends when no fraction of a Newton step decreases the residual: the equation is
+        then solved to rounding, or the iteration has stalled. The caller has to test the residual.
         """
         at = self.at
 
@@ -383,7 +383,7 @@ class Step:
             if share <= 1e-15:
                 break
             change = np.linalg.solve(self.jacobian(r, theta), -residual)
-            # Next to rounding, shorter steps do not help where a full one does not.
+            # Close to rounding level, shorter steps do not help if a full one does not.
             for length in 0.5 ** np.arange(12 if share > 1e-13 else 1):
                 trial = equation(r + length * change)
                 if trial[1] < size:
@@ -396,19 +396,19 @@ class Step:
     def solve(self, theta: float) -> tuple[Array, Array, float]:
         """Return r, q and their residual.
 
-        With theta held, Newton is safe: only A_out(u) q is nonlinear then. So theta is a root of
-        theta(r(theta)) - theta, a scalar function. It is bracketed, from a start, on the side that
-        the sign at the start tells; the bracket is halved until Newton on all of the equation,
-        with the derivative of theta, ends within it.
+        For fixed theta Newton is robust, since only A_out(u) q is nonlinear. Therefore theta is
+        computed as a root of the scalar function theta(r(theta)) - theta. It is bracketed from a
+        starting value, in the direction given by the sign there; the bracket is halved until Newton
+        on the full equation, with the derivative of theta, ends within it.
 
-        There may be several roots: c1 ||r||_X^2 / ||r||_VX~^2 turns with the shape of r, which for
-        nu > 0 need not tend to zero. With theta of the step before as start the solution is
-        the one that continues that step.
+        There may be several roots: c1 ||r||_X^2 / ||r||_VX~^2 depends on the shape of r, which for
+        nu > 0 need not tend to zero. Starting with theta of the previous step selects the solution
+        that continues it.
 
         Raises
         ------
         ArithmeticError
-            If the residual stays above TOLERANCE.
+            The residual stays above TOLERANCE.
         """
         old = self.u_old - self.u_alpha
         r = self._continued(np.log(theta), old) if theta > 0 else self.newton(old)
@@ -421,7 +421,7 @@ class Step:
         return r, q, residual
 
     def _continued(self, near: float, r: Array) -> Array:
-        """Return r for the root log theta that is next to `near` on the side `solve` tells."""
+        """Return r for the root log theta next to `near`, in the direction stated in `solve`."""
 
         def mismatch(log_theta: float, r: Array) -> tuple[float, Array]:
             r = self.newton(r, np.exp(log_theta))
@@ -497,12 +497,12 @@ def truth(at: Discretisation, times: Array) -> tuple[Array, Array, Array]:
 
 
 def run(setting: Setting) -> Trajectory:
-    """Make the data of a setting and run the method on them.
+    """Generate the data of a setting and run the method on them.
 
     Raises
     ------
     ArithmeticError
-        If a step is not solved.
+        A step is not solved.
     """
     at = Discretisation(setting)
     times = setting.h * np.arange(setting.steps + 1.0)
@@ -526,7 +526,7 @@ def run(setting: Setting) -> Trajectory:
 def residuals(at: Discretisation, Q: Array, U: Array, Z: Array, F: Array) -> Array:
     """Return the relative residual of each step of any trajectory, rows as in `Trajectory`.
 
-    Where a step has several solutions, this tells whether a trajectory is one of them.
+    If a step has several solutions, a small residual shows that a trajectory is one of them.
     """
     q, (u, z, f) = Q[:, at.Q.free], (rows[:, at.X.free] for rows in (U, Z, F))
     steps = [Step(at, u[k - 1], q[k - 1], z[k], f[k]) for k in range(1, len(u))]

@@ -14,12 +14,12 @@ __all__ = ["FULL", "PAPER", "SETTINGS", "TWIN", "VARYING", "scaled"]
 
 
 def paper_q(x: Any) -> Any:
-    """q* of section 4."""
+    """Parameter q* of section 4."""
     return 0.025 * x**2 - 0.025 * x
 
 
 def paper_u(x: Any, t: float) -> Any:
-    """u* of section 4."""
+    """State u* of section 4."""
     return np.sin(np.pi * x) / (1 + t)
 
 
@@ -29,22 +29,22 @@ def paper_f(x: Any, t: float) -> Any:
 
 
 def twin_q(x: Any) -> Any:
-    """q* of a process that stays excited."""
+    """Parameter q* of a persistently excited process."""
     return 2 + 3 * np.sin(np.pi * x) ** 2
 
 
 def twin_u(x: Any, t: float) -> Any:
-    """u* of a process that stays excited."""
+    """State u* of a persistently excited process."""
     return (1 + np.sin(t) / 2) * np.sin(np.pi * x) + np.cos(0.7 * t) / 2 * np.sin(2 * np.pi * x)
 
 
 def varying_D(x: Any) -> Any:
-    """D > 0 that varies by a factor of nine."""
+    """Positive diffusivity D that varies by a factor of nine."""
     return 1 + 0.8 * np.sin(2 * np.pi * x)
 
 
 def wave(size: float, x: Any, t: float) -> Any:
-    """Smooth error of data."""
+    """Smooth data error."""
     return size * np.sin(2 * np.pi * x) * np.cos(t)
 
 

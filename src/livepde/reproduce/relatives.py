@@ -1,4 +1,4 @@
-"""The paper's law beside its two relatives, on the same data.
+"""Comparison of the paper's law with two related laws on the same data.
 
 The paper's example and the excited twin, exact discrete data, all of the state and a part of it
 observed; the laws of Boiger and Kaltenbacher (2016), Baumeister et al. (1997) and Kügler (2010)
@@ -36,7 +36,7 @@ Key = tuple[str, str, str, float]
 
 
 def law(name: str, gain: float, pull: float) -> AnyLaw:
-    """Return a law by its name: the pull is c_1 of the paper's rule, or mu."""
+    """Return a law by its name; the pull is c_1 of the paper's rule, or mu."""
     if name == LAWS[0]:
         return paper.law(gain, ResidualDamping(pull))
     return (BaumeisterLaw if name == LAWS[1] else KueglerLaw)(gain, pull, paper.STRICT)
@@ -149,7 +149,7 @@ RELATIVES = Experiment(
     conduct=run,
 )
 
-# What it must show: largest relative L2 error of q at t = 60 over the pulls 0.1, 1 and 10. For the
+# Expected results: largest relative L2 error of q at t = 60 over the pulls 0.1, 1 and 10. For the
 # paper's law with partial data of the seed 0.072 was measured, with the splitting by integrals.
 EXPECTED = {
     ("seed", "full", "Boiger, Kaltenbacher"): 0.05,

@@ -4,12 +4,12 @@
 
 with D = 1, q* = 0.025 x^2 - 0.025 x, u* = sin(pi x)/(1 + t), N = 31 cubic Hermite nodes, implicit
 Euler with h = 0.6 to t = 60, omega = (0.3, 0.87), exact data, q^(0) = 0: their first figure. The
-paper does not name the inner product's scale (`gain`); the table shows what it does.
+paper does not state the scale of the inner product (`gain`); the table shows its effect.
 
 All settings are the paper's (`livepde.paper`). Its space has no slope functions at the ends, where
-u* and q* have slopes; a second table keeps them, as `Field` does by default, and adds the law that
-tunes itself. omega is the union of the elements within (0.3, 0.87), up to 26/30: the uniform mesh
-has no node at 0.87.
+u* and q* have slopes; a second table keeps them, as `Field` does by default, and adds the
+self-tuning law. omega is the union of the elements within (0.3, 0.87), up to 26/30: the uniform
+mesh has no node at 0.87.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ def u_true(x: Any, t: float) -> Any:
 
 
 def f(x: Any, t: float) -> Any:
-    """The source that makes u* the solution for q*."""
+    """The source for which u* is the solution with q*."""
     return (D * np.pi**2 - 1 / (1 + t) + q_true(x)) * u_true(x, t)
 
 
 def build(std: float = 1.0, nodes: int = N, *, clamped: bool = False) -> tuple[Model, Subdomain]:
-    """Return the paper's model, with a prior deviation of q, and observation.
+    """Return the paper's model, with a prior standard deviation of q, and observation.
 
     Parameters
     ----------
     std
-        Prior deviation of q.
+        Prior standard deviation of q.
     nodes
-        Of the uniform mesh.
+        Number of nodes of the uniform mesh.
     clamped
-        Take the paper's space, which has no slope functions at the ends; else they are kept.
+        True: the paper's space, which has no slope functions at the ends; False: they are kept.
     """
     mesh = interval(0, 1, nodes - 1)
     element = hermite(mesh)
@@ -95,7 +95,7 @@ def identify(twin: Twin, gain: float, c1: float, progress: bool = False) -> Trac
 
 
 def start(x: Any) -> Any:
-    """The exact state at t = 0, which all runs start from."""
+    """The exact state at t = 0, the initial state of all runs."""
     return u_true(x, 0.0)
 
 
@@ -173,7 +173,7 @@ def _learned(
     kept: dict[tuple[float, float], Track],
     effect: float,
 ) -> tuple[Any, Any]:
-    """Checks and words for data of the same scheme: q is found."""
+    """Return checks and sentences for data of the same scheme: q is found."""
     checks = [
         Check(
             f"error of q at t = 60, {_label(gain, c1)}{where}",
@@ -223,7 +223,7 @@ def _learned(
 
 
 def _hidden(twin: Twin, tracks: dict[tuple[float, float], Track], effect: float) -> tuple[Any, Any]:
-    """Checks and words for data of the exact solution: the scheme's own error hides q."""
+    """Return checks and sentences for data of the exact solution: the scheme's error hides q."""
     early, late = ([found.error(t) for found in tracks.values()] for t in (6.0, 60.0))
     truncation = _distance(twin_of(clamped=False), twin)
     source = "the exact u*" if twin.truth == "analytic" else "a run with 20 times smaller steps"
@@ -274,8 +274,8 @@ SEED = Experiment(
     conduct=run,
 )
 
-# What it must show: (gain, c1) -> relative L2 error of q at t = 60 with discrete truth, measured
-# with the dense implementation in reference.py: `run(Setting(..., state_ends="clamped",
+# Expected results: for each (gain, c1) the relative L2 error of q at t = 60 with discrete truth,
+# measured with the dense implementation in reference.py: `run(Setting(..., state_ends="clamped",
 # parameter_ends="clamped", omega=(0.3, 0.87)))`, and the same with "zero". The laws agree with it
 # in all these digits. They are those of the paper's splitting, by integrals over omega; with R and
 # P that select coefficients the second table is 0.80, 0.06, 0.12, 0.04, 0.04, which is no method of
@@ -295,7 +295,8 @@ WITH_SLOPES = {
     (1e4, 1.0): 0.0643,
 }
 TOLERANCE = 0.02
-AUTO = 0.06  # without a hand-set gain
+# Bound on the error of the self-tuning law, without a hand-set gain.
+AUTO = 0.06
 LIKE_PAPER = (100.0, 1.0)
 BEST = (1e4, 1.0)
 SETTLED = ((1e4, 0.1), (1e4, 1.0))

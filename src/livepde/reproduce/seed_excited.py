@@ -1,4 +1,4 @@
-"""The excited twin: the paper's equation with a state that keeps moving.
+"""The excited twin: the paper's equation with a persistently exciting state.
 
 In the paper's example the state decays like 1/(1 + t), and with it all information on q. Here
 
@@ -33,7 +33,8 @@ D = 1.0
 N = 31
 TIMES = 0.05 * np.arange(1201)
 SHOWN = (0.0, 0.5, 2.0, 10.0, 60.0)
-NOISE_LEVEL = 1e-3  # told to the sensitivity law; the data are exact
+# Noise level passed to the sensitivity law, although the data are exact.
+NOISE_LEVEL = 1e-3
 
 
 def q_true(x: Any) -> Any:
@@ -48,7 +49,7 @@ def u_true(x: Any, t: float) -> Any:
 
 
 def f(x: Any, t: float) -> Any:
-    """The source that makes u* the solution for q*."""
+    """The source for which u* is the solution with q*."""
     first, second = np.sin(np.pi * x[0]), np.sin(2 * np.pi * x[0])
     rate = np.cos(t) / 2 * first - 0.35 * np.sin(0.7 * t) * second
     curvature = (1 + np.sin(t) / 2) * first + 4 * np.cos(0.7 * t) / 2 * second
@@ -56,7 +57,7 @@ def f(x: Any, t: float) -> Any:
 
 
 def build(std: float = 1.0) -> tuple[Model, Full]:
-    """Return model, with a prior deviation of q, and observation."""
+    """Return model, with a prior standard deviation of q, and observation."""
     mesh = interval(0, 1, N - 1)
     element = hermite(mesh)
     model = Model(
@@ -175,5 +176,6 @@ SEED_EXCITED = Experiment(
     conduct=run,
 )
 
-# What it must show: law -> bound on the relative L2 error of q at t = 60, exact discrete data.
+# Expected results: for each law a bound on the relative L2 error of q at t = 60, exact discrete
+# data.
 EXPECTED = {"gradient": 0.005, "sensitivity": 0.001}

@@ -229,7 +229,7 @@ def tables(data: xr.Dataset) -> list[Table]:
                 cells.append(shown(float(data[label].attrs.get("reference", math.nan)), ".5g"))
                 cells.append(shown(100 * _error(data, label), ".2g", " %"))
             rows.append((label, *cells))
-        columns: tuple[str, ...] = ("unknown", "value", "± deviation", "95 %", "unit")
+        columns: tuple[str, ...] = ("unknown", "value", "± std. dev.", "95 %", "unit")
         title = "Estimates"
         if compared:
             columns += ("reference", "error")
@@ -246,7 +246,7 @@ def tables(data: xr.Dataset) -> list[Table]:
             numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
             unit = data[name].attrs.get("units", "")
             rows.append((name, *numbers, shown(deviation, ".2g"), _left_out(data, name), unit))
-        columns = ("field", "least", "mean", "largest", "mean deviation", "left-out modes", "unit")
+        columns = ("field", "least", "mean", "largest", "mean std. dev.", "left-out modes", "unit")
         result.append(Table("Estimated fields", columns, rows))
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
@@ -295,7 +295,7 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
         count, told = int(modes.attrs["of"]), float(modes[-1])
         share = math.sqrt(max(1.0 - told / count, 0.0)) if count else math.nan
         rows.append((name, _share(share), f"{told:.1f} of {count} modes told"))
-    return Table("What the data have told", ("unknown", "prior deviation left", "state"), rows)
+    return Table("What the data have told", ("unknown", "prior std. dev. left", "state"), rows)
 
 
 def _share(left: float) -> str:

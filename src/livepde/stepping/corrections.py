@@ -16,9 +16,15 @@ from livepde.stepping.newton import StepFailed
 
 __all__ = ["At", "Corrections", "Kept", "solved"]
 
-SHARE = 1e-2  # of what a stage changes: the error is at most this, however slow the process
-ROUNDING = 1e-11  # relative corrections below this are the end of what arithmetic can do
-SLOW = 0.3  # a factor whose corrections leave more than this share of the error is made again
+# Bound on the error of a stage relative to the change of the state in it, so that the accuracy does
+# not depend on how slow the process is.
+SHARE = 1e-2
+# Relative size of a correction at the level of accumulated rounding errors: further corrections
+# would not improve the solution.
+ROUNDING = 1e-11
+# A factor with a contraction rate above this is replaced: five corrections would gain fewer than
+# three digits.
+SLOW = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +126,8 @@ class Corrections:
             update = solved(self.factor(*self.factor_at), r)
             x, count = x + update, count + 1
             moved, size = float(np.linalg.norm(update)), float(np.linalg.norm(x))
+            # The factor of the stage's own matrix needs no iteration, and at rounding level
+            # corrections only exchange rounding errors.
             if exact or moved <= ROUNDING * size:
                 return x
             last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
@@ -127,6 +135,7 @@ class Corrections:
             # the new iterate is needed anyway for the next correction.
             rate = float(np.linalg.norm(r)) / last if last else math.inf  # squares may underflow
             if rate <= SLOW:
+                # The remaining error is the geometric series of all further corrections.
                 left = moved * rate / (1.0 - rate)
                 change = float(np.linalg.norm(x - before))
                 allowed = max(min(tolerance * size, SHARE * change), ROUNDING * size)

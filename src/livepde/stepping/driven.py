@@ -13,8 +13,11 @@ from livepde.stepping.span import Moments
 
 __all__ = ["DrivenVector"]
 
-SCALES = (1e-3, 1.0, 1e3, 1e6)  # of random inputs that tell whether a vector is affine in them
-ROUNDING = 1e-11  # relative: less is no curvature
+# Magnitudes of the random inputs with which affinity is tested: a kink or saturation may lie far
+# from one.
+SCALES = (1e-3, 1.0, 1e3, 1e6)
+# Relative deviation from affinity that is attributed to rounding in the assembly.
+ROUNDING = 1e-11
 # Inputs at which responses are measured: so large that subtracting the vector without inputs
 # cancels no digits, and a power of two so that the division is exact.
 LARGE = 2.0**20
@@ -102,6 +105,7 @@ class DrivenVector:
             return self.vector(at.member(0))[None]
         base = self._at(at.t, np.zeros(len(self.channels)))
         total = base[None]
+        # Affine in the inputs, but time-dependent: one evaluation per channel serves all members.
         largest_inputs = np.abs(at.inputs[:, : len(self.channels)]).max(axis=0)
         for c, largest in enumerate(largest_inputs):
             if largest > 0.0:  # a difference at the size of the values: no digits are lost

@@ -19,7 +19,8 @@ from livepde.stepping.schemes import Scheme, Stage
 
 __all__ = ["Advance", "Interval", "advance", "own_noise"]
 
-MOST_HALVINGS = 30  # beyond, a substep is shorter than what times resolve
+# Beyond this number of halvings a substep would be shorter than the resolution of usual times.
+MOST_HALVINGS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,8 @@ class Interval:
         if count == 1:
             return [self]
         share = [k / count for k in range(count + 1)]
+        # The ends are the given values, not interpolated ones, so that dividing an interval does
+        # not change a digit there.
         times = [self.t0, *(self.t0 + s * (self.t1 - self.t0) for s in share[1:-1]), self.t1]
         inputs = [self.inputs0, *(self.at(t).inputs for t in times[1:-1]), self.inputs1]
         z = [self.z0, *(self.z(t) for t in times[1:-1]), self.z1]
@@ -165,6 +168,8 @@ def _width(t: float, stop: float) -> float:
     Differences of equidistant times differ in their last digits. Rounding makes them identical, so
     that a matrix factorised for one step length serves all equal steps.
     """
+    # The unit is 16 units in the last place of the larger time. Very short widths are not rounded,
+    # as that would change more than their last digits.
     unit = math.ldexp(1.0, math.frexp(max(abs(t), abs(stop)))[1] - 49)
     width = stop - t
     return round(width / unit) * unit if width > 1e6 * unit else width
@@ -204,6 +209,8 @@ def advance(
             continue
         steps += 1
         tick += stride
+        # A stride is doubled only at a multiple of its double, so that substeps stay on the grid of
+        # halvings.
         if stride < 1 << control.halvings and tick % (2 * stride) == 0:
             stride <<= 1
     return y, steps, None

@@ -33,9 +33,14 @@ from livepde.stepping.newton import StepFailed
 from livepde.stepping.span import Moments
 from livepde.stepping.state import ForwardStage
 
-GAIN = 1e-4  # relative error of a square root of the covariance: it steers the gain only
-ESTIMATE = 1e-8  # of the estimated deviation of the state
-MOST_UNKNOWNS = 64  # of which each has a matrix of its own
+# Relative error of a covariance square root. It affects the gain only, not the innovation, and may
+# be coarser than the state.
+GAIN = 1e-4
+# Relative error of the tangent that carries the estimated mean, as accurate as the state itself.
+ESTIMATE = 1e-8
+# Largest number of unknowns with an assembled matrix A_j each: the cost of summing them grows
+# linearly.
+MOST_UNKNOWNS = 64
 
 __all__ = [
     "BandedStage",

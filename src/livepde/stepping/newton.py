@@ -15,9 +15,13 @@ from livepde.linalg import Array, Factor
 
 __all__ = ["TINY", "Near", "Newton", "Solution", "StageEquation", "StagePoint", "StepFailed"]
 
-TINY = 1e-300  # what is zero counts as this large
-HALVINGS = 8  # of a Newton update that does not reduce the residual
-FACTORS = 3  # made from a prediction before the iteration begins anew from the ordinary start
+# Lower bound of a divisor that may be zero.
+TINY = 1e-300
+# Maximum number of halvings of a Newton update that does not reduce the residual.
+HALVINGS = 8
+# Maximum number of factorisations from a prediction. A prediction that needs more was misleading,
+# and the iteration restarts from the ordinary initial iterate.
+FACTORS = 3
 
 
 class StepFailed(Exception):
@@ -172,6 +176,8 @@ class Newton:
             with suppress(StepFailed):  # the prediction was no good one
                 return iteration.run(at, near, allowed, FACTORS)
         at = equation.evaluate(start() if callable(start) else start)
+        # Without a prediction the residual at the start does not measure the truncation error, so
+        # the strict tolerance holds.
         return iteration.run(at, Near(at.y), self.tolerance, self.iterations)
 
 

@@ -30,10 +30,15 @@ from livepde.stepping.newton import TINY, Newton, StepFailed
 
 __all__ = ["ForwardStage"]
 
-STATE = 1e-8  # relative error of the state that corrections with a kept factor leave
-ROUNDING = 1e-15  # times the sizes of all terms: what their sum is exact to
-PASSES = 2  # corrections of the state by the factor of a q nearby; those of tangents are one less
-LINEAR = 1e-12  # relative asymmetry that is rounding
+# Relative error of a state that is solved with a reused factor.
+STATE = 1e-8
+# Relative rounding error of a sum of terms, in units of the sizes of its terms.
+ROUNDING = 1e-15
+# Expected corrections of the state with a factor of a nearby q; tangents need one less. Only
+# corrections beyond it count as excess solves.
+PASSES = 2
+# Relative asymmetry that is attributed to rounding in the assembly.
+LINEAR = 1e-12
 
 
 class ForwardStage:
@@ -89,6 +94,8 @@ class ForwardStage:
         """
         if not self.keeps:
             return False
+        # One random parameter suffices, with probability one, if the matrix is linear in q;
+        # `_factorise` tests every matrix again.
         model, rows = self.model, self._free[1]
         some = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
         inputs = Inputs(dict.fromkeys(model.channels, 1.0))
@@ -329,6 +336,8 @@ class ForwardStage:
                     new[:, part] = solved(tangent, driven(u, part) * free)
             return new, kept
         at, keeps = At(q, h), len(kept.q) > 0
+        # Linear extrapolation in time predicts the state; the error of the predictor decides how
+        # many corrections are needed.
         guess = begin + h * kept.trend if keeps else begin
         system = self._system(q, h, moment)
         known = self._known(begin, system, q, h, moment)
