@@ -552,14 +552,16 @@ def peers(
     _report(context, outcome, as_json)
 
 
-KILLS, LENGTH, BROKEN = Count(200, 4), Count(2000, 400), Count(100_000, 2000)
+KILLS, LENGTH, BROKEN = Count(600, 6), Count(2000, 400), Count(100_000, 2000)
 FLIPS = Count(200, 20)
 
 
 @app.command()
 def faults(
     context: typer.Context,
-    kills: Annotated[int, KILLS.option("Kills, with a file and with a broker.")] = KILLS.usual,
+    kills: Annotated[
+        int, KILLS.option("Kills in all, over a file, standard input and a broker.")
+    ] = KILLS.usual,
     samples: Annotated[
         int, LENGTH.option("Samples of a run that is killed.", least=50)
     ] = LENGTH.usual,
@@ -569,10 +571,11 @@ def faults(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            help="One of file, mqtt, restart, malformed, messages, journals, clocks, visitors, "
-            "cases. Repeat it."
+            help="One of file, stdin, mqtt, restart, malformed, messages, journals, clocks, "
+            "visitors, cases. Repeat it."
         ),
     ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Runs that are killed at a time.")] = 1,
     quick: Annotated[
         bool,
         typer.Option(
@@ -597,6 +600,7 @@ def faults(
         FLIPS.of(context, "flips"),
         seed,
         only or (),
+        workers,
         progress=True,
     )
     _report(context, outcome, as_json)

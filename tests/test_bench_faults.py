@@ -31,14 +31,15 @@ def failed(outcome) -> list[str]:
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("part", ["file", pytest.param("mqtt", marks=MQTT)])
+@pytest.mark.parametrize("part", ["file", "stdin", pytest.param("mqtt", marks=MQTT)])
 def test_runs_are_killed_and_lose_nothing(part):
-    pytest.importorskip("paho.mqtt")
+    if part == "mqtt":
+        pytest.importorskip("paho.mqtt")
     outcome = faults.faults(kills=2, samples=100, only=[part], seed=2)
     assert not failed(outcome)
     (table,) = outcome.tables
     assert table.rows[0][0] >= 1
-    assert sum(table.rows[0][1:5]) == 2
+    assert sum(table.rows[0][1:5]) >= 2
 
 
 @pytest.mark.broker
@@ -212,7 +213,7 @@ def test_the_commands_print_json(monkeypatch):
     code, out = bench("faults", "--kills", "7", "--only", "file", "--json")
     assert code == 0
     assert json.loads(out)["command"].endswith(
-        "--kills 7 --samples 2000 --malformed 100000 --flips 200 --seed 0 --only file"
+        "--kills 7 --samples 2000 --malformed 100000 --flips 200 --seed 0 --only file --workers 1"
     )
     with pytest.raises(lp.ConfigurationError, match="there is no part 'nothing'"):
         bench("faults", "--only", "nothing")

@@ -1,4 +1,4 @@
-"""What brings rows to a run: a file that grows, and topics of a broker that can be stopped."""
+"""What brings rows to a run: a file that grows, standard input, topics of a broker."""
 
 from __future__ import annotations
 
@@ -7,17 +7,29 @@ import os
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from benchmarks.faults.rod import Row
+from benchmarks.faults.rod import STEP, Row
 from livepde.errors import RunError
 
-__all__ = ["BROKER", "PATIENCE", "GrowingFile", "Mosquitto", "Plant", "Topic", "wait"]
+__all__ = [
+    "BROKER",
+    "PATIENCE",
+    "Feeder",
+    "GrowingFile",
+    "Mosquitto",
+    "Plant",
+    "Topic",
+    "launched",
+    "wait",
+]
 
 PATIENCE = 120.0  # seconds after which a run that does not go on is given up
 BROKER = "/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin:/opt/homebrew/sbin"
@@ -31,8 +43,23 @@ class Plant(Protocol):
     def supply(self, count: int) -> None:
         """Have the first so many rows there."""
 
+    def launch(self, command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
+        """Start a run in its folder."""
+        return launched(command, folder)
 
-class GrowingFile:
+
+def launched(
+    command: Sequence[str],
+    folder: Path,
+    stdin: int | None = None,
+    stdout: int = subprocess.DEVNULL,
+) -> subprocess.Popen[bytes]:
+    """Start a command in a folder, with its log there."""
+    with (folder / "log.txt").open("ab") as log:
+        return subprocess.Popen(command, cwd=folder, stdin=stdin, stdout=stdout, stderr=log)
+
+
+class GrowingFile(Plant):
     """A file that grows, not always by whole lines."""
 
     source = 'file = "rows.csv"\nfollow = true'
@@ -56,7 +83,82 @@ class GrowingFile:
         self._written = end
 
 
-class Topic:
+class Feeder(Plant):
+    """A program that writes rows to the standard input of a run, and reads its estimates.
+
+    Rows up to the last estimate that was printed have been taken for good. A run that is started
+    again is sent all that follows, and often rows before, too.
+
+    Attributes
+    ----------
+    first
+        Number of the row with which the run that was started last was begun.
+    """
+
+    source = ""
+    OVERLAP = (0, 0, 1, 40, 400)  # rows that are sent again without need
+
+    def __init__(self, folder: Path, rows: Sequence[Row], seed: int) -> None:
+        self.first = 0
+        self._lines = [json.dumps(row).encode() + b"\n" for row in rows]
+        self._estimates = folder / "estimates.jsonl"
+        self._rng = np.random.default_rng(seed)
+        self._count = self._known = 0
+        self._changed = threading.Condition()
+        self._fed: subprocess.Popen[bytes] | None = None
+
+    def launch(self, command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
+        """Start a run with a pipe to its standard input."""
+        self._known = max(self._known, self._printed())
+        self.first = max(self._known - int(self._rng.choice(self.OVERLAP)), 0)
+        with self._estimates.open("wb") as out:
+            command = [*command, "--realtime", "--data", "-", "--estimates"]
+            process = launched(command, folder, subprocess.PIPE, out.fileno())
+        self._feed(process)
+        threading.Thread(target=self._pump, args=(process, self.first), daemon=True).start()
+        return process
+
+    def supply(self, count: int) -> None:
+        """Have the first so many rows sent as fast as they are read."""
+        with self._changed:
+            self._count = max(count, self._count)
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Send nothing more."""
+        self._feed(None)
+
+    def _feed(self, process: subprocess.Popen[bytes] | None) -> None:
+        with self._changed:
+            self._fed = process
+            self._changed.notify_all()
+
+    def _printed(self) -> int:
+        """Return the number of rows up to the last estimate of which a whole line was printed."""
+        if not self._estimates.exists():
+            return 0
+        *lines, _ = self._estimates.read_bytes().split(b"\n")
+        return round(json.loads(lines[-1])["t"] / STEP) + 1 if lines else 0
+
+    def _pump(self, process: subprocess.Popen[bytes], k: int) -> None:
+        """Write rows from the k-th on, until another process is to be fed or nobody reads."""
+        pipe = process.stdin
+        if pipe is None:
+            raise RunError("benchmark faults: a run has no standard input.")
+        with suppress(OSError), pipe:
+            while (end := self._asked_for(process, k)) > k:
+                pipe.write(b"".join(self._lines[k:end]))
+                pipe.flush()
+                k = end
+
+    def _asked_for(self, process: subprocess.Popen[bytes], k: int) -> int:
+        """Wait for more than k rows to be asked for; return how many, 0 if others are fed now."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._fed is not process or self._count > k)
+            return self._count if self._fed is process else 0
+
+
+class Topic(Plant):
     """Messages of a broker that keeps them for who is away."""
 
     def __init__(self, broker: Mosquitto, rows: Sequence[Row], name: str) -> None:

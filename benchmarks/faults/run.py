@@ -6,14 +6,21 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from benchmarks.faults.damage import Found
-from benchmarks.faults.plants import PATIENCE, GrowingFile, Mosquitto, Topic, wait
+from benchmarks.faults.plants import (
+    PATIENCE,
+    GrowingFile,
+    Mosquitto,
+    Topic,
+    launched,
+    wait,
+)
 from benchmarks.faults.rod import Row, case_text, rod_rows
 from livepde.errors import RunError
 from livepde.runs import JOURNAL, Journal
@@ -25,8 +32,14 @@ __all__ = ["Run", "hearing", "undisturbed", "undisturbed_journal"]
 class Run:
     """`livepde run` of the case in a folder, as a process that can be killed."""
 
-    def __init__(self, folder: Path, source: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        source: str,
+        launch: Callable[[Sequence[str], Path], subprocess.Popen[bytes]] = launched,
+    ) -> None:
         self.folder = folder
+        self._launch = launch
         self.out = folder / "run"
         self._journal: Journal | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -34,16 +47,19 @@ class Run:
 
     def start(self) -> None:
         command = [sys.executable, "-m", "livepde", "run", "case.toml", "--out", "run", "--resume"]
-        with (self.folder / "log.txt").open("ab") as log:
-            self._process = subprocess.Popen(
-                command, cwd=self.folder, stdout=subprocess.DEVNULL, stderr=log
-            )
+        self._process = self._launch(command, self.folder)
 
     def look(self) -> int:
         """Return how many samples are accepted; a reader is open all the time."""
         if self._journal is None and (self.out / JOURNAL).exists():
             self._journal = Journal.open(self.out / JOURNAL)
         return 0 if self._journal is None else self._journal.accepted
+
+    def counted(self, kind: str) -> int:
+        """Return how many remarks of a kind the journal has."""
+        self.look()
+        counts = {} if self._journal is None else self._journal.counts
+        return sum(number for (what, _), number in counts.items() if what == kind)
 
     @property
     def log_size(self) -> int:
