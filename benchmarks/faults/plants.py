@@ -195,9 +195,12 @@ class Topic(Plant):
 
 
 class Mosquitto:
-    """A broker of its own, with sessions that survive its restart, in a folder of its own."""
+    """A broker of its own, in a folder of its own; sessions survive its restart if they are saved.
 
-    def __init__(self, parent: Path) -> None:
+    It saves all of them with each message then, which costs more than all else.
+    """
+
+    def __init__(self, parent: Path, saved: bool = False) -> None:
         program = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:{BROKER}")
         if program is None:
             raise RunError(
@@ -211,12 +214,11 @@ class Mosquitto:
         folder = parent / "broker"
         folder.mkdir()
         config = folder / "mosquitto.conf"
-        user = "user root\n" if os.geteuid() == 0 else ""
-        config.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence true\n"
-            f"persistence_location {folder}/\nautosave_interval 1\nautosave_on_changes true\n"
-            f"max_queued_messages 0\n{user}"
-        )
+        text = f"listener {self.port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n"
+        if saved:
+            text += f"persistence true\npersistence_location {folder}/\n"
+            text += "autosave_interval 1\nautosave_on_changes true\n"
+        config.write_text(text + ("user root\n" if os.geteuid() == 0 else ""))
         self._command = [program, "-c", str(config)]
         self.start()
 

@@ -132,12 +132,12 @@ class Run:
 
 
 @contextmanager
-def hearing(rows: Sequence[Row]) -> Iterator[tuple[Mosquitto, Topic, Run]]:
+def hearing(rows: Sequence[Row], saved: bool = False) -> Iterator[tuple[Mosquitto, Topic, Run]]:
     """Yield a broker, a topic that has rows, and a run that hears it."""
     with TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name) / "mqtt"
         folder.mkdir()
-        broker = Mosquitto(Path(name))
+        broker = Mosquitto(Path(name), saved)
         stack.callback(broker.close)
         topic = stack.enter_context(closing(Topic(broker, rows, "rod")))
         run = stack.enter_context(closing(Run(folder, topic.source)))
