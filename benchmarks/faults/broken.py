@@ -144,10 +144,11 @@ class Fed:
 
     def table(self, title: str) -> Table:
         """Return what was sent and what was said of it."""
-        rows = [("sent", kind, number) for kind, number in sorted(self.sent.items())]
+        rows: list[tuple[str, str, float]] = []
+        rows += [("sent", kind, number) for kind, number in sorted(self.sent.items())]
         rows += [("counted", kind, number) for kind, number in sorted(self.reasons.items())]
         rows += [("right rows", "sent", self.right), ("right rows", "arrived", self.arrived)]
-        rows += [("rows a second", "", self.rate)]
+        rows.append(("rows a second", "", self.rate))
         return Table(f"Broken rows, {title}", ("", "kind", "number"), rows)
 
     def checks(self, title: str) -> list[Check]:
