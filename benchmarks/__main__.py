@@ -571,7 +571,7 @@ def peers(
     _report(context, outcome, as_json)
 
 
-KILLS, LENGTH, BROKEN = Count(200, 4), Count(2000, 400), Count(100_000, 2000)
+KILLS, LENGTH, BROKEN = Count(600, 6), Count(2000, 400), Count(100_000, 2000)
 FLIPS = Count(200, 20)
 
 
@@ -579,7 +579,7 @@ FLIPS = Count(200, 20)
 def faults(
     context: typer.Context,
     kills: Annotated[
-        int, KILLS.option("Kills, with a file, standard input and a broker.")
+        int, KILLS.option("Kills in all, over a file, standard input and a broker.")
     ] = KILLS.usual,
     samples: Annotated[
         int, LENGTH.option("Samples of a run that is killed.", least=50)
@@ -594,6 +594,7 @@ def faults(
             "visitors, cases. Repeat it."
         ),
     ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Runs that are killed at a time.")] = 1,
     quick: Annotated[
         bool,
         typer.Option(
@@ -618,6 +619,7 @@ def faults(
         FLIPS.of(context, "flips"),
         seed,
         only or (),
+        workers,
         progress=True,
     )
     _report(context, outcome, as_json)

@@ -17,13 +17,13 @@ from time import process_time
 
 import numpy as np
 
+from benchmarks.progress import shown
 from livepde.errors import RunError
 from livepde.fem import Channel, Field, Inputs, RandomWalk, Scalar, dot, grad, interval, linear
 from livepde.identifier import Identifier, Sample
 from livepde.laws import Jumps, SensitivityLaw
 from livepde.model import Model
 from livepde.observation import Points
-from livepde.progress import watched
 from livepde.result import Estimate
 from livepde.runs import Check, Journal, Outcome, Table, journal_of
 from livepde.runs.database import log_of
@@ -118,7 +118,7 @@ def soak(steps: int = STEPS, *, share: float = 1.0, progress: bool = False) -> O
             meter = Meter(reader, _fresh())
             live = Live(
                 identifier,
-                Samples(watched(samples, steps) if progress else samples),
+                Samples(shown(samples, steps, "samples") if progress else samples),
                 journal,
                 sinks=[meter],
                 fields_every=EVERY,

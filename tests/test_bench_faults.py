@@ -40,7 +40,7 @@ def test_runs_are_killed_and_lose_nothing(part):
     assert not failed(outcome)
     (table,) = outcome.tables
     assert table.rows[0][0] >= 1
-    assert sum(table.rows[0][1:5]) == 2
+    assert sum(table.rows[0][1:5]) >= 2
 
 
 @pytest.mark.process
@@ -227,7 +227,7 @@ def test_the_commands_print_json(monkeypatch):
     code, out = bench("faults", "--kills", "7", "--only", "file", "--json")
     assert code == 0
     assert json.loads(out)["command"].endswith(
-        "--kills 7 --samples 2000 --malformed 100000 --flips 200 --seed 0 --only file"
+        "--kills 7 --samples 2000 --malformed 100000 --flips 200 --seed 0 --only file --workers 1"
     )
     with pytest.raises(lp.ConfigurationError, match="there is no part 'nothing'"):
         bench("faults", "--only", "nothing")

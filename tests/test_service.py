@@ -157,6 +157,23 @@ def test_what_a_process_sends_does_not_end_a_run(here):
         assert "85 is not between -20 and 60" in [event.message for event in journal.events]
 
 
+def test_what_is_sent_again_to_standard_input_is_used_once(here):
+    lines = [json.dumps(row(k)) + "\n" for k in range(12)]
+    options = ("--realtime", "--data", "-", "--estimates", "--resume", "--out")
+    assert call("run", case(), *options, "whole", stdin="".join(lines))[0] == 0
+    _, first = call("run", case(), *options, "run", stdin="".join(lines[:8]) + lines[8][:20])
+    kept = max(json.loads(line)["t"] for line in first.splitlines() if line.startswith("{"))
+    assert kept == 7 * 60.0
+    _, second = call("run", case(), *options, "run", stdin="".join(lines[3:]))
+    found = [json.loads(line)["t"] for line in second.splitlines() if line.startswith("{")]
+    assert found == [60.0 * k for k in range(8, 12)]
+    with Journal.open(Path("run") / JOURNAL) as journal:
+        assert journal.counts == {("malformed", ""): 1, ("repeated", ""): 5}
+    expected, resumed = (runs.open(name).dataset for name in ("whole", "run"))
+    assert np.array_equal(resumed["time"], expected["time"])
+    assert np.array_equal(resumed["alpha"], expected["alpha"])
+
+
 def test_what_is_not_valid_is_counted_in_files_too(here):
     rows = [row(k) for k in range(12)]
     rows[4]["T_3"], rows[7]["left"] = 85.0, ""

@@ -16,6 +16,7 @@ are right. Each is counted with a reason, and what is right arrives.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 from benchmarks.faults.broken import broken_messages, broken_rows
@@ -23,7 +24,7 @@ from benchmarks.faults.clocks import clock_faults
 from benchmarks.faults.disk import failing_disks
 from benchmarks.faults.flips import damaged_journals
 from benchmarks.faults.hostile import hostile_cases
-from benchmarks.faults.kills import kills_of_files, kills_of_pipes, kills_of_topics
+from benchmarks.faults.kills import KILLED
 from benchmarks.faults.outages import outages
 from benchmarks.faults.plan import Plan
 from benchmarks.faults.visitors import slow_visitors
@@ -31,12 +32,10 @@ from livepde.runs import Check, Outcome, Table
 
 __all__ = ["PARTS", "faults"]
 
-KILLS, SAMPLES, MALFORMED, FLIPS = 200, 2000, 100_000, 200
+KILLS, SAMPLES, MALFORMED, FLIPS = 600, 2000, 100_000, 200
 
 PARTS: Mapping[str, Callable[[Plan], Outcome]] = {
-    "file": kills_of_files,
-    "stdin": kills_of_pipes,
-    "mqtt": kills_of_topics,
+    **KILLED,
     "restart": outages,
     "disk": failing_disks,
     "malformed": broken_rows,
@@ -55,6 +54,7 @@ def faults(
     flips: int = FLIPS,
     seed: int = 0,
     only: Sequence[str] = (),
+    workers: int = 1,
     progress: bool = False,
 ) -> Outcome:
     """Do harm to runs, and count what was lost.
@@ -62,19 +62,22 @@ def faults(
     Parameters
     ----------
     kills, samples
-        Kills of runs with so many samples, for a file, for standard input and for a broker.
+        Kills in all, spread over those parts that kill, of runs with so many samples.
     malformed
         Rows and messages that are broken.
     flips
         Journals that are damaged.
     only
         Some of `PARTS`.
+    workers
+        Runs that are killed at a time.
     """
     tables: list[Table] = []
     checks: list[Check] = []
     notes: list[str] = []
+    share = math.ceil(kills / max(len(KILLED.keys() & set(only or PARTS)), 1))
     for name in only or PARTS:
-        outcome = PARTS[name](Plan(kills, samples, malformed, flips, seed, progress))
+        outcome = PARTS[name](Plan(share, samples, malformed, flips, seed, progress, workers))
         tables += outcome.tables
         checks += outcome.checks
         notes += outcome.notes

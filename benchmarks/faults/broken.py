@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import math
+import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,6 +36,8 @@ from livepde.streams.sources import Source
 
 __all__ = ["Fed", "broken_messages", "broken_rows", "fed"]
 
+TOGETHER = 100  # messages that are sent before the first of them is acknowledged
+
 
 def broken_rows(plan: Plan) -> Outcome:
     """Feed broken rows to a live run, between right ones."""
@@ -54,8 +57,11 @@ def broken_rows(plan: Plan) -> Outcome:
             feeds["soil, CSV"] = (soil[0], soil[1], "soil.csv")
             feeds["soil, JSON"] = (soil[0], soil[1], "soil.jsonl")
         sent, each = 0, math.ceil(plan.malformed / len(feeds))
-        for title, (case, chosen, file) in feeds.items():
+        items = [*feeds.items()]
+        for k in plan.watched(len(items), f"files of {each} broken rows"):
+            title, (case, chosen, file) = items[k]
             found = fed(case, chosen, folder / file, each, rng)
+            (folder / file).unlink()
             tables.append(found.table(title))
             checks += found.checks(title)
             sent += found.sent.total()
@@ -71,23 +77,31 @@ def broken_messages(plan: Plan) -> Outcome:
     expected, _ = undisturbed(len(rows))
     with hearing(rows) as (_, topic, run):
         per_row = np.bincount(rng.integers(0, len(rows), count), minlength=len(rows))
-        for k, times in enumerate(per_row.tolist()):
+        begun = time.monotonic()
+        for k in plan.watched(len(rows), "right rows with broken messages between them"):
             topic.supply(k + 1)
-            for _ in range(times):
-                _, line = broken_line(JSON | BYTES, rows[k], json_line, rng)
-                topic.send(line).wait_for_publish(PATIENCE)
+            for some in _parts(int(per_row[k]), TOGETHER):
+                lines = [broken_line(JSON | BYTES, rows[k], json_line, rng)[1] for _ in some]
+                for message in [topic.send(line) for line in lines]:
+                    message.wait_for_publish(PATIENCE)
         run.end(len(rows))
+        rate = (count + len(rows)) / (time.monotonic() - begun)
         found = Found.of(run.out)
     damage = Damage()
     damage.compare(found, expected)
     reasons = ", ".join(f"{kind} {number}" for kind, number in sorted(found.counts.items()))
     table = Table(
         f"Broken messages between {len(rows)} right ones, from a broker to livepde run",
-        ("sent", "reasons", "lost", "doubled", "different"),
-        [(count, reasons, damage.lost, damage.doubled, damage.different)],
+        ("sent", "reasons", "lost", "doubled", "different", "a second"),
+        [(count, reasons, damage.lost, damage.doubled, damage.different, rate)],
     )
     counted = Check("broken messages: counted", found.counts.total(), count, ">=")
     return Outcome(tables=[table], checks=[counted, *damage.checks("broken messages")])
+
+
+def _parts(count: int, most: int) -> Iterator[range]:
+    """Yield ranges of at most so many numbers."""
+    return (range(k, min(k + most, count)) for k in range(0, count, most))
 
 
 def _soil() -> tuple[Case, list[dict[str, Any]]] | None:
@@ -126,12 +140,15 @@ class Fed:
     right: int
     arrived: int
     different: int
+    rate: float  # rows a second, right and broken, with the steps
 
     def table(self, title: str) -> Table:
         """Return what was sent and what was said of it."""
-        rows = [("sent", kind, number) for kind, number in sorted(self.sent.items())]
+        rows: list[tuple[str, str, float]] = []
+        rows += [("sent", kind, number) for kind, number in sorted(self.sent.items())]
         rows += [("counted", kind, number) for kind, number in sorted(self.reasons.items())]
         rows += [("right rows", "sent", self.right), ("right rows", "arrived", self.arrived)]
+        rows.append(("rows a second", "", self.rate))
         return Table(f"Broken rows, {title}", ("", "kind", "number"), rows)
 
     def checks(self, title: str) -> list[Check]:
@@ -162,7 +179,9 @@ def fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.
                 sent[kind] += 1
                 broken.add(file.tell())
                 file.write(line + b"\n")
+    begun = time.monotonic()
     found, reasons = _taken(case, path)
+    rate = (count + len(rows)) / (time.monotonic() - begun)
     told = Counter(kind for place in broken for kind in sorted(reasons.get(place, ()))[:1])
     return Fed(
         sent,
@@ -171,6 +190,7 @@ def fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.
         len(expected),
         len(found),
         sum(not same(one, other) for one, other in zip(found, expected, strict=False)),
+        rate,
     )
 
 

@@ -1,13 +1,17 @@
-"""Kills of runs at any moment, that take rows from a file, a pipe or a broker."""
+"""Kills of runs at any moment, that take rows from a file, from standard input or from a broker."""
 
 from __future__ import annotations
 
+import math
 import shutil
 import signal
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -15,16 +19,19 @@ import numpy as np
 
 from benchmarks.faults.damage import Damage, Found
 from benchmarks.faults.plan import Plan
-from benchmarks.faults.plants import GrowingFile, Mosquitto, Plant, StandardInput, Topic, wait
+from benchmarks.faults.plants import Feeder, GrowingFile, Mosquitto, Plant, Topic, wait
 from benchmarks.faults.rod import Row, rod_rows
 from benchmarks.faults.run import Run, undisturbed
 from livepde.runs import Check, Outcome, Table
 
-__all__ = ["kills_of_files", "kills_of_pipes", "kills_of_topics"]
+__all__ = ["KILLED", "kills_of_files", "kills_of_input", "kills_of_topics"]
 
 STRIDE = 0.25  # seconds after a sign of life within which a kill falls
 LEAD = (20, 400)  # rows that are there before they are asked for
 MOMENTS = {"start": 0.25, "step": 0.4, "write": 0.25, "end": 0.1}  # share of the kills
+PROGRESS = 0.7  # share of the kills that have to fall after new samples
+
+Plants = Callable[[Path, Sequence[Row], int], Plant]
 
 
 def kills_of_files(plan: Plan) -> Outcome:
@@ -33,14 +40,14 @@ def kills_of_files(plan: Plan) -> Outcome:
         return _killed(plan, Path(folder), "file", GrowingFile)
 
 
-def kills_of_pipes(plan: Plan) -> Outcome:
-    """Kill runs that read standard input, and send them again what they have not kept."""
+def kills_of_input(plan: Plan) -> Outcome:
+    """Kill runs that read standard input, and send again what was not acknowledged."""
+    with TemporaryDirectory() as name, ExitStack() as stack:
 
-    def plant(here: Path, rows: Sequence[Row], seed: int) -> StandardInput:
-        return StandardInput(rows, seed)
+        def plant(here: Path, rows: Sequence[Row], seed: int) -> Feeder:
+            return stack.enter_context(closing(Feeder(here, rows, seed)))
 
-    with TemporaryDirectory() as folder:
-        return _killed(plan, Path(folder), "stdin", plant)
+        return _killed(plan, Path(name), "stdin", plant)
 
 
 def kills_of_topics(plan: Plan) -> Outcome:
@@ -56,69 +63,114 @@ def kills_of_topics(plan: Plan) -> Outcome:
         return _killed(plan, folder, "mqtt", plant)
 
 
-def _killed(
-    plan: Plan, folder: Path, name: str, plants: Callable[[Path, Sequence[Row], int], Plant]
-) -> Outcome:
-    rows, rng = rod_rows(plan.samples), np.random.default_rng(plan.seed)
-    expected, start = undisturbed(plan.samples)
-    damage, fallen, progress = Damage(), Counter[str](), 0
-    again = untold = 0  # rows that were sent twice, and counted or not
-    bar = plan.watched(plan.kills, f"kills, {name}")
-    next(bar, None)
-    while fallen.total() < plan.kills:
-        here = folder / f"{name}-{damage.runs}"
+KILLED = {"file": kills_of_files, "stdin": kills_of_input, "mqtt": kills_of_topics}
+
+
+@dataclass
+class _Hunt:
+    """Kills of runs in several threads, until there are enough of them.
+
+    Attributes
+    ----------
+    fallen
+        Moment -> kills.
+    progress
+        Kills after new samples.
+    uncounted
+        Rows that were sent again, had been taken, and were not counted as that; or were late.
+    """
+
+    plan: Plan
+    folder: Path
+    name: str
+    plants: Plants
+    bar: Iterator[int]
+    damage: Damage = field(default_factory=Damage)
+    fallen: Counter[str] = field(default_factory=Counter)
+    progress: int = 0
+    uncounted: int = 0
+    _begun: int = 0
+    _over: bool = False
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @property
+    def open(self) -> bool:
+        """Return whether kills are missing."""
+        few = self.fallen.total() < self.plan.kills
+        return not self._over and (few or self.progress < PROGRESS * self.plan.kills)
+
+    def hunt(self) -> None:
+        """Kill one run after the other; nobody goes on after an error."""
+        try:
+            while self.open:
+                with self._lock:
+                    number = self._begun
+                    self._begun += 1
+                self._run(number)
+        except BaseException:
+            self._over = True
+            raise
+
+    def _run(self, number: int) -> None:
+        rows, rng = rod_rows(self.plan.samples), np.random.default_rng([self.plan.seed, number])
+        expected, start = undisturbed(self.plan.samples)
+        here = self.folder / f"{self.name}-{number}"
         here.mkdir()
-        plant = plants(here, rows, plan.seed + damage.runs)
-        with closing(_run(here, plant)) as run:
-            while run.look() < len(rows) - LEAD[0] and fallen.total() < plan.kills:
+        plant = self.plants(here, rows, self.plan.seed + number)
+        with closing(Run(here, plant.source, plant.launch)) as run:
+            while self.open and run.look() < len(rows) - LEAD[0]:
                 before = run.look()
                 moment = str(rng.choice([*MOMENTS], p=[*MOMENTS.values()]))
                 if _kill(run, plant, len(rows) - 1, moment, start, rng):
-                    fallen[moment] += 1
-                    progress += run.look() > before
-                    next(bar, None)
+                    self._fell(moment, run.look() > before)
+            before, repeated = run.look(), run.counted("repeated")
             plant.supply(len(rows))
             run.start()
             run.end(len(rows))
         found = Found.of(here / "run")
-        damage.compare(found, expected)
-        if isinstance(plant, StandardInput):
-            again += found.counts["repeated"]
-            untold += max(plant.twice - found.counts["repeated"], 0)
+        with self._lock:
+            self.damage.compare(found, expected)
+            if isinstance(plant, Feeder):  # it knows what it has sent again
+                again = before - plant.first
+                self.uncounted += abs(found.counts["repeated"] - repeated - again)
+                self.uncounted += found.counts["late"]
         shutil.rmtree(here)
-    table = Table(
-        f"Kills, {name}: {plan.samples} samples a run",
-        (
-            "runs",
-            *(f"at {moment}" for moment in MOMENTS),
-            "lost",
-            "doubled",
-            "different",
-            "after new samples",
-            "rows sent again",
-        ),
-        [
-            (
-                damage.runs,
-                *(fallen[moment] for moment in MOMENTS),
-                damage.lost,
-                damage.doubled,
-                damage.different,
-                progress,
-                again,
-            )
-        ],
-    )
-    enough = Check(f"{name}: kills", fallen.total(), plan.kills, ">=")
-    counted = Check(f"{name}: rows sent again and not counted", untold, 0, "<=")
-    return Outcome(tables=[table], checks=[enough, *damage.checks(name), counted])
+
+    def _fell(self, moment: str, after_progress: bool) -> None:
+        with self._lock:
+            self.fallen[moment] += 1
+            self.progress += after_progress
+            next(self.bar, None)
+
+    def outcome(self) -> Outcome:
+        """Return what was done, and what was lost."""
+        name, damage = self.name, self.damage
+        head = ("runs", *(f"at {moment}" for moment in MOMENTS), "lost", "doubled", "different")
+        moments = (self.fallen[moment] for moment in MOMENTS)
+        row = (damage.runs, *moments, damage.lost, damage.doubled, damage.different, self.progress)
+        title = f"Kills, {name}: {self.plan.samples} samples a run"
+        table = Table(title, (*head, "after new samples"), [row])
+        least = math.ceil(PROGRESS * self.plan.kills)
+        checks = [
+            Check(f"{name}: kills", self.fallen.total(), self.plan.kills, ">="),
+            Check(f"{name}: kills after new samples", self.progress, least, ">="),
+            *damage.checks(name),
+        ]
+        if name == "stdin":
+            told = "rows sent again that are not counted as repeated"
+            checks.append(Check(f"{name}: {told}", self.uncounted, 0, "<="))
+        return Outcome(tables=[table], checks=checks)
 
 
-def _run(folder: Path, plant: Plant) -> Run:
-    """Return the run of a plant."""
-    if isinstance(plant, StandardInput):
-        return Run(folder, plant.source, options=("--data", "-"), feeder=plant)
-    return Run(folder, plant.source)
+def _killed(plan: Plan, folder: Path, name: str, plants: Plants) -> Outcome:
+    undisturbed(plan.samples)  # once, before threads ask for it
+    bar = plan.watched(plan.kills, f"kills, {name}")
+    next(bar, None)
+    hunt = _Hunt(plan, folder, name, plants, bar)
+    with ThreadPoolExecutor(plan.workers) as pool:
+        for ended in [pool.submit(hunt.hunt) for _ in range(plan.workers)]:
+            ended.result()
+    return hunt.outcome()
 
 
 def _kill(

@@ -39,7 +39,7 @@ def outages(plan: Plan) -> Outcome:
 
 
 def _broker_away(rows: Sequence[Row]) -> Found:
-    with hearing(rows) as (broker, topic, run):
+    with hearing(rows, saved=True) as (broker, topic, run):
         for part in np.linspace(0, len(rows) // 3, RESTARTS + 1, dtype=int).tolist()[1:]:
             topic.supply(part)
             run.wait_for(part // 2)  # the others are on their way

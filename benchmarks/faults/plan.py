@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from livepde.progress import watched
+from benchmarks.progress import shown
 
 __all__ = ["Plan"]
 
@@ -20,6 +20,9 @@ class Plan:
     flips: int
     seed: int
     progress: bool
+    workers: int = 1
 
     def watched(self, count: int, what: str) -> Iterator[int]:
-        return watched(range(count), count, what) if self.progress else iter(range(count))
+        """Yield so many numbers, and show how far that is."""
+        numbers = range(count)
+        return shown(numbers, count, what) if self.progress else iter(numbers)

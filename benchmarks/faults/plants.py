@@ -1,4 +1,4 @@
-"""What brings rows to a run: a file that grows, and topics of a broker that can be stopped."""
+"""What brings rows to a run: a file that grows, standard input, topics of a broker."""
 
 from __future__ import annotations
 
@@ -7,29 +7,30 @@ import os
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from benchmarks.faults.rod import Row
+from benchmarks.faults.rod import STEP, Row
 from livepde.errors import RunError
 
 __all__ = [
     "BROKER",
     "PATIENCE",
+    "Feeder",
     "GrowingFile",
     "Mosquitto",
     "Plant",
-    "StandardInput",
     "Topic",
+    "launched",
     "wait",
 ]
 
-AGAIN = 6  # fewer rows than this are sent again that are kept already
 PATIENCE = 120.0  # seconds after which a run that does not go on is given up
 BROKER = "/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin:/opt/homebrew/sbin"
 
@@ -42,8 +43,23 @@ class Plant(Protocol):
     def supply(self, count: int) -> None:
         """Have the first so many rows there."""
 
+    def launch(self, command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
+        """Start a run in its folder."""
+        return launched(command, folder)
 
-class GrowingFile:
+
+def launched(
+    command: Sequence[str],
+    folder: Path,
+    stdin: int | None = None,
+    stdout: int = subprocess.DEVNULL,
+) -> subprocess.Popen[bytes]:
+    """Start a command in a folder, with its log there."""
+    with (folder / "log.txt").open("ab") as log:
+        return subprocess.Popen(command, cwd=folder, stdin=stdin, stdout=stdout, stderr=log)
+
+
+class GrowingFile(Plant):
     """A file that grows, not always by whole lines."""
 
     source = 'file = "rows.csv"\nfollow = true'
@@ -67,47 +83,82 @@ class GrowingFile:
         self._written = end
 
 
-class StandardInput:
-    """Rows as lines of JSON to standard input: a new process is sent again what it has not kept.
+class Feeder(Plant):
+    """A program that writes rows to the standard input of a run, and reads its estimates.
 
-    And some rows that it has, as of a feeder that knows the last stored time not quite.
+    Rows up to the last estimate that was printed have been taken for good. A run that is started
+    again is sent all that follows, and often rows before, too.
+
+    Attributes
+    ----------
+    first
+        Number of the row with which the run that was started last was begun.
     """
 
     source = ""
+    OVERLAP = (0, 0, 1, 40, 400)  # rows that are sent again without need
 
-    def __init__(self, rows: Sequence[Row], seed: int) -> None:
-        self._lines = [(json.dumps(row) + "\n").encode() for row in rows]
+    def __init__(self, folder: Path, rows: Sequence[Row], seed: int) -> None:
+        self.first = 0
+        self._lines = [json.dumps(row).encode() + b"\n" for row in rows]
+        self._estimates = folder / "estimates.jsonl"
         self._rng = np.random.default_rng(seed)
-        self._stream: IO[bytes] | None = None
-        self._count = self._sent = 0
-        self.twice = 0  # rows that the process of now was sent although they are kept
+        self._count = self._known = 0
+        self._changed = threading.Condition()
+        self._fed: subprocess.Popen[bytes] | None = None
 
-    def connect(self, stream: IO[bytes], stored: int) -> None:
-        """Begin with a new process, whose journal has so many rows."""
-        self.close()
-        self._stream = stream
-        self.twice = min(int(self._rng.integers(1, AGAIN)), stored)
-        self._sent = stored - self.twice
-        self.supply(0)
+    def launch(self, command: Sequence[str], folder: Path) -> subprocess.Popen[bytes]:
+        """Start a run with a pipe to its standard input."""
+        self._known = max(self._known, self._printed())
+        self.first = max(self._known - int(self._rng.choice(self.OVERLAP)), 0)
+        with self._estimates.open("wb") as out:
+            command = [*command, "--realtime", "--data", "-", "--estimates"]
+            process = launched(command, folder, subprocess.PIPE, out.fileno())
+        self._feed(process)
+        threading.Thread(target=self._pump, args=(process, self.first), daemon=True).start()
+        return process
 
     def supply(self, count: int) -> None:
-        self._count = max(count, self._count)
-        if self._stream is None:
-            return
-        with suppress(BrokenPipeError):  # it was killed
-            self._stream.write(b"".join(self._lines[self._sent : self._count]))
-            self._stream.flush()
-        self._sent = self._count
+        """Have the first so many rows sent as fast as they are read."""
+        with self._changed:
+            self._count = max(count, self._count)
+            self._changed.notify_all()
 
     def close(self) -> None:
-        """Let go of the last process."""
-        if self._stream is not None:
-            with suppress(BrokenPipeError):
-                self._stream.close()
-        self._stream = None
+        """Send nothing more."""
+        self._feed(None)
+
+    def _feed(self, process: subprocess.Popen[bytes] | None) -> None:
+        with self._changed:
+            self._fed = process
+            self._changed.notify_all()
+
+    def _printed(self) -> int:
+        """Return the number of rows up to the last estimate of which a whole line was printed."""
+        if not self._estimates.exists():
+            return 0
+        *lines, _ = self._estimates.read_bytes().split(b"\n")
+        return round(json.loads(lines[-1])["t"] / STEP) + 1 if lines else 0
+
+    def _pump(self, process: subprocess.Popen[bytes], k: int) -> None:
+        """Write rows from the k-th on, until another process is to be fed or nobody reads."""
+        pipe = process.stdin
+        if pipe is None:
+            raise RunError("benchmark faults: a run has no standard input.")
+        with suppress(OSError), pipe:
+            while (end := self._asked_for(process, k)) > k:
+                pipe.write(b"".join(self._lines[k:end]))
+                pipe.flush()
+                k = end
+
+    def _asked_for(self, process: subprocess.Popen[bytes], k: int) -> int:
+        """Wait for more than k rows to be asked for; return how many, 0 if others are fed now."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._fed is not process or self._count > k)
+            return self._count if self._fed is process else 0
 
 
-class Topic:
+class Topic(Plant):
     """Messages of a broker that keeps them for who is away."""
 
     def __init__(self, broker: Mosquitto, rows: Sequence[Row], name: str) -> None:
@@ -144,9 +195,12 @@ class Topic:
 
 
 class Mosquitto:
-    """A broker of its own, with sessions that survive its restart, in a folder of its own."""
+    """A broker of its own, in a folder of its own; sessions survive its restart if they are saved.
 
-    def __init__(self, parent: Path) -> None:
+    It saves all of them with each message then, which costs more than all else.
+    """
+
+    def __init__(self, parent: Path, saved: bool = False) -> None:
         program = shutil.which("mosquitto", path=f"{os.environ.get('PATH', '')}:{BROKER}")
         if program is None:
             raise RunError(
@@ -160,12 +214,11 @@ class Mosquitto:
         folder = parent / "broker"
         folder.mkdir()
         config = folder / "mosquitto.conf"
-        user = "user root\n" if os.geteuid() == 0 else ""
-        config.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\npersistence true\n"
-            f"persistence_location {folder}/\nautosave_interval 1\nautosave_on_changes true\n"
-            f"max_queued_messages 0\n{user}"
-        )
+        text = f"listener {self.port} 127.0.0.1\nallow_anonymous true\nmax_queued_messages 0\n"
+        if saved:
+            text += f"persistence true\npersistence_location {folder}/\n"
+            text += "autosave_interval 1\nautosave_on_changes true\n"
+        config.write_text(text + ("user root\n" if os.geteuid() == 0 else ""))
         self._command = [program, "-c", str(config)]
         self.start()
 

@@ -9,8 +9,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-__all__ = ["Row", "case_text", "rod_rows"]
+__all__ = ["STEP", "Row", "case_text", "rod_rows"]
 
+STEP = 60.0  # seconds from one row to the next
 ALPHA = 2e-5  # m^2/s, of the rod
 SILENCE = 1.0  # seconds after which a source is said to be silent
 
@@ -65,12 +66,12 @@ def rod_rows(count: int) -> list[dict[str, Any]]:
     """Return rows of a rod whose end is warmed and cooled, with noise."""
     rng, start = np.random.default_rng(0), datetime(2026, 1, 1)
     x, rate = np.array([0.0, 0.3, 0.6]), 0.04  # places, and the phase that passes in a minute
-    decay = x / math.sqrt(2.0 * ALPHA / (rate / 60.0))  # of a wave that goes into the rod
+    decay = x / math.sqrt(2.0 * ALPHA / (rate / STEP))  # of a wave that goes into the rod
     found = []
     for k in range(count):
         wave = np.exp(-decay) * np.cos(rate * k - decay)
         T = 20.0 + 5.0 * (1.0 - x - wave) + [0.0, *0.2 * rng.standard_normal(2)]
         names = ("left", "T_3", "T_6")
         values = dict(zip(names, T.tolist(), strict=True))
-        found.append({"time": str(start + timedelta(minutes=k)), **values})
+        found.append({"time": str(start + timedelta(seconds=STEP * k)), **values})
     return found

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from functools import cache
 from pathlib import Path
@@ -17,8 +17,8 @@ from benchmarks.faults.plants import (
     PATIENCE,
     GrowingFile,
     Mosquitto,
-    StandardInput,
     Topic,
+    launched,
     wait,
 )
 from benchmarks.faults.rod import Row, case_text, rod_rows
@@ -36,27 +36,27 @@ class Run:
     ----------
     folder, source
         Where it runs, and the lines of its case that name the source.
+    launch
+        Starts the command.
     options, wrapper
         What comes after its command, and before it.
     codes
         With which it may end by itself.
-    feeder
-        Writes to its standard input.
     """
 
     def __init__(
         self,
         folder: Path,
         source: str,
+        launch: Callable[[Sequence[str], Path], subprocess.Popen[bytes]] = launched,
         *,
         options: Sequence[str] = (),
         wrapper: Sequence[str] = (),
         codes: Sequence[int] = (0, -signal.SIGKILL),
-        feeder: StandardInput | None = None,
     ) -> None:
         self.folder = folder
-        self._options, self._wrapper = options, wrapper
-        self._codes, self._feeder = codes, feeder
+        self._options, self._wrapper, self._codes = options, wrapper, codes
+        self._launch = launch
         self.out = folder / "run"
         self._journal: Journal | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -64,22 +64,19 @@ class Run:
 
     def start(self) -> None:
         command = [sys.executable, "-m", "livepde", "run", "case.toml", "--out", "run", "--resume"]
-        with (self.folder / "log.txt").open("ab") as log:
-            self._process = subprocess.Popen(
-                [*self._wrapper, *command, *self._options],
-                cwd=self.folder,
-                stdin=None if self._feeder is None else subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=log,
-            )
-        if self._feeder is not None and self._process.stdin is not None:
-            self._feeder.connect(self._process.stdin, self.look())
+        self._process = self._launch([*self._wrapper, *command, *self._options], self.folder)
 
     def look(self) -> int:
         """Return how many samples are accepted; a reader is open all the time."""
         if self._journal is None and (self.out / JOURNAL).exists():
             self._journal = Journal.open(self.out / JOURNAL)
         return 0 if self._journal is None else self._journal.accepted
+
+    def counted(self, kind: str) -> int:
+        """Return how many remarks of a kind the journal has."""
+        self.look()
+        counts = {} if self._journal is None else self._journal.counts
+        return sum(number for (what, _), number in counts.items() if what == kind)
 
     @property
     def log_size(self) -> int:
@@ -147,19 +144,17 @@ class Run:
         if self._process is not None and self._process.poll() is None:
             self._process.kill()
             self._process.wait()
-        if self._feeder is not None:
-            self._feeder.close()
         if self._journal is not None:
             self._journal.close()
 
 
 @contextmanager
-def hearing(rows: Sequence[Row]) -> Iterator[tuple[Mosquitto, Topic, Run]]:
+def hearing(rows: Sequence[Row], saved: bool = False) -> Iterator[tuple[Mosquitto, Topic, Run]]:
     """Yield a broker, a topic that has rows, and a run that hears it."""
     with TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name) / "mqtt"
         folder.mkdir()
-        broker = Mosquitto(Path(name))
+        broker = Mosquitto(Path(name), saved)
         stack.callback(broker.close)
         topic = stack.enter_context(closing(Topic(broker, rows, "rod")))
         run = stack.enter_context(closing(Run(folder, topic.source)))
