@@ -157,7 +157,8 @@ def plate(seed: int) -> tuple[list[str], Array, Array]:
 
 def _places() -> Array:
     """Return where the sensors of the plate are: middles of cells of the truth, the same always."""
-    rng, found = np.random.default_rng(7), []
+    rng = np.random.default_rng(7)
+    found: list[Array] = []
     while len(found) < SENSORS:
         at = (np.floor(SIDE * rng.uniform(0.05, 0.95, 2)) + 0.5) / SIDE
         if min(at) < 0.45 and all(np.linalg.norm(at - other) > 0.08 for other in found):

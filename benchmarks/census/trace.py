@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-from functools import partial
 from types import MappingProxyType
 
 import numpy as np
 
 from benchmarks.census.faults import Array, Scene
 from benchmarks.honest.batch import Batch
-from benchmarks.honest.problem import Problem
+from benchmarks.honest.problem import Problem, Signal
 
 __all__ = ["VISIBLE", "trace"]
 
@@ -32,6 +31,11 @@ def trace(scene: Scene) -> float:
     return float(np.linalg.norm(scene.z - told.predict(best)) / scene.noise)
 
 
+def _interpolated(times: Array, column: Array) -> Signal:
+    """Return a channel as straight lines between its readings."""
+    return lambda t: np.asarray(np.interp(t, times, column))
+
+
 def _told(scene: Scene) -> Problem:
     """Return the problem as livepde is told of it."""
     told = copy.copy(scene.told or scene.problem)
@@ -40,10 +44,7 @@ def _told(scene: Scene) -> Problem:
     times, names = told.times, list(told.channels)
     columns = [_filled(column) for column in scene.inputs.T]
     told.channels = MappingProxyType(
-        {
-            name: partial(np.interp, xp=times, fp=column)
-            for name, column in zip(names, columns, strict=True)
-        }
+        {name: _interpolated(times, column) for name, column in zip(names, columns, strict=True)}
     )
     return told
 
