@@ -21,7 +21,7 @@ from livepde.cases import Case, load
 from livepde.cases.template import write_template
 from livepde.errors import ConfigurationError, RunError
 from livepde.exchange import export_fmu
-from livepde.exchange.process import Process, of_case
+from livepde.exchange.process import UnitProcess, of_case
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
@@ -139,7 +139,7 @@ def _apart(expected: Array, found: Array) -> list[float]:
 
 
 def _stepped(
-    identifier: Identifier, process: Process, samples: list[Sample]
+    identifier: Identifier, process: UnitProcess, samples: list[Sample]
 ) -> Iterator[list[float]]:
     """Yield what the outputs have to be after each sample."""
     for sample in samples:
@@ -147,7 +147,7 @@ def _stepped(
         yield [*process.shown(identifier, estimate), STATUS_CODES.index(estimate.status.code)]
 
 
-def _driven(unit: str | Path, process: Process, samples: list[Sample]) -> Iterator[list[float]]:
+def _driven(unit: str | Path, process: UnitProcess, samples: list[Sample]) -> Iterator[list[float]]:
     """Yield the outputs after each sample."""
     inputs = [port.name for port in process.inputs]
     outputs = [*(item.name for item in process.outputs()), "status"]
