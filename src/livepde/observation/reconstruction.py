@@ -110,8 +110,8 @@ class Apriori(Alpha):
     power, factor
         Exponent and factor of the rule.
     delta, level
-        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default what `noise` of the
-        observation says.
+        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default given by `noise`
+        of the observation.
     """
 
     power: float = 1.0
@@ -148,8 +148,8 @@ class Discrepancy(Alpha):
     tau
         > 1 in theory, so that alpha is never chosen too small for the noise.
     delta, level
-        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default what `noise` of the
-        observation says.
+        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default given by `noise`
+        of the observation.
     """
 
     tau: float = 1.1

@@ -2,9 +2,9 @@
 
 Data as in `seed-excited`, fully observed, with Gaussian noise that is white in Z = L2(omega): the
 noise n of a sample is the L2 projection of white noise onto the state space, so values and slopes
-of the Hermite elements carry what a noisy *function* has, with E ||n||_Z^2 = level^2 ||z||_Z^2 for
-each sample, independent from sample to sample. (The other model, `RelativeNoise`, draws every
-coefficient by itself; the table has both.)
+of the Hermite elements have the size of those of a noisy *function*, with E ||n||_Z^2 = level^2
+||z||_Z^2 for each sample, independent from sample to sample. (The other model, `RelativeNoise`,
+draws every coefficient by itself; the table has both.)
 
 Smoothing is a local polynomial in time and Tikhonov in the V~ norm in space, with alpha from the
 discrepancy principle. Gains, window and tau are fixed below, for every level and every seed: law
