@@ -151,7 +151,9 @@ class Identifier:
         if not self.inputs:
             self._begin(self._inputs)
 
-    def placed(self, state: Any, t: float, z: Array, inputs: Array, samples: int) -> Identifier:
+    def placed(
+        self, state: Any, t: float, z: Array, inputs: Array, held: Array, samples: int
+    ) -> Identifier:
         """Return an identifier of the same parts that stands elsewhere; for `Fleet.identifier`.
 
         Parameters
@@ -160,11 +162,14 @@ class Identifier:
             Of the law; None before it has begun.
         t, z, inputs
             Time, measurements and input channels of the last accepted sample.
+        held
+            Duration of the gap of each input channel by then, shape (channels,).
         samples
             How many were taken.
         """
         other = copy.copy(self)
         other._state, other._t, other._z, other._samples = state, t, z, samples
+        other._gaps = InputLedger(np.zeros(1 + len(held), dtype=np.int64), held)
         begun = zip(self.inputs, inputs.tolist(), strict=True) if state is not None else ()
         other._inputs = Inputs(dict(begun))
         return other

@@ -35,7 +35,7 @@ from livepde.stepping import Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 4  # of the checkpoint
+FORMAT = 5  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -138,6 +138,7 @@ class Fleet:
         self._t = np.full(count, float(t0))
         self._z = np.full((count, self.observed.size), np.nan)
         self._inputs = np.full((count, len(self.inputs)), np.nan)
+        self._held = np.zeros((count, len(self.inputs)))  # duration of the gaps of inputs by now
         self._samples = 0
         if not self.inputs:
             self._begin(self._inputs)
@@ -233,6 +234,9 @@ class Fleet:
                 "sort the stream, and drop repeated samples."
             )
         values, held = self._filled(named)
+        none = np.zeros(len(self))
+        missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
+        missing = missing.reshape(len(self.inputs), len(self)).T
         longest = MOST_SUBSTEPS * self.problem.control.dt_max
         if t - last > longest:
             raise SampleError(
@@ -248,10 +252,14 @@ class Fleet:
             self._state = self._engine.begin(self._state, span)
         else:
             ends = self._inputs, values, self._z, used
-            span = Span(self._t, t, self.inputs, *ends, noise=noise)
+            gaps = np.stack([self._held, missing], axis=1)
+            some = gaps if gaps.any() else None
+            span = Span(self._t, t, self.inputs, *ends, noise=noise, gaps=some)
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
         good = np.array([status.ok for status in report.statuses])
+        lasting = (self._held + (t - self._t)[:, None]) * missing
+        self._held = np.where(good[:, None], lasting, self._held)
         self._t = np.where(good, t, self._t)
         self._z = np.where(good[:, None], used, self._z)
         self._inputs = np.where(good[:, None], values, self._inputs)
@@ -322,7 +330,7 @@ class Fleet:
         k = member if isinstance(member, int) else self.members.index(member)
         state = None if self._state is None else self._engine.member(self._state, k)
         t, z, inputs = float(self._t[k]), self._z[k].copy(), self._inputs[k]
-        return self._one.placed(state, t, z, inputs, self._samples)
+        return self._one.placed(state, t, z, inputs, self._held[k].copy(), self._samples)
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
         """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
@@ -444,6 +452,7 @@ class Fleet:
         """Return the state as `save` writes it."""
         header = {**self._fingerprint, "begun": self._state is not None}
         leaves = {"t": self._t, "z": self._z, "inputs": self._inputs, "samples": self._samples}
+        leaves["held"] = self._held
         if self._state is not None:
             leaves |= {
                 f"state/{path}": leaf for path, leaf in self._engine.leaves(self._state).items()
@@ -480,13 +489,14 @@ class Fleet:
                     if path.startswith("state/")
                 }
                 state = self._engine.restored(template, inner)
-            parts = leaves["t"], leaves["z"], leaves["inputs"], int(leaves["samples"])
+            ends = leaves["t"], leaves["z"], leaves["inputs"]
+            held, samples = leaves["held"], int(leaves["samples"])
         except (KeyError, ValueError) as error:
             raise RunError(
                 f"{where} does not fit this fleet ({error}): build it with the law's options as "
                 "they were when it was saved."
             ) from error
-        self._t, self._z, self._inputs, self._samples = parts
+        (self._t, self._z, self._inputs), self._held, self._samples = ends, held, samples
         self._state = state
         if state is None and not self.inputs:
             self._begin(self._inputs)

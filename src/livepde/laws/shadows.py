@@ -262,8 +262,10 @@ class InputShadow(Shadow):
         expected = s.slope * (held + 0.5 * h) * h
         line = 0.5 * held * (change - s.slope * held)
         missed = s.missed + np.where(missing, -expected, bend - line)
-        bend = np.zeros_like(missed)  # of the next steps nothing is expected
-        length = np.where(missing.all(), s.length, whole.max(axis=1))
+        # Of the next steps nothing is expected, where there is a gap.
+        some: Mask = np.asarray((gaps > 0.0).any(axis=(1, 2)))
+        bend = np.where(some[:, None], 0.0, bend)
+        length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))
         return changed(s, slope=slope, length=length, bend=bend, missed=missed)
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
@@ -487,7 +489,9 @@ class ShadowSet:
             s = shadow.read(s, span)
         s, jumps = _watched(s, x, end, span)
         # What gaps miss counts at once: later it might cancel with that of the next one.
-        due = (s.count >= s.due) | jumps | (span.gaps is not None)
+        due = (s.count >= s.due) | jumps
+        if span.gaps is not None:
+            due = due | (span.gaps > 0.0).any(axis=(1, 2))
         for t in np.unique(s.begun[due]) if due.any() else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):

@@ -266,7 +266,8 @@ class Journal:
         try:
             return self._db.execute(command, values).fetchall()
         except (sqlite3.Error, UnicodeDecodeError) as error:  # the latter of a damaged file
-            if self._lock is not None and isinstance(error, sqlite3.OperationalError):
+            disk = self._lock is not None and remedy_of(error)
+            if disk and isinstance(error, sqlite3.OperationalError):
                 self._fail(error)  # SQLite may have rolled back what was not committed
             raise RunError(told(self.path, error)) from error
 

@@ -64,7 +64,7 @@ class Span:
         None if all are defaults.
     gaps
         Duration of the gap of each channel before this interval, and 1 if it lasts at its end,
-        shape (1, 2, channels); None without a gap.
+        shape (members, 2, channels) or (1, 2, channels); None without a gap.
     """
 
     t0: Array
@@ -143,4 +143,9 @@ class Span:
             for inputs in (self.inputs0, self.inputs1)
         )
         noise = None if self.noise is None else self.noise[k]
-        return Interval(float(self.t0[k]), self.t1, first, last, self.z0[k], self.z1[k], noise)
+        gaps = {}
+        if self.gaps is not None:
+            each = zip(self.channels, *self.gaps[k].tolist(), strict=True)
+            gaps = {name: (held, again > 0.0) for name, held, again in each if held or again}
+        z0, z1 = self.z0[k], self.z1[k]
+        return Interval(float(self.t0[k]), self.t1, first, last, z0, z1, noise, gaps)
