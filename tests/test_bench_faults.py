@@ -89,14 +89,14 @@ def test_damaged_journals_are_told_and_salvaged():
     assert 0 < salvaged <= whole
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_clocks_go_wrong_and_are_told():
     outcome = faults.faults(only=["clocks"])
     assert not failed(outcome)
     assert outcome.tables[0].rows[0] == ("none", 500, 0, "–")
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_slow_visitors_keep_nobody_out(monkeypatch):
     monkeypatch.setattr("benchmarks.faults.visitors.PAUSE", 0.0)
     monkeypatch.setattr("benchmarks.faults.visitors.SOON", 60.0)  # no timed test

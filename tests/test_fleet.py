@@ -85,14 +85,21 @@ MODELS = {
     "sources": sources,
     "layers": layers,
 }
+
+
+def law(**options) -> lp.SensitivityLaw:
+    """Return a law whose runs are not judged: those of a fleet are not."""
+    return lp.SensitivityLaw(verdict=False, **options)
+
+
 LAWS = {
-    "drift": lp.SensitivityLaw(drift=0.1),
-    "rank": lp.SensitivityLaw(rank=8),
-    "plain": lp.SensitivityLaw(),
-    "gate, noise": lp.SensitivityLaw(gate=3.0, noise="auto"),
-    "replay": lp.SensitivityLaw(replay=lp.Replay(first=5)),
-    "jumps": lp.SensitivityLaw(jumps=lp.Jumps(settle=5)),
-    "no guards, memory": lp.SensitivityLaw(guards=None, memory=2.0),
+    "drift": law(drift=0.1),
+    "rank": law(rank=8),
+    "plain": law(),
+    "gate, noise": law(gate=3.0, noise="auto"),
+    "replay": law(replay=lp.Replay(first=5)),
+    "jumps": law(jumps=lp.Jumps(settle=5)),
+    "no guards, memory": law(guards=None, memory=2.0),
 }
 
 

@@ -199,7 +199,6 @@ ENGINES = {
     "superlu": (None, lambda pattern: SuperLUSolver(pattern, symmetric=True)),
     "cholmod": ("sksparse.cholmod", CholmodSolver),
     "pardiso": ("pypardiso", lambda pattern: PardisoSolver(pattern, symmetric=True)),
-    "pardiso, general": ("pypardiso", PardisoSolver),
     "multigrid": (None, MultigridSolver),
 }
 
