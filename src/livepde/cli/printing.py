@@ -117,10 +117,14 @@ def show(
 def print_table(console: Console, table: Table) -> None:
     """Print a table: numbers are never cut; where the terminal is too narrow, words are folded.
 
-    A table whose numbers alone are wider than the terminal is printed as wide as they are.
+    A table without rows is its title. A table whose numbers alone are wider than the terminal is
+    printed as wide as they are.
     """
     from rich.box import SIMPLE_HEAD
 
+    if not table.rows:
+        console.print(f"[bold]{escape(table.title)}[/]", soft_wrap=True)
+        return
     grid = RichTable(
         title=escape(table.title), title_justify="left", box=SIMPLE_HEAD, title_style="bold"
     )

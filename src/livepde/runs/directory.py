@@ -472,6 +472,8 @@ def _markdown_table(table: Table) -> str:
         shown = (f"{c:.5g}" if isinstance(c, float) else str(c) for c in cells)
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in shown) + " |"
 
+    if not table.rows:
+        return f"## {table.title}"
     rule = "|" + "---|" * len(table.columns)
     return "\n".join([f"## {table.title}", "", line(table.columns), rule, *map(line, table.rows)])
 
