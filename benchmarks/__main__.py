@@ -168,6 +168,32 @@ def fleet(
     _report(context, _both(separate, rods()), as_json)
 
 
+LIVE, DEATHS = Count(10_000, 2000), Count(20, 4)
+
+
+@app.command()
+def shard(
+    context: typer.Context,
+    members: Annotated[int, LIVE.option("How many rods are live.")] = LIVE.usual,
+    kills: Annotated[int, DEATHS.option("How often a worker is killed.")] = DEATHS.usual,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Fewer rods, of which the memory of 10 000 is extrapolated; few kills."
+        ),
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure live shards of rods: memory, time of a sample, and kills of their workers.
+
+    Example:  python -m benchmarks shard --json
+    """
+    from benchmarks.shard import shard as benchmark
+
+    outcome = benchmark(LIVE.of(context, "members"), DEATHS.of(context, "kills"))
+    _report(context, outcome, as_json)
+
+
 STORED = Count(8000, 2000)
 
 

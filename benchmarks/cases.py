@@ -26,12 +26,13 @@ from livepde.errors import CaseError, LivepdeError
 from livepde.laws import Belief, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.progress import watched
-from livepde.result import Result
-from livepde.runs import Check, Outcome, Table, measures
+from livepde.result import Result, unknown_of
+from livepde.runs import Check, Outcome, Table, measures, verdict
 from livepde.runs.directory import markdown
 from livepde.runs.outcome import Bound, Sense
 from livepde.runs.summary import digits, shown
 from livepde.stepping import ForwardStage, Interval, advance
+from livepde.verdict import MOST
 
 __all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run_job"]
 
@@ -91,6 +92,8 @@ class Run:
         Samples, and their time over that of as many forward steps.
     prior
         RMSE with the unknowns frozen at their prior.
+    verdict
+        At the end: its level, and the findings that are no notes.
     error
         Why there is nothing of this.
     """
@@ -103,6 +106,7 @@ class Run:
     samples: int = 0
     ratio: float = math.nan
     prior: float = math.nan
+    verdict: str = ""
     error: str = ""
 
 
@@ -231,14 +235,23 @@ def run_job(job: Job) -> Run:
         source=case.source,
         numbers=measures(data),
         unknowns={
-            label: (space.unknowns[label.split("[")[0]].unit, case.references.get(label, math.nan))
+            label: (unknown_of(space, label).unit, case.references.get(label, math.nan))
             for label in space.labels
         },
         expected=variants[job.variant] if job.variant else case.expected,
         samples=data.sizes["time"],
         ratio=ratio,
         prior=measures(prior)["rmse"],
+        verdict=_verdict(data),
     )
+
+
+def _verdict(data: xr.Dataset) -> str:
+    """Return the level of a verdict, and what it found of what, the gravest first."""
+    found = verdict(data)
+    graver = [item for item in found.findings if item.severity != "note"]
+    said = dict.fromkeys(f"{item.what} {item.subject}".strip() for item in graver)
+    return ": ".join(filter(None, (found.level, ", ".join([*said][:MOST]))))
 
 
 # --- a run beside a forward run ------------------------------------------------------------------
@@ -343,19 +356,20 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
     quality: list[tuple[Any, ...]] = []
     for job, run in runs:
         if run.error:
-            quality.append((job.label, *["–"] * 5, "failed"))
+            quality.append((job.label, *["–"] * 5, "failed", "–"))
             continue
         numbers = run.numbers
         rmse, withheld = numbers["rmse"], numbers.get("rmse.withheld", math.nan)
         errors = [shown(value) for value in (rmse, withheld, run.prior)]
         steps = int(numbers["failed_steps"])
-        quality.append((job.label, *errors, run.samples, shown(run.ratio, ".1f"), steps))
+        cost = shown(run.ratio, ".1f")
+        quality.append((job.label, *errors, run.samples, cost, steps, run.verdict))
         for label, (unit, reference) in run.unknowns.items():
             estimate = digits(numbers[label], numbers[f"{label}.std"])
             error = shown(100 * numbers.get(f"{label}.error", math.nan), ".2g", " %")
             rows.append((job.label, label, *estimate, unit, shown(reference, ".5g"), error))
     columns = ("case", "unknown", "estimate", "± std. dev.", "unit", "reference", "error")
-    more = ("case", "RMSE", "withheld", "prior", "samples", "time", "failed steps")
+    more = ("case", "RMSE", "withheld", "prior", "samples", "time", "failed steps", "verdict")
     return [Table("Estimates", columns, rows), Table("Runs", more, quality)]
 
 

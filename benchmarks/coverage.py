@@ -314,7 +314,7 @@ def _score(
         hits = []
         for name in (*space.labels, *space.fields):
             part = space.labels[name] if name in space.labels else space.part(name)
-            low, high = estimate.interval(name, level)
+            low, high = estimate[name].interval(level)
             hits.append(np.mean((low <= exact[part]) & (exact[part] <= high)))
         inside[level] = _mean(hits)
     errors = (belief.q - truth) / np.asarray(belief.q_std, dtype=float)

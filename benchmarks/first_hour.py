@@ -237,5 +237,5 @@ def _plate_scores(clone: Path, program: Path, seed: int) -> dict[str, float]:
 
 
 def _holds(estimate: lp.Estimate, name: str, truth: float) -> bool:
-    low, high = estimate.interval(name)
+    low, high = estimate[name].interval()
     return bool(low <= truth <= high)

@@ -18,7 +18,7 @@ from benchmarks.cases import find_cases
 from livepde.cases import load
 from livepde.errors import ConfigurationError
 from livepde.runs import Check, Outcome, Table
-from livepde.runs.feeds import Samples
+from livepde.runs.feeds import SampleFeed
 from livepde.runs.live import Live
 
 __all__ = ["journal"]
@@ -100,6 +100,6 @@ def _run(case: Path) -> tuple[Stopwatch, Stopwatch, int, int]:
         with prepared.journal(file) as kept:
             written.watch(kept, *WRITES)
             stepped.watch(identifier, "step")
-            feed = Samples(prepared.stream, identifier.observed.names)
+            feed = SampleFeed(prepared.stream, identifier.observed.names)
             Live(identifier, feed, kept, fields_every=loaded.fields_every, strict=True).run()
         return written, stepped, stepped.calls, file.stat().st_size

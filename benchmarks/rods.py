@@ -298,7 +298,9 @@ def fleet(members: int = MEMBERS, *, runs: int = RUNS, first: int = FIRST) -> Ou
 def _fleet_pair(given: Rod, members: int, samples: Sequence[Any]) -> tuple[float, float, float]:
     """Return median and mean cost of a sample over the reference's, and how q differs."""
     law = SensitivityLaw(guards=None, start_window=0, shadows=None)  # as the reference
-    together = Fleet(given.model, given.sensors, law, members, u0=0.0, scheme=ImplicitEuler())
+    together = Fleet(
+        given.model, given.sensors, law, members, u0=0.0, scheme=ImplicitEuler(), halvings=0
+    )
     matrices, spent, reference = given.matrices, [], []
     G = given.sensors.matrix(given.model.state_space).toarray()[:, matrices.order] / NOISE
     start = given.model.initial(0.0, _moment(samples[0]))

@@ -27,7 +27,7 @@ from livepde.observation import Points
 from livepde.result import Estimate
 from livepde.runs import Check, Journal, Outcome, Table, journal_of
 from livepde.runs.database import log_of
-from livepde.runs.feeds import Samples
+from livepde.runs.feeds import SampleFeed
 from livepde.runs.live import Live, Retention
 from livepde.stepping import Advance, simulate
 
@@ -118,7 +118,7 @@ def soak(steps: int = STEPS, *, share: float = 1.0, progress: bool = False) -> O
             meter = Meter(reader, _fresh())
             live = Live(
                 identifier,
-                Samples(shown(samples, steps, "samples") if progress else samples),
+                SampleFeed(shown(samples, steps, "samples") if progress else samples),
                 journal,
                 sinks=[meter],
                 fields_every=EVERY,

@@ -185,7 +185,7 @@ def judge(data: Data, identifier: Identifier) -> Score:
     """Return how an estimate compares with the truth."""
     estimate, model = identifier.estimate(), data.model
     (name,) = model.parameter_space.fields
-    low, high = (_shown(model, end) for end in estimate.interval(name))
+    low, high = (_shown(model, end) for end in estimate[name].interval())
     hit = np.where(np.isfinite(low), (low <= data.true) & (data.true <= high), np.nan)
     latent = identifier.latent_belief()
     std = np.full(latent.q.shape, np.nan) if latent.q_std is None else latent.q_std

@@ -243,11 +243,11 @@ def test_a_resumed_run_gives_the_same_numbers(noise: float | None, tmp_path: Any
     stops, first = (5, 45, 190, 260), build(noise=noise)
     for begin, stop in pairwise((0, *stops)):
         run(first, still()[begin:stop])
-        first.save(tmp_path / f"{stop}.npz")
+        first.save(tmp_path / f"{stop}.bin")
     expected = run(build(noise=noise), still()[:300])[-1]
     for stop in stops:
         second = build(noise=noise)
-        second.load(tmp_path / f"{stop}.npz")
+        second.load(tmp_path / f"{stop}.bin")
         found = run(second, still()[stop:300])[-1]
         np.testing.assert_array_equal(found.q, expected.q)
         np.testing.assert_array_equal(found.u, expected.u)

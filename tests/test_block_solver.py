@@ -253,9 +253,9 @@ def test_a_run_resumed_gives_the_same_numbers(gain, stream, tmp_path):
     model, sensors, samples, fresh = stream
     whole = fresh(gain)
     settled(model, sensors, samples[:20], whole)
-    whole.save(tmp_path / "half.npz")
+    whole.save(tmp_path / "half.bin")
     again = fresh(gain)
-    again.load(tmp_path / "half.npz")
+    again.load(tmp_path / "half.bin")
     one, kept = settled(model, sensors, samples[20:], whole)
     other, made = settled(model, sensors, samples[20:], again)
     assert made[0] == kept[0] + 1

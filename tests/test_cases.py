@@ -176,9 +176,61 @@ def test_layers(rod):
     assert len(preview(prepared, prepared.stream).unknowns) == 2
 
 
-def test_layers_that_end_inside_of_a_cell_get_a_note(rod):
-    path = rod(LAYERS, ("cells = 40 ", "cells = 39 "))
-    assert "ends inside of a cell" in cases.load(path).notes[0]
+def test_layers_with_priors_of_their_own(rod):
+    own = """{ over = ["20 cm", "40 cm"], prior = 0.8, std = "3e-5 m^2/s",
+        evolution = { kind = "mean-reverting", time = "1 h" } }"""
+    layers = (LAYERS[0], LAYERS[1].replace('["20 cm", "40 cm"]', " ".join(own.split())))
+    case = cases.load(
+        rod(layers, ('prior = "5e-5 m^2/s"', 'prior = 0.5\nunit = "cm^2/s"'), NO_REPLAY)
+    )
+    space = case.model.parameter_space
+    a, b = (space.unknown_of(f"alpha[{name}]") for name in "ab")
+    assert (a.prior, b.prior) == pytest.approx((5e-5, 8e-5))
+    assert b.std == pytest.approx(3e-5)
+    assert (a.evolution.moves, b.evolution) == (False, lp.MeanReverting(3600.0))
+    assert b.bounds == a.bounds
+    assert len(preview(case.prepare(), case.prepare().stream).unknowns) == 2
+
+
+@pytest.mark.parametrize(
+    ("region", "named"),
+    [
+        ("{ prior = 1 }", "the key '{}.over' is missing"),
+        ("{ over = [0, 1], priro = 1 }", "no key '{}.priro'; did you mean 'prior'"),
+        ('{ over = [0, 1], prior = "1 m" }', "{}.prior: 'm' cannot be converted"),
+        ('{ over = [0, 1], prior = "1e-2 m^2/s" }', "{}: the prior 0.01 lies outside"),
+        ("3", "{}: got 3"),
+    ],
+)  # fmt: skip
+def test_layers_that_are_refused(rod, region, named):
+    with pytest.raises(lp.CaseError) as error:
+        cases.load(rod((LAYERS[0], f"regions = {{ a = {region} }}\nbounds = [")))
+    assert named.replace("{}", "unknowns.alpha.regions.a") in str(error.value)
+
+
+@pytest.mark.parametrize("spacing", ["uniform", "geometric"])
+def test_nodes_move_to_the_ends_of_layers_and_sources(rod, spacing):
+    heated = '[sources]\nheater = { value = "1 K/s", over = ["5 cm", "33.3 cm"] }\n[channels] '
+    cells = f'cells = 39\nspacing = "{spacing}"'
+    more = [("from = 0", "from = 0.001"), ("a = [0,", "a = [0.001,")]
+    path = rod(LAYERS, ("cells = 40 ", cells), ("[channels]", heated), *more)
+    case = cases.load(path)
+    assert not any("inside of a cell" in note for note in case.notes)
+    nodes = case.mesh.p[0]
+    assert len(nodes) == 40
+    for edge in (0.05, 0.2, 0.333):
+        assert np.abs(nodes - edge).min() < 1e-12
+    plain = lp.interval(0.001, 0.4, 39, geometric=spacing == "geometric").p[0]
+    assert int((np.abs(nodes - plain) > 1e-12).sum()) == 3
+
+
+def test_layers_that_end_inside_of_a_cell_get_one_note(rod):
+    mesh = 'from = 0\nto = "40 cm"\ncells = 40'
+    path = rod(LAYERS, (mesh, "nodes = [0, 0.1, 0.19, 0.3, 0.4]\n#"))
+    notes = [note for note in cases.load(path).notes if "inside of a cell" in note]
+    assert notes == [
+        "Layer 'a' of alpha, layer 'b' of alpha end inside of a cell: add the ends to mesh.nodes."
+    ]
 
 
 @pytest.mark.slow

@@ -34,6 +34,7 @@ COMMANDS = (
     "run",
     "fleet",
     "report",
+    "explain",
     "watch",
     "export",
     "citation",
@@ -153,7 +154,7 @@ def test_init_check_run_report(here):
     assert "alpha" in output
     assert "runs/mine" in output
     names = {p.name for p in (here / "runs" / "mine").iterdir()}
-    assert {"run.json", "case.toml", "estimates.nc", "checkpoint.npz", "report.md"} <= names
+    assert {"run.json", "case.toml", "estimates.nc", "checkpoint.bin", "report.md"} <= names
     assert call("run", "mine/case.toml")[1].strip().endswith("runs/mine-2")
 
     before = (here / "runs" / "mine" / "report.md").read_text()
@@ -261,7 +262,7 @@ def lines(count: int) -> str:
 def test_standard_input(rod):
     code, output = call("run", rod, "--data", "-", "--json", "--out", "out", stdin=lines(12))
     assert code in (0, 1)
-    assert json.loads(output)["tables"][2]["rows"][0][4] == 12
+    assert json.loads(output)["tables"][2]["rows"][0][5] == 12
 
 
 @pytest.mark.slow

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import subprocess
 import sys
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from commands import call
+from commands import call, estimates, until
+from patience import PATIENCE
 
 from livepde import Fleet, cases, runs
 from livepde.cases import together
@@ -257,13 +262,162 @@ def test_each_process_steps_its_part_together(alike):
         equal(Path("two") / name, Path("one") / name)
 
 
+def workers(parent: int) -> list[int]:
+    """Return the worker processes that loky has started."""
+    text = Path(f"/proc/{parent}/task/{parent}/children").read_text()
+    found = []
+    for child in map(int, text.split()):
+        with suppress(OSError):
+            if "LokyProcess" in Path(f"/proc/{child}/cmdline").read_text():
+                found.append(child)
+    return found
+
+
+@pytest.fixture
+def longer(alike):
+    """Data that take a while: of twenty times as many samples."""
+    for path in (Path("rod/rod.csv"), Path("rod/other.csv"), Path("rod/third.csv")):
+        table = pd.read_csv(path)
+        table = pd.concat([table] * 20, ignore_index=True)
+        table[table.columns[0]] = 20.0 * np.arange(len(table))
+        table.to_csv(path, index=False)
+    Path("rods.csv").write_text(ALIKE + "d,rod/third.csv,\n")
+    return alike
+
+
+@pytest.mark.process
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
+@pytest.mark.usefixtures("longer")
+def test_a_killed_worker_is_replaced_and_told():
+    """All members finish, with the numbers of runs that nobody killed."""
+    pytest.importorskip("joblib", reason="'fleet' is not installed")
+    call(*FIRST, "one", "--separately")
+    command = [sys.executable, "-m", "livepde", *FIRST, "two", "--separately", "--jobs", "2"]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen([*command, "--json"], stdout=pipe, stderr=pipe, text=True)
+    until(lambda: any(estimates(f"two/{name}") > 50 for name in "abcd"), process)
+    os.kill(workers(process.pid)[0], signal.SIGKILL)
+    output, errors = process.communicate(timeout=PATIENCE)
+    assert "Traceback" not in errors
+    (told,) = (note for note in json.loads(output)["notes"] if "worker process died" in note)
+    assert told.endswith("members open: they went on from their run directories.")
+    assert pd.read_csv("two/fleet.csv")["status"].tolist() == ["finished"] * 4
+    for name in "abcd":
+        mine, wanted = (runs.open(Path(folder) / name) for folder in ("two", "one"))
+        assert mine.status == "finished"
+        xr.testing.assert_identical(*(run.dataset.drop_attrs() for run in (mine, wanted)))
+
+
+@pytest.mark.process
+@pytest.mark.usefixtures("processes")
+def test_workers_that_die_again_and_again_end_the_command(here, monkeypatch):
+    """With a sentence for each member, a summary, and no run that seems to go on."""
+    Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
+    call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
+    record = Path("rods/plain/run.json")
+    record.write_text(record.read_text().replace('"finished"', '"running"'))
+    died = []
+
+    def parallel(self, tasks):
+        died.append(len(list(tasks)))
+        raise BrokenProcessPool
+
+    with monkeypatch.context() as patch:
+        patch.setattr("joblib.Parallel.__call__", parallel)
+        code, output = call(*FIRST, "rods", "--resume", "--jobs", "2", "--json")
+    assert (code, len(died)) == (1, 5)
+    assert runs.open(Path("rods/plain")).status == "failed"
+    assert runs.open(Path("rods/warm")).status == "finished"
+    table = pd.read_csv("rods/fleet.csv")
+    assert table["status"].tolist() == ["failed", "finished"]
+    assert table["samples"].tolist() == [39, 29]
+    assert "plain: A worker process died" in output
+    call(*FIRST, "rods", "--resume")
+    assert runs.open(Path("rods/plain")).status == "finished"
+
+
+def test_the_summary_is_written_also_if_the_command_fails(here, monkeypatch):
+    Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
+
+    def defect(self, member, prepared):
+        if member.name == "warm":
+            self._writer(member, prepared.case)
+            raise ZeroDivisionError
+        return alone(self, member, prepared)
+
+    module = sys.modules["livepde.cli.fleet"]
+    alone = module.Runs._alone
+    monkeypatch.setattr(module.Runs, "_alone", defect)
+    with pytest.raises(ZeroDivisionError):
+        call(*FIRST, "rods", "--separately")
+    assert runs.open(Path("rods/warm")).status == "failed"
+    assert pd.read_csv("rods/fleet.csv")["status"].tolist() == ["finished", "failed"]
+
+
+KILLED = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from commands import call, estimates
+
+def kill():
+    while not any(estimates(f"two/{name}") > 50 for name in "abcd"):
+        time.sleep(0.01)
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            ours = f"HERE={os.getcwd()}" in (process / "environ").read_text()
+            if ours and os.environ["KILLED"] in (process / "cmdline").read_text():
+                found.append(int(process.name))
+        except OSError:
+            pass
+    os.kill(min(found), signal.SIGKILL)
+
+if __name__ == "__main__":
+    threading.Thread(target=kill, daemon=True).start()
+    print(call(*sys.argv[1:])[1])
+"""
+WORKERS = {"dask": "--multiprocessing-fork", "ray": "ray::PoolActor"}
+
+
+@pytest.mark.process
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
+@pytest.mark.usefixtures("longer")
+@pytest.mark.parametrize("backend", WORKERS)
+def test_a_worker_of_another_engine_is_killed(backend):
+    """Members of its part go on from their run directories, in another process."""
+    name = {"dask": "distributed"}.get(backend, backend)
+    pytest.importorskip(name, reason=f"{backend} is not installed")
+    call(*FIRST, "one", "--separately")
+    Path("script.py").write_text(KILLED)
+    command = [sys.executable, "script.py", *FIRST, "two", "--separately"]
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    environment = os.environ | {
+        "PYTHONPATH": paths,
+        "HERE": os.getcwd(),
+        "KILLED": WORKERS[backend],
+    }
+    done = subprocess.run(
+        [*command, "--backend", backend, "--jobs", "2"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        env=environment,
+    )
+    assert "Run directories: two" in done.stdout, done.stderr
+    assert pd.read_csv("two/fleet.csv")["status"].tolist() == ["finished"] * 4
+    assert any("resumed" in runs.open(Path("two") / name).record for name in "abcd")
+    for name in "abcd":
+        mine, wanted = (runs.open(Path(folder) / name) for folder in ("two", "one"))
+        xr.testing.assert_identical(*(run.dataset.drop_attrs() for run in (mine, wanted)))
+
+
 def test_what_it_leaves_serves_other_commands(alike):
     call(*FIRST, "rods")
     call("report", "rods/b")
     call("export", "rods/b", "b.csv", "b.html")
     assert len(pd.read_csv("b.csv")) == 39
     case = cases.load("rod/case.toml").prepare("rod/other.csv")
-    case.identifier.load("rods/b/checkpoint.npz")
+    case.identifier.load("rods/b/checkpoint.bin")
     run = runs.open(Path("rods/b"))
     assert case.identifier.t == run.dataset["time"][-1]
     estimate = case.identifier.estimate()

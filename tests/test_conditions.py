@@ -144,7 +144,7 @@ def test_a_case_finds_conductivity_and_heat_flux(tmp_path: Path) -> None:
     prepared = load(wall(tmp_path)).prepare()
     for sample in prepared.stream:
         estimate = prepared.identifier.step(sample.t, sample.z, sample.inputs)
-    low, high = np.array([estimate.interval(name) for name in ("k", "J")]).reshape(2, 2).T
+    low, high = np.array([estimate[name].interval() for name in ("k", "J")]).reshape(2, 2).T
     assert (low < [28.5, 2e4]).all()
     assert (high > [28.5, 2e4]).all()
     assert estimate.q_std[1] < 500.0
@@ -229,3 +229,98 @@ def test_heat_takes_fluxes_over_the_heat_capacity() -> None:
     two = heat(mesh, lp.Scalar(K / C, 1.0), {"right": 0.0})
     two = with_conditions(two, {"left": Flux(6.0 / C)})
     assert steady(one, {"k": K}) == pytest.approx(steady(two, {"alpha": K / C}))
+
+
+def test_a_constant_input_equals_its_channel() -> None:
+    mesh = lp.interval(0.0, LENGTH, 40)
+    unknowns = {"k": K, "loss": 0.3, "transfer": 0.2}
+    scalars = {name: lp.Scalar(value, 1.0) for name, value in unknowns.items()}
+    model = conduction(mesh, dirichlet={"right": 0.0}, C=C, **scalars)
+    constant = model.with_constant_inputs({"ambient": 7.0})
+    assert (model.channels, constant.channels) == (("ambient",), ())
+    assert constant.constant
+    assert not model.constant
+    expected = steady(model, unknowns, lambda t: {"ambient": 7.0})
+    assert steady(constant, unknowns) == pytest.approx(expected, abs=1e-9)
+    with pytest.raises(ModelError, match=r"no input 'Q'; it has \['ambient'\]"):
+        model.with_constant_inputs({"Q": 1.0})
+
+
+def test_one_input_is_constant_and_another_a_channel() -> None:
+    model = with_conditions(slab({"right": 0.0}), {"left": Flux(lp.Channel("J"))})
+    model = with_conditions(model, sources={"s": Source(lp.Channel("P"))})
+    part = model.with_constant_inputs({"P": 2.0})
+    assert part.channels == ("J",)
+    both = steady(model, {"k": K}, lambda t: {"J": 3.0, "P": 2.0})
+    assert steady(part, {"k": K}, lambda t: {"J": 3.0}) == pytest.approx(both, abs=1e-9)
+
+
+def test_a_source_with_a_constant_input_is_assembled_once() -> None:
+    mesh = lp.interval(0.0, LENGTH, 4)
+    field = lp.Field(mesh, lp.linear(mesh))
+    source = lp.Model(
+        field,
+        {"a": lp.Scalar()},
+        A=lambda q, u, v, x: q.a * u * v,
+        f=lp.On("left", lambda x, t: x.inputs["Q"]),
+        inputs=["Q"],
+    )
+    assert source.with_constant_inputs({"Q": 2.0}).form_F.constant
+    assert not source.form_F.constant
+
+
+TEST = """\
+equation = "borehole"
+initial = "10 degC"
+mesh = { from = "7.5 cm", to = "8 m", cells = 30, spacing = "geometric" }
+data = { file = "test.csv", time = "t", time_unit = "h" }
+options = { H = "100 m", rho_c = "2.3e6 J/(m^3 K)", T0 = "10 degC" }
+unknowns.k = { prior = "2 W/(m K)", std = "0.6 W/(m K)", transform = "log" }
+unknowns.R_b = { prior = "0.1 m K/W", std = "0.03 m K/W", transform = "log" }
+INPUT
+[channels]
+T = { role = "sensor", column = "T", quantity = "fluid", noise = "0.05 K" }
+COLUMN
+"""
+COLUMN = 'Q = { role = "input", column = "Q", unit = "kW" }'
+
+
+def response(folder: Path, given: str, column: str) -> Path:
+    rows = [f"{t},{10.0 + 3.0 * np.log1p(t)},5" for t in range(30)]
+    (folder / "test.csv").write_text("\n".join(["t,T,Q", *rows]) + "\n")
+    path = folder / "case.toml"
+    path.write_text(TEST.replace("INPUT", given).replace("COLUMN", column))
+    return path
+
+
+def test_a_constant_input_of_a_case_is_that_of_a_column(tmp_path: Path) -> None:
+    found = []
+    for given, column in (("", COLUMN), ('inputs.Q = "5 kW"', "")):
+        prepared = load(response(tmp_path, given, column)).prepare()
+        for sample in prepared.stream:
+            estimate = prepared.identifier.step(sample.t, sample.z, sample.inputs)
+        found.append(estimate)
+    assert found[1].q == pytest.approx(found[0].q, rel=1e-6)
+    assert found[1].q_std == pytest.approx(found[0].q_std, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "column", "text"),
+    [
+        ('inputs.Q = "5 kW"', COLUMN, "inputs.Q: there is a channel 'Q', too; keep one"),
+        ('inputs.q = "5 kW"', "", "inputs: the equation 'borehole' has no 'q' here"),
+        ('inputs.Q = "5 K"', "", "inputs.Q: 'K' cannot be converted to 'W'"),
+        ("", "", "channels.Q is missing: .* with role = 'input'; or a constant, inputs.Q"),
+    ],
+)
+def test_a_constant_input_that_is_refused(
+    tmp_path: Path, given: str, column: str, text: str
+) -> None:
+    with pytest.raises(CaseError, match=text):
+        load(response(tmp_path, given, column))
+
+
+def test_a_constant_input_that_nothing_reads_is_refused(tmp_path: Path) -> None:
+    text = "inputs.ambient: the equation does not read it with these unknowns"
+    with pytest.raises(CaseError, match=text):
+        load(changed(tmp_path, ("[boundary]", 'inputs.ambient = "12 degC"\n[boundary]')))

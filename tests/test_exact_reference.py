@@ -36,7 +36,7 @@ def found():
 def test_law_and_reference_have_the_same_data():
     for name in ("partial, clamped", "varying D, nu = 0.1", "scaled, S = 1e3, error 0.1 %"):
         setting = replace(SETTINGS[name], cut=False, steps=3)
-        samples, run = exact.Samples.of(setting), reference.run(setting)
+        samples, run = exact.ReferenceSamples.of(setting), reference.run(setting)
         columns = samples.at.X.free[samples.at.observed]
         np.testing.assert_array_equal(samples.z, run.Z[:, columns])
         np.testing.assert_array_equal(samples.loads, run.F)
@@ -67,13 +67,13 @@ def test_of_several_solutions_both_take_the_same(found):
     item = found["partial, nu = 0.01"]
     assert max(item.of_strict) < 1e-8
     other = replace(SETTINGS["partial, nu = 0.01"], cut=False, nu=0.0101)
-    moved = exact.follow(exact.Samples.of(other), exact.law(other, paper.STRICT))
+    moved = exact.follow(exact.ReferenceSamples.of(other), exact.law(other, paper.STRICT))
     assert np.abs(moved.Q - item.strict.Q).max() > 1e-5
 
 
 def test_a_law_that_is_another_one_is_seen():
     setting = replace(SETTINGS["partial, nu = 0.1"], cut=False, steps=20)
-    samples, run = exact.Samples.of(setting), reference.run(setting)
+    samples, run = exact.ReferenceSamples.of(setting), reference.run(setting)
     for change in ({"nu": 0.0}, {"sigma": 1e-3}, {"c1": 0.9}, {"gain": 99.0}):
         law = exact.law(replace(setting, **change), paper.STRICT)
         course = exact.follow(samples, law)
@@ -98,7 +98,7 @@ def test_energy_never_grows(monkeypatch):
 
 def test_growth_of_the_energy_is_seen():
     setting = replace(exact.FULL, steps=10, truth="exact")  # data of another scheme
-    samples = exact.Samples.of(setting)
+    samples = exact.ReferenceSamples.of(setting)
     course = exact.follow(samples, exact.law(setting, paper.STRICT))
     assert exact.growth(samples, course) > 1.0
     failed = replace(course, ok=np.zeros(11, dtype=bool))

@@ -43,6 +43,7 @@ def test_every_example_is_tested():
         "heated_rod",
         "room_wall",
         "battery_charge",
+        "live_shards",
     }
 
 

@@ -34,17 +34,16 @@ EDITS = {  # line of the template -> line for data of his own: dates, another co
 
 
 OPEN = {  # what his table does not tell: the ends, the places, a unit, the prior, the noise
-    'from = "?': "from = 0",
-    'to = "?': 'to = "40 cm"',
-    'prior = "?': 'prior = "5e-5 m^2/s"',
-    'std = "?': 'std = "3e-5 m^2/s"',
+    'from = "?': 'mesh = { from = 0, to = "40 cm", cells = 40 }',
+    'prior = "?': "unknowns.alpha = "
+    '{ prior = "5e-5 m^2/s", std = "3e-5 m^2/s", transform = "log" }',
     'column = "T_left"': 'left = { role = "boundary", column = "T_left", at = "left" }',
     'column = "probe': 'probe = { role = "sensor", column = "probe near furnace", at = "10 cm", '
     'unit = "degF" }',
     'column = "T_20"': 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }',
     'column = "T_30"': 'T_30 = { role = "sensor", column = "T_30", at = "30 cm" }',
     'column = "T_right"': 'right = { role = "boundary", column = "T_right", at = "right" }',
-    'noise = "?': f'noise = "{NOISE} K"',
+    'noise = "?': f'law = {{ noise = "{NOISE} K" }}',
 }
 
 

@@ -13,7 +13,7 @@ from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from benchmarks.fleet import fleet as benchmark
-from livepde.fleet import Kept
+from livepde.fleet import FleetRecords
 from livepde.laws.innovations import Innovations
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern
 from livepde.models import heat
@@ -333,8 +333,8 @@ def test_goes_on_from_a_checkpoint_with_the_same_numbers(law, tmp_path):
     stream = samples(fleet, steps=90)
     for sample in stream[:40]:
         fleet.step(*sample)
-    fleet.save(tmp_path / "fleet.npz")
-    other.load(tmp_path / "fleet.npz")
+    fleet.save(tmp_path / "fleet.bin")
+    other.load(tmp_path / "fleet.bin")
     for sample in stream[40:]:
         mine, restored = fleet.step(*sample), other.step(*sample)
         np.testing.assert_array_equal(mine.q, restored.q)
@@ -342,7 +342,7 @@ def test_goes_on_from_a_checkpoint_with_the_same_numbers(law, tmp_path):
     assert fleet.dump() == other.dump()
     strange = lp.Fleet(model, SENSORS, law, ["a", "c"])
     with pytest.raises(lp.RunError, match="another members"):
-        strange.load(tmp_path / "fleet.npz")
+        strange.load(tmp_path / "fleet.bin")
 
 
 def test_a_fleet_that_has_not_begun_is_saved_too():
@@ -480,7 +480,7 @@ def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
     """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
     model = MODELS[name]()
     fleet = lp.Fleet(model, SENSORS, LAWS["gate, noise"], 3, withheld=lp.Points({"hidden": 0.4}))
-    kept = Kept(model, 4)
+    kept = FleetRecords(model, 4)
     results = [Result(model, fleet.observed, fleet.withheld, 4) for _ in range(3)]
     for t, z, inputs in samples(fleet, 9):
         estimate = fleet.step(t, z, inputs)
@@ -501,7 +501,7 @@ def test_members_that_step_separately_are_not_kept_as_arrays():
     fleet = lp.Fleet(rod(), SENSORS, lp.GradientLaw(), 2)
     estimate = fleet.step(*samples(fleet, 5)[0])
     with pytest.raises(lp.ConfigurationError, match="separately"):
-        Kept(fleet.model).add(estimate)
+        FleetRecords(fleet.model).add(estimate)
 
 
 @pytest.mark.parametrize("law", ["plain", "drift", "gate, noise"])

@@ -204,7 +204,9 @@ ENGINES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", list(ENGINES))
+@pytest.mark.parametrize(
+    "engine", [*list(ENGINES)[:-1], pytest.param("multigrid", marks=pytest.mark.study)]
+)
 def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
     model, engine, monkeypatch
 ):

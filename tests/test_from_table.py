@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 import livepde as lp
 from livepde import cases
 from livepde.cases.measured import measured
+from livepde.cases.sources import source_of
 from livepde.cases.template import write_template
 from livepde.cli import app
 from livepde.models import EQUATIONS
@@ -275,7 +277,7 @@ def test_graded_meshes_where_the_equation_wants_them(here, name):
     filled = {"mesh.from": "0.1 m", "mesh.to": "900 m", "options.b": "10 m", "law.noise": "1 cm"}
     filled |= {f"unknowns.k.{key}": "1e-4 m/s" for key in ("prior", "std")}
     filled |= {f"unknowns.Ss.{key}": "1e-5 1/m" for key in ("prior", "std")}
-    filled |= {"channels.a.at": "9 m", "channels.Q.column": "a"}
+    filled |= {"channels.a.at": "9 m", "inputs.Q": "36 m^3/h"}
     told = "where 'pumping_test' changes most: mesh.spacing = 'geometric'"
     for spacing, expected in (("geometric", False), ("uniform", True)):
         case = cases.load("mine/case.toml", settings={**filled, "mesh.spacing": spacing})
@@ -320,7 +322,7 @@ def test_inputs_and_units_of_another_equation(here):
     assert found["unknowns"]["Ss"] == {"prior": "? 1/m", "std": "? 1/m", "transform": "log"}
     Path("mine/case.toml").unlink()
     found = begun("time (min),near 8 m\n0,0\n1,1\n", equation="pumping_test")
-    assert found["channels"]["Q"] == {"role": "input", "column": "?"}
+    assert found["inputs"] == {"Q": "? m^3/s"}
 
 
 @pytest.mark.parametrize("name", EQUATIONS)
@@ -333,7 +335,8 @@ def test_a_case_of_every_equation_has_what_it_needs(here, name):
     chosen = {*list(equation.alternatives)[-1:]}
     assert found["equation"] == name
     assert set(found["unknowns"]) == needed(equation.unknowns) | chosen
-    assert set(found["channels"]) == {"a", *needed(equation.inputs)}
+    assert set(found["channels"]) == {"a"}
+    assert set(found.get("inputs", ())) == needed(equation.inputs)
     assert set(found.get("options", ())) == {
         key
         for key, option in equation.options.items()
@@ -406,11 +409,11 @@ def test_questions_on_a_terminal(here, monkeypatch):
         "40 cm",
         "5e-5",  # prior
         "",  # std: skipped
+        "0.05",  # law.noise
         "left",
         "0.1",
         "-",
         "",
-        "0.05",
     ]
     done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"], "\n".join(answers) + "\n")
     assert done.exit_code == 0, done.output
@@ -443,11 +446,11 @@ def test_questions_on_rows_of_sensors_and_on_columns(here, monkeypatch):
     names = [f"s_{k}" for k in range(9)]
     row = ",".join("0" for _ in names)
     Path("my.csv").write_text(f"time_s,rate,{','.join(names)}\n0,1,{row}\n60,1,{row}\n")
-    answers = ["8 m", "0.1", "900", "", "", "", "", "-", "1", "1, 9 m", "flow", "rate", ""]
+    answers = ["8 m", "0.1", "900", "", "", "", "", "flow", "rate", "", "-", "1", "1, 9 m"]
     begin = ["init", "mine", "--data", "my.csv", "--equation", "pumping_test"]
     done = CliRunner().invoke(app, begin, "\n".join(answers) + "\n")
     assert done.exit_code == 0, done.output
-    assert "There is no column 'flow' among rate, s_0" in done.output
+    assert "inputs.Q: got 'flow'; expected a number in m^3/s" in done.output
     assert "Got 1 values; expected 2" in done.output
     found = tomllib.loads(Path("mine/case.toml").read_text())
     assert found["options"] == {"b": "8 m"}
@@ -506,6 +509,23 @@ def test_a_process_that_nothing_drives_is_noted(here, more, driven):
 
 
 @pytest.mark.slow
+def test_the_case_of_a_rod_is_fifteen_lines_and_runs(here):
+    write_template(Path("rod"))
+    runner = CliRunner()
+    places = [f"channels.T_{k}.at={k} cm" for k in (10, 20, 30)]
+    ends = [f"channels.T_{e}.{i}" for e in ("left", "right") for i in (f"at={e}", "role=boundary")]
+    known = ["mesh.from=0", "mesh.to=40 cm", "law.noise=0.05 K", *places, *ends]
+    known += ["unknowns.alpha.prior=5e-5 m^2/s", "unknowns.alpha.std=3e-5 m^2/s"]
+    sets = [part for item in known for part in ("--set", item)]
+    done = runner.invoke(app, ["init", "mine", "--data", "rod/rod.csv", *sets])
+    assert "nothing is left open" in done.output
+    lines = [line for line in Path("mine/case.toml").read_text().splitlines() if line]
+    assert len([line for line in lines if not line.startswith("#")]) <= 15
+    done = runner.invoke(app, ["run", "mine/case.toml", "--out", "out", "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["measures"]["alpha"] == pytest.approx(9.7e-5, rel=0.02)
+
+
 def test_from_a_table_to_estimates(here):
     rod, _ = write_template(Path("rod"))
     runner = CliRunner()
@@ -518,10 +538,10 @@ def test_from_a_table_to_estimates(here):
     case = Path("mine/case.toml")
     with pytest.raises(lp.CaseError) as error:
         cases.load(case)
-    named = "mesh.from, mesh.to, unknowns.alpha.prior, unknowns.alpha.std, channels.T_left.at, "
+    named = "mesh.from, mesh.to, unknowns.alpha.prior, unknowns.alpha.std, law.noise, "
     assert str(error.value) == (
-        f"mine/case.toml: still to be filled in, where it says '?': {named}channels.T_10.at, "
-        "channels.T_20.at, channels.T_30.at, channels.T_right.at, law.noise."
+        f"mine/case.toml: still to be filled in, where it says '?': {named}channels.T_left.at, "
+        "channels.T_10.at, channels.T_20.at, channels.T_30.at, channels.T_right.at."
     )
     places = {f"channels.T_{k}.at": f"{k} cm" for k in (10, 20, 30)}
     ends = {
@@ -541,3 +561,129 @@ def test_from_a_table_to_estimates(here):
     value, std = result.last.parameters["alpha"]
     assert abs(value - 9.7e-5) < 4 * std < 2e-6
     assert runner.invoke(app, ["init", "mine", "--data", "rod/rod.csv"]).exception is not None
+
+
+# --- several tables of one process ---------------------------------------------------------------
+
+WARM = "time_s;T_5cm;T_15cm\n0;20,0;20,0\n60;21,0;20,5\n120;22,0;\n180;23,0;21,5\n240;24,0;22,0\n"
+HEATER = "t [min],Q_kW,state\n-1,5,on\n1,7,on\n2.5,10,on\n4,10,off\n"
+FILES = {"mesh.from": "3 cm", "mesh.to": "1 m", "law.noise": "0.1 K", "options.H": "1 m"}
+FILES |= {"options.T0": "20 degC", "channels.T_15cm.role": "withheld"}
+FILES |= {"unknowns.k.prior": "2 W/(m K)", "unknowns.k.std": "1 W/(m K)"}
+FILES |= {"unknowns.R_b.prior": "0.1 m K/W", "unknowns.R_b.std": "0.1 m K/W"}
+FILES |= {"options.rho_c": "2e6 J/(m^3 K)"}
+
+
+def two_tables() -> list[str]:
+    Path("warm.csv").write_text(WARM)
+    Path("heater.csv").write_text(HEATER)
+    return ["--data", "warm.csv", "--data", "heater.csv", "--equation", "borehole"]
+
+
+def test_two_tables_are_joined_by_time(here):
+    begin = ["init", "mine", *two_tables()]
+    sets = [part for key, value in FILES.items() for part in ("--set", f"{key}={value}")]
+    done = CliRunner().invoke(app, [*begin, *sets])
+    assert "for warm.csv and heater.csv: nothing is left open" in done.output, done.output
+    found = tomllib.loads(Path("mine/case.toml").read_text())["data"]
+    other = {"file": "../heater.csv", "time": "t [min]", "time_unit": "min"}
+    other |= {"separator": ",", "decimal": "."}
+    assert found == {
+        "file": ["../warm.csv", other],
+        "time": "time_s",
+        "time_unit": "s",
+        "separator": ";",
+        "decimal": ",",
+    }
+    prepared = cases.load("mine/case.toml").prepare()
+    raw = prepared.raw
+    # It begins where both tables have begun, and the rows are those of both.
+    np.testing.assert_allclose(raw.t, [0, 60, 120, 150, 180, 240])
+    at = {name: raw.values[:, k] for k, name in enumerate(raw.names)}
+    np.testing.assert_allclose(at["T_5cm"], [20, 21, 22, np.nan, 23, 24])
+    np.testing.assert_allclose(at["T_15cm"], [20, 20.5, np.nan, np.nan, 21.5, 22])
+    np.testing.assert_allclose(at["Q"], [6e3, 7e3, np.nan, 1e4, np.nan, 1e4])
+    filled = prepared.stream
+    assert np.isfinite(filled.values[:, filled.names.index("Q")]).all()
+    done = CliRunner().invoke(app, ["run", "mine/case.toml", "--out", "out", "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["status"] == "finished"
+
+
+def test_tables_with_dates_are_joined(here):
+    Path("a.csv").write_text("time,T_1cm\n2026-03-02 08:00,20\n2026-03-02 08:10,21\n")
+    Path("b.csv").write_text("time,T_2cm\n2026-03-02 08:05,19\n2026-03-02 08:10,20\n")
+    Path("case.toml").write_text("""
+equation = "heat"
+initial = 20
+mesh = { from = 0, to = "10 cm", cells = 10 }
+data = { file = ["a.csv", "b.csv"], time = "time" }
+unknowns.alpha = { prior = 1e-5, std = 1e-5 }
+law = { noise = 0.1 }
+boundary.left = 20
+[channels]
+T_1 = { role = "sensor", column = "T_1cm", at = "1 cm" }
+T_2 = { role = "sensor", column = "T_2cm", at = "2 cm" }
+""")
+    prepared = cases.load("case.toml").prepare()
+    assert prepared.origin is not None
+    assert f"{prepared.origin}" == "2026-03-02 08:05:00"
+    np.testing.assert_allclose(prepared.raw.t, [0, 300])
+    np.testing.assert_allclose(prepared.raw.values, [[np.nan, 19], [21, 20]])
+    skipped = cases.load("case.toml", settings={"channels.T_1.missing": "skip"}).prepare()
+    np.testing.assert_allclose(skipped.raw.values, [[21, 20]])
+    assert skipped.raw.remarks["skipped", "T_1"] == 1
+
+
+@pytest.mark.parametrize(
+    ("files", "channel", "told"),
+    [
+        (
+            ("t,a\n0,1\n1,1\n", "t,a\n0,1\n"),
+            "a",
+            "a.csv and b.csv have a column 'a' each; rename one",
+        ),
+        (("t,a\n0,1\n1,1\n", "t,b\n0,1\n"), "a", "no channel has a column of .*b.csv; leave it"),
+        (("t,a\n0,1\n1,1\n", "t,b\n0,1\n"), "c", "channels.s: no file has the column 'c'"),
+        (("t,a\n0,1\n1,1\n", "t,b\n5,1\n6,1\n"), "", "the files have no time in common"),
+        (("t,a\n0,1\n", "t,b\n2026-03-02,1\n"), "", "of one file are dates and of another numbers"),
+        (("t,a\n0,\n1,\n", "t,b\n0,\n1,\n"), "", "no sensor has a value where all files have one"),
+    ],
+)
+def test_tables_that_cannot_be_joined(here, files, channel, told):
+    for name, text in zip(("a.csv", "b.csv"), files, strict=True):
+        Path(name).write_text(text)
+    both = {"s": channel} if channel else {"s": "a", "r": "b"}
+    lines = [f'{k} = {{ role = "sensor", column = "{c}", at = 0.5 }}' for k, c in both.items()]
+    case = Path("case.toml")
+    case.write_text(
+        'equation = "heat"\ninitial = 20\nmesh = { from = 0, to = 1, cells = 10 }\n'
+        'data = { file = ["a.csv", "b.csv"], time = "t" }\nlaw = { noise = 0.1 }\n'
+        "unknowns.alpha = { prior = 1e-5, std = 1e-5 }\n[channels]\n" + "\n".join(lines)
+    )
+    with pytest.raises(lp.LivepdeError, match=told):
+        cases.load(case).prepare()
+
+
+def test_several_tables_are_not_followed(here):
+    CliRunner().invoke(app, ["init", "mine", *two_tables()])
+    with pytest.raises(lp.CaseError, match="follow belongs to one file that grows"):
+        cases.load("mine/case.toml", settings={**FILES, "data.follow": True})
+    case = cases.load("mine/case.toml", settings=FILES)
+    with pytest.raises(lp.CaseError, match="a process is followed in one: name it"):
+        source_of(case.frame, None, "")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("time_s,T_5cm\n0,20\n", "the column 'T_5cm' is in another table, too: rename one"),
+        ("time,Q\n2026-03-02 08:00,5\n", "are dates in one and numbers in the other"),
+    ],
+)
+def test_tables_that_init_refuses(here, text, told):
+    arguments = two_tables()
+    Path("heater.csv").write_text(text)
+    error = CliRunner().invoke(app, ["init", "mine", *arguments]).exception
+    assert isinstance(error, lp.DataError)
+    assert told in str(error)

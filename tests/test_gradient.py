@@ -278,7 +278,7 @@ def test_a_wrong_factor_is_never_accepted(spoiled):
     p = problem
     data = stage.solver.data(p)
     factor = Spoiled(stage.solver.factor(data, stage.solver.evaluate(data, other)))
-    equation = stage_module._Equation(stage.solver, data)
+    equation = stage_module._CoupledEquation(stage.solver, data)
     solved = newton.solve(equation, p.c, Near(p.c.copy(), factor))
     assert solved.at.size <= newton.tolerance
     assert dense.relative(solved.at.y, *given) <= 3 * newton.tolerance

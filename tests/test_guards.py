@@ -11,7 +11,7 @@ from factories import driven_rod, readings
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.excitation import Excitation, Probes, pairs
+from livepde.laws.excitation import ExcitationLevel, Probes, pairs
 from livepde.laws.guards import Scale
 from livepde.laws.history import added, empty_log, opened
 from livepde.reproduce import seed_excited
@@ -45,9 +45,11 @@ def samples(
     return readings(model, POINTS, lambda t: q, 0.05 * np.arange(count + 1), 0.01, seed, **options)
 
 
-def run(model: lp.Model, stream: Any, scheme: Any = None, **options: Any) -> list[lp.Estimate]:
+def run(
+    model: lp.Model, stream: Any, scheme: Any = None, halvings: int = 8, **options: Any
+) -> list[lp.Estimate]:
     law = lp.SensitivityLaw(**options)
-    identifier = lp.Identifier(model, POINTS, law, u0=0.0, scheme=scheme)
+    identifier = lp.Identifier(model, POINTS, law, u0=0.0, scheme=scheme, halvings=halvings)
     return [identifier.step(t, z) for t, z in stream]
 
 
@@ -172,7 +174,7 @@ def test_no_burst_follows_a_rest():
         for guards, found in ends.items():
             # With shadows the gate knows the error of the step, and lets the burst be corrected.
             options = {"guards": guards, "start_window": 0, "shadows": None}
-            estimates = run(model, stream, scheme, **options)
+            estimates = run(model, stream, scheme, halvings=0, **options)
             found.append([e.parameters["a"][0] for e in estimates[240:]])
     assert np.min(ends[None]) < 0.0  # a burst, and then negative and sure of it
     assert np.min([values[-1] for values in ends[None]]) < 0.0
@@ -333,8 +335,8 @@ def test_a_rest_is_told_from_noise_alone():
     rng, gate = np.random.default_rng(0), lp.ExcitationGate()
     slow, noise = np.sin(0.1 * np.arange(300))[:, None], rng.standard_normal((300, 16))
 
-    def after(seen: np.ndarray, followed: np.ndarray) -> Excitation:
-        state = Excitation.none()
+    def after(seen: np.ndarray, followed: np.ndarray) -> ExcitationLevel:
+        state = ExcitationLevel.none()
         for a, b in zip(seen, followed, strict=True):
             state = gate.add(state, a, b)
         return state
@@ -425,9 +427,9 @@ def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
     identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=100.0), u0=0.0)
     for t, z in stream[:150]:
         identifier.step(t, z)
-    identifier.save(tmp_path / "rest.npz")
+    identifier.save(tmp_path / "rest.bin")
     again = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=100.0), u0=0.0)
-    again.load(tmp_path / "rest.npz")
+    again.load(tmp_path / "rest.bin")
     pairs = [(identifier.step(t, z), again.step(t, z)) for t, z in stream[150:]]
     assert any(one.notes.get("at_rest") for one, _ in pairs)
     assert all(one.notes == other.notes for one, other in pairs)

@@ -311,9 +311,9 @@ def test_a_run_can_be_saved_and_continued(tmp_path) -> None:
     whole = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
     for s in samples[:40]:
         whole.step(s.t, s.z)
-    whole.save(tmp_path / "state.npz")
+    whole.save(tmp_path / "state.bin")
     other = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
-    other.load(tmp_path / "state.npz")
+    other.load(tmp_path / "state.bin")
     for s in samples[40:60]:
         one, two = whole.step(s.t, s.z), other.step(s.t, s.z)
     assert np.array_equal(one.q, two.q)

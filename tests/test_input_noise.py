@@ -41,7 +41,7 @@ def states(model, inputs, scheme) -> np.ndarray:
     """Return what the sensors see of a run with these inputs and the unknowns of the prior."""
     name = model.channels[0]
     points = lp.Points(SENSORS, noise=1.0)
-    one = lp.Identifier(model, points, lp.SensitivityLaw(), u0=0.0, scheme=scheme)
+    one = lp.Identifier(model, points, lp.SensitivityLaw(), u0=0.0, scheme=scheme, halvings=0)
     for k, value in enumerate(inputs):
         one.step(H * k, {name: value})
     belief = one.latent_belief()
@@ -68,6 +68,7 @@ def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tole
         lp.SensitivityLaw(shadows=None),
         u0=0.0,
         scheme=scheme,
+        halvings=0,
         input_noise={name: noise},
     )
     for k, value in enumerate(inputs):
@@ -95,6 +96,7 @@ def test_a_model_that_is_not_linear_has_it_too():
         lp.SensitivityLaw(shadows=None),
         u0=0.0,
         scheme=ImplicitEuler(),
+        halvings=0,
         input_noise={"left": noise},
     )
     for k, value in enumerate(inputs):

@@ -38,15 +38,17 @@ def run(ident: lp.Identifier) -> tuple[Any, Any]:
 def test_a_plain_number_has_value_and_deviations():
     estimate, data = run(identifier(a=lp.Scalar(0.3, 0.1)))
     value, std = estimate.parameters["a"]
-    assert estimate.interval("a") == pytest.approx((value - 1.959964 * std, value + 1.959964 * std))
-    assert estimate.interval("a", 0.6826895) == pytest.approx((value - std, value + std))
+    assert estimate["a"].interval() == pytest.approx(
+        (value - 1.959964 * std, value + 1.959964 * std)
+    )
+    assert estimate["a"].interval(0.6826895) == pytest.approx((value - std, value + std))
     assert "a_low" not in data
 
 
 def test_a_logarithm_has_quantiles_of_a_log_normal_number():
     estimate, data = run(identifier(a=lp.Scalar(0.3, 0.3, transform="log")))
     value, std = estimate.parameters["a"]
-    low, high = estimate.interval("a")
+    low, high = estimate["a"].interval()
     assert low > 0
     assert low * high == pytest.approx(value**2)
     assert np.log(high / value) == pytest.approx(1.959964 * std / value)
@@ -57,10 +59,10 @@ def test_a_logarithm_has_quantiles_of_a_log_normal_number():
 
 def test_bounds_cut_an_interval_off():
     estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1, bounds=(0.28, 0.33))))
-    low, high = estimate.interval("a", 0.9999)
+    low, high = estimate["a"].interval(0.9999)
     assert (low, high) == (0.28, 0.33)
     inside = identifier(a=lp.Scalar(0.3, 0.1, bounds=(0.1, 0.6), transform="logit"))
-    low, high = run(inside)[0].interval("a", 0.999999)
+    low, high = run(inside)[0]["a"].interval(0.999999)
     assert 0.1 < low < high < 0.6
 
 
@@ -81,7 +83,7 @@ def test_an_interval_ends_where_latent_values_do():
 def test_fields_have_an_interval_for_each_coefficient():
     field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=0.3, std=0.2, transform="log")
     estimate, data = run(identifier(a=field))
-    low, high = estimate.interval("a")
+    low, high = estimate["a"].interval()
     assert low.shape == estimate.q.shape
     assert (low > 0).all()
     assert (low * high) == pytest.approx(estimate.q**2)
@@ -93,16 +95,29 @@ def test_fields_have_an_interval_for_each_coefficient():
 
 def test_without_covariance_there_is_no_interval():
     estimate, data = run(identifier(lp.GradientLaw(), a=lp.Scalar(0.3, 0.1, bounds=(0.0, 1.0))))
-    assert np.isnan(estimate.interval("a")).all()
+    assert np.isnan(estimate["a"].interval()).all()
     assert tables(data)[0].rows[0][3] == "–"
+
+
+def test_an_unknown_is_read_by_its_label():
+    estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1)))
+    value, std = estimate.parameters["a"]
+    assert (estimate["a"].mean, estimate["a"].std) == (value, std)
+    assert str(estimate["a"]) == f"{value:.4g} ± {std:.2g}"
+    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=0.2, std=0.1)
+    estimate, _ = run(identifier(a=field))
+    assert estimate["a"].mean.shape == estimate["a"].std.shape == (9,)
+    low, high = estimate["a"].interval()
+    assert (low < estimate["a"].mean).all()
+    assert (estimate["a"].mean < high).all()
 
 
 def test_bad_questions():
     estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1)))
     with pytest.raises(lp.ConfigurationError, match=r"no unknown 'b'; there are \['a'\]"):
-        estimate.interval("b")
+        estimate["b"].interval()
     with pytest.raises(lp.SpaceError, match="level must lie between 0 and 1"):
-        estimate.interval("a", 95)
+        estimate["a"].interval(95)
     belief = estimate.belief
     replaced = replace(estimate, belief=replace(belief, q_factor=2.0 * belief.q_factor))
-    assert np.diff(replaced.interval("a")) == pytest.approx(2 * np.diff(estimate.interval("a")))
+    assert np.diff(replaced["a"].interval()) == pytest.approx(2 * np.diff(estimate["a"].interval()))

@@ -6,7 +6,7 @@ from factories import truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
-from livepde.laws import iterated_smoother, one_member
+from livepde.laws import iterated_smoother
 from livepde.models import heat
 
 SENSORS = lp.Points([0.2, 0.5, 0.8], noise=0.02)
@@ -110,7 +110,7 @@ def test_one_beginning_serves_where_all_is_linear_and_explained(monkeypatch, exp
         return smoothed(work, state)
 
     monkeypatch.setattr(iterated_smoother, "_descended", watched)
-    monkeypatch.setattr(one_member, "iterated_smoother", counted)
+    monkeypatch.setattr(iterated_smoother, "iterated_smoother", counted)
     model = sourced()
     samples = list(readings(model, [1.5]))
     if not explained:  # a bias of ten standard deviations, which no source makes
@@ -163,7 +163,7 @@ def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():
 
 
 def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatch):
-    monkeypatch.setattr(one_member, "iterated_smoother", lambda work, state: None)
+    monkeypatch.setattr(iterated_smoother, "iterated_smoother", lambda work, state: None)
     model = sourced()
     samples = list(readings(model, [1.5]))
     plain = ends(model, lp.SensitivityLaw(start_window=0), samples)[-1]
@@ -183,3 +183,37 @@ def test_a_settled_run_iterates_no_more():
 def test_a_window_that_is_negative_is_refused():
     with pytest.raises(lp.LawError, match="start_window"):
         lp.SensitivityLaw(start_window=-1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
+    """A rod with two conductivities is through after few samples, and costs few steps till then."""
+    taken, assimilate = [], iterated_smoother.assimilate
+    monkeypatch.setattr(
+        iterated_smoother, "assimilate", lambda *args: taken.append(1) or assimilate(*args)
+    )
+    layers = {"k_0": lambda x: x[0] < 0.5, "k_1": lambda x: x[0] >= 0.5}
+    model = lp.Model(
+        lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP1(), dirichlet={"boundary": 0.0}),
+        {"k": lp.Piecewise(layers, 1.0, 0.2)},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+        f=10.0,
+    )
+    found = ends(model, lp.SensitivityLaw(), readings(model, [1.2, 0.8], seed=seed))
+    moved = [estimate.notes.get("smoother_moved", 0.0) for estimate in found]
+    assert max(moved[:16]) > 0.0
+    assert not any(moved[32:])
+    assert len(taken) <= 2 * len(found)
+
+
+def test_a_direction_that_is_not_told_keeps_the_start_open():
+    model = sourced()
+    law = lp.SensitivityLaw(start_window=16)
+    identifier = lp.Identifier(model, SENSORS, law, u0=0.0)
+    for t in TIMES[1:]:
+        identifier.step(t, np.full(3, np.nan) if t < 2.0 else np.zeros(3))
+    assert identifier._state.start_due[0] == iterated_smoother.NEVER
+    silent = lp.Identifier(model, lp.Points([0.5], noise=1e3), law, u0=0.0)
+    for t in TIMES[1:]:
+        silent.step(t, np.zeros(1))
+    assert silent._state.start_due[0] < iterated_smoother.NEVER

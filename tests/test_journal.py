@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import pickle
 import shutil
 import sqlite3
 import subprocess
@@ -26,7 +27,7 @@ from livepde import checkpoint
 from livepde.records import Record
 from livepde.runs import RunWriter, database
 from livepde.runs.database import in_use, log_of, written
-from livepde.runs.feeds import Samples
+from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import KEPT_EVENTS, Event, Journal
 from livepde.runs.live import CHECKPOINT, Live, Retention
 from livepde.runs.salvage import Salvage
@@ -36,8 +37,8 @@ from livepde.streams.sources import Follow, Rows, json_row
 NAME = "journal.sqlite"
 
 
-def samples(count: int, after: float = -np.inf) -> Samples:
-    return Samples((lp.Sample(row.pop("t"), row) for row in rows(count)), after=after)
+def samples(count: int, after: float = -np.inf) -> SampleFeed:
+    return SampleFeed((lp.Sample(row.pop("t"), row) for row in rows(count)), after=after)
 
 
 def started(folder: Path, count: int, **options) -> Live:
@@ -620,40 +621,20 @@ class Evil:
         return os.system, ("touch evil",)
 
 
-def archive(**leaves) -> bytes:
-    import io
-
-    found = io.BytesIO()
-    np.savez(found, **leaves)
-    return found.getvalue()
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pickle", "bomb", "header", "nested", "huge", "shapes"])
+@pytest.mark.parametrize("kind", ["pickle", "text", "complex", "shape"])
 def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
     path = finished(tmp_path)
     good = identifier()
     good.step(0.0, {"a": 1.0, "b": 1.0, "left": 1.0})
     header, leaves = checkpoint.unpacked(good.dump(), "here")
-    if kind == "pickle":
-        state = archive(header=np.array(Evil(), dtype=object))
-    elif kind == "bomb":
-        import io
-
-        found = io.BytesIO()
-        np.savez_compressed(found, header=json.dumps(header), zeros=np.zeros(10**7))
-        state = found.getvalue()
-    elif kind == "header":
-        state = archive(header="[1, 2]")
-    elif kind == "nested":
-        state = archive(header="[" * 100_000)
-    elif kind == "huge":
-        plain = archive(header=json.dumps(header), t=np.zeros(3))
-        state = plain.replace(b"(3,)", b"(3" + b"0" * 9 + b",)").replace(b" " * 9 + b"\n", b"\n")
-    else:
-        state = checkpoint.packed(header, {**leaves, "z": np.zeros((2, 2), dtype=complex)})
-        state = checkpoint.packed(header, {name: np.array("x") for name in leaves})
+    other = {
+        "text": {name: np.array("x") for name in leaves},
+        "complex": {**leaves, "z": leaves["z"].astype(complex)},
+        "shape": {**leaves, "z": np.zeros((2, 2))},
+    }
+    state = pickle.dumps(Evil()) if kind == "pickle" else checkpoint.packed(header, other[kind])
     with sqlite3.connect(path) as raw:
         raw.execute("UPDATE checkpoints SET state = ?", (state,))
     raw.close()

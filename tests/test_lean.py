@@ -47,7 +47,8 @@ def latent(given: costs.Rod, state: lean.Filter):
 def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
     given = costs.Rod(nodes, unknowns, ends)
     samples = given.samples(COUNT)
-    identifier = lp.Identifier(given.model, given.sensors, LAW, u0=0.0, scheme=lp.ImplicitEuler())
+    steps = {"scheme": lp.ImplicitEuler(), "halvings": 0}
+    identifier = lp.Identifier(given.model, given.sensors, LAW, u0=0.0, **steps)
     identifier.step(*samples[0])
     matrices, G, state = started(given, 1)
     for sample in samples[1:]:
@@ -66,8 +67,8 @@ def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
 def test_members_side_by_side_have_the_numbers_of_a_fleet(ends):
     given, members = costs.Rod(31, 2, ends), 5
     streams = [given.samples(COUNT, seed) for seed in range(members)]
-    scheme = lp.ImplicitEuler()
-    fleet = lp.Fleet(given.model, given.sensors, LAW, members, u0=0.0, scheme=scheme)
+    steps = {"scheme": lp.ImplicitEuler(), "halvings": 0}
+    fleet = lp.Fleet(given.model, given.sensors, LAW, members, u0=0.0, **steps)
     matrices, G, state = started(given, members)
     for k in range(COUNT + 1):
         t, z, inputs = streams[0][k][0], np.array([one[k][1] for one in streams]), streams[0][k][2]

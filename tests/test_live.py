@@ -22,7 +22,7 @@ from live_rod import CLOCK, COLUMNS, OPENED, identifier, journal, live, rows, sa
 from patience import PATIENCE
 
 import livepde as lp
-from livepde.runs.feeds import Samples
+from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Event, Journal
 from livepde.runs.live import Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
@@ -64,15 +64,15 @@ def test_samples_in_order_go_on_after_the_last_one(tmp_path):
         return (lp.Sample(row.pop("t"), row) for row in rows(20))
 
     with journal(tmp_path / "one.sqlite") as kept:
-        run = Live(identifier(), Samples(samples()), kept)
+        run = Live(identifier(), SampleFeed(samples()), kept)
         run.run()
         whole = list(kept)
     path = tmp_path / "two.sqlite"
     with journal(path) as kept:
-        run = Live(identifier(), Samples(itertools.islice(samples(), 8)), kept)
+        run = Live(identifier(), SampleFeed(itertools.islice(samples(), 8)), kept)
         run.run()
     with Journal.open(path, write=True) as kept:
-        run = Live(identifier(), Samples(samples(), after=kept.last), kept)
+        run = Live(identifier(), SampleFeed(samples(), after=kept.last), kept)
         assert run.resume() == 0
         run.run()
         assert [record.t for record in kept] == [record.t for record in whole]

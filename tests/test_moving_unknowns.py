@@ -134,7 +134,8 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, subste
     # Samples at equal distances: dt_max then divides each step alike.
     stream = [(0.1 * k, z) for k, (_, z) in enumerate(samples())]
     scheme = lp.ImplicitEuler()  # as in the dense filter
-    identifier = lp.Identifier(model, sensors(), law, scheme=scheme, dt_max=0.1 / substeps)
+    steps = {"scheme": scheme, "dt_max": 0.1 / substeps, "halvings": 0}
+    identifier = lp.Identifier(model, sensors(), law, **steps)
     dense, before = Dense(model, identifier.observed), 0.0
     directions = model.latent.V @ identifier._work.filter.reduction.Phi
     for t, z in stream:
@@ -167,9 +168,9 @@ def test_a_checkpoint_of_other_modes_is_refused_whatever_its_width(tmp_path: Pat
     )
     for t, z in samples(4):
         first.step(t, z)
-    first.save(tmp_path / "state.npz")
+    first.save(tmp_path / "state.bin")
     with pytest.raises(lp.RunError, match=r"state\.now\.da|state\.now\.C"):
-        other.load(tmp_path / "state.npz")
+        other.load(tmp_path / "state.bin")
 
 
 def test_an_initial_state_may_read_channels():
@@ -329,6 +330,29 @@ def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
     assert other.posterior == pytest.approx(row.posterior, rel=1e-6)
 
 
+def test_the_preview_tells_of_the_end_and_of_errors_that_are_not_seen(
+    tmp_path: Path, monkeypatch: Any
+):
+    monkeypatch.setattr("livepde.cases.preview.MOST_SAMPLES", 60)
+    path, _ = write_template(tmp_path)
+    settings = {
+        "steps": {"scheme": "implicit-euler", "dt_max": "300 s"},
+        "channels.T_10.noise": "0.001 K",
+        "channels.T_30.noise": "0.001 K",
+    }
+    prepared = cases.load(path, settings=settings).prepare()
+    stream = list(prepared.stream)
+    assert len(stream) > 60
+    found = preview(prepared, stream)
+    assert found.samples == 60
+    (first,), (last,) = found.unknowns, found.last
+    assert last.name == first.name
+    assert 0 < last.left < 1
+    assert last.left != pytest.approx(first.left, rel=1e-3)
+    assert any("The discretisation has shifted" in text for text in found.sentences)
+    assert not preview(prepared, stream[:60]).last
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: Any):
@@ -361,7 +385,7 @@ def test_replays_find_the_most_probable_parameter():
         initial=lambda q, v, x: q.w * np.sin(np.pi * x[0]) * v,
     )
     law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
-    identifier = lp.Identifier(model, sensors(), law)
+    identifier = lp.Identifier(model, sensors(), law, halvings=0)
     latent, forward, times = model.latent, ForwardStage(model), 0.02 * np.arange(64)
 
     def seen(a: Array) -> Array:

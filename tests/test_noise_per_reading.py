@@ -179,8 +179,8 @@ def test_a_checkpoint_keeps_the_noise_of_stored_readings(tmp_path):
         one, two = identifier(law), identifier(law)
         for k, (t, z, std) in enumerate(stream()):
             if k == 11:
-                one.save(tmp_path / "state.npz")
-                two.load(tmp_path / "state.npz")
+                one.save(tmp_path / "state.bin")
+                two.load(tmp_path / "state.bin")
             last = one.step(t, np.column_stack([z, std]))
             again = two.step(t, np.column_stack([z, std])) if k >= 11 else None
         assert same(last, again)

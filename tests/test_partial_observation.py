@@ -59,7 +59,7 @@ def found(seed: int, law: lp.SensitivityLaw) -> Found:
     identifier = lp.Identifier(model, points, law, u0=0.0, scheme=lp.Alexander2())
     for t, row in zip(TIMES, z, strict=True):
         estimate = identifier.step(float(t), row)
-    low, high = estimate.interval("q")
+    low, high = estimate["q"].interval()
     prior = 2 * 1.959964 * np.sqrt(model.Q.variance)
     return Found(
         model.mesh.p[0], true, estimate.q, (low <= true) & (true <= high), (high - low) / prior
@@ -110,7 +110,7 @@ def test_what_modes_leave_out_stays_as_the_prior_has_it():
         identifier = lp.Identifier(model, points, law, u0=0.0)
         estimate = identifier.estimate()
         assert estimate.q_std == pytest.approx(prior)
-        low, high = estimate.interval("q")
+        low, high = estimate["q"].interval()
         assert high - low == pytest.approx(2 * 1.959964 * prior)
         data = identifier.run([(0.1, [0.1])]).to_xarray()
         assert (data["q_std"][-1] > 0.9 * prior).all()

@@ -136,6 +136,15 @@ def test_the_band_of_the_prior_does_not_flatten_the_estimate() -> None:
     assert high - low < 3
 
 
+def test_a_run_with_dates_shows_them() -> None:
+    data = dataset(scalars={"k": 3.0}, span=20 * DAY, unit="s")
+    data.attrs["origin"] = "2016-06-28 06:45:00"
+    ax = panel(plots.overview(data), "k")
+    assert ax.get_xlabel() == ""
+    assert str(ax.lines[0].get_xdata()[0]).startswith("2016-06-28T06:45")
+    assert texts(panel(plots.overview(data), "u"))[0] == "2016-06-28 06:45:00"
+
+
 def test_long_runs_in_seconds_are_shown_in_days() -> None:
     data = dataset(scalars={"k": 3.0}, span=20 * DAY, unit="s")
     ax = panel(plots.overview(data), "k")
@@ -182,7 +191,7 @@ def test_a_field_in_the_plane_is_a_map_with_its_deviation() -> None:
     data = dataset(fields=("q",), points=points)
     figure = drawn(plots.overview(data))
     titles = [ax.get_title() for ax in figure.axes]
-    assert {"q at t = 9.31", "deviation of q at t = 9.31", "u at t = 9.31"} <= set(titles)
+    assert {"q at t = 9.31", "standard deviation of q at t = 9.31", "u at t = 9.31"} <= set(titles)
     data["triangle"] = (("cell", "corner"), np.array([[0, 1, 4], [0, 2, 4]]))
     given = panel(drawn(plots.overview(data)), "q at").collections[0]
     assert len(given.get_array()) == 5
@@ -283,3 +292,11 @@ def test_loops_name_a_limit_once():
     legends = [ax.get_legend() for ax in figure.axes]
     assert [text.get_text() for text in legends[0].get_texts()] == ["reference", "limit"]
     assert legends[1] is None
+
+
+def test_an_unknown_over_orders_of_magnitude_has_a_logarithmic_axis() -> None:
+    data = dataset(scalars={"k": 3.0}, span=60.0, unit="s")
+    assert panel(plots.overview(data), "k").get_yscale() == "linear"
+    data["k"][0] = 300.0
+    data["k_low"], data["k_high"] = data["k"] / 2.0, 2.0 * data["k"]
+    assert panel(plots.overview(data), "k").get_yscale() == "log"

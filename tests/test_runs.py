@@ -229,7 +229,7 @@ def test_checkpoint_continues(tmp_path):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")
     writer.finish(status="finished", identifier=first)
     second = identifier()
-    second.load(tmp_path / "run" / "checkpoint.npz")
+    second.load(tmp_path / "run" / "checkpoint.bin")
     drive(second, samples()[3:])
     drive(whole, samples())
     assert np.array_equal(second.estimate().q, whole.estimate().q)

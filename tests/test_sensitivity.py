@@ -55,7 +55,7 @@ def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
     batch = prior + covariance @ (H.T @ (weights * (z - zero - H @ prior)))
 
     law = lp.SensitivityLaw(replay=replay, shadows=None)
-    ident = lp.Identifier(model, SENSORS, law)
+    ident = lp.Identifier(model, SENSORS, law, halvings=0)
     for t, sample in data[1:]:
         estimate = ident.step(t, sample)
     np.testing.assert_allclose(estimate.q, batch, rtol=1e-8)

@@ -21,7 +21,7 @@ from livepde.cases.live import Wiring
 from livepde.cases.sources import source_of
 from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal
-from livepde.runs.feeds import Paced, Samples
+from livepde.runs.feeds import Paced, SampleFeed
 from livepde.streams.sources import Rows
 
 pytestmark = pytest.mark.process
@@ -253,7 +253,7 @@ def test_a_finished_file_is_replayed_at_its_pace():
         now[0] += seconds
 
     samples = [lp.Sample(float(t), {"a": 0.0}) for t in (0, 60, 120, 300)]
-    feed = Paced(Samples(samples), 60.0, lambda: now[0], sleep)
+    feed = Paced(SampleFeed(samples), 60.0, lambda: now[0], sleep)
     seen = []
     while not feed.done:
         seen += [(ready.t, now[0] - 100.0) for ready in feed.poll(0.5)]
@@ -323,7 +323,7 @@ def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
         signal.raise_signal(signal.SIGINT)
         return begin(*arguments)
 
-    class Health(beside._Health):
+    class Health(beside._LiveHealth):
         def __setattr__(self, name, value):
             if name == "live" and value is not None:
                 signal.raise_signal(signal.SIGINT)
@@ -332,7 +332,7 @@ def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
     if moment == "the case begins":
         monkeypatch.setattr(cases.Case, "begin", begins)
     else:
-        monkeypatch.setattr(beside, "_Health", Health)
+        monkeypatch.setattr(beside, "_LiveHealth", Health)
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(5))))
     arguments = ["run", case('file = "rows.csv"'), "--realtime", "--speed", "inf", "--out", "live"]
     assert call(*arguments)[0] == 0
@@ -349,7 +349,7 @@ def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
     [
         ('file = "rows.csv"\nzone = "Mars"', "", "", "data.zone: there is no time zone 'Mars'"),
         ("mqtt = {}", "", "", "expected rows = [topics], or columns"),
-        ('follow = true\nmqtt = { rows = ["a"] }', "", "", "follow belongs to a file"),
+        ('follow = true\nmqtt = { rows = ["a"] }', "", "", "follow belongs to one file that grows"),
         ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are two sources"),
         ('file = "rows.csv"\nfollow = true\nevery = 2', "", "", "every belongs to data that are"),
         ('file = "rows.csv"', 'wait = "-1 s"', "", "wait must be a time >= 0"),

@@ -201,7 +201,7 @@ def test_intervals_hold_on_a_coarse_mesh() -> None:
     for seed in range(12):
         rows = samples(seed)[:100]
         for law, into in ((lp.SensitivityLaw(), held), (PLAIN, plain)):
-            low, high = ran(identifier(5, law), rows).interval("k")
+            low, high = ran(identifier(5, law), rows)["k"].interval()
             into.append(low <= TRUE["k"] <= high)
     assert np.mean(plain) < 0.5
     assert np.mean(held) >= 0.9
@@ -227,9 +227,9 @@ def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> No
     law, rows = lp.SensitivityLaw(replay=replay), samples()[:90]
     whole = identifier(8, law)
     ran(whole, rows[:50])
-    whole.save(tmp_path / "state.npz")
+    whole.save(tmp_path / "state.bin")
     again = identifier(8, law)
-    again.load(tmp_path / "state.npz")
+    again.load(tmp_path / "state.bin")
     one, other = ran(whole, rows[50:]), ran(again, rows[50:])
     np.testing.assert_array_equal(one.q_std, other.q_std)
     assert dict(one.notes) == dict(other.notes)

@@ -532,3 +532,42 @@ def test_inputs_that_do_not_touch_the_state_keep_the_factor():
 )
 def test_terms_that_may_touch_the_state_are_not_kept(term):
     assert not wells([conducts, term]).steady
+
+
+def test_steps_near_the_start_are_graded():
+    """A step is at most half of the time since the start, and at least an eighth of its length."""
+    ends: list[float] = []
+
+    def stage(c, t, h):
+        ends.append(t)
+        return c
+
+    scheme = lp.ImplicitEuler()
+    for t0, t1 in ((1.0, 2.0), (2.0, 3.0), (3.0, 4.0)):
+        advance(lp.Advance(scheme, start=1.0), stage, np.zeros(1), t0, t1)
+    assert ends == [1.125, 1.25, 1.375, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0]
+    for control in (lp.Advance(scheme), lp.Advance(scheme, start=2.5)):
+        assert control.grade(1.0, 1.0) == 0
+    assert lp.Advance(scheme, halvings=0, start=1.0).grade(1.0, 1.0) == 0
+    halves: list[float] = []
+    again = lp.Advance(scheme, parts=2, start=1.0)
+    advance(again, lambda c, t, h: halves.append(t) or c, np.zeros(1), 1.0, 2.0)
+    assert halves[1::2] == [1.125, 1.25, 1.375, 1.5, 1.75, 2.0]  # every step in two
+
+
+@pytest.mark.slow
+def test_a_flux_that_sets_in_is_followed_by_graded_steps():
+    """The state goes with the square root of time: one long step misses it."""
+    model = lp.Model(
+        lp.Field(lp.interval(0.0, 4.0, 400), ElementLineP1()),
+        lp.Scalar(1.0, 0.1),
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        f=[lp.On("left", lambda x, t: 1.0)],
+    )
+    times, errors = np.arange(0.0, 0.51, 0.05), []
+    for start in (np.nan, 0.0):
+        control = lp.Advance(lp.Alexander2(), start=start)
+        run = lp.simulate(model, np.array([1.0]), 0.0, times.tolist(), control)
+        surface = np.argmin(model.mesh.p[0])
+        errors.append(max(abs(u[surface] - 2.0 * np.sqrt(t / np.pi)) for t, u in run))
+    assert errors[1] < 0.05 * errors[0]

@@ -421,7 +421,7 @@ def test_noise_size_is_the_mean_over_draws():
         assert getattr(expected, name) == pytest.approx(mean, rel=0.1)
     u = model.initial(lambda x: np.sin(np.pi * x[0]))
     assert dg.noise_size(spaces, std, matrix, u).V > expected.V
-    with pytest.raises(ConfigurationError, match="3 deviations"):
+    with pytest.raises(ConfigurationError, match="3 standard deviations"):
         dg.noise_size(spaces, std[:3], matrix)
 
 

@@ -143,7 +143,7 @@ class Case:
     samples: int = 6
 
     def identifier(self, model: lp.Model) -> lp.Identifier:
-        return lp.Identifier(model, self.sensors(), self.law, u0=0.0, halvings=2)
+        return lp.Identifier(model, self.sensors(), self.law, u0=0.0, halvings=0)
 
 
 def inner() -> lp.Observation:
@@ -185,20 +185,18 @@ CASES = {
     "auto gain, square": Case(lp.GradientLaw(gain="auto"), square, inner),
     "Baumeister": Case(lp.BaumeisterLaw(gain=10.0), field_rod, lp.Full),
     "Kuegler": Case(lp.KueglerLaw(gain=10.0), nonlinear_rod, inner, samples=4),
-    "sensitivity": Case(lp.SensitivityLaw(), samples=15),
-    "sensitivity, inputs": Case(
-        lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=15
-    ),
-    "sensitivity, nonlinear": Case(lp.SensitivityLaw(), nonlinear_rod, samples=15),
-    "sensitivity, positive unknown": Case(lp.SensitivityLaw(), positive_rod, samples=15),
+    "sensitivity": Case(lp.SensitivityLaw(), samples=8),
+    "sensitivity, inputs": Case(lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=8),
+    "sensitivity, nonlinear": Case(lp.SensitivityLaw(), nonlinear_rod, samples=5),
+    "sensitivity, positive unknown": Case(lp.SensitivityLaw(), positive_rod, samples=8),
     "sensitivity, moving sensor": Case(lp.SensitivityLaw(), powered_rod, probe),
     "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages, samples=12),
     "sensitivity, large square": Case(
         lp.SensitivityLaw(modes=3), large_square, averages, samples=3
     ),
-    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=15),
-    "guards and jumps": Case(GUARDED, powered_rod, samples=15),
-    "bank": Case(lp.AutoLaw(), powered_rod, samples=10),
+    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=8),
+    "guards and jumps": Case(GUARDED, powered_rod, samples=8),
+    "bank": Case(lp.AutoLaw(), powered_rod, samples=6),
 }
 
 

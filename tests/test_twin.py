@@ -169,7 +169,7 @@ def test_absolute_noise() -> None:
     ]
     std = np.std(draws, axis=0).mean(axis=0)
     assert np.allclose(std, [0.1, 2.0], rtol=0.1)
-    with pytest.raises(lp.ConfigurationError, match="2 deviations for"):
+    with pytest.raises(lp.ConfigurationError, match="2 standard deviations for"):
         list(twin(noise=AbsoluteNoise([0.1, 2.0])))
 
 

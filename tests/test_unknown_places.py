@@ -91,7 +91,8 @@ def model_of(place: str) -> lp.Model:
 def found(model: lp.Model, sensors: lp.Observation, truth: Any, **law: Any) -> lp.Estimate:
     """Return the last estimate from noisy data of the model itself."""
     rng = np.random.default_rng(0)
-    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=8), **law))
+    filtering = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None, verdict=False, **law)
+    identifier = lp.Identifier(model, sensors, filtering)
     exact = model.initial_parameter(truth)
     physical, forward = model.latent.value(exact), ForwardStage(model)
     u = model.initial_state(exact)

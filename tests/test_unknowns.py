@@ -19,6 +19,7 @@ from livepde.errors import ConfigurationError, LawError, SpaceError
 from livepde.fem import FunctionSpace, Latent
 from livepde.fem.evolution import CONSTANT
 from livepde.fem.transforms import Log, Logit
+from livepde.laws.reduction import Reduction
 from livepde.stepping import ForwardStage
 
 NOISE = 0.01
@@ -90,6 +91,12 @@ UNKNOWNS = {
         mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.1, evolution=lp.Periodic(5.0)
     ),
     "walk": lp.Scalar(0.4, 0.2, evolution=lp.RandomWalk(0.1)),
+    "own": lp.Piecewise(
+        {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5},
+        0.4,
+        0.2,
+        own={"r": lp.Scalar(0.3, 0.1, transform="log", evolution=lp.MeanReverting(3.0))},
+    ),
 }
 
 
@@ -122,7 +129,9 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
     q = space.prior
     np.testing.assert_allclose(latent.value(latent.inverse(q)), q, atol=1e-14)
     assert latent.dim == space.dim + 4 + 2 * 21
-    assert list(space.labels)[-2:] == ["n[x]", "n[y]"]
+    assert list(space.labels)[-4:] == ["own[l]", "own[r]", "n[x]", "n[y]"]
+    given = {"own": np.array([0.1, 0.2]), "own[r]": 0.7, "n": 0.5}
+    np.testing.assert_array_equal(space.interpolate(given)[-4:], [0.1, 0.7, 0.5, 0.5])
     q = q.copy()
     q[0] = -1.0
     with pytest.raises(SpaceError, match="'log': a value lies outside"):
@@ -207,6 +216,10 @@ def rms(found: list[lp.Estimate], a: Any, after: float) -> tuple[float, float]:
     return float(np.sqrt((errors**2).mean())), float(np.sqrt(((errors / values[:, 1]) ** 2).mean()))
 
 
+# The data are those of the same scheme on the same mesh, and nobody asks for a verdict.
+BARE = lp.SensitivityLaw(shadows=None, verdict=False)
+
+
 @pytest.mark.slow
 def test_a_periodic_unknown_is_followed_without_delay():
     def a(t: float) -> float:
@@ -215,8 +228,8 @@ def test_a_periodic_unknown_is_followed_without_delay():
     samples = data(a, np.arange(0.0, 30.0, 0.05))
     periodic = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.Periodic(10.0))})
     walking = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.RandomWalk(0.1))})
-    error, deviations = rms(estimates(periodic, lp.SensitivityLaw(), samples), a, 10.0)
-    slower, _ = rms(estimates(walking, lp.SensitivityLaw(), samples), a, 10.0)
+    error, deviations = rms(estimates(periodic, BARE, samples), a, 10.0)
+    slower, _ = rms(estimates(walking, BARE, samples), a, 10.0)
     assert error < 0.004
     assert 0.3 < deviations < 2.0
     assert 3 * error < slower < 0.03
@@ -229,7 +242,7 @@ def test_a_random_walk_is_followed_with_an_honest_deviation():
     walk = 0.4 + rate * np.sqrt(0.05) * np.cumsum(rng.standard_normal(len(times)))
     samples = data(lambda t: float(np.interp(t, times, walk)), times)
     model = rod({"a": lp.Scalar(0.4, 0.2, evolution=lp.RandomWalk(rate))})
-    found = estimates(model, lp.SensitivityLaw(), samples)
+    found = estimates(model, BARE, samples)
     error, deviations = rms(found, lambda t: float(np.interp(t, times, walk)), 5.0)
     assert 0.7 < deviations < 1.3
     assert error < 0.5 * np.sqrt(((walk - 0.4) ** 2).mean())
@@ -372,3 +385,53 @@ def test_a_first_sample_at_the_start_says_what_is_unknown_there():
             estimate = identifier.step(t, identifier.observed.G @ u)
         value, std = estimate.parameters["u0"]
         assert abs(value - 2.0) < 3 * std < 0.03
+
+
+HALVES = {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}
+
+
+def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
+    common = {"prior": 0.5, "std": 0.2, "transform": "log", "evolution": lp.RandomWalk(0.01)}
+    both = [lp.Piecewise(HALVES, **common, own=own) for own in ({}, {"r": lp.Scalar(**common)})]
+    samples = data(lambda t: 0.3, np.linspace(0.0, 2.0, 21))
+    plain, own = (estimates(rod({"a": a}), lp.SensitivityLaw(), samples)[-1] for a in both)
+    assert list(own.parameters) == ["a[l]", "a[r]"]
+    np.testing.assert_allclose(own.q, plain.q, rtol=1e-9)
+    np.testing.assert_allclose(own.q_std, plain.q_std, rtol=1e-9)
+
+
+def test_a_region_moves_and_another_does_not():
+    walk = lp.Scalar(0.5, 0.3, evolution=lp.RandomWalk(0.2))
+    a = lp.Piecewise(HALVES, 0.4, 0.1, own={"r": walk})
+    model = rod({"a": a})
+    before = estimates(model, lp.SensitivityLaw(), data(lambda t: 0.3, np.linspace(0.0, 0.5, 6)))[0]
+    assert before.q_std == pytest.approx([0.1, 0.3])
+    identifier = lp.Identifier(model, lp.Points(SENSORS, noise=NOISE), lp.SensitivityLaw())
+    samples = data(lambda t: 0.3, np.linspace(0.0, 2.0, 21))
+    for t, z in samples:
+        seen = identifier.step(t, z)
+    later = identifier.step(12.0, [np.nan] * 3)
+    assert later.q_std[0] == pytest.approx(seen.q_std[0], rel=1e-6)
+    assert later.q_std[1] ** 2 == pytest.approx(seen.q_std[1] ** 2 + 0.2**2 * 10.0, rel=1e-6)
+
+
+def test_jumps_of_a_region_or_of_all():
+    a = lp.Piecewise(HALVES, 0.4, 0.1, own={"r": lp.Scalar(0.5, 0.3)})
+    identifier = lp.Identifier(rod({"a": a}), lp.Points(SENSORS), lp.SensitivityLaw(noise=NOISE))
+    reduction = Reduction.of(identifier.problem, "auto")
+    assert reduction.stay == [("a[l]", 0), ("a[r]", 1)]
+    assert reduction.named(["a"], "Jumps").tolist() == [True, True]
+    assert reduction.named(["a[r]"], "Jumps").tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: lp.Piecewise(HALVES, own={"c": lp.Scalar()}), "the name of a region, one of"),
+        (lambda: lp.Piecewise(HALVES, own={"l": 2.0}), "and a Scalar"),
+        (lambda: rod(lp.Piecewise(HALVES, own={"l": lp.Scalar()})), "needs a name"),
+    ],
+)
+def test_priors_of_regions_that_are_refused(build: Any, words: str):
+    with pytest.raises(SpaceError, match=words):
+        build()

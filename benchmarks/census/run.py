@@ -213,7 +213,7 @@ def _off(problem: Problem, scene: Scene, estimate: lp.Estimate) -> float:
             continue
         part = space.labels[label] if label in space.labels else space.part(label)
         centre, low, high = (
-            latent.inverse(item) for item in (estimate.q[part], *estimate.interval(label))
+            latent.inverse(item) for item in (estimate.q[part], *estimate[label].interval())
         )
         half = 0.5 * (high - low) / 1.96
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -30,8 +30,7 @@ from livepde.records import Record
 from livepde.runs import Check, Outcome, Table
 from livepde.runs.feeds import Gathered
 from livepde.runs.live import Live
-from livepde.streams.intake import Intake, Ready
-from livepde.streams.intake import Outcome as RowOutcome
+from livepde.streams.intake import Intake, IntakeOutcome, Ready
 from livepde.streams.sources import Source
 
 __all__ = ["Fed", "broken_messages", "broken_rows", "fed"]
@@ -123,7 +122,7 @@ class _Audited(Gathered):
         super().__init__(source, intake)
         self.reasons: dict[int, set[str]] = {}
 
-    def _used(self, outcome: RowOutcome) -> list[Ready]:
+    def _used(self, outcome: IntakeOutcome) -> list[Ready]:
         for remark in outcome.remarks:
             _, (_, place) = remark.row
             self.reasons.setdefault(place, set()).add(remark.kind)

@@ -32,7 +32,7 @@ class Found:
                 counts[kind] += number
             events = Counter(event.kind for event in journal.events)
             records = list(journal)
-            state = (folder / "checkpoint.npz").read_bytes()
+            state = (folder / "checkpoint.bin").read_bytes()
             return cls(records, journal.accepted, state, events, counts)
 
 

@@ -155,7 +155,7 @@ def _identified(problem: Problem, data: Data, freed: bool, smooths: bool = False
         space = estimate.space
         for label, latent in problem.latents.items():
             part = space.labels[label] if label in space.labels else space.part(label)
-            found = (estimate.q[part], *estimate.interval(label))
+            found = (estimate.q[part], *estimate[label].interval())
             seen.values[k, label] = tuple(latent.inverse(item) for item in found)  # type: ignore[assignment]
 
     names = tuple(problem.channels)

@@ -38,6 +38,7 @@ from .errors import (
     ModelError,
     NameClashError,
     ObservationError,
+    OffsetError,
     RunError,
     SampleError,
     SpaceError,
@@ -80,7 +81,7 @@ from .fem import (
     transpose,
     upwind,
 )
-from .fleet import Fleet, FleetEstimate, FleetResult
+from .fleet import Fleet, FleetEstimate, FleetResult, Shard, ShardEstimates
 from .forecast import Forecast
 from .identifier import Identifier
 from .laws import (
@@ -185,6 +186,7 @@ __all__ = [
     "Newton",
     "Observation",
     "ObservationError",
+    "OffsetError",
     "On",
     "Periodic",
     "Piecewise",
@@ -206,6 +208,8 @@ __all__ = [
     "Scheme",
     "SensitivityLaw",
     "Shadows",
+    "Shard",
+    "ShardEstimates",
     "Sobolev",
     "SpaceError",
     "Status",

@@ -1,13 +1,19 @@
-"""Checkpoint files: a NumPy archive of plain arrays, without pickle, written atomically."""
+"""Checkpoints: header and arrays in one buffer, without pickle, with a checksum.
+
+The buffer is MAGIC, the length of a text, a digest of all that follows, the text, and the bytes of
+the arrays one after the other, each begun at a multiple of ALIGNED. The text is JSON: the header,
+and for each array its name, its type as NumPy writes it ("<f8"), and its shape.
+"""
 
 from __future__ import annotations
 
-import io
+import hashlib
 import json
+import math
 import os
-import zipfile
-from collections.abc import Iterable, Mapping
-from dataclasses import Field, fields, is_dataclass
+import struct
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,33 +26,44 @@ from livepde.linalg import Array
 
 __all__ = ["flatten", "packed", "read", "rebuild", "unpacked", "write"]
 
-# Exceptions of reading a file that is no archive, is damaged, or was crafted to do harm.
-DAMAGE = (
-    EOFError,
-    LookupError,
-    MemoryError,
-    NotImplementedError,
-    OSError,
-    OverflowError,
-    RecursionError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    zipfile.BadZipFile,
-)
+MAGIC = b"livepde1"
+DIGEST = 16  # bytes
+START = struct.Struct(f"<8sQ{DIGEST}s")
+ALIGNED = 16  # bytes
+MOST = 1 << 40  # values in one array
+PLAIN = "biufcU"  # kinds of arrays that are plain numbers or text
 
 
 def flatten(value: Any, prefix: str = "state") -> dict[str, Any]:
     """Return the leaves of nested dataclasses and tuples of arrays, keyed by dotted path."""
-    if isinstance(value, tuple):
-        parts = [flatten(item, f"{prefix}.{k}") for k, item in enumerate(value)]
-        return {path: leaf for part in parts for path, leaf in part.items()}
-    if not is_dataclass(value) or isinstance(value, type):
-        return {prefix: value}
     leaves: dict[str, Any] = {}
-    for item in fields(value):
-        leaves |= flatten(getattr(value, item.name), f"{prefix}.{item.name}")
+    _gather(value, prefix, leaves)
     return leaves
+
+
+def _gather(value: Any, prefix: str, leaves: dict[str, Any]) -> None:
+    if isinstance(value, tuple):
+        for k, item in enumerate(value):
+            _gather(item, f"{prefix}.{k}", leaves)
+        return
+    kind: Any = type(value)
+    parts = _parts(kind)
+    if parts is None:
+        leaves[prefix] = value
+        return
+    for name, _, _ in parts:
+        _gather(getattr(value, name), f"{prefix}.{name}", leaves)
+
+
+@lru_cache(maxsize=256)
+def _parts(kind: type) -> tuple[tuple[str, int, bool], ...] | None:
+    """Return name, axis that grows, and whether it begins anew of each field of a dataclass."""
+    if not is_dataclass(kind):
+        return None
+    return tuple(
+        (item.name, item.metadata.get("grows", 0), bool(item.metadata.get("begins_anew")))
+        for item in fields(kind)
+    )
 
 
 def rebuild(
@@ -63,24 +80,25 @@ def rebuild(
         return tuple(
             rebuild(item, leaves, f"{prefix}.{k}", grows) for k, item in enumerate(template)
         )
-    if is_dataclass(template) and not isinstance(template, type):
-        parts = {
-            item.name: _part(item, getattr(template, item.name), leaves, f"{prefix}.{item.name}")
-            for item in fields(template)
-        }
-        return type(template)(**parts)
+    kind: Any = type(template)
+    parts = _parts(kind)
+    if parts is not None:
+        found = {}
+        for name, axis, anew in parts:
+            part = _anew if anew else rebuild
+            found[name] = part(getattr(template, name), leaves, f"{prefix}.{name}", axis)
+        return kind(**found)
     array = leaves[prefix]
     if not isinstance(template, np.ndarray):
-        return type(template)(array.item())
-    if _others(array, grows) != _others(template, grows):
+        return kind(array.item())
+    if array.dtype != template.dtype:
+        raise ValueError(f"{prefix} is of type {array.dtype}, needs {template.dtype}")
+    if array.shape != template.shape and _others(array, grows) != _others(template, grows):
         raise ValueError(f"{prefix} has shape {array.shape}, needs {template.shape}")
     return array
 
 
-def _part(item: Field[Any], template: Any, leaves: Mapping[str, Array], prefix: str) -> Any:
-    grows = item.metadata.get("grows", 0)
-    if not item.metadata.get("begins_anew"):
-        return rebuild(template, leaves, prefix, grows)
+def _anew(template: Any, leaves: Mapping[str, Array], prefix: str, grows: int) -> Any:
     try:
         return rebuild(template, leaves, prefix, grows)
     except ValueError:
@@ -97,48 +115,73 @@ def _others(array: Array, axis: int) -> list[int]:
 
 
 def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
-    """Return an archive of header and leaves as bytes."""
-    archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w", allowZip64=True) as members:
-        for name, leaf in {"header": json.dumps(dict(header)), **leaves}.items():
-            array = np.asarray(leaf, order="C")
-            content = _array_header(array.dtype.str, array.shape) + array.tobytes()
-            members.writestr(zipfile.ZipInfo(f"{name}.npy"), content)
-    return archive.getvalue()
-
-
-@lru_cache(maxsize=4096)
-def _array_header(dtype: str, shape: tuple[int, ...]) -> bytes:
-    """Return the header of an array in NumPy's format, cached: most arrays of a state repeat it."""
-    header = io.BytesIO()
-    about = {"descr": dtype, "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(header, about)
-    return header.getvalue()
+    """Return header and leaves as one buffer."""
+    arrays = [np.asarray(leaf, order="C") for leaf in leaves.values()]
+    described = zip(leaves, (a.dtype.str for a in arrays), (a.shape for a in arrays), strict=True)
+    text = _text(json.dumps(dict(header)), tuple(described))
+    parts = [text, bytes(-len(text) % ALIGNED)]
+    for array in arrays:
+        parts += [array.tobytes(), bytes(-array.nbytes % ALIGNED)]
+    body = b"".join(parts)
+    return START.pack(MAGIC, len(text), _digest(body)) + body
 
 
 def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Return header and leaves of an archive; `where` names it in messages."""
+    """Return header and leaves of a buffer; `where` names it in messages.
+
+    Raises
+    ------
+    RunError
+        It is no checkpoint, or damaged.
+    """
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            _refuse_bombs(archive.zip.infolist(), len(content))
-            leaves = {name: archive[name] for name in archive.files}
-        header: dict[str, Any] = dict(json.loads(str(leaves.pop("header"))))
-    except DAMAGE as error:
+        magic, length, digest = START.unpack_from(content)
+        body = memoryview(content)[START.size :]
+        if magic != MAGIC or digest != _digest(body):
+            raise ValueError("it begins or adds up otherwise")
+        text = bytes(body[:length])
+        header, described = _read(text)
+        numbers = bytearray(body[length + -length % ALIGNED :])
+        leaves, at = {}, 0
+        for name, kind, shape in described:
+            array = np.ndarray(shape, kind, numbers, at)
+            leaves[name] = array
+            at += array.nbytes + -array.nbytes % ALIGNED
+    except (struct.error, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise RunError(
-            f"{where} is not a checkpoint of livepde, or it is damaged: {error}."
+            f"{where} is not a checkpoint of this version of livepde, or it is damaged: {error}."
         ) from error
-    return header, leaves
+    return dict(header), leaves
 
 
-def _refuse_bombs(members: Iterable[zipfile.ZipInfo], size: int) -> None:
-    """Reject an archive that expands beyond its size (zip bomb): `packed` never compresses."""
-    for member in members:
-        if member.compress_type != zipfile.ZIP_STORED or member.file_size > size:
-            raise ValueError(f"{member.filename} is compressed")
+def _digest(body: Any) -> bytes:
+    return hashlib.blake2b(body, digest_size=DIGEST).digest()
+
+
+@lru_cache(maxsize=64)
+def _text(header: str, described: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
+    """Return header and descriptions as text, cached: those of successive states repeat."""
+    for name, kind, _ in described:
+        if np.dtype(kind).kind not in PLAIN:
+            raise TypeError(f"{name}: a checkpoint holds arrays of numbers and texts, not {kind}.")
+    return f"[{header}, {json.dumps(described)}]".encode()
+
+
+@lru_cache(maxsize=64)
+def _read(text: bytes) -> tuple[dict[str, Any], list[tuple[str, np.dtype[Any], tuple[int, ...]]]]:
+    """Return what `_text` has written, its types checked."""
+    header, described = json.loads(text)
+    found = []
+    for name, kind, shape in described:
+        dtype, lengths = np.dtype(str(kind)), tuple(int(length) for length in shape)
+        if dtype.kind not in PLAIN or min(lengths, default=0) < 0 or math.prod(lengths) > MOST:
+            raise ValueError(f"'{name}' is no array of numbers")
+        found.append((str(name), dtype, lengths))
+    return dict(header), found
 
 
 def write(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write an archive atomically: the file appears complete or not at all."""
+    """Write a checkpoint atomically: the file appears complete or not at all."""
     target = Path(path)
     try:
         write_bytes(target, content, sync=True)
@@ -150,7 +193,7 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def read(path: str | os.PathLike[str]) -> bytes:
-    """Return the contents of an archive file."""
+    """Return the contents of a checkpoint file."""
     try:
         return Path(path).read_bytes()
     except OSError as error:

@@ -13,7 +13,8 @@
     ├── DataError                   one sample that cannot be used; the estimate is unchanged
     │   ├── SampleError             wrong shape, text, infinity, unknown channel
     │   ├── TimeOrderError          time going backwards
-    │   └── MissingInputError       an input without any value yet
+    │   ├── MissingInputError       an input without any value yet
+    │   └── OffsetError             a batch that does not continue where a shard stands
     ├── RunError                    a run directory that is taken, missing or damaged
     └── LinearAlgebraError          a matrix that cannot be factorised
 
@@ -33,6 +34,7 @@ __all__ = [
     "ModelError",
     "NameClashError",
     "ObservationError",
+    "OffsetError",
     "RunError",
     "SampleError",
     "SpaceError",
@@ -86,6 +88,10 @@ class TimeOrderError(DataError):
 
 class MissingInputError(DataError):
     """An input or boundary channel that has not had any value yet."""
+
+
+class OffsetError(DataError):
+    """A batch that does not begin at the offset of a shard: a repetition, or after a gap."""
 
 
 class RunError(LivepdeError, OSError):

@@ -69,7 +69,8 @@ class Identifier:
         divided into substeps.
     halvings
         A substep that is not solved is halved at most this often, before the step is a failed
-        status. 0: that at once, as where steps are to be those of the samples and no others.
+        status. 0: that at once, as where steps are to be those of the samples and no others; nor
+        are the first ones graded then, as for laws with a covariance (`Advance.start`).
     assimilate_from
         Samples before this time drive inputs and are scored, but not assimilated.
     hold
@@ -127,7 +128,8 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
-        control = Advance(scheme or law.scheme, dt_max, halvings, hold)
+        start = float(t0) if law.graded_start else math.nan
+        control = Advance(scheme or law.scheme, dt_max, halvings, hold, start=start)
         if u0_from and u0 is None:
             raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
         noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
@@ -288,14 +290,16 @@ class Identifier:
             self._begun_by(values, t)
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         start = self._inputs if t > self._t else values
-        missing = np.array([name in held for name in self.inputs], dtype=float)
-        gaps = self._gaps.gaps(self.inputs, missing)
+        missing, gaps = np.array([name in held for name in self.inputs], dtype=float), {}
+        if self.inputs:
+            gaps = self._gaps.gaps(self.inputs, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
         self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
-            self._gaps = self._gaps.add(t - self._t, missing)
+            if self.inputs:
+                self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held, scored=True)
 
@@ -341,7 +345,7 @@ class Identifier:
         return before, Report(failure, np.full(self.observed.size, np.nan))
 
     def _expected(self, interval: Interval) -> Array:
-        """Return what the sensors show of the estimate of now."""
+        """Return the predicted readings of the current estimate."""
         belief = self._belief()
         return self.observed.predict(belief.u, belief.q, interval.end)
 
@@ -365,7 +369,7 @@ class Identifier:
             )
 
     def latent_belief(self) -> Belief:
-        """Return what the law itself believes: q and its factor in latent coefficients.
+        """Return the belief of the law: q and its factor in latent coefficients.
 
         Those are the coefficients of `Model.Q`: of logarithms, say, or of harmonics.
         """
@@ -373,7 +377,7 @@ class Identifier:
         return belief
 
     def _belief(self) -> Belief:
-        """Return what the law believes, of the physical parameter."""
+        """Return the belief of the law about the physical parameter."""
         return self.problem.physical(self.latent_belief())
 
     def _reader(self) -> Callable[[], Belief]:
@@ -471,7 +475,7 @@ class Identifier:
         return replace(estimate, belief=belief, judge=self._judge(state, estimate.notes))
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
-        """Return what the sensors will show if nothing more is measured; nothing is learned.
+        """Return predicted readings if nothing more is measured; nothing is learned.
 
         Unknowns that evolve go on as their prior says, and deviations grow with them.
 
@@ -571,7 +575,7 @@ class Identifier:
         return self.law.unsmoothed(self._work)
 
     def smoothed(self, stream: Iterable[Any], *, fields_every: int = 1) -> xr.Dataset:
-        """Return what unknowns and state were at each sample of a run, given all of them.
+        """Return the smoothed unknowns and state at each sample of a run, given all of them.
 
         A fixed-interval smoother: see `livepde.laws.smoother`. All samples are taken by a copy of
         this identifier, as in a run, and then at least once more; this one stays as it is.
@@ -682,7 +686,8 @@ class Identifier:
                 )
         state = None
         try:
-            t, samples, z = float(leaves["t"]), int(leaves["samples"]), leaves["z"]
+            t, samples = float(leaves["t"]), int(leaves["samples"])
+            z = checkpoint.rebuild(self._z, leaves, "z")
             withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
             gaps = InputLedger(leaves["held_counts"].astype(np.int64), leaves["held"])
             names = self.inputs if len(leaves["inputs"]) else ()

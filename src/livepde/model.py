@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -32,6 +32,7 @@ from livepde.fem import (
     dot,
     grad,
     reads,
+    with_constants,
 )
 from livepde.linalg import Array, IntArray
 from livepde.operators import DualOperator
@@ -196,11 +197,11 @@ class Model:
             This model has one unknown without a name, or a name is taken.
         """
         space = self.parameter_space
-        taken = sorted(set(space.unknowns) & set(more))
+        taken = sorted(set(space.names) & set(more))
         if space.single or taken:
             what = f"the name '{taken[0]}' is taken" if taken else "its one unknown has no name"
             raise ModelError(f"with_unknowns: {what}; write parameter={{name: unknown, ...}}.")
-        unknowns = {**space.unknowns, **more}
+        unknowns = {**cast(Mapping[str, Unknown], self.parameter), **more}
         return Model(self.state, unknowns, **self._parts, time_unit=self.time_unit)
 
     def with_terms(
@@ -231,6 +232,33 @@ class Model:
             parts[name] = [*given, *more]
         parts["inputs"] = tuple(dict.fromkeys([*self.inputs, *inputs]))
         return Model(self.state, self.parameter, **parts, time_unit=self.time_unit)
+
+    def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
+        """Return the same process with constants in the place of some of its inputs.
+
+        Raises
+        ------
+        ModelError
+            The process has no such input.
+        """
+        if other := sorted(set(values) - set(self.inputs)):
+            raise ModelError(
+                f"with_constant_inputs: the model has no input '{other[0]}'; it has "
+                f"{list(self.inputs)}."
+            )
+
+        def bound(part: Any) -> Any:
+            if isinstance(part, On):
+                return On(part.name, bound(part.form))
+            if isinstance(part, Mapping):
+                return {name: bound(item) for name, item in part.items()}
+            if isinstance(part, Sequence):
+                return [bound(item) for item in part]
+            return with_constants(part, values) if callable(part) else part
+
+        parts = {name: bound(part) for name, part in self._parts.items() if name != "inputs"}
+        left = [name for name in self.inputs if name not in values]
+        return Model(self.state, self.parameter, **parts, inputs=left, time_unit=self.time_unit)
 
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.

@@ -21,7 +21,7 @@ Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
 
 def unknown_of(space: FunctionSpace, label: str) -> Any:
     """Return the unknown of a scalar label."""
-    return space.unknowns[label.split("[")[0]]
+    return space.unknown_of(label)
 
 
 class ScalarReadout:

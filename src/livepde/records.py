@@ -1,4 +1,4 @@
-"""What is kept of each estimate, and the dataset that it becomes.
+"""Records of estimates, and the dataset made of them.
 
 A record holds numbers and arrays only; what they mean (names, units, coordinates) stands once, in a
 layout of plain values. So a run can be read without its model, and while it goes on.
@@ -45,7 +45,11 @@ DATE = "date"  # column of an exported table, beside the variables of the datase
 # What stands beside an unknown or a component of the state: end of the variable's name -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
 INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
-NUMBER_ENDS = {**STATE_ENDS, **INTERVAL_ENDS, "_left": "the share left of the prior deviation"}
+NUMBER_ENDS = {
+    **STATE_ENDS,
+    **INTERVAL_ENDS,
+    "_left": "the share left of the prior standard deviation",
+}
 FIELD_ENDS = {
     **STATE_ENDS,
     **INTERVAL_ENDS,
@@ -467,7 +471,7 @@ class Layout:
 
 
 def bare(name: str) -> str:
-    """Return what a variable beside an unknown belongs to."""
+    """Return the name of the unknown that a variable belongs to."""
     for end in (*STATE_ENDS, *INTERVAL_ENDS):
         name = name.removesuffix(end)
     return name

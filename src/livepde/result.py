@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Estimate",
+    "Marginal",
     "Result",
     "interval_ends",
     "layout_of",
@@ -124,7 +125,7 @@ class Estimate:
             return held[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy needs: the belief itself."""
+        """Return the belief itself, for a copy."""
         own = {"belief": self.belief, "verdict": self.verdict}
         return own | {k: v for k, v in vars(self).items() if k not in ("_read", "judge")}
 
@@ -185,17 +186,13 @@ class Estimate:
             "verdict": self.verdict.level,
         }
 
-    def interval(self, name: str, level: float = 0.95) -> tuple[Any, Any]:
-        """Return the ends of the central interval that holds an unknown with probability `level`.
-
-        Within its bounds, and not symmetric for one with a transform. NaN for a law without
-        covariance.
+    def __getitem__(self, name: str) -> Marginal:
+        """Return the marginal of one unknown: its mean, standard deviation and intervals.
 
         Parameters
         ----------
         name
-            Label of a scalar unknown, for which two numbers are returned; or name of a field, for
-            two arrays of coefficients.
+            Label of an unknown number, or name of a field.
 
         Raises
         ------
@@ -206,16 +203,45 @@ class Estimate:
         std = self.q_std if self.q_std is not None else np.full_like(self.q, np.nan)
         if name in space.labels:
             k = space.labels[name]
-            low, high = unknown_of(space, name).interval(self.q[k], std[k], level)
-            return float(low), float(high)
+            return Marginal(float(self.q[k]), float(std[k]), unknown_of(space, name))
         if name not in space.fields:
             raise ConfigurationError(
-                f"interval: there is no unknown '{name}'; there are "
+                f"estimate['{name}']: there is no unknown '{name}'; there are "
                 f"{[*space.labels, *space.fields]}."
             )
         part = space.part(name)
-        ends: tuple[Array, Array] = unknown_of(space, name).interval(self.q[part], std[part], level)
-        return ends
+        return Marginal(self.q[part], std[part], unknown_of(space, name))
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """What an estimate says of one unknown.
+
+    Attributes
+    ----------
+    mean, std
+        A number each; of a field arrays of coefficients. The standard deviation is NaN for a law
+        without covariance.
+    unknown
+        The unknown with its prior, transform and bounds.
+    """
+
+    mean: Any
+    std: Any
+    unknown: Any
+
+    def interval(self, level: float = 0.95) -> tuple[Any, Any]:
+        """Return the ends of the central interval that holds it with probability `level`.
+
+        Within its bounds, and not symmetric for an unknown with a transform. NaN for a law without
+        covariance.
+        """
+        low, high = self.unknown.interval(self.mean, self.std, level)
+        return (float(low), float(high)) if isinstance(self.mean, float) else (low, high)
+
+    def __str__(self) -> str:
+        numbers = isinstance(self.mean, float)
+        return f"{self.mean:.4g} ± {self.std:.2g}" if numbers else repr(self)
 
 
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
@@ -290,7 +316,7 @@ class Result:
             self.last, self._settled = estimate, estimate.belief
 
     def record(self, estimate: Estimate, keeps: bool) -> Record:
-        """Return what is kept of an estimate; `keeps`: with its fields."""
+        """Return the record of an estimate; `keeps`: with its fields."""
         return Record(
             estimate.t,
             np.array(self._readout(estimate.belief)),
@@ -401,14 +427,14 @@ def _number(value: float) -> float | None:
 
 
 def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> Layout:
-    """Return what the numbers of the records of a run mean."""
+    """Return names, units and coordinates of the records of a run."""
     numbers: dict[str, dict[str, Any]] = {}
     for label in model.parameter_space.labels:
         unknown = unknown_of(model.parameter_space, label)
         unit: dict[str, Any] = {"units": unknown.unit}
         numbers |= {label: {**unit, **_prior(unknown)}, f"{label}_std": unit}
         numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
-        numbers[f"{label}_left"] = {"long_name": "share of the prior deviation"}
+        numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
     points = model.mesh.p[:, vertex_order(model)]
     components = model.state_space.fields.items()
     return Layout(

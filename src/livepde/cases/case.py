@@ -1,4 +1,4 @@
-"""From a case file to an identifier and its stream."""
+"""Case: identifier and stream made from a case file."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Prepared:
         )
 
     def uncertain(self, law: AnyLaw) -> dict[str, Any]:
-        """Return what an identifier is told of noise beside that of its sensors."""
+        """Return the options of an identifier for noise of inputs and of initial readings."""
         case = self.case
         if isinstance(law, GradientLaw):  # it has no covariance
             return {}
@@ -260,7 +260,7 @@ class Case:
             if label not in space.labels:
                 text = f"there is no unknown number '{label}'; "
                 raise frame.error("reference", text + did_you_mean(label, space.labels))
-            unit = space.unknowns[label.split("[")[0]].unit
+            unit = space.unknown_of(label).unit
             found[label] = frame.convert(value, unit, f"reference.{label}")
         return found
 

@@ -75,7 +75,7 @@ def conditioned(frame: Frame) -> Frame:
 
 
 def _passing(names: _Names, units: Fluxes, name: str, given: BoundarySpec) -> list[Flux | Exchange]:
-    """Return what passes through a boundary."""
+    """Return the flux through a boundary."""
     found: list[Flux | Exchange] = []
     key = f"boundary.{name}"
     if given.flux is not None:

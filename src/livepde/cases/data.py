@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,14 @@ import numpy as np
 
 from livepde.cases.code import check_options, load_code
 from livepde.cases.frame import Frame
-from livepde.cases.schema import CaseSpec
+from livepde.cases.schema import CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
 from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
 from livepde.streams.clock import since_1970
+from livepde.streams.csvfile import header_of
 from livepde.streams.gaps import fill_table
+from livepde.streams.join import join_tables
 from livepde.streams.names import no_file
 from livepde.streams.table import JSON_LINES
 
@@ -36,9 +39,9 @@ DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
 
 
-def clock_of(frame: Frame) -> Clock:
-    """Return how times are read."""
-    data, unit = frame.spec.data, frame.equation.time_unit
+def clock_of(frame: Frame, data: DataSpec | None = None) -> Clock:
+    """Return how times are read, by default those of `[data]`."""
+    data, unit = data or frame.spec.data, frame.equation.time_unit
     rule = conversion(data.time_unit or unit, unit, frame.where("data.time_unit"))
     second = conversion("s", unit, frame.where("data.time")).factor if unit else 1.0
     start, stop = _instant(frame, data.start, "start"), _instant(frame, data.stop, "stop")
@@ -83,7 +86,7 @@ def read_data(
     ending = (
         ""
         if source is not None and not isinstance(source, str)
-        else Path(source if source is not None else spec.file or "").suffix
+        else Path(str(source if source is not None else spec.file or "")).suffix
     )
     if clock.hour and ending in ("", ".parquet", *JSON_LINES):
         text = "times in two columns are read from CSV files only: join them in one column."
@@ -92,6 +95,8 @@ def read_data(
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
     if source is None and frame.reader is not None:
         return _from_reader(frame, frame.reader, columns, clock)
+    if source is None and isinstance(spec.file, tuple):
+        return _joined(frame, spec.file, columns)
     path = Path(source) if source is not None else data_file(frame)
     if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
@@ -109,6 +114,57 @@ def read_data(
         encoding=spec.encoding,
         skip=spec.skip,
     )
+
+
+def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Column]) -> Table:
+    """Return several files as one table, joined by time; each channel comes from one of them."""
+    data = frame.spec.data
+    specs = [data.of(file) for file in files]
+    paths = [_found(frame, str(spec.file)) for spec in specs]
+    headers = [_header(frame, spec, path) for spec, path in zip(specs, paths, strict=True)]
+    owners: dict[str, int] = {}
+    for name, column in columns.items():
+        places = [k for k, header in enumerate(headers) if set(column.names) <= set(header)]
+        if len(places) != 1:
+            what = " and ".join(map(repr, column.names))
+            text = f"no file has the column {what}; the files are {', '.join(map(str, paths))}."
+            if places:
+                both = " and ".join(str(paths[k]) for k in places)
+                text = f"{both} have a column {what} each; rename one."
+            raise frame.error(f"channels.{column.noise_of or name}", text)
+        owners[name] = places[0]
+    tables = []
+    for k, (spec, path) in enumerate(zip(specs, paths, strict=True)):
+        own = {
+            name: replace(column, decimal=spec.decimal, needed=False)
+            for name, column in columns.items()
+            if owners[name] == k
+        }
+        if not own:
+            raise frame.error("data.file", f"no channel has a column of {path}; leave it out.")
+        tables.append(
+            read_csv(
+                path,
+                own,
+                clock_of(frame, spec),
+                every=spec.every,
+                missing=spec.missing,
+                separator=spec.separator,
+                encoding=spec.encoding,
+                skip=spec.skip,
+            )
+        )
+    second = clock_of(frame).second
+    sensors = frame.roles("sensor", "withheld")
+    needed = [name for name, column in columns.items() if column.needed]
+    return join_tables(tables, second, sensors, needed, frame.where("data.file"))
+
+
+def _header(frame: Frame, spec: DataSpec, path: Path) -> list[str]:
+    """Return the names of the columns of one of several files."""
+    if path.suffix in (".parquet", *JSON_LINES):
+        raise frame.error("data.file", f"{path} is no CSV file; only these are joined.")
+    return header_of(path, spec.separator, spec.encoding, spec.skip)
 
 
 def without_gaps(frame: Frame, table: Table) -> Table:
@@ -133,7 +189,7 @@ def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any
 def _from_reader(
     frame: Frame, reader: Callable[..., Any], columns: Mapping[str, Column], clock: Clock
 ) -> Table:
-    """Return what the user's function reads: times, and a mapping from column to values."""
+    """Return the data of the user's function: times, and a mapping from column to values."""
     spec, where = frame.spec.data, frame.where(f"data.reader: {frame.spec.data.reader}")
     folder = _measurements(frame)
     try:
@@ -168,6 +224,14 @@ def data_file(frame: Frame) -> Path:
     given = frame.spec.data.file
     if given is None:
         raise frame.missing("data.file", "name one, or add --data to the command.")
+    if not isinstance(given, str):
+        text = "several files are joined for 'check' and 'run' of a complete record; a process is "
+        raise frame.error("data.file", text + "followed in one: name it, or join them first.")
+    return _found(frame, given)
+
+
+def _found(frame: Frame, given: str) -> Path:
+    """Return where a file of the case is; relative names start at the case file."""
     if VARIABLE in given:
         given = given.replace(VARIABLE, str(_data_folder(frame)))
     path = frame.path.parent / Path(given).expanduser()

@@ -69,7 +69,8 @@ def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
             key: Variable(item.unit or "", "")
             for key, item in spec.channels.items()
             if item.role == "input"
-        },
+        }
+        | {key: Variable("", "") for key in spec.inputs},
         options={key: _option(value) for key, value in spec.options.items()},
         build=build,
         element=linear,

@@ -11,7 +11,7 @@ from livepde.cases.read import is_blank, read_toml, spec_of
 from livepde.cases.settings import apply, key_path, toml_line
 from livepde.errors import CaseError
 
-__all__ = ["Blank", "blanks", "filled"]
+__all__ = ["Blank", "blanks", "filled", "with_channel"]
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class _Line:
 
 
 def blanks(text: str) -> list[Blank]:
-    """Return what is to be filled in in the text of a case, line by line."""
+    """Return the blanks in the text of a case, line by line."""
     found = []
     for line in _values(text):
         given = line.value if isinstance(line.value, Mapping) else {"": line.value}
@@ -84,11 +84,21 @@ def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
     for key, value in settings.items():
         expected = apply(read_toml(text, where), {key: value}, where)
         text = _with(text, key_path(key, where), value)
-        if read_toml(text, where) != expected:
+        if _without_empty(read_toml(text, where)) != _without_empty(expected):
             raise CaseError(f"{where}: {key}: cannot be set here; edit the file in its place.")
     if settings:
         spec_of(read_toml(text, where), where)
     return text
+
+
+def with_channel(text: str, name: str, given: Mapping[str, Any]) -> str:
+    """Return the text of a case with one more channel."""
+    return _with(text, ("channels", name), given)
+
+
+def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document without its empty tables, which are there with a head of their own only."""
+    return {name: value for name, value in document.items() if value != {}}
 
 
 def _with(text: str, path: tuple[str, ...], value: Any) -> str:
@@ -112,8 +122,12 @@ def _with(text: str, path: tuple[str, ...], value: Any) -> str:
         return text
     *table, name = path
     heads = [k for k, line in enumerate(lines) if _table(line) == tuple(table)]
+    others = [line for line in _values(text) if line.path[:-1] == tuple(table)]
     if heads:
         lines.insert(heads[0] + 1, toml_line(name, value))
+    elif table and others:  # options.H = ... has no head
+        key = lines[others[-1].number].partition(" = ")[0].rpartition(".")[0]
+        lines.insert(others[-1].number + 1, f"{key}.{toml_line(name, value)}")
     elif table:
         lines += ["", f"[{'.'.join(toml_line(part, 0)[:-4] for part in table)}]"]
         lines.append(toml_line(name, value))

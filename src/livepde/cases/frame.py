@@ -1,4 +1,4 @@
-"""What all parts of a case need: file, specification, equation, and conversion with a location."""
+"""Frame of a case: file, specification, equation, and unit conversion with a location."""
 
 from __future__ import annotations
 

@@ -27,6 +27,7 @@ SUFFIX = re.compile(r"(?<=\w)_(?P<unit>[A-Za-z]\w*)$")  # Q_W, dH_mm
 NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
 PLACES = "places.csv"  # the table of positions that is written beside the case
 FAMILY = 8  # so many numbered columns become one line of [channels]
+USUAL = {"skip": 0, "time_format": "", "separator": ",", "decimal": ".", "encoding": UTF_8}
 HEAD = """\
 # A case of livepde: which process, what is unknown, which channel is what.
 #   livepde check {case}     what is in here, and what its sensors can tell
@@ -70,16 +71,21 @@ class FoundChannel:
 def case_for(table: Measured, folder: Path, equation: Equation) -> str:
     """Return the text of a case in `folder` that equation and table tell; the rest is open."""
     found = channels_in(table, equation)
-    blocks = [
-        _top(table, equation, {item.name for item in found if not item.is_sensor}),
-        _mesh(equation),
-        ["[data]", *_data(table, folder)],
-        *_unknowns(equation, found),
-        ["[channels]", *_channels(equation, found)],
-        ["[law]", _told(f"noise = {_noise(equation)}", "standard deviation of a single reading")],
+    given = {item.name for item in found if item.columns and not item.is_sensor}
+    lines = [
+        *_top(table, equation, given),
+        *_inline("mesh", _mesh(equation)),
+        *_inline("data", _data(table, folder)),
+        *_contents(table),
+        *_unknowns(equation, given),
+        *_inputs(found),
+        *_inline("law", {"noise": _noise(equation)}, "standard deviation of a single reading"),
         *_steps(table, equation),
+        "",
+        "[channels]",
+        *_channels(equation, found),
     ]
-    text = "\n\n".join("\n".join(lines) for lines in blocks)
+    text = "\n".join(lines)
     return f"{HEAD.format(case=folder / 'case.toml')}{text}\n"
 
 
@@ -96,18 +102,20 @@ def _noise(equation: Equation) -> str:
 
 
 def _quantity(number: str, unit: str) -> str:
-    """Return a number with a unit as TOML."""
-    return f'"{number} {unit}"' if unit else number if number != BLANK else f'"{BLANK}"'
+    """Return a number with a unit."""
+    return f"{number} {unit}" if unit else number
 
 
 def _open(unit: str) -> str:
-    """Return what stands for a quantity that is to be filled in."""
+    """Return the blank of a quantity that is to be filled in."""
     return _quantity(BLANK, unit)
 
 
-def _blank(unit: str) -> str:
-    """Return the same without quotes."""
-    return _open(unit).strip('"')
+def _inline(key: str, given: Mapping[str, Any], told: str = "") -> Iterator[str]:
+    """Yield the line of a table, with dots in its key; none of an empty table."""
+    if given:
+        shown = toml_line("x", given).partition(" = ")[2]
+        yield _told(f"{key} = {shown}", told)
 
 
 def _told(line: str, text: str) -> str:
@@ -123,62 +131,72 @@ def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]
     asked = equation.alternatives.get(_alternative(equation, inputs), ())
     for name, option in equation.options.items():
         if option.default is None or name in asked:
-            yield _told(f"options.{name} = {_open(option.unit)}", option.text)
+            yield _told(f'options.{name} = "{_open(option.unit)}"', option.text)
     unit = equation.state.unit
     if equation.components:
-        parts = ", ".join(f"{name} = {_open(unit)}" for name in equation.components)
-        yield _told(f"initial = {{ {parts} }}", equation.state.text)
+        parts = dict.fromkeys(equation.components, _open(unit))
+        yield from _inline("initial", parts, equation.state.text)
     elif equation.dimension > 1:
-        yield _told(f"initial = {_open(unit)}", f"{equation.state.text} at the start")
+        yield _told(toml_line("initial", _open(unit)), f"{equation.state.text} at the start")
     else:
         yield _told('initial = "interpolate"', "from the first sample; or a number")
 
 
-def _mesh(equation: Equation) -> list[str]:
-    """Return the lines of the mesh."""
+def _mesh(equation: Equation) -> dict[str, Any]:
+    """Return the mesh."""
     side = _open(equation.length_unit)
     if equation.dimension > 1:
-        return ["[mesh]", f"x = [{side}, {side}]", f"y = [{side}, {side}]", "cells = [20, 20]"]
-    lines = ["[mesh]", f"from = {side}", f"to = {side}", "cells = 40"]
-    if equation.spacing == "geometric":
-        lines[1] = _told(lines[1], "more than 0, where the cells are smallest")
-        lines.append('spacing = "geometric"')
-    return lines
+        return {"x": [side, side], "y": [side, side], "cells": [20, 20]}
+    graded = {"spacing": "geometric"} if equation.spacing == "geometric" else {}
+    return {"from": side, "to": side, "cells": 40, **graded}
 
 
-def _data(table: Measured, folder: Path) -> Iterator[str]:
-    """Yield the lines of [data]: how the file is written, and what is in it."""
+def _data(table: Measured, folder: Path) -> dict[str, Any]:
+    """Return how the files are written."""
+    first, *others = (_written(one, folder) for one in table.tables)
+    found = {key: value for key, value in first.items() if value != USUAL.get(key)}
+    if others:
+        own = [{key: v for key, v in other.items() if v != first.get(key)} for other in others]
+        found["file"] = [first["file"], *(o if len(o) > 1 else o["file"] for o in own)]
+    return found
+
+
+def _written(table: Measured, folder: Path) -> dict[str, Any]:
+    """Return how a file is written, with what is usual."""
     written, path = table.written, table.path
     file = path if path.is_absolute() else beside(path, folder)
-    yield toml_line("file", file.as_posix())
-    if written.skip:
-        yield _told(toml_line("skip", written.skip), "lines before the header")
-    yield toml_line("time", table.time[0] if len(table.time) == 1 else list(table.time))
+    found: dict[str, Any] = {"file": file.as_posix(), "skip": written.skip}
+    found["time"] = table.time[0] if len(table.time) == 1 else list(table.time)
     if table.samples.origin is None and table.time_unit:
-        yield toml_line("time_unit", table.time_unit)
-    if table.time_format:
-        yield toml_line("time_format", table.time_format)
-    if written.separator != ",":
-        yield toml_line("separator", written.separator)
-    if written.decimal != ".":
-        yield toml_line("decimal", written.decimal)
-    if written.encoding != UTF_8:
-        yield toml_line("encoding", written.encoding)
-    yield f"# {table.span}"
-    if table.row_numbers:
-        yield f"# numbers of rows: {', '.join(table.row_numbers)}"
-    if table.texts:
-        yield f"# without numbers: {', '.join(table.texts)}"
+        found["time_unit"] = table.time_unit
+    return {
+        **found,
+        "time_format": table.time_format,
+        "separator": written.separator,
+        "decimal": written.decimal,
+        "encoding": written.encoding,
+    }
 
 
-def _steps(table: Measured, equation: Equation) -> Iterator[list[str]]:
-    """Yield the table of time steps, where intervals between samples are uneven."""
+def _contents(table: Measured) -> Iterator[str]:
+    """Yield in comments what is in the files."""
+    for one in table.tables:
+        yield f"# {one.path.name}: {one.span}" if table.more else f"# {one.span}"
+        if one.row_numbers:
+            yield f"# numbers of rows: {', '.join(one.row_numbers)}"
+        if one.texts:
+            yield f"# without numbers: {', '.join(one.texts)}"
+
+
+def _steps(table: Measured, equation: Equation) -> Iterator[str]:
+    """Yield the line of time steps, where intervals between samples are uneven."""
     steps = table.steps
     if len(steps) and steps.max() > 1.5 * np.median(steps):
         known = table.time_unit != BLANK
         number = f"{np.median(steps):g}" if known else BLANK
         step = _quantity(number, table.time_unit if known else equation.time_unit)
-        yield ["[steps]", _told(f"dt_max = {step}", "longer intervals are divided")]
+        given = step if table.time_unit or number == BLANK else float(step)
+        yield from _inline("steps", {"dt_max": given}, "longer intervals are divided")
 
 
 def _alternative(equation: Equation, inputs: set[str]) -> str:
@@ -192,26 +210,34 @@ def _alternative(equation: Equation, inputs: set[str]) -> str:
     return next(reversed(list(equation.alternatives)), "")
 
 
-def _unknowns(equation: Equation, found: list[FoundChannel]) -> Iterator[list[str]]:
-    """Yield the tables of the unknowns that have to be there."""
-    chosen = _alternative(equation, {item.name for item in found if not item.is_sensor})
+def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
+    """Yield the lines of the unknowns that have to be there."""
+    yield "# prior: what you would have said without data; std: how far off that may be;"
+    yield '# transform = "log" keeps an unknown positive: drop it where it need not be'
+    chosen = _alternative(equation, inputs)
     for name, variable in equation.unknowns.items():
         if name == chosen or not variable.optional:
             others = [other for other in equation.alternatives if other != name]
             more = f"; or {', '.join(others)}, or both" if name == chosen else ""
-            yield list(_unknown(name, variable, more))
+            yield from _unknown(name, variable, more)
 
 
 def _unknown(name: str, variable: Variable, more: str) -> Iterator[str]:
     prior = _open(variable.unit)
-    yield _told(f"[unknowns.{name}]", variable.text + more)
-    yield _told(f"prior = {prior}", "what you would have said without data ...")
-    yield _told(f"std = {prior}", "... and how far off that may be")
-    if variable.transform == "log":
-        yield _told('transform = "log"', "it is positive; if it need not be, drop this line")
-    elif variable.transform == "logit":
-        yield "bounds = [0, 1]"
-        yield _told('transform = "logit"', "it stays between its bounds")
+    given: dict[str, Any] = {"prior": prior, "std": prior}
+    if variable.transform == "logit":
+        given["bounds"] = [0, 1]
+    if variable.transform:
+        given["transform"] = variable.transform
+    yield from _inline(f"unknowns.{name}", given, variable.text + more)
+
+
+def _inputs(found: list[FoundChannel]) -> Iterator[str]:
+    """Yield the lines of the inputs without a column: constants, unless one is named."""
+    for item in found:
+        if not item.columns:
+            more = f'or [channels] {item.name} = {{ role = "input", column = ... }}'
+            yield _told(f'inputs.{item.name} = "{item.given["value"]}"', f"{item.told}; {more}")
 
 
 def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
@@ -223,13 +249,13 @@ def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
         units = equation.fluxes
         yield ENDS if units is None else VALUES.format(flux=units.flux)
     for item in found:
-        yield _told(toml_line(item.name, item.given), item.told)
+        if item.columns:
+            yield _told(toml_line(item.name, item.given), item.told)
 
 
 def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
     """Return the channels of a table, and at the end the inputs that it lacks."""
-    samples = table.samples
-    columns = dict(zip(samples.names, samples.values.T, strict=True))
+    columns = table.columns
     keys = [re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns]
     found, inputs = [], dict(equation.inputs)
     for key, (name, values) in zip(keys, columns.items(), strict=True):
@@ -247,7 +273,7 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
     found = _in_families(equation, found)
     for name, variable in inputs.items():
         if not variable.optional or name in chosen:
-            given = {"role": "input", "column": BLANK}
+            given = {"role": "input", "value": _open(variable.unit)}
             found.append(FoundChannel(name, given, (), variable.text))
     return found
 
@@ -277,7 +303,7 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
     """Return a sensor with the place and the unit that the name of its column states."""
     told, given = [_range(values)], {"role": "sensor", "column": name}
     place, fraction = PLACE.search(name), FRACTION.search(name)
-    at: Any = _blank(equation.length_unit)
+    at: Any = _open(equation.length_unit)
     if equation.dimension > 1:
         at = [at] * equation.dimension
     elif place is not None and equation.length_unit:

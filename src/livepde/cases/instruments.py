@@ -1,4 +1,4 @@
-"""What sensors add: families of them, and unknown offsets, gains and correlated errors."""
+"""Sensor families, and unknown offsets, gains and correlated errors of sensors."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _dimension(channel: ChannelSpec) -> int:
 
 
 def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:
-    """Return what all sensors have in common: they share a prior."""
+    """Return the common value of all sensors: they share a prior."""
     (first, value), *others = given.items()
     for name, other in others:
         if other != value:
@@ -164,7 +164,7 @@ def _difference(unit: str) -> str:
 def calibrated(
     frame: Frame, base: Observation, names: Sequence[str], **options: Any
 ) -> Observation:
-    """Return what the instruments show: gain * (what the base sees) + offset + correlated."""
+    """Return the readings: gain * (reading of the base) + offset + correlated."""
     channels = frame.spec.channels
 
     def reading(y: Any, q: Any, x: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What a case may ask for: its size, depth and numbers, looked at before anything is built."""
+"""Limits of size, depth and numbers of a case, checked before anything is built."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from livepde.cases.data import read_data
 from livepde.cases.sources import Data, limits_of, policy_of, publishers_of, source_of
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
-from livepde.runs.feeds import Feed, Gathered, Paced, Samples, shifted
+from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed, shifted
 from livepde.runs.journal import Journal
 from livepde.runs.live import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
@@ -214,16 +214,17 @@ class Wiring:
         case, journal, spec = self.case, self._journal, self.case.frame.spec.data
         last = -math.inf if journal is None else journal.last
         named = data if isinstance(data, str) else None
-        file = spec.file or "" if data is None else named or ""
+        own = spec.file if data is None else named
+        joined, file = isinstance(own, tuple), own if isinstance(own, str) else ""
         reader = data is None and case.frame.reader is not None
-        if spec.every > 1 and not (file or reader):
+        if spec.every > 1 and not (file or reader or joined):
             text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
             raise case.frame.error("data.every", text)
-        whole = spec.every > 1 or spec.skip or len(spec.times) > 1
+        whole = joined or spec.every > 1 or spec.skip or len(spec.times) > 1
         if reader or file.endswith(".parquet") or whole:
             table = read_data(case.frame, case.columns, case.clock, named)
             self._origin = table.origin
-            return Samples(table, after=last)
+            return SampleFeed(table, after=last)
         begun = None if journal is None else journal.layout.attrs.get("origin")
         shift, position = shifted("" if journal is None else journal.position)
         self._intake = Intake(

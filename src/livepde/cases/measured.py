@@ -1,4 +1,4 @@
-"""How a table of measurements is written, and what its columns hold, for `livepde init`."""
+"""Layout and contents of a table of measurements, for `livepde init`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -54,6 +54,8 @@ class Measured:
         Times, and the columns that hold numbers.
     row_numbers, texts
         Columns that are not used: numbers of rows, and those without numbers.
+    more
+        Tables that are joined to this one by time.
     """
 
     path: Path
@@ -64,6 +66,34 @@ class Measured:
     samples: Table
     row_numbers: tuple[str, ...]
     texts: tuple[str, ...]
+    more: tuple[Measured, ...] = ()
+
+    @property
+    def tables(self) -> tuple[Measured, ...]:
+        """Tables that are joined: the first is this one."""
+        return (self, *self.more)
+
+    @property
+    def columns(self) -> dict[str, Array]:
+        """Values of each column of numbers, of all tables."""
+        return {
+            name: values
+            for table in self.tables
+            for name, values in zip(table.samples.names, table.samples.values.T, strict=True)
+        }
+
+    def joined(self, other: Measured) -> Measured:
+        """Return this table with another one that is joined to it by time; raises `DataError`."""
+        if both := sorted(self.columns.keys() & other.columns.keys()):
+            raise SampleError(
+                f"{other.path}: the column '{both[0]}' is in another table, too: rename one."
+            )
+        if (self.samples.origin is None) != (other.samples.origin is None):
+            raise SampleError(
+                f"{other.path}: its times and those of {self.path} are dates in one and numbers "
+                "in the other: write both alike."
+            )
+        return replace(self, more=(*self.more, other))
 
     @property
     def steps(self) -> Array:

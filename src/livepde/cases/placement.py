@@ -1,4 +1,4 @@
-"""Where one more sensor would help most, before a case is run."""
+"""Sensor placement: the position of one more sensor that tells most."""
 
 from __future__ import annotations
 

@@ -1,19 +1,23 @@
-"""What the sensors of a case can tell about its unknowns, before it is run."""
+"""Preview of a case: identifiability, discretisation error and unseen sensor errors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import tee
+from typing import Any
 
 import numpy as np
 
 from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
 from livepde.identifier import Sample
-from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw
+from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw, Shadows
 from livepde.laws.filter_state import FilterState
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
+from livepde.verdict import REFINE, discretised
 
 __all__ = ["Identified", "Preview", "linearised", "preview"]
 
@@ -60,12 +64,17 @@ class Preview:
     samples
         How many samples with a measurement it took.
     sentences
-        What is traded off, and how many modes of each field are known.
+        What is traded off, and how many modes of each field are known; what the discretisation
+        does to the unknowns, and which errors of sensors would not be seen.
+    last
+        The same unknowns if the run began with the last samples instead, as many; empty if there
+        are no more.
     """
 
     unknowns: tuple[Identified, ...] = ()
     samples: int = 0
     sentences: tuple[str, ...] = ()
+    last: tuple[Identified, ...] = ()
 
 
 class StatedNoise(SensitivityLaw):
@@ -92,7 +101,7 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
 
 
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
-    """Return what the first samples would tell, linearised at the prior.
+    """Return the identifiability by the first samples, linearised at the prior.
 
     A filter that is linear about one reference has a covariance that does not depend on what is
     measured, only on when and with which inputs. So the law runs about the prior, never moves its
@@ -104,8 +113,20 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
         return Preview()
     if linear.noise is None and prepared.identifier.observed.noise is None:
         return Preview()  # to be found from the samples
+    begun, all_of = tee(samples)
+    found = _told(prepared, replace(linear, shadows=Shadows()), begun)
+    end = deque(enumerate(all_of, 1), maxlen=MOST_SAMPLES)
+    if not found.samples or not end or end[-1][0] <= MOST_SAMPLES:
+        return found
+    last = [sample for _, sample in end]
+    late = replace(prepared, first=last[0], assimilate_from=-np.inf)
+    return replace(found, last=_told(late, linear, last).unknowns)
+
+
+def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample]) -> Preview:
+    """Return the posterior after the first of some samples, linearised at the prior."""
     identifier = prepared.identifier_with(linear)
-    count = 0
+    count, estimate = 0, None
     for sample in samples:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         if sample.t >= prepared.assimilate_from:
@@ -115,7 +136,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     model = prepared.case.model
     belief = identifier.latent_belief()
     prior, posterior = belief.prior_factor, belief.q_factor
-    if not count or prior is None or posterior is None:
+    if not count or estimate is None or prior is None or posterior is None:
         return Preview()
     latent = model.latent
     rest = None if belief.rest is None else latent.deviation(latent.prior, belief.rest)
@@ -123,8 +144,26 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
         replace(belief, q_factor=latent.tangent(latent.prior, factor), rest=rest)
         for factor in (prior, posterior)
     )
-    found = identifiability(model, belief)
-    return Preview(tuple(_compare(prepared, before, after)), count, tuple(found.sentences))
+    told = tuple(_compare(prepared, before, after))
+    sentences = (
+        *identifiability(model, belief).sentences,
+        *_shifted(estimate.notes, {item.name: item.posterior for item in told}),
+        *estimate.verdict.unseen,
+    )
+    return Preview(told, count, sentences)
+
+
+def _shifted(notes: Mapping[str, Any], std: Mapping[str, float]) -> list[str]:
+    """Return the shifts of numbers by the discretisation, in posterior standard deviations."""
+    labels = [label for label in std if std[label] > 0.0]
+    each = {
+        kind: [float(notes.get(f"{label}_{kind}_shift", 0.0)) / std[label] for label in labels]
+        for kind in REFINE
+    }
+    total = np.abs(np.sum(list(each.values()), axis=0)).max(initial=0.0)
+    sizes = {f"{kind}_shift": max(map(abs, sizes), default=0.0) for kind, sizes in each.items()}
+    found = discretised({**notes, **sizes, "discretisation_shift": float(total)}, labels)
+    return [finding.sentence for finding in found]
 
 
 def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identified]:
@@ -133,7 +172,7 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
     units = {name: unknown.unit for name, unknown in space.unknowns.items()}
     prior, posterior = (np.asarray(belief.q_std) for belief in (before, after))
     found = [
-        Identified(label, float(prior[k]), float(posterior[k]), units.get(label.split("[")[0], ""))
+        Identified(label, float(prior[k]), float(posterior[k]), space.unknown_of(label).unit)
         for label, k in space.labels.items()
     ]
     for name, block in space.fields.items():

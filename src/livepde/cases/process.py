@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from livepde.cases.read import did_you_mean
 from livepde.cases.regions import inside, sides_of
 from livepde.cases.schema import EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
-from livepde.errors import ModelError, NameClashError, SpaceError
+from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem import (
     Channel,
     Evolution,
@@ -33,10 +34,11 @@ from livepde.fem import (
     read_mesh,
     rectangle,
 )
+from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import Option
 
-__all__ = ["drive_notes", "mesh_of", "model_of", "options_of", "process_notes"]
+__all__ = ["constants_of", "drive_notes", "mesh_of", "model_of", "options_of", "process_notes"]
 
 
 def mesh_of(frame: Frame) -> Any:
@@ -67,11 +69,52 @@ def mesh_of(frame: Frame) -> Any:
     geometric = spec.spacing == "geometric"
     if geometric and not start > 0:
         raise frame.error("mesh.spacing", "'geometric' needs from > 0.")
-    return interval(start, stop, cells, geometric=geometric)
+    plain = interval(start, stop, cells, geometric=geometric)
+    edges = [edge for _, edge in layer_edges(frame)]
+    through = _fitted(plain.p[0], edges)
+    mesh = interval(start, stop, cells, geometric=geometric, through=through)
+    own = {edge for edge in edges if _inside(mesh.p[0], edge)} - set(through)
+    return line(sorted({*mesh.p[0].tolist(), *own})) if own else mesh
+
+
+def layer_edges(frame: Frame) -> list[tuple[str, float]]:
+    """Return the ends of layers of an interval, of unknowns and of sources, each with its name."""
+    given: list[tuple[str, str, Any]] = [
+        (f"layer '{layer}' of {name}", f"unknowns.{name}.regions.{layer}", item.over)
+        for name, unknown in frame.spec.unknowns.items()
+        for layer, item in (unknown.regions or {}).items()
+    ]
+    given += [
+        (f"source '{name}'", f"sources.{name}.over", item.over)
+        for name, item in frame.spec.sources.items()
+    ]
+    unit = frame.equation.length_unit
+    return [
+        (what, edge)
+        for what, key, over in given
+        if isinstance(over, tuple) and len(over) == 2
+        for edge in frame.pair(over, unit, key)
+    ]
+
+
+def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
+    """Return the edges inside of a mesh to which its nearest nodes can move, each to one."""
+    inner = nodes[1:-1]
+    found: dict[int, float] = {}
+    for edge in edges:
+        if len(inner) and _inside(nodes, edge):
+            found.setdefault(int(np.abs(inner - edge).argmin()), edge)
+    return list(found.values())
+
+
+def _inside(nodes: Array, edge: float) -> bool:
+    """Return whether an edge lies between the ends of a mesh, and not on them."""
+    slack = 1e-6 * float(np.ptp(nodes))
+    return bool(nodes.min() + slack < edge < nodes.max() - slack)
 
 
 def _built(frame: Frame, key: str, build: Callable[[], Any]) -> Any:
-    """Return what is built; what does not fit is said with its key."""
+    """Return the built mesh; an error names the key of the case."""
     try:
         return build()
     except SpaceError as error:
@@ -111,19 +154,26 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     """Return the model."""
     inputs = frame.roles("input")
     frame.only(inputs, frame.equation.inputs, "channels (role input)")
+    constants = constants_of(frame)
     for name, variable in frame.equation.inputs.items():
-        if name not in inputs and not variable.optional:
-            raise frame.missing(f"channels.{name}", f"the {variable.text}, with role = 'input'.")
+        if name not in {**inputs, **constants} and not variable.optional:
+            raise _without_input(frame, name, f"the {variable.text}")
     unknowns = _unknowns(frame, mesh)
     try:
         model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
     except NameClashError as error:
         raise frame.error("unknowns", str(error)) from None
     for name in model.inputs:
-        if name not in inputs:
+        if name not in {**inputs, **constants}:
             known = frame.equation.inputs.get(name)
-            text = f"the {known.text}" if known else "the equation reads it"
-            raise frame.missing(f"channels.{name}", f"{text}, with role = 'input'.")
+            raise _without_input(
+                frame, name, f"the {known.text}" if known else "the equation reads it"
+            )
+    for name in constants:
+        if name not in model.inputs:
+            text = "the equation does not read it with these unknowns; leave it out."
+            raise frame.error(f"inputs.{name}", text)
+    model = model.with_constant_inputs(constants) if constants else model
     own = unknowns_of(frame)
     if not own:
         return model
@@ -131,6 +181,24 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
         return model.with_unknowns(own)
     except ModelError as error:
         raise frame.error("channels", str(error)) from None
+
+
+def constants_of(frame: Frame) -> dict[str, float]:
+    """Return the inputs of the equation that are constants, in its units."""
+    known, given = frame.equation.inputs, frame.spec.inputs
+    frame.only(given, known, "inputs")
+    for name in given:
+        if name in frame.spec.channels:
+            raise frame.error(f"inputs.{name}", f"there is a channel '{name}', too; keep one.")
+    return {
+        name: frame.convert(value, known[name].unit, f"inputs.{name}")
+        for name, value in given.items()
+    }
+
+
+def _without_input(frame: Frame, name: str, what: str) -> CaseError:
+    text = f"{what}, with role = 'input'; or a constant, inputs.{name}."
+    return frame.missing(f"channels.{name}", text)
 
 
 def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
@@ -163,6 +231,24 @@ def _unknowns(frame: Frame, mesh: Any) -> dict[str, Any]:
 def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     """Return an unknown with its prior in the model's unit; plain numbers are in `spec.unit`."""
     key, unit = f"unknowns.{name}", frame.equation.unknowns[name].unit
+    prior_of = _prior(frame, spec, unit, key)
+    if spec.field:
+        return _built(frame, key, lambda: _field(frame, mesh, spec, name, prior_of))
+    if spec.regions is None:
+        return _built(frame, key, lambda: Scalar(**prior_of))
+    places = {region: item.over for region, item in spec.regions.items()}
+    regions = _regions(frame, mesh, places, f"{key}.regions")
+    own = {}
+    for region, item in spec.regions.items():
+        if (there := spec.at(item)) is not None:
+            where = f"{key}.regions.{region}"
+            given = _prior(frame, there, unit, where)
+            own[region] = _built(frame, where, partial(Scalar, **given))
+    return _built(frame, key, lambda: Piecewise(regions, **prior_of, own=own))
+
+
+def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
+    """Return prior, bounds, transform and evolution in the model's unit."""
     rule = conversion(spec.unit or unit, unit, frame.where(f"{key}.unit"))
 
     def value(given: float | str, item: str) -> float:
@@ -190,12 +276,7 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     prior_of |= {"transform": spec.transform, "within": spec.within}
     if spec.evolution is not None:
         prior_of["evolution"] = _evolution(frame, spec, spec.evolution, unit, f"{key}.evolution")
-    if spec.field:
-        return _built(frame, key, lambda: _field(frame, mesh, spec, name, prior_of))
-    if spec.regions is None:
-        return _built(frame, key, lambda: Scalar(**prior_of))
-    regions = _regions(frame, mesh, spec.regions, f"{key}.regions")
-    return _built(frame, key, lambda: Piecewise(regions, **prior_of))
+    return prior_of
 
 
 def _evolution(
@@ -300,7 +381,7 @@ def drive_notes(frame: Frame, model: Model) -> list[str]:
 
 
 def process_notes(frame: Frame, mesh: Any) -> list[str]:
-    """Return what is allowed and yet deserves a word."""
+    """Return notes on settings that are allowed and yet doubtful."""
     found = []
     nodes, spec = mesh.p[0], frame.spec.mesh
     graded = frame.equation.spacing == "geometric"
@@ -309,15 +390,16 @@ def process_notes(frame: Frame, mesh: Any) -> list[str]:
             "The mesh is uniform, with cells too large at the left end, where "
             f"'{frame.equation.name}' changes most: mesh.spacing = 'geometric'."
         )
-    for name, unknown in frame.spec.unknowns.items():
-        for layer, given in (unknown.regions or {}).items():
-            if isinstance(given, str) or len(given) != 2:
-                continue
-            edges = frame.pair(given, frame.equation.length_unit, f"unknowns.{name}.regions")
-            inner = [edge for edge in edges if nodes.min() < edge < nodes.max()]
-            if any(np.abs(nodes - edge).min() > 1e-6 * np.ptp(nodes) for edge in inner):
-                found.append(
-                    f"Layer '{layer}' of {name} ends inside of a cell: choose mesh.cells such "
-                    "that nodes fall on the edges."
-                )
+    if len(mesh.p) == 1 and spec.file is None:
+        within = 1e-6 * np.ptp(nodes)
+        crossed = dict.fromkeys(
+            what
+            for what, edge in layer_edges(frame)
+            if _inside(nodes, edge) and np.abs(nodes - edge).min() > within
+        )
+        if crossed:
+            remedy = "add the ends to mesh.nodes" if spec.nodes else "take more mesh.cells"
+            names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
+            names = f"{names[0].upper()}{names[1:]}"
+            found.append(f"{names} {end} inside of a cell: {remedy}.")
     return found

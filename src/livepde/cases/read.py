@@ -1,4 +1,4 @@
-"""From a TOML file to a checked specification, or to one sentence about what is wrong."""
+"""Reader of case files: TOML to a checked specification, or one sentence about an error."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from livepde.cases.schema import (
     JumpsSpec,
     MeshSpec,
     OutputSpec,
+    RegionSpec,
     ReplaySpec,
     SensitivitySpec,
     ShadowsSpec,
@@ -74,6 +75,7 @@ TABLES: dict[str, type[BaseModel]] = {
     "steps": StepsSpec,
     "output": OutputSpec,
     "unknowns.*": UnknownSpec,
+    "regions.*": RegionSpec,
     "channels.*": ChannelSpec,
     "law.guards": GuardsSpec,
     "law.shadows": ShadowsSpec,
@@ -258,7 +260,8 @@ def _keys(path: list[str], raw: Mapping[str, Any]) -> list[str]:
         model = laws.get(str(kind), SensitivitySpec)
     elif path:
         first = path[0].partition("[")[0]  # variants[0] is one of the variants
-        names = (".".join(path), f"*.{path[-1]}", f"{first}.*")
+        region = "regions.*" if path[2:3] == ["regions"] and len(path) == 4 else ""
+        names = (region, ".".join(path), f"*.{path[-1]}", f"{first}.*")
         model = next((TABLES[name] for name in names if name in TABLES), None)
     if model is None:
         return []

@@ -1,4 +1,4 @@
-"""What a case file may say, as pydantic models: a class for each table."""
+"""Schema of case files, as pydantic models: a class for each table."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ __all__ = [
     "EvolutionSpec",
     "GradientSpec",
     "MeshSpec",
+    "RegionSpec",
     "SensitivitySpec",
     "SourceSpec",
     "StepsSpec",
@@ -131,10 +132,31 @@ class OpcuaSpec(Spec):
     password_env: Name | None = None
 
 
+class FileSpec(Spec):
+    """One of several files, and what is written otherwise in it than `[data]` says."""
+
+    file: Name
+    separator: Annotated[str, Field(min_length=1, max_length=1)] | None = None
+    decimal: Literal[".", ","] | None = None
+    encoding: Encoding | None = None
+    skip: NonNegativeInt | None = None
+    time: Name | tuple[Name, Name] | None = None
+    time_unit: str | None = None
+    time_format: TimeFormat | None = None
+
+
+def _file(given: Any) -> Any:
+    """Take what is no table as the name of a file."""
+    return given if isinstance(given, Mapping) else {"file": given}
+
+
+File: TypeAlias = Annotated[FileSpec, BeforeValidator(_file)]
+
+
 class DataSpec(Spec):
     """Where rows come from, and how their times are read."""
 
-    file: Name | None = None
+    file: Name | Annotated[tuple[File, ...], Field(min_length=2)] | None = None
     follow: StrictBool = False
     mqtt: MqttSpec | None = None
     opcua: OpcuaSpec | None = None
@@ -163,13 +185,18 @@ class DataSpec(Spec):
         sources = [n for n in ("file", "reader", "mqtt", "opcua") if getattr(self, n) is not None]
         if len(sources) > 1:
             raise ValueError(f"{sources[0]} and {sources[1]} are two sources: keep one")
-        if self.follow and self.file is None:
-            raise ValueError("follow belongs to a file that grows")
+        if self.follow and not isinstance(self.file, str):
+            raise ValueError("follow belongs to one file that grows; several are not followed")
         if self.live and (self.skip or not isinstance(self.time, str)):
             raise ValueError("skip and a time in two columns belong to a file that is complete")
         if self.live and self.every > 1:
             raise ValueError("every belongs to data that are there, not to a source that goes on")
         return self
+
+    def of(self, file: FileSpec) -> DataSpec:
+        """Return the table of one of several files."""
+        own = {key: getattr(file, key) for key in file.model_fields_set}
+        return self.model_copy(update=own)
 
     @property
     def times(self) -> tuple[str, ...]:
@@ -212,6 +239,26 @@ class EvolutionSpec(Spec):
         return self
 
 
+class RegionSpec(Spec):
+    """A region, and what is said of the unknown there instead of everywhere."""
+
+    over: Pair | Box | Name
+    prior: Quantity | None = None
+    std: Quantity | None = None
+    bounds: Pair | None = None
+    transform: Literal["log", "logit"] | None = None
+    evolution: EvolutionSpec | None = None
+    within: PositiveFloat | None = None
+
+
+def _over(given: Any) -> Any:
+    """Take what is no table as the place of a region."""
+    return given if isinstance(given, Mapping) else {"over": given}
+
+
+Region: TypeAlias = Annotated[RegionSpec, BeforeValidator(_over)]
+
+
 class UnknownSpec(Spec):
     """One unknown: a number, one number for each layer, or a field."""
 
@@ -219,7 +266,7 @@ class UnknownSpec(Spec):
     std: Quantity
     bounds: Pair | None = None
     unit: str | None = None
-    regions: dict[Name, Pair | Box | Name] | None = None
+    regions: dict[Name, Region] | None = None
     field: bool = False
     length: Quantity | None = None
     transform: Literal["log", "logit"] | None = None
@@ -233,6 +280,11 @@ class UnknownSpec(Spec):
         if self.length is not None and not self.field:
             raise ValueError("length belongs to a field: add field = true")
         return self
+
+    def at(self, region: RegionSpec) -> UnknownSpec | None:
+        """Return the prior of the unknown in a region; None if it has none of its own."""
+        own = {key: getattr(region, key) for key in region.model_fields_set - {"over"}}
+        return self.model_copy(update=own) if own else None
 
 
 class CorrelatedSpec(Spec):
@@ -518,6 +570,7 @@ class CaseSpec(Spec):
     options: dict[Identifier, StrictBool | Quantity] = Field(default_factory=dict)
     boundary: dict[Name, Boundary] = Field(default_factory=dict)
     sources: dict[Name, SourceSpec] = Field(default_factory=dict)
+    inputs: dict[Name, Quantity] = Field(default_factory=dict)
     data: DataSpec
     intake: IntakeSpec = Field(default_factory=IntakeSpec)
     unknowns: dict[Identifier, UnknownSpec] = Field(min_length=1)

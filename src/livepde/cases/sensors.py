@@ -11,11 +11,13 @@ import numpy as np
 
 from livepde.cases.frame import Frame
 from livepde.cases.instruments import calibrated, positions_of
+from livepde.cases.process import constants_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.regions import sides_of
 from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.errors import MissingInputError
+from livepde.fem import with_constants
 from livepde.identifier import Sample
 from livepde.observation import (
     Averages,
@@ -84,7 +86,7 @@ def _noise_column(frame: Frame, name: str, channel: ChannelSpec, factor: float) 
 def observation_of(
     frame: Frame, mesh: Any, options: Mapping[str, Any], role: str
 ) -> Observation | None:
-    """Return what the channels of a role see; None if there are none."""
+    """Return the observation of the channels of a role; None if there are none."""
     channels = frame.roles(role)
     if not channels:
         return None
@@ -170,7 +172,7 @@ def _part(
     channels: Mapping[str, ChannelSpec],
     common: Mapping[str, Any],
 ) -> Observation:
-    """Return what channels of one kind see."""
+    """Return the observation of channels of one kind."""
     if kind == "over":
         return Averages(_regions(frame, mesh, channels), **common)
     if kind == "along":
@@ -178,8 +180,9 @@ def _part(
     if kind == "follows":
         return Moving(_followed(frame, mesh, channels), **common)
     points = {name: _position(frame, mesh, name, item) for name, item in channels.items()}
+    constants = constants_of(frame)
     direct = {  # what a quantity sees beside the state
-        name: frame.equation.quantities[item.quantity].direct(options)
+        name: with_constants(frame.equation.quantities[item.quantity].direct(options), constants)
         for name, item in channels.items()
         if item.quantity is not None
     }
@@ -241,7 +244,7 @@ def _inside_mesh(frame: Frame, mesh: Any, at: Any, key: str) -> Any:
 
 
 def sensor_notes(frame: Frame, mesh: Any) -> list[str]:
-    """Return what is allowed of places of sensors and yet deserves a word."""
+    """Return notes on positions of sensors that are allowed and yet doubtful."""
     channels = frame.roles("sensor", "withheld")
     if len(mesh.p) != 1 or any(item.at is None for item in channels.values()):
         return []

@@ -1,4 +1,4 @@
-"""Where the rows of a case come from, what becomes of them, and where estimates go."""
+"""Data sources of a case, and destinations of its estimates."""
 
 from __future__ import annotations
 
@@ -80,6 +80,8 @@ def source_text(frame: Frame) -> str:
         return f"{topics} of the broker at {spec.mqtt.host}:{spec.mqtt.port}"
     if spec.opcua is not None:
         return f"{len(spec.opcua.columns)} nodes of {spec.opcua.url}"
+    if isinstance(spec.file, tuple):
+        return ", ".join(file.file for file in spec.file)
     return str(spec.file or spec.reader)
 
 
@@ -109,7 +111,7 @@ def _password(frame: Frame, variable: str | None, key: str) -> str | None:
 
 
 def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
-    """Return what waits, what is kept, and after how many seconds a source is silent."""
+    """Return limits of backlog and retention, and the seconds until a source is silent."""
     spec = frame.spec
     span = math.inf
     if spec.output.retain is not None:
@@ -122,7 +124,7 @@ def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
 
 
 def policy_of(frame: Frame) -> Policy:
-    """Return what becomes of rows that do not come one by one, in order and complete."""
+    """Return the policy for rows that are late, doubled or incomplete."""
     spec, unit = frame.spec.intake, frame.equation.time_unit
 
     def duration(value: float | str, key: str) -> float:

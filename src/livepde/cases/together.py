@@ -14,14 +14,14 @@ import numpy as np
 
 from livepde.cases.case import Case, Prepared
 from livepde.errors import DataError, LivepdeError, RunError
-from livepde.fleet import Fleet, Kept
+from livepde.fleet import Fleet, FleetRecords
 from livepde.identifier import Identifier
 from livepde.result import Result, layout_of
 from livepde.runs import Driven, Journal, stopped_by_signals
 from livepde.runs.journal import Event
 from livepde.streams import Table
 
-__all__ = ["Block", "blocks"]
+__all__ = ["MemberBlock", "blocks"]
 
 WAITING = 2**23  # numbers that wait to be written
 ALONE = "no other one has their settings and sample times"
@@ -40,7 +40,7 @@ READ = {
 TOLD = {"title", "initial", "data", "intake", "reference", "expect", "variants"}
 
 
-def blocks(members: Mapping[str, Prepared]) -> tuple[list[Block], dict[str, str]]:
+def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
     """Return members that can be stepped together, and of all others why they cannot.
 
     Together go those whose cases differ in nothing but data, initial state and what is said about
@@ -70,7 +70,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[Block], dict[str, str]
         if len(rest) < 2:
             apart |= dict.fromkeys(rest, ALONE)
             continue
-        block = Block(rest)
+        block = MemberBlock(rest)
         if block.fleet.together:
             found.append(block)
         else:
@@ -79,7 +79,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[Block], dict[str, str]
 
 
 def _settings(case: Case) -> str:
-    """Return what members have in common if they step together, as text."""
+    """Return the common settings of members that step together, as text."""
     unread = {"channels": {"__all__": READ}}
     return case.frame.spec.model_dump_json(exclude={**dict.fromkeys(TOLD, True), **unread})
 
@@ -97,7 +97,7 @@ def _refuses(one: Prepared) -> str:
     return "an input has no value in their first sample" if missing else ""
 
 
-class Block:
+class MemberBlock:
     """Members that are stepped together.
 
     Parameters
@@ -129,7 +129,7 @@ class Block:
         self.status = "finished"
         self.error: DataError | None = None
         self._paths: list[Path] = []
-        self._kept = Kept(case.model, case.fields_every)
+        self._kept = FleetRecords(case.model, case.fields_every)
         self._events: list[list[Event]] = [[] for _ in self._each]
         self._taken = self._written = 0  # samples
 

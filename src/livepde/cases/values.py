@@ -1,4 +1,4 @@
-"""What a single value of a case file may be: quantities, places, dates, names, bounds."""
+"""Types of single values in a case file: quantities, places, dates, names, bounds."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,10 +28,11 @@ __all__ = ["equations", "init"]
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
     data: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             metavar="FILE.csv",
-            help="Your own table, with a header: what it tells is filled in.",
+            help="Your own table, with a header: what it tells is filled in. Repeatable: several "
+            "are joined by time.",
             show_default=False,
         ),
     ] = None,
@@ -80,7 +81,7 @@ def init(
     from livepde.models import EQUATIONS
 
     console = terminal()
-    if data is None:
+    if not data:
         given = {"--equation": equation, "--time-format": time_format, "--set": settings}
         given |= {"--skip": None if skip is None else "given"}
         for option in (name for name, value in given.items() if value):
@@ -107,13 +108,19 @@ def init(
     console.print(f"  livepde check {case}\n  livepde run {case}", soft_wrap=True)
 
 
-def _read(data: Path, equation: Equation, time_format: str, skip: int | None) -> Measured:
-    """Read a table; on a terminal ask for the order of day and month where it is open."""
+def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int | None) -> Measured:
+    """Read the tables; on a terminal ask for the order of day and month where it is open."""
     from livepde.cases.measured import measured
     from livepde.cli.questions import asks, date_order
 
     choose = date_order if asks() else None
-    return measured(data, equation.time_unit, time_format=time_format, skip=skip, choose=choose)
+    first, *others = (
+        measured(file, equation.time_unit, time_format=time_format, skip=skip, choose=choose)
+        for file in data
+    )
+    for other in others:
+        first = first.joined(other)
+    return first
 
 
 def _known(text: str, read: Measured, equation: Equation, settings: list[str], where: str) -> str:
@@ -123,16 +130,18 @@ def _known(text: str, read: Measured, equation: Equation, settings: list[str], w
     from livepde.cli.questions import answered, asks
 
     text = filled(text, parse(settings), where)
-    return answered(text, equation, read.samples.names, where) if asks() else text
+    return answered(text, equation, list(read.columns), where) if asks() else text
 
 
-def _show_written(console: Console, case: Path, data: Path, files: Mapping[str, str]) -> None:
+def _show_written(
+    console: Console, case: Path, data: Sequence[Path], files: Mapping[str, str]
+) -> None:
     """Print which files were written and what is open in them."""
     from livepde.cases.fill import blanks
 
     left = len(blanks(files["case.toml"]))
     told = ": nothing is left open" if not left else f": fill in what it says '?' for ({left})"
-    console.print(f"Wrote {case} for {data}{told}. Next:", soft_wrap=True)
+    console.print(f"Wrote {case} for {' and '.join(map(str, data))}{told}. Next:", soft_wrap=True)
     for name in files:
         if name != "case.toml":
             console.print(f"  fill in {case.parent / name}", soft_wrap=True)
@@ -146,7 +155,7 @@ def _show_read(console: Console, read: Measured, equation: Equation) -> None:
     from livepde.runs import Table
 
     rows: list[tuple[Any, ...]] = []
-    values = dict(zip(read.samples.names, read.samples.values.T, strict=True))
+    values = read.columns
     for item in channels_in(read, equation):
         role, given = item.given["role"], item.given.get("unit", "")
         state = equation.inputs[item.name] if role == "input" else equation.state
@@ -158,11 +167,12 @@ def _show_read(console: Console, read: Measured, equation: Equation) -> None:
             columns += f" ... {item.columns[-1]}"
         gaps = "" if not item.columns else block.size - present.size
         rows.append((columns, role, item.name, given or state.unit, *ends, gaps))
-    rows += [(name, "row number", "", "", "", "", "") for name in read.row_numbers]
-    rows += [(name, "text", "", "", "", "", "") for name in read.texts]
+    for table in read.tables:
+        rows += [(name, "row number", "", "", "", "", "") for name in table.row_numbers]
+        rows += [(name, "text", "", "", "", "", "") for name in table.texts]
     headings = ("column", "role", "channel", "unit", "least", "largest", "missing")
-    where = f"{read.path}: {read.span}"
-    console.print(f"{escape(where)}.", soft_wrap=True)
+    for table in read.tables:
+        console.print(f"{escape(f'{table.path}: {table.span}')}.", soft_wrap=True)
     print_table(console, Table(f"Times in {' and '.join(read.time)}", headings, rows))
 
 

@@ -89,25 +89,28 @@ def _refused(prepared: Prepared) -> list[str]:
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     """Print what the sensors can tell; return sentences on it."""
-    from livepde.cases.preview import preview
+    from livepde.cases.preview import MOST_SAMPLES, preview
     from livepde.runs import Table
     from livepde.verdict import TELLING
 
     found = preview(prepared, prepared.stream)
+    late = {item.name: item.left for item in found.last}
     rows = [
         (
             item.name,
             f"{item.prior:.3g}",
             f"{item.posterior:.3g}",
             _percent(item.left),
+            *([_percent(late[item.name])] if item.name in late else []),
             item.unit,
             "hardly identified" if item.hardly else "",
         )
         for item in found.unknowns
     ]
     if rows:
-        columns = ("unknown", "prior deviation", "after", "left", "unit", "")
-        title = f"What {found.samples} samples can tell, at best"
+        more = [f"left by the last {MOST_SAMPLES}"] if late else []
+        columns = ("unknown", "prior std. dev.", "after", "left", *more, "unit", "")
+        title = f"What {'the first ' if late else ''}{found.samples} samples can tell, at best"
         print_table(console, Table(title, columns, rows))
     hardly = [
         f"{item.name}: these data can tell hardly anything. {TELLING}"
@@ -131,7 +134,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
     at = ", ".join(f"{x:.3g}" for x in found.position)
     rows = [(name, _percent(left), _percent(found.then[name])) for name, left in found.now.items()]
     title = f"One more sensor helps most at {at} {unit}".rstrip()
-    columns = ("unknown", "deviation left", "with the sensor")
+    columns = ("unknown", "std. dev. left", "with the sensor")
     print_table(console, Table(title, columns, rows))
     console.print(
         f"Best of {found.candidates} vertices by the mean share of variance left, with the noise "

@@ -1,4 +1,4 @@
-"""How to cite: CITATION.cff, which lies in the package, as text for a bibliography."""
+"""Citation of livepde: CITATION.cff of the package, as text for a bibliography."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import typer
 
 from livepde.cli.printing import terminal
 
-__all__ = ["Form", "citation"]
+__all__ = ["CitationForm", "citation"]
 
 Work = Mapping[str, Any]
 
 
-class Form(StrEnum):
+class CitationForm(StrEnum):
     """What a citation is written for."""
 
     bibtex = "bibtex"
@@ -26,18 +26,19 @@ class Form(StrEnum):
 
 def citation(
     form: Annotated[
-        Form, typer.Option("--format", help="BibTeX, a line in the style of the APA, or the file.")
-    ] = Form.bibtex,
+        CitationForm,
+        typer.Option("--format", help="BibTeX, a line in the style of the APA, or the file."),
+    ] = CitationForm.bibtex,
 ) -> None:
     """Print how to cite livepde, and the paper whose method it implements.
 
     Example:  livepde citation --format apa
     """
     text = files("livepde").joinpath("CITATION.cff").read_text(encoding="utf-8")
-    if form is not Form.cff:
+    if form is not CitationForm.cff:
         import yaml
 
-        write: Callable[[Work], str] = _bibtex if form is Form.bibtex else _apa
+        write: Callable[[Work], str] = _bibtex if form is CitationForm.bibtex else _apa
         software = yaml.safe_load(text)
         text = "\n\n".join(write(work) for work in (software, *software["references"]))
     terminal().print(text.rstrip(), markup=False, highlight=False, soft_wrap=True)

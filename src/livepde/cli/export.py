@@ -90,7 +90,7 @@ def export(
 def _moment(text: str, data: Dataset) -> float:
     """Return a time of the command line in the run's unit."""
     from livepde.cases.units import convert
-    from livepde.runs.dates import dated
+    from livepde.dates import dated
 
     unit = str(data["time"].attrs.get("units", ""))
     try:

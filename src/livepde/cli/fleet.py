@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,16 +14,17 @@ import typer
 from rich.markup import escape
 
 from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case
+from livepde.cli.parts import Backend, in_parts
 from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, print_json, show, terminal
 from livepde.cli.run import batch, concluded, writer_of
-from livepde.errors import ConfigurationError, DataError, LivepdeError
+from livepde.errors import ConfigurationError, DataError, LivepdeError, RunError
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
     from livepde.cases import Case, Prepared
-    from livepde.cases.together import Block
+    from livepde.cases.together import MemberBlock
     from livepde.runs import Check, Driven, Run, RunWriter, Table
 
 __all__ = ["fleet"]
@@ -104,6 +105,14 @@ def fleet(
     jobs: Annotated[
         int, typer.Option(min=-1, help="Processes at once; -1 for one on each processor.")
     ] = 1,
+    backend: Annotated[
+        Backend | None,
+        typer.Option(
+            help="Backend of joblib for the processes: loky on this machine (default with --jobs); "
+            "Dask or Ray, with the cluster that DASK_SCHEDULER_ADDRESS or RAY_ADDRESS names.",
+            show_default=False,
+        ),
+    ] = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -142,12 +151,9 @@ def fleet(
         if not resume and (folder / row.name).exists():
             refuse_taken(folder / row.name)
     run = Runs(case, folder, allow_code, tuple(settings or ()), resume, separately)
-    ended = _each(run, rows, jobs)
-    summary = _summary(ended)
-    folder.mkdir(parents=True, exist_ok=True)
-    summary.to_csv(folder / SUMMARY, index=False)
+    ended, told, summary = _each(run, rows, jobs, backend)
     wrong = [item for item in ended if item.status == "failed" or item.failed]
-    notes = [how] if (how := _how(ended)) else []
+    notes = [*([how] if (how := _how(ended)) else []), *told]
     notes += [f"{item.name}: {item.error}" for item in ended if item.error]
     notes += [
         f"{item.name}: {count} of {item.samples} steps failed: {why}"
@@ -201,23 +207,41 @@ def _read(path: Path) -> list[Member]:
 
 
 def _each(
-    run: Callable[[Sequence[Member]], list[Ended]], rows: Sequence[Member], jobs: int
-) -> list[Ended]:
-    """Run all members, in so many processes."""
-    if jobs == 1:
-        return run(rows)
+    run: Runs, rows: Sequence[Member], jobs: int, backend: Backend | None
+) -> tuple[list[Ended], list[str], pd.DataFrame]:
+    """Run all members; return how they ended, notes on lost workers, and the summary.
+
+    The summary is written also if an error or Ctrl-C ends the command.
+    """
+    ended: dict[str, Ended] = {}
+    told: list[str] = []
+
+    def summed_up() -> pd.DataFrame:
+        summary = _summary([ended[row.name] for row in rows if row.name in ended])
+        run.folder.mkdir(parents=True, exist_ok=True)
+        summary.to_csv(run.folder / SUMMARY, index=False)
+        return summary
+
     try:
-        from joblib import Parallel, delayed, effective_n_jobs, parallel_config
-    except ImportError as error:
-        raise ConfigurationError(
-            "--jobs needs joblib: pip install 'livepde[fleet]'; without it the runs follow each "
-            "other."
-        ) from error
-    with parallel_config(backend="loky", inner_max_num_threads=1):
-        count = min(effective_n_jobs(jobs), len(rows))
-        parts = Parallel(n_jobs=count)(delayed(run)(rows[k::count]) for k in range(count))
-    ended = {item.name: item for part in parts for item in part}
-    return [ended[row.name] for row in rows if row.name in ended]
+        if jobs == 1 and backend is None:
+            ended |= {item.name: item for item in run(rows)}
+        else:
+            # A backend may run a part again by itself, so each part goes on with what is there.
+            parallel = replace(run, resume=True, home=Path.cwd())
+            for found in in_parts(parallel, rows, jobs, backend, told):
+                ended |= {item.name: item for item in found}
+    except ConfigurationError:
+        raise
+    except RunError as error:  # workers died again and again
+        given_up = f"{error} Go on with --resume."
+        lost = {row.name: Ended(row.name, "failed", error=given_up) for row in rows}
+        ended = lost | run.left(rows, ended, "failed", given_up) | ended
+    except (Exception, KeyboardInterrupt) as error:
+        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        ended |= run.left(rows, ended, status, "The command was ended: go on with --resume.")
+        summed_up()
+        raise
+    return [ended[row.name] for row in rows if row.name in ended], told, summed_up()
 
 
 @dataclass(frozen=True)
@@ -228,6 +252,8 @@ class Runs:
     ----------
     case, folder, allow_code, settings, resume, separately
         As given to the command.
+    home
+        Folder that relative paths begin at, for processes that run elsewhere.
     """
 
     case: Path
@@ -236,6 +262,7 @@ class Runs:
     settings: tuple[str, ...]
     resume: bool
     separately: bool = False
+    home: Path = Path()
 
     def __call__(self, rows: Sequence[Member]) -> list[Ended]:
         """Run members as `livepde run` would, as blocks where they can."""
@@ -249,13 +276,13 @@ class Runs:
         for row in rows:
             try:
                 if row.settings not in loaded:
-                    loaded[row.settings] = load_case(self.case, self.allow_code, self._own(row))
+                    loaded[row.settings] = self._load(row)
                 case = loaded[row.settings]
                 self._refuse_other(row, case)
-                ready[row.name] = case.read(row.data or None)
+                ready[row.name] = case.read(str(self.home / row.data) if row.data else None)
             except LivepdeError as error:
                 ended[row.name] = Ended(row.name, "failed", error=str(error))
-        begun = {name for name in ready if (self.folder / name / JOURNAL).exists()}
+        begun = {name for name in ready if (self._target(name) / JOURNAL).exists()}
         new = {name: one for name, one in ready.items() if name not in begun}
         found, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
         apart |= dict.fromkeys(begun, GOES_ON)
@@ -266,11 +293,55 @@ class Runs:
                 ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
         return [ended[row.name] for row in rows if row.name in ended]
 
+    def left(
+        self,
+        rows: Sequence[Member],
+        ended: Mapping[str, Ended],
+        status: str,
+        why: str,
+    ) -> dict[str, Ended]:
+        """Return how runs ended that no process follows any more, marked so in their records.
+
+        Parameters
+        ----------
+        rows, ended
+            Members, and those that are accounted for.
+        status, why
+            Of runs that are still marked as running.
+        """
+        from livepde import runs
+
+        found = {}
+        for name in (row.name for row in rows if row.name not in ended):
+            target = self._target(name)
+            if not (target / runs.RECORD).exists():
+                continue
+            try:
+                run = runs.open(target)
+                begun = run.status != "running" or (target / runs.JOURNAL).exists()
+                dataset = run.dataset if begun else None
+                if run.status == "running":
+                    writer = runs.RunWriter(target, run.record)
+                    writer.finish(status=status, dataset=dataset, notes=[why])
+                    run = runs.open(target)
+                found[name] = Ended(name, run.status, error=why)
+                if dataset is not None:
+                    found[name] = replace(_ended(name, run, dataset, run.checks), error=why)
+            except LivepdeError as error:
+                found[name] = Ended(name, status, error=str(error))
+        return found
+
+    def _load(self, member: Member) -> Case:
+        return load_case(self.home / self.case, self.allow_code, self._own(member))
+
+    def _target(self, name: str) -> Path:
+        return self.home / self.folder / name
+
     def _own(self, member: Member) -> list[str]:
         return [*self.settings, *member.settings]
 
     def _command(self, member: Member) -> list[str]:
-        target = self.folder / member.name
+        target = self.folder / member.name  # as the user names it: records say the same anywhere
         command = ["livepde", "run", str(self.case), "--out", str(target)]
         command += ["--data", member.data] if member.data else []
         return command + [word for text in self._own(member) for word in ("--set", text)]
@@ -279,16 +350,16 @@ class Runs:
         """Raise `RunError` if there is a run to go on with that is none of this member."""
         from livepde import runs
 
-        target = self.folder / member.name
+        target = self._target(member.name)
         if self.resume and (target / runs.RECORD).exists():
             run = runs.open(target)
             run.refuse_other(self._command(member), case.text, self._own(member))
 
     def _writer(self, member: Member, case: Case) -> RunWriter:
-        target, command = self.folder / member.name, self._command(member)
+        target, command = self._target(member.name), self._command(member)
         return writer_of(case, target, self._own(member), self.resume, command)
 
-    def _together(self, block: Block, members: Mapping[str, Member]) -> dict[str, Ended]:
+    def _together(self, block: MemberBlock, members: Mapping[str, Member]) -> dict[str, Ended]:
         """Run members as a block."""
         from livepde.runs import JOURNAL
 
@@ -297,7 +368,7 @@ class Runs:
             writers = {
                 name: self._writer(members[name], one.case) for name, one in block.members.items()
             }
-            block.run([self.folder / name / JOURNAL for name in writers])
+            block.run([self._target(name) / JOURNAL for name in writers])
             for k, (name, writer) in enumerate(writers.items()):
                 with block.ended(k) as (identifier, driven):
                     one = (block.members[name], identifier, driven, writer)
@@ -311,7 +382,7 @@ class Runs:
     def _alone(self, member: Member, prepared: Prepared) -> Ended:
         """Run one member, or find that it is through."""
         case, name = prepared.case, member.name
-        target = self.folder / name
+        target = self._target(name)
         try:
             through = self._through(member, prepared)
             if through is not None:
@@ -330,7 +401,7 @@ class Runs:
         from livepde import runs
         from livepde.streams import Table as Samples
 
-        target, table = self.folder / member.name, prepared.stream
+        target, table = self._target(member.name), prepared.stream
         if not (self.resume and (target / runs.RECORD).exists() and isinstance(table, Samples)):
             return None
         run = runs.open(target)

@@ -78,7 +78,7 @@ def beside(
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
 
     wiring = stack.enter_context(Wiring(case, how.data, path=folder / JOURNAL, pace=how.speed))
-    health, stopping = _Health(wiring), threading.Event()
+    health, stopping = _LiveHealth(wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
     writer = write()
     if how.page is not None:
@@ -95,7 +95,7 @@ def beside(
         return writer, (wiring.prepared, conduct(live, patient=True))
 
 
-class _Health:
+class _LiveHealth:
     """What /health says, also before there is a run."""
 
     def __init__(self, wiring: Wiring) -> None:

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from livepde.cases import Case
+    from livepde.cases import Case, Prepared
     from livepde.model import Model
+    from livepde.runs import Run
 
 __all__ = [
     "CaseArgument",
@@ -25,6 +26,7 @@ __all__ = [
     "SetOption",
     "load_case",
     "names_in",
+    "prepare_again",
     "with_engine",
 ]
 
@@ -89,6 +91,29 @@ def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> C
     if engine is not None:
         engine.build(_model, case, allow_code, settings, known=loaded.model)
     return loaded
+
+
+def prepare_again(
+    opened: Run, data: str | None, allow_code: bool, more: Sequence[str] = ()
+) -> Prepared:
+    """Read the case and the data of a run, with its settings and more.
+
+    Parameters
+    ----------
+    data
+        The run's data, if its case was moved.
+    """
+    from livepde.errors import CaseError, RunError
+
+    case = opened.case_file()
+    try:
+        loaded = load_case(case, allow_code, [*opened.settings, *more])
+        return loaded.prepare(data or opened.data_file)
+    except CaseError as error:
+        if case.parent != opened.path:
+            raise
+        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
+        raise RunError(f"{error} {moved}") from error
 
 
 def _load(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:

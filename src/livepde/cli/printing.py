@@ -1,4 +1,4 @@
-"""What commands print: tables, checks and notes for people, one JSON object for programs."""
+"""Output of commands: tables, checks and notes as text, or one JSON object."""
 
 from __future__ import annotations
 

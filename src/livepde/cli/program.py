@@ -14,6 +14,7 @@ from livepde.cli.cases import equations, init
 from livepde.cli.check import check
 from livepde.cli.citation import citation
 from livepde.cli.experiments import demo, reproduce
+from livepde.cli.explain import explain
 from livepde.cli.export import export
 from livepde.cli.fleet import fleet
 from livepde.cli.fmu import fmu
@@ -43,6 +44,7 @@ COMMANDS = (
     fleet,
     watch,
     report,
+    explain,
     export,
     fmu,
     equations,

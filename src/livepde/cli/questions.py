@@ -1,4 +1,4 @@
-"""What `livepde init` asks on a terminal: what a table of measurements does not tell."""
+"""Questions of `livepde init` on a terminal about a table of measurements."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from livepde.cases.fill import Blank, blanks, filled
+from livepde.cases.fill import Blank, blanks, filled, with_channel
 from livepde.cases.settings import parse
 from livepde.cases.units import convert
 from livepde.errors import CaseError
@@ -54,6 +54,9 @@ def _ask(text: str, blank: Blank, equation: Equation, columns: Sequence[str], wh
         given = typer.prompt(_question(blank, equation), default="", show_default=False).strip()
         if not given:
             return text
+        if blank.path[0] == "inputs" and given in columns:
+            channel = {"role": "input", "column": given}
+            return with_channel(filled(text, {blank.key: None}, where), blank.path[1], channel)
         try:
             return filled(text, _settings(blank, given, equation, columns), where)
         except CaseError as error:
@@ -69,6 +72,8 @@ def _question(blank: Blank, equation: Equation) -> str:
         ends = "left or right for a value given there, " if equation.takes_values else ""
         quantities = "".join(f"{name}, " for name in equation.quantities)
         more = f" ({quantities}{ends}- to drop it)"
+    elif blank.path[0] == "inputs":
+        more = " (or the name of its column)"
     elif isinstance(blank.value, list):
         more = " (two, with a comma between them)"
     return f"{blank.key}{unit}{more}{': ' if about else ''}{about}\n "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -11,7 +11,7 @@ from rich.markup import escape
 from livepde.cli.options import (
     CodeOption,
     JsonOption,
-    load_case,
+    prepare_again,
 )
 from livepde.cli.printing import (
     CHECK_FAILED,
@@ -21,9 +21,6 @@ from livepde.cli.printing import (
     show,
     terminal,
 )
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["report"]
 
@@ -88,17 +85,9 @@ def report(
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
     """Take a run's samples again, and print and write what the theory says."""
     from livepde.diagnostics import theory_report
-    from livepde.errors import CaseError, RunError
     from livepde.runs import Table
 
-    case = opened.case_file()
-    try:
-        prepared = load_case(case, allow_code, opened.settings).prepare(data or opened.data_file)
-    except CaseError as error:
-        if case.parent != opened.path:
-            raise
-        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
-        raise RunError(f"{error} {moved}") from error
+    prepared = prepare_again(opened, data, allow_code)
     found = theory_report(prepared.identifier, prepared.stream)
     target = opened.path / "theory.md"
     target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")

@@ -347,7 +347,7 @@ def _with_smoothed(
 
 
 def _traded(loaded: Case, identifier: Identifier) -> list[str]:
-    """Return what a run's data tell only together."""
+    """Return the notes on the data of a whole run."""
     from livepde.diagnostics import identifiability
     from livepde.laws import AutoLaw, SensitivityLaw
 

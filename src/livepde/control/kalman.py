@@ -71,7 +71,8 @@ class Kalman:
             size = {**drive, **(offset or {})}[name]
             if not (np.isfinite(size) and size >= 0.0):
                 raise ConfigurationError(
-                    f"Kalman: the deviation of '{name}' must be a number, at least 0; got {size}."
+                    f"Kalman: the standard deviation of '{name}' must be a number, at least 0; "
+                    f"got {size}."
                 )
         if not (np.isfinite(period) and period > 0.0):
             raise ConfigurationError(f"Kalman: period must be a positive number; got {period}.")

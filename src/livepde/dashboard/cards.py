@@ -16,13 +16,13 @@ import xarray as xr
 from dash import html
 
 from livepde.dashboard.times import at_time, when_axis
-from livepde.dashboard.view import Seen
-from livepde.diagnostics.identifiability import Known
+from livepde.dashboard.view import RunView
+from livepde.diagnostics.identifiability import InformationGain
 from livepde.plots.dataset import groups, interval_95, labelled, scalars
 from livepde.records import STATUS_CODES
 from livepde.runs import severities
 from livepde.runs.directory import bound_text
-from livepde.runs.summary import digits, scored
+from livepde.runs.summary import channel_errors, digits
 from livepde.verdict import Severity
 
 __all__ = ["cards", "chip", "facts", "pretty", "summary", "tables", "verdict"]
@@ -71,13 +71,13 @@ def _between(low: str, high: str) -> str:
     return f"{pretty(low.partition('e')[0] if power == other else low)} to {pretty(high)}"
 
 
-def chip(seen: Seen) -> list[Any]:
+def chip(seen: RunView) -> list[Any]:
     """Return the status of a run."""
     level, text = STATUS.get(seen.status, ("info", seen.status))
     return [_sign(level), html.Span(text)]
 
 
-def facts(seen: Seen) -> str:
+def facts(seen: RunView) -> str:
     """Return how far a run is, in a line."""
     parts = [f"{seen.samples} sample{'s' * (seen.samples != 1)}"]
     if seen.dataset is not None and seen.dataset.sizes["time"]:
@@ -99,8 +99,8 @@ def _ago(seconds: float) -> str:
     return f"{max(seconds, 0.0):.0f} s ago"
 
 
-def summary(seen: Seen) -> str:
-    """Return what is estimated from what, in a sentence."""
+def summary(seen: RunView) -> str:
+    """Return a sentence on unknowns, sensors and law."""
     data = seen.dataset
     if data is None:
         return "Nothing is estimated yet."
@@ -116,7 +116,7 @@ def summary(seen: Seen) -> str:
     return f"{found}."
 
 
-def verdict(seen: Seen) -> list[Any]:
+def verdict(seen: RunView) -> list[Any]:
     """Return whether anything is wrong: a sentence each, the gravest first."""
     found: list[tuple[Level, str]] = []
     if seen.problem:
@@ -212,7 +212,7 @@ def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
     attrs = data[label].attrs
     bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
     moves = "prior_std" not in attrs
-    known = Known(label, left, bound=bounds[0] if bounds else math.nan, moves=moves)
+    known = InformationGain(label, left, bound=bounds[0] if bounds else math.nan, moves=moves)
     state = "moves" if moves and known.verdict == "partly" else known.verdict
     level, text = VERDICTS[state]
     if state in ("partly", "pinned"):
@@ -253,8 +253,8 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
 # --- tables --------------------------------------------------------------------------------------
 
 
-def tables(seen: Seen) -> dict[str, list[Any]]:
-    """Return what stands in tables: section -> components."""
+def tables(seen: RunView) -> dict[str, list[Any]]:
+    """Return the tables: section -> components."""
     found: dict[str, list[Any]] = {"sensors": [], "events": []}
     data = seen.dataset
     if data is not None and data.sizes["time"]:
@@ -298,7 +298,7 @@ def _sensor_table(data: xr.Dataset) -> Any:
             f"{float(errors.mean()):+.2g}" if len(errors) else "–",
             f"{float(np.sqrt((errors**2).mean())):.3g}" if len(errors) else "–",
         )
-        for name, (role, errors) in scored(data).items()
+        for name, (role, errors, _) in channel_errors(data).items()
     ]
     unit = labelled("", str(data["innovation"].attrs.get("units", ""))).strip()
     title = f"Measured minus expected {unit}".rstrip()

@@ -1,4 +1,4 @@
-"""What is shown of a run in a browser: figures in sections, each with what it says in words.
+"""Panels of a run in a browser: figures in sections, each with a caption.
 
 Pure functions: a dataset as `Result.to_xarray()` or `Layout.dataset` gives it, and the time to look
 back to.
@@ -81,8 +81,8 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
         found.append(Panel("ratio", "sensors", title, about, ratio(data, at)))
     if open_shares(data, at):
         about = (
-            "What is left of the deviation that was assumed before any data: left of 10 % the data "
-            "decide, right of 90 % they have told hardly anything."
+            "What is left of the standard deviation that was assumed before any data: left of 10 % "
+            "the data decide, right of 90 % they have told hardly anything."
         )
         found.append(Panel("told", "told", "How much is still open", about, told(data, at)))
     if "correlation" in data:

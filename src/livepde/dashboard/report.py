@@ -138,7 +138,7 @@ def _written(run: Run) -> str:
 
 
 def _journal(run: Run) -> tuple[list[Event], dict[tuple[str, str], int]]:
-    """Return what happened, and what was not used how often."""
+    """Return the events of the run, and counts of values not used."""
     path = run.path / JOURNAL
     if not path.is_file():
         return [], {}

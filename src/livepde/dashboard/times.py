@@ -1,4 +1,4 @@
-"""How times of a run are shown in a browser, and which of them is looked at."""
+"""Time axis of a run in a browser, and the time that is looked at."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from livepde.dates import dated
 from livepde.plots import time_scale
-from livepde.runs.dates import dated
 from livepde.streams.clock import since_1970
 
 __all__ = ["TimeAxis", "at_time", "when_axis"]
@@ -37,7 +37,7 @@ class TimeAxis:
     dates: bool = False
 
     def values(self, t: Any) -> Any:
-        """Return what is drawn for times."""
+        """Return the coordinates of times on the axis."""
         return self.start + np.asarray(t, dtype=float) * self.scale
 
     def text(self, t: float) -> str:

@@ -1,4 +1,4 @@
-"""What a run directory shows now: read bit by bit while the run goes on, and afterwards."""
+"""View of a run directory: read bit by bit while the run goes on, and afterwards."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from livepde.runs.database import in_use, written
 from livepde.runs.directory import JOURNAL
 from livepde.runs.journal import Event
 
-__all__ = ["Seen", "Spread", "View"]
+__all__ = ["RunView", "Spread", "View"]
 
 T = TypeVar("T")
 
@@ -83,7 +83,7 @@ class Spread(Generic[T]):
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RunView:
     """What there is to see of a run.
 
     Attributes
@@ -154,10 +154,10 @@ class View:
         self._mark: object = None
         self._failures = 0
         self._begin(runs.open(path))
-        self._seen = Seen(title=runs.open(path).title)
+        self._seen = RunView(title=runs.open(path).title)
 
-    def look(self) -> Seen:
-        """Return what there is to see now."""
+    def look(self) -> RunView:
+        """Return the current contents."""
         with self._lock:
             if time.monotonic() - self._looked < OFTEN and not self._seen.reading:
                 return self._seen
@@ -171,7 +171,7 @@ class View:
             self._looked = time.monotonic()
             return self._seen
 
-    def _unreadable(self, error: Exception) -> Seen:
+    def _unreadable(self, error: Exception) -> RunView:
         said = str(error) if isinstance(error, RunError) else f"it is damaged ({error})."
         problem = f"The run cannot be read: {said}"
         self._mark = None
@@ -187,7 +187,7 @@ class View:
         self._fields: Spread[Record] = Spread(FIELDS)
         self._number = 0
 
-    def _read(self) -> Seen:
+    def _read(self) -> RunView:
         run = runs.open(self.path)
         if run.record.get("started") != self._started:  # another run in the same place
             self._begin(run)
@@ -217,13 +217,13 @@ class View:
         self._mark = mark
         return seen
 
-    def _load(self, seen: Seen, run: runs.Run) -> Seen:
+    def _load(self, seen: RunView, run: runs.Run) -> RunView:
         if run.status == "running":
             return replace(seen, dataset=None)
         data = run.dataset
         return replace(seen, dataset=data, samples=data.sizes["time"])
 
-    def _follow(self, seen: Seen, path: Path) -> Seen:
+    def _follow(self, seen: RunView, path: Path) -> RunView:
         with Journal.open(path) as journal:
             # The last one again: its fields may have been kept after it.
             new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]

@@ -5,7 +5,12 @@ from __future__ import annotations
 from livepde.diagnostics.bounds import Errors, TwinTracker, bounds, conditions
 from livepde.diagnostics.constants import Part, Spaces, constants
 from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
-from livepde.diagnostics.identifiability import Direction, Identifiability, Known, identifiability
+from livepde.diagnostics.identifiability import (
+    Direction,
+    Identifiability,
+    InformationGain,
+    identifiability,
+)
 from livepde.diagnostics.law import check_law
 from livepde.diagnostics.links import Interpolation, Link, interpolation, link
 from livepde.diagnostics.model import check_model
@@ -29,8 +34,8 @@ __all__ = [
     "Excitation",
     "ExcitationState",
     "Identifiability",
+    "InformationGain",
     "Interpolation",
-    "Known",
     "Link",
     "OnlineStopping",
     "OnlineTracker",

@@ -18,7 +18,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.verdict import FLAT
 
-__all__ = ["FLAT", "Direction", "Identifiability", "Known", "identifiability"]
+__all__ = ["FLAT", "Direction", "Identifiability", "InformationGain", "identifiability"]
 
 # Largest remaining share of the prior standard deviation of a well-determined unknown.
 PINNED = 0.1
@@ -29,7 +29,7 @@ WEIGHT = 0.3
 
 
 @dataclass(frozen=True)
-class Known:
+class InformationGain:
     """Information gain about one unknown.
 
     Attributes
@@ -91,7 +91,7 @@ class Identifiability:
         Leading combinations of three or more numbers that are pinned although no single number is.
     """
 
-    unknowns: tuple[Known, ...]
+    unknowns: tuple[InformationGain, ...]
     pairs: tuple[tuple[str, str, float], ...]
     directions: tuple[Direction, ...]
 
@@ -104,8 +104,8 @@ class Identifiability:
             for a, b, r in self.pairs
         ]
         found += [
-            f"Of {', '.join(d.weights)} the data pin the combination {d} (in prior deviations; "
-            f"{d.left:.0%} left), and none of them alone."
+            f"Of {', '.join(d.weights)} the data pin the combination {d} (in prior "
+            f"standard deviations; {d.left:.0%} left), and none of them alone."
             for d in self.directions
         ]
         found += [
@@ -157,11 +157,11 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     before = np.linalg.norm(latent.tangent(belief.q, prior)[rows], axis=1)
     numbers = latent.tangent(belief.q, posterior)[rows] / before[:, None]
     unknowns = [
-        Known(
+        InformationGain(
             label,
             float(np.linalg.norm(row)),
             bound=_bound(model, belief, label),
-            moves=space.unknowns[label.split("[")[0]].evolution.moves,
+            moves=space.unknown_of(label).evolution.moves,
         )
         for label, row in zip(labels, numbers, strict=True)
     ]
@@ -174,7 +174,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
         left = belief.modes_left(item.part)
         counts = (int((left <= PINNED).sum()), int((left > FLAT).sum()), len(block))
         rms = float(np.sqrt((left**2).sum() / len(block)))
-        unknowns.append(Known(name, rms, counts, moves=item.evolution.moves))
+        unknowns.append(InformationGain(name, rms, counts, moves=item.evolution.moves))
         pairs += [
             (label, name, r)
             for label, row in zip(labels, numbers, strict=True)
@@ -209,7 +209,7 @@ def _explained(row: Array, block: Array) -> float:
 
 
 def _directions(
-    unknowns: list[Known], labels: list[str], factor: Array, belief: Belief
+    unknowns: list[InformationGain], labels: list[str], factor: Array, belief: Belief
 ) -> list[Direction]:
     """Return pinned combinations of three or more numbers that are not pinned individually."""
     vectors, sizes, _ = np.linalg.svd(factor, full_matrices=False)

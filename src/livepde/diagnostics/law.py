@@ -170,7 +170,7 @@ def _restarted(
     for item in items[:middle]:
         _step(first, item)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "state.npz"
+        path = Path(folder) / "state.bin"
         first.save(path)
         second.load(path)
     return [_step(second, item) for item in items[middle:]]

@@ -71,7 +71,7 @@ def noise_size(
     matrix = spaces.split.inverse if reconstruction is None else reconstruction
     if matrix.shape[1] != len(std):
         raise ConfigurationError(
-            f"noise_size: {len(std)} deviations for {matrix.shape[1]} sensors."
+            f"noise_size: {len(std)} standard deviations for {matrix.shape[1]} sensors."
         )
     std = np.asarray(std, dtype=float)
     if len(std) > MOST_SENSORS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livepde.fem.blocks import FieldBlock
+from livepde.fem.blocks import FieldBlock, base_name
 from livepde.fem.branches import absolute, maximum, minimum, positive
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.fields import (
@@ -31,7 +31,7 @@ from livepde.fem.meshes import (
     rectangle,
     smooth,
 )
-from livepde.fem.place import START, Inputs, Moment, Place
+from livepde.fem.place import START, Inputs, Moment, Place, with_constants
 from livepde.fem.reading import reads
 from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
@@ -65,6 +65,7 @@ __all__ = [
     "Sobolev",
     "Unknown",
     "absolute",
+    "base_name",
     "box",
     "cells",
     "compose",
@@ -90,4 +91,5 @@ __all__ = [
     "trace",
     "transpose",
     "upwind",
+    "with_constants",
 ]

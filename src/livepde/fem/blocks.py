@@ -23,7 +23,7 @@ from livepde.fem.place import Moment, Place
 from livepde.fem.scatter import scatter, shared
 from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
-__all__ = ["Block", "FieldBlock", "Local", "ScalarBlock", "block_of"]
+__all__ = ["Block", "FieldBlock", "Local", "ScalarBlock", "base_name", "block_of"]
 
 JETS = ("value", "grad", "hess")
 # Relative residual of an L2 projection on a large mesh, solved by conjugate gradients.
@@ -145,7 +145,7 @@ class ScalarBlock(Block):
     def labels(self, name: str) -> tuple[str, ...]:
         if isinstance(self.unknown, Scalar):
             return (name,)
-        return tuple(f"{name}[{region}]" for region in self.unknown.regions)
+        return tuple(f"{base_name(name)}[{region}]" for region in self.unknown.regions)
 
 
 class NamesBlock(Block):
@@ -612,6 +612,11 @@ def _slope(g: Any, axis: int, width: float) -> Any:
         return np.asarray(total / (60.0 * step) + 0.0 * x[0])
 
     return slope
+
+
+def base_name(name: str) -> str:
+    """Return the name of an unknown in forms, without its region: k for k[soil]."""
+    return name.partition("[")[0]
 
 
 def block_of(unknown: Unknown) -> Block:

@@ -35,6 +35,7 @@ __all__ = [
 # Half width of the default trust region in prior standard deviations: a Gaussian value exceeds it
 # with a probability of 2e-23.
 WITHIN = 10.0
+PRIOR = ("prior", "std", "bounds", "transform", "evolution", "within")
 
 Integrand: TypeAlias = Callable[..., Any]
 """A weak form's integrand; see `Model` for the arguments."""
@@ -402,7 +403,7 @@ class Scalar(_Prior):
 
 @dataclass(frozen=True, eq=False)
 class Piecewise(_Prior):
-    """One unknown number for each named region, with a common prior.
+    """One unknown number for each named region, with a common prior or priors of their own.
 
     Parameters
     ----------
@@ -411,6 +412,9 @@ class Piecewise(_Prior):
         the value zero; in two regions, the sum.
     prior, std, bounds, unit, transform, evolution, within
         As for `Scalar`.
+    own
+        Name of a region -> `Scalar` whose prior, bounds, transform and evolution hold there
+        instead. The unknown then needs a name: parameter={"k": Piecewise(...)}.
     """
 
     regions: Mapping[str, Predicate | str]
@@ -421,11 +425,30 @@ class Piecewise(_Prior):
     transform: str | None = None
     evolution: Evolution = CONSTANT
     within: float = WITHIN
+    own: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.regions:
             raise SpaceError("Piecewise: needs at least one region.")
+        for name, scalar in self.own.items():
+            if name not in self.regions or not isinstance(scalar, Scalar):
+                raise SpaceError(
+                    f"Piecewise: own={{'{name}': {scalar!r:.60}}}; expected the name of a region, "
+                    f"one of {list(self.regions)}, and a Scalar."
+                )
         self._check()
+
+    def separated(self, name: str) -> dict[str, Piecewise]:
+        """Return an unknown for each region, as "k[soil]"; this one itself if all share a prior."""
+        if not self.own:
+            return {name: self}
+        found = {}
+        for region, where in self.regions.items():
+            given = self.own.get(region, self)
+            shared = {key: getattr(given, key) for key in PRIOR}
+            unit = given.unit or self.unit
+            found[f"{name}[{region}]"] = Piecewise({region: where}, **shared, unit=unit)
+        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import wraps
 from types import MappingProxyType
+from typing import Any
 
 from livepde.errors import MissingInputError
 from livepde.linalg import Array
 
-__all__ = ["START", "Moment", "Place"]
+__all__ = ["START", "Moment", "Place", "with_constants"]
 
 
 class Inputs(Mapping[str, float]):
@@ -103,3 +105,50 @@ class Place:
         if self._normal is None:
             raise AttributeError("x.normal exists on boundaries only: wrap the form in lp.On(...).")
         return self._normal
+
+
+class _Constants(Mapping[str, float]):
+    """Inputs of a place of which some are constant; only the others are recorded as read."""
+
+    def __init__(self, place: Place, constants: Mapping[str, float]) -> None:
+        self._place = place
+        self._constants = constants
+
+    def __getitem__(self, name: str) -> float:
+        return self._constants[name] if name in self._constants else self._place.inputs[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self._place.inputs, **self._constants})
+
+    def __len__(self) -> int:
+        return len({**self._place.inputs, **self._constants})
+
+
+class _PlaceWithConstants:
+    """A place x of which some inputs are constant."""
+
+    def __init__(self, place: Place, constants: Mapping[str, float]) -> None:
+        self._place = place
+        self.inputs = _Constants(place, constants)
+
+    def __getitem__(self, axis: int) -> Array:
+        return self._place[axis]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._place, name)
+
+
+def with_constants(form: Callable[..., Any], constants: Mapping[str, float]) -> Callable[..., Any]:
+    """Return a function of a place that finds some inputs as constants there."""
+    if not constants:
+        return form
+
+    @wraps(form)
+    def bound(*given: Any) -> Any:
+        places = (
+            _PlaceWithConstants(item, constants) if isinstance(item, Place) else item
+            for item in given
+        )
+        return form(*places)
+
+    return bound

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dis import get_instructions
+from inspect import unwrap
 from types import FunctionType
 from typing import Any
 
@@ -11,6 +12,7 @@ __all__ = ["reads"]
 
 def reads(function: Any, position: int) -> bool:
     """Return False if a function never uses the argument at a position; True if it may."""
+    function = unwrap(function)
     if not isinstance(function, FunctionType) or function.__code__.co_argcount <= position:
         return True
     code = function.__code__

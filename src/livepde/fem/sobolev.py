@@ -104,7 +104,7 @@ class Sobolev:
         if not self.s > half:
             raise SpaceError(
                 f"Sobolev({self.s:g}).pointwise({dimension}): values at points have a finite "
-                f"deviation for s > {half:g} only; take a larger s."
+                f"standard deviation for s > {half:g} only; take a larger s."
             )
         gamma = scipy.special.gamma
         volume = (4.0 * np.pi) ** half * self.length**dimension

@@ -12,8 +12,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.blocks import FieldBlock, Local, block_of
-from livepde.fem.fields import Unknown
+from livepde.fem.blocks import FieldBlock, Local, base_name, block_of
+from livepde.fem.fields import Piecewise, Unknown
 from livepde.fem.measure import Measure
 from livepde.fem.place import Moment
 from livepde.linalg import Array, IntArray, compact
@@ -174,7 +174,10 @@ class LocalSpace:
             start = stop
         if self.space.single:
             return jets[0]
-        return Named(**dict(zip(self.space.blocks, jets, strict=True)))
+        found: dict[str, Any] = {}
+        for name, jet in zip(map(base_name, self.space.blocks), jets, strict=True):
+            found[name] = found[name] + jet if name in found else jet
+        return Named(**found)
 
 
 def _parts(density: Array, axes: tuple[int, ...]) -> Iterator[tuple[tuple[int, ...], Array]]:
@@ -196,6 +199,7 @@ class FunctionSpace:
     ----------
     unknowns
         Mapping from name to unknown. With `single`, forms get the unknown itself, not a namespace.
+        Regions with priors of their own are unknowns, "k[soil]", of which forms see the sum, q.k.
     """
 
     unknowns: Mapping[str, Unknown]
@@ -210,7 +214,14 @@ class FunctionSpace:
             for key in unknown:
                 if not key.isidentifier():
                     raise SpaceError(f"unknown '{key}': the name must be a Python identifier.")
-            return cls(dict(unknown), single=False)
+            separated: dict[str, Unknown] = {}
+            for key, item in unknown.items():
+                separated |= item.separated(key) if isinstance(item, Piecewise) else {key: item}
+            return cls(separated, single=False)
+        if isinstance(unknown, Piecewise) and unknown.own:
+            raise SpaceError(
+                "Piecewise: with own= it needs a name: parameter={'k': Piecewise(...)}."
+            )
         return cls({getattr(unknown, "name", "") or name: unknown}, single=True)
 
     @cached_property
@@ -229,10 +240,28 @@ class FunctionSpace:
         """Number of coefficients."""
         return sum(block.size for block in self.blocks.values())
 
+    @cached_property
+    def parts(self) -> dict[str, slice]:
+        """Slice of each block among the coefficients, and of each name that forms see."""
+        found: dict[str, slice] = {}
+        for (name, block), start in zip(self.blocks.items(), self.starts, strict=True):
+            found[name] = slice(start, start + block.size)
+            first = found.get(base_name(name), found[name])
+            found[base_name(name)] = slice(first.start, start + block.size)
+        return found
+
     def part(self, name: str) -> slice:
-        """Return the slice of one block among the coefficients."""
-        start = self.starts[list(self.blocks).index(name)]
-        return slice(start, start + self.blocks[name].size)
+        """Return the slice of one block, or of all regions of an unknown, in the coefficients."""
+        return self.parts[name]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names that forms see."""
+        return tuple(dict.fromkeys(map(base_name, self.blocks)))
+
+    def unknown_of(self, label: str) -> Unknown:
+        """Return the unknown of a scalar label."""
+        return self.unknowns[label if label in self.unknowns else base_name(label)]
 
     @cached_property
     def fixed(self) -> IntArray:
@@ -342,11 +371,9 @@ class FunctionSpace:
         With several fields, a number is the value of all of them.
         """
         if isinstance(value, Mapping):
-            unknown = set(value) - set(self.blocks)
+            unknown = set(value) - set(self.parts)
             if unknown:
-                raise SpaceError(
-                    f"no unknown is called {sorted(unknown)}; {list(self.blocks)} are."
-                )
+                raise SpaceError(f"no unknown is called {sorted(unknown)}; {list(self.parts)} are.")
             result = self.prior.copy()
             for name, item in value.items():
                 result[self.part(name)] = self._interpolate(name, item)
@@ -365,14 +392,12 @@ class FunctionSpace:
         return array.copy()
 
     def _interpolate(self, name: str, value: Any) -> Array:
-        block = self.blocks[name]
+        block, part = self.blocks.get(name), self.part(name)
         if isinstance(block, FieldBlock) and (callable(value) or np.ndim(value) == 0):
             return block.interpolate(value)
-        array = np.asarray(value, dtype=float)
+        array, size = np.asarray(value, dtype=float), part.stop - part.start
         if array.ndim == 0:
-            return np.full(block.size, float(array))
-        if array.shape != (block.size,):
-            raise SpaceError(
-                f"'{name}': coefficients of shape {array.shape}; expected ({block.size},)."
-            )
+            return np.full(size, float(array))
+        if array.shape != (size,):
+            raise SpaceError(f"'{name}': coefficients of shape {array.shape}; expected ({size},).")
         return array.copy()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.fleet.fleet import Fleet
-from livepde.fleet.kept import Kept
+from livepde.fleet.kept import FleetRecords
+from livepde.fleet.shard import Shard
+from livepde.fleet.shard_estimates import ShardEstimates
 
-__all__ = ["Fleet", "FleetEstimate", "FleetResult", "Kept"]
+__all__ = ["Fleet", "FleetEstimate", "FleetRecords", "FleetResult", "Shard", "ShardEstimates"]

@@ -1,4 +1,4 @@
-"""What steps the members of a fleet, and what it tells."""
+"""Interface of the steppers of a fleet, and the beliefs they return."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from livepde.fem import Moment
 from livepde.laws import Belief, MemberReports, Report, Status
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.stepping import Span
 
-__all__ = ["Beliefs", "Engine", "Factors", "State", "reported"]
+__all__ = ["Beliefs", "Factors", "FleetEngine", "State", "reported"]
 
 State: TypeAlias = Any
 """What evolves: the arrays or values of an engine."""
@@ -63,8 +63,12 @@ class Beliefs:
     factors: Factors | None = None
 
 
-class Engine(Protocol):
+class FleetEngine(Protocol):
     """Steps all members. A state is a value: what was returned is not changed any more."""
+
+    def subset(self, which: IntArray) -> FleetEngine:
+        """Return a stepper of some members, by number."""
+        ...
 
     def start(self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]) -> State:
         """Return the state at the start, from coefficients of each member."""
@@ -83,11 +87,11 @@ class Engine(Protocol):
         ...
 
     def believed(self, state: State, k: int) -> Belief:
-        """Return what the law believes of a member, in latent coefficients."""
+        """Return the belief about a member, in latent coefficients."""
         ...
 
     def beliefs(self, state: State) -> Beliefs:
-        """Return what the law believes of all members."""
+        """Return the beliefs about all members."""
         ...
 
     def member(self, state: State, k: int) -> Any:

@@ -1,4 +1,4 @@
-"""What is known of all members at one time, and as a table with axes."""
+"""Estimates of all members of a fleet at one time, and as a table with axes."""
 
 from __future__ import annotations
 

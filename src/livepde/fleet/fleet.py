@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -20,18 +21,18 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engine import Engine
+from livepde.fleet.engine import FleetEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.fleet.separately import Separately
 from livepde.fleet.together import Together
 from livepde.identifier import MOST_SUBSTEPS, Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import layout_of
 from livepde.samples import check_noise, noise_channel
-from livepde.stepping import Scheme, Span, own_noise
+from livepde.stepping import Advance, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
@@ -56,7 +57,7 @@ class Fleet:
         How many, or their names.
     q0, u0, u0_from
         As for `Identifier`, for all members; or a list with one for each.
-    t0, withheld, scheme, dt_max, assimilate_from, input_noise
+    t0, withheld, scheme, dt_max, halvings, assimilate_from, input_noise
         As for `Identifier`.
 
     Raises
@@ -87,6 +88,7 @@ class Fleet:
         withheld: Observation | None = None,
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
+        halvings: int = Advance.halvings,
         assimilate_from: float = -np.inf,
         input_noise: Mapping[str, float] | None = None,
         u0_from: Mapping[str, Any] | list[Mapping[str, Any]] | None = None,
@@ -111,6 +113,7 @@ class Fleet:
             withheld=withheld,
             scheme=scheme,
             dt_max=dt_max,
+            halvings=halvings,
             assimilate_from=assimilate_from,
             input_noise=input_noise,
             u0_from=max(made_of, key=len),
@@ -123,7 +126,7 @@ class Fleet:
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
-        self._engine: Engine = Separately(law, self._work, self.problem)
+        self._engine: FleetEngine = Separately(law, self._work, self.problem)
         self.note = law.stepped_alone(self._work)
         if not self.note:
             readings = [self._one.initial_readings(one) for one in made_of]
@@ -266,7 +269,7 @@ class Fleet:
         return self._estimate(span, measured, withheld, report, held)
 
     def _expected(self, span: Span) -> MemberReports:
-        """Return what the sensors are expected to show at the start."""
+        """Return the predicted readings at the start."""
         members = range(len(self))
         beliefs = [self._believed(self._state, k) for k in members]
         predicted = [
@@ -309,7 +312,7 @@ class Fleet:
 
     @staticmethod
     def _shown(observed: Observed, u: Array, q: Array, span: Span) -> Array:
-        """Return what sensors are expected to show, shape (members, sensors)."""
+        """Return the predicted readings, shape (members, sensors)."""
         if type(observed) is Observed and observed.linear:
             shown: Array = (observed.G @ u.T).T
             return shown
@@ -331,6 +334,47 @@ class Fleet:
         state = None if self._state is None else self._engine.member(self._state, k)
         t, z, inputs = float(self._t[k]), self._z[k].copy(), self._inputs[k]
         return self._one.placed(state, t, z, inputs, self._held[k].copy(), self._samples)
+
+    def template(self) -> Any:
+        """Return the state of the first member at its start without inputs: for its structure."""
+        moments = self._moments(self._t[:1], np.zeros_like(self._inputs[:1]))
+        engine = self._engine.subset(np.array([0]))
+        return engine.start(self._q0[:1], self._u0[:1], moments)
+
+    def subset(self, which: IntArray, state: Any, samples: int) -> Fleet:
+        """Return a fleet of some members, which stand where they do here; for `Shard`.
+
+        Parameters
+        ----------
+        which
+            Numbers of the members.
+        state
+            Of the engine; None before the first sample.
+        samples
+            How many they have taken.
+        """
+        other = copy.copy(self)
+        vars(other).pop("fingerprint", None)
+        other.members = tuple(self.members[k] for k in which)
+        other._engine = self._engine.subset(which)
+        other._q0, other._u0 = ([all_[k] for k in which] for all_ in (self._q0, self._u0))
+        other._t, other._z = self._t[which], self._z[which]
+        other._inputs, other._held = self._inputs[which], self._held[which]
+        other._state, other._samples = state, samples
+        if state is None and not self.inputs:
+            other._begin(other._inputs)
+        return other
+
+    def adopt(self, which: IntArray, part: Fleet) -> Any:
+        """Take over times and values of a subset, and return its state; for `Shard`."""
+        self._t[which], self._z[which] = part._t, part._z
+        self._inputs[which], self._held[which] = part._inputs, part._held
+        return part._state
+
+    @property
+    def ends(self) -> dict[str, Array]:
+        """Times, measurements, inputs and their gaps at the last sample of each member."""
+        return {"t": self._t, "z": self._z, "inputs": self._inputs, "held": self._held}
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
         """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
@@ -432,7 +476,8 @@ class Fleet:
         return values, held
 
     @cached_property
-    def _fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self) -> dict[str, Any]:
+        """What a fleet must have in common with one whose state it takes over."""
         return {
             "format": FORMAT,
             "law": type(self.law).__name__,
@@ -450,7 +495,7 @@ class Fleet:
 
     def dump(self) -> bytes:
         """Return the state as `save` writes it."""
-        header = {**self._fingerprint, "begun": self._state is not None}
+        header = {**self.fingerprint, "begun": self._state is not None}
         leaves = {"t": self._t, "z": self._z, "inputs": self._inputs, "samples": self._samples}
         leaves["held"] = self._held
         if self._state is not None:
@@ -472,7 +517,7 @@ class Fleet:
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
         """Continue from what `dump` returned; `where` names it in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
-        for key, value in self._fingerprint.items():
+        for key, value in self.fingerprint.items():
             if header.get(key) != value:
                 raise RunError(
                     f"{where} was saved with another {key}; build the fleet as it was when it was "

@@ -1,4 +1,4 @@
-"""What is kept of the estimates of a fleet: for each member the records of a run of its own."""
+"""Records of the estimates of a fleet: for each member those of a run of its own."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from livepde.model import Model
 from livepde.records import STATUS_CODES, Record, Snapshot
 from livepde.result import interval_ends, unknown_of, vertex_order
 
-__all__ = ["Kept"]
+__all__ = ["FleetRecords"]
 
 
 @dataclass(frozen=True, eq=False)
-class _Row:
+class _MemberRow:
     """What is kept of an estimate, each array over members."""
 
     t: float
@@ -52,7 +52,7 @@ class _Row:
         )
 
 
-class Kept:
+class FleetRecords:
     """Estimates of members that step together, as `Result` keeps those of one.
 
     Parameters
@@ -68,7 +68,7 @@ class Kept:
         self.fields_every = fields_every
         self.size = 0  # numbers that wait
         self._count = 0
-        self._rows: list[_Row] = []
+        self._rows: list[_MemberRow] = []
 
     def add(self, estimate: FleetEstimate) -> None:
         """Add one estimate of all members.
@@ -84,7 +84,7 @@ class Kept:
             raise ConfigurationError("what members do that step separately is kept separately.")
         if self._count % self.fields_every == 0:
             profiles, correlation = self._profiles(beliefs.u, factors), self._correlation(factors)
-        row = _Row(
+        row = _MemberRow(
             estimate.t,
             self._numbers(beliefs, factors),
             estimate.innovation,
@@ -110,7 +110,7 @@ class Kept:
         self.size = 0
 
     def _numbers(self, beliefs: Beliefs, factors: Factors) -> Array:
-        """Return what `Record.numbers` holds, shape (members, numbers)."""
+        """Return `Record.numbers` of all members, shape (members, numbers)."""
         space, columns = self.model.parameter_space, []
         after, before = (np.linalg.norm(factor, axis=2) for factor in (factors.q, factors.prior))
         shares = after / np.where(before > 0.0, before, np.nan)

@@ -11,7 +11,7 @@ from livepde import checkpoint
 from livepde.fem import Moment
 from livepde.fleet.engine import Beliefs, reported
 from livepde.laws import AnyLaw, Belief, MemberReports, Problem
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.stepping import Span
 
 __all__ = ["Separately"]
@@ -24,6 +24,9 @@ class Separately:
         self.law = law
         self.work = work
         self.problem = problem
+
+    def subset(self, which: IntArray) -> Separately:
+        return self
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]

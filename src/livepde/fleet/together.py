@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from livepde.fleet.engine import Beliefs, Factors
 from livepde.laws import Belief, InitialReading, MemberReports
 from livepde.laws.members import join, take
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.stepping import Span
 
 __all__ = ["Together"]
@@ -35,7 +36,19 @@ class Together:
     ) -> None:
         self.law = law
         self.work = work
-        self._begins = [work.made_of(*one) for one in zip(readings, initial, strict=True)]
+        made: dict[int, SensitivityWork] = {}  # of members that begin alike: it caches matrices
+        self._begins = []
+        for one, u0 in zip(readings, initial, strict=True):
+            begin = made.get(id(u0)) if not one else None
+            if begin is None:
+                begin = work.made_of(one, u0)
+                made |= {} if one else {id(u0): begin}
+            self._begins.append(begin)
+
+    def subset(self, which: IntArray) -> Together:
+        other = copy.copy(self)
+        other._begins = [self._begins[k] for k in which]
+        return other
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]

@@ -155,14 +155,17 @@ def _absorbed(
         noise = np.sqrt(x.level)[:, None] * noise
     Y, d = Y / noise[:, None], d / noise
     largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
-    e = d / np.sqrt(1.0 + (Y * Y).sum(axis=1))
+    variance = 1.0 + (Y * Y).sum(axis=1)
+    e = d / np.sqrt(variance)
     refused, count, newest = x.refused, np.zeros(len(x)), None
     shadows = filter_.shadows
     off = None if shadows is None else shadows.seen(x, span.end)
-    known = np.zeros_like(d)  # what the discretisation is known to do to the innovations
+    expected, told = e, d
     if shadows is not None and off is not None:
+        # What the discretisation is known to do to the innovations has a finding of its own.
         known = off[:, shadows.counted].sum(axis=1) / noise
-    far = _far(x, d / np.sqrt(1.0 + (Y * Y).sum(axis=1) + known * known), used, options.gate)
+        expected, told = d / np.sqrt(variance + known * known), d + known
+    far = _far(x, expected, used, options.gate)
     if far is not None:
         refused = np.where(far, refused + 1, np.where(used, 0, refused))
         kept = used & ~(far & (refused <= options.patience))
@@ -172,9 +175,12 @@ def _absorbed(
         used, whole = kept, bool(kept.all())
         e = np.where(used, e, np.nan)
     if not whole:  # zeros tell nothing: what is missing takes part as such
-        Y, d = np.where(used[:, None], Y, 0.0), np.where(used, d, 0.0)
+        Y, d, told = (
+            np.where(used[:, None], Y, 0.0),
+            np.where(used, d, 0.0),
+            np.where(used, told, 0.0),
+        )
     if filter_.judge is not None:
-        told = d + used * known  # the discretisation has a finding of its own
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     new, made = filter_.update(x, Y, d)
     parts: dict[str, Any] = {

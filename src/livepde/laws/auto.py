@@ -109,6 +109,7 @@ class AutoLaw(Law[Bank, AutoState]):
     shadows: Shadows | None = field(default_factory=Shadows)
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
+    graded_start: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0

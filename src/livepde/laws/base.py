@@ -1,4 +1,4 @@
-"""What an update law is."""
+"""Interface of update laws: problem, state, report, belief."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class Problem:
         return replace(interval, z1=np.where(used, np.nan, interval.z1)) if any(used) else interval
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        """Return what the sensors are expected to show, for state u and latent parameter q."""
+        """Return the predicted readings for state u and latent parameter q."""
         return self.observed.predict(u, self.model.latent.value(q), moment)
 
     def linear_readings(self, interval: Interval, u: Array) -> Interval:
@@ -276,7 +276,7 @@ class Notes(Mapping[str, Value]):
         return len(self._values)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what a copy needs: the numbers themselves."""
+        """Return the numbers themselves, for a copy."""
         return dict, (dict(self._values),)
 
 
@@ -366,13 +366,16 @@ class Law(ABC, Generic[Work, State]):
     ----------
     scheme
         Time scheme of an identifier that states none: the paper's, implicit Euler.
+    graded_start
+        True if steps at the start of a run are graded, as `Advance.start` says.
     """
 
     scheme: ClassVar[Scheme] = ImplicitEuler()
+    graded_start: ClassVar[bool] = False
 
     @abstractmethod
     def prepare(self, problem: Problem) -> Work:
-        """Return what is computed once: matrices, modes, stages. Raises `LawError`."""
+        """Return matrices, modes and stages, computed once. Raises `LawError`."""
 
     @abstractmethod
     def init(self, work: Work, q0: Array, u0: Array) -> State:

@@ -34,7 +34,7 @@ from livepde.model import Model, h1_form, mass_form
 from livepde.observation import Split
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Excitation", "ExcitationGate", "Probes"]
+__all__ = ["ExcitationGate", "ExcitationLevel", "Probes"]
 
 PROBES = 16  # pairs of random functions: their products scatter by a quarter
 
@@ -77,7 +77,7 @@ class ExcitationGate:
             if not 0 < value < 1:
                 raise LawError(f"ExcitationGate: {name} must lie between 0 and 1; got {value}.")
 
-    def closed(self, excitation: Excitation) -> bool:
+    def closed(self, excitation: ExcitationLevel) -> bool:
         """Return true at a rest: q is held."""
         return (
             excitation.correlation < self.correlation
@@ -85,7 +85,7 @@ class ExcitationGate:
             and excitation.noise > self.noise
         )
 
-    def add(self, excitation: Excitation, a: Array, followed: Array) -> Excitation:
+    def add(self, excitation: ExcitationLevel, a: Array, followed: Array) -> ExcitationLevel:
         """Return the excitation after a sample.
 
         Parameters
@@ -107,11 +107,11 @@ class ExcitationGate:
         if scale > 0.0:
             jump = left - excitation.left
             noise += share * (min(float(jump @ jump) / (size + excitation.size), 1.0) - noise)
-        return Excitation(a, left, size, correlation, energy, correlated, largest, noise)
+        return ExcitationLevel(a, left, size, correlation, energy, correlated, largest, noise)
 
 
 @dataclass(frozen=True, eq=False)
-class Excitation:
+class ExcitationLevel:
     """How far what excites q is more than noise.
 
     Attributes
@@ -138,7 +138,7 @@ class Excitation:
     noise: float
 
     @classmethod
-    def none(cls) -> Excitation:
+    def none(cls) -> ExcitationLevel:
         """Return the value before any sample."""
         return cls(np.zeros(PROBES), np.zeros(PROBES), 0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -162,7 +162,7 @@ class Probes:
             self.pairs = np.zeros((0, PROBES)), np.zeros((0, PROBES))  # no longer needed
 
     def __call__(self, states: Array, q: Array, moment: Moment) -> Array:
-        """Return what the pairs see of several states, shapes (n, k) -> (PROBES, k)."""
+        """Return the probe values of several states, shapes (n, k) -> (PROBES, k)."""
         if self.fixed is not None:
             return self.fixed @ states
         p, e = self.pairs

@@ -82,7 +82,7 @@ class FollowedErrors(Protocol):
     """Errors of the discretisation, followed beside a filter: `livepde.laws.shadows`."""
 
     def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
-        """Return what is known of one member at the start; None stands for no moment yet."""
+        """Return the filter state of one member at the start; None stands for no moment yet."""
         ...
 
     def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
@@ -101,7 +101,7 @@ class FollowedErrors(Protocol):
     def updated(
         self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array, t: float
     ) -> ShadowState:
-        """Return what is known after a sample; weights: one over noise, (members, sensors)."""
+        """Return the filter state after a sample; weights: one over noise, (members, sensors)."""
         ...
 
     def notes(self, x: FilterState) -> dict[str, Array]:

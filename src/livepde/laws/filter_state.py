@@ -1,4 +1,4 @@
-"""What a filter knows of each member: its estimate, and how well it is known."""
+"""State of the reduced-order filter: mean and covariance square root of each member."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.laws.innovations import Innovations
+from livepde.laws.members import changed
 from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = ["FilterState", "along"]
+__all__ = ["NO_LEDGER", "FilterState", "along", "without_ledger"]
+
+NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,3 +98,8 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
     weights = np.linalg.lstsq(x.C[k].T, shift, rcond=None)[0]
     moved: Array = weights @ x.U[k]
     return moved
+
+
+def without_ledger(x: FilterState) -> FilterState:
+    """Return a filter without what only its verdict needs."""
+    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)

@@ -12,7 +12,7 @@ from livepde.fem import Moment
 from livepde.laws.base import Belief, Law, Notes, Problem, Report, Status
 from livepde.laws.coupled import KeptFactor
 from livepde.laws.damping import Damping, ResidualDamping
-from livepde.laws.excitation import Excitation, ExcitationGate
+from livepde.laws.excitation import ExcitationGate, ExcitationLevel
 from livepde.laws.gradient_parts import GradientParts, StageSequence, constant_parts, tuned_parts
 from livepde.laws.metrics import StepBegin, Transition
 from livepde.linalg import Array
@@ -55,7 +55,7 @@ class GradientState:
     frozen: bool
     observed: Any
     metric: Any
-    excitation: Excitation
+    excitation: ExcitationLevel
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             frozen=False,
             observed=work.observed.init(),
             metric=work.metric.init(q0),
-            excitation=Excitation.none(),
+            excitation=ExcitationLevel.none(),
         )
 
     def start(self, work: GradientParts, q0: Array, u0: Array, moment: Moment) -> GradientState:

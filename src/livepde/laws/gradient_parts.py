@@ -19,7 +19,7 @@ from livepde.laws.coupled import (
     StageTerms,
 )
 from livepde.laws.damping import Damping, ResidualDamping
-from livepde.laws.excitation import Excitation, ExcitationGate, Probes
+from livepde.laws.excitation import ExcitationGate, ExcitationLevel, Probes
 from livepde.laws.information import InformationMetric
 from livepde.laws.metrics import ConstantMetric, MetricRule, MetricStep
 from livepde.laws.observed_part import (
@@ -92,13 +92,13 @@ class GradientParts:
         self.stage(present).solver.prepare()
         return self
 
-    def closed(self, excitation: Excitation) -> bool:
+    def closed(self, excitation: ExcitationLevel) -> bool:
         """Return true if the gate is closed: q is held."""
         return self.gate is not None and self.gate.closed(excitation)
 
     def excited(
-        self, excitation: Excitation, w: Array, u: Array, q: Array, moment: Moment
-    ) -> Excitation:
+        self, excitation: ExcitationLevel, w: Array, u: Array, q: Array, moment: Moment
+    ) -> ExcitationLevel:
         """Return the excitation after a sample, from w and the estimate u."""
         if self.gate is None or self.probes is None:
             return excitation

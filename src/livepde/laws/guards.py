@@ -1,4 +1,4 @@
-"""When a filter is out of its depth: what it notices, and what it does then."""
+"""Safeguards of a filter against steps beyond its linearisation and runaway estimates."""
 
 from __future__ import annotations
 

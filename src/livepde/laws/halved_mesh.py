@@ -103,7 +103,7 @@ class HalvedMesh:
         return np.asarray(self.model.initial(given, moment) - coarse)
 
     def seen(self, u: Array, q: Array, difference: Array, moment: Moment) -> Array:
-        """Return what sensors see of a difference of the state there, shape (sensors,).
+        """Return the difference in the readings for one of the state there, shape (sensors,).
 
         Parameters
         ----------

@@ -92,7 +92,7 @@ def trimmed(log: Array, first: int) -> Array:
     return log[:, first:].copy()
 
 
-class _Row(NamedTuple):
+class _LogRow(NamedTuple):
     """A row of the log of one member."""
 
     t: float
@@ -101,19 +101,19 @@ class _Row(NamedTuple):
     inputs: Inputs
 
 
-def _rows(log: Array, channels: tuple[str, ...]) -> list[_Row]:
+def _rows(log: Array, channels: tuple[str, ...]) -> list[_LogRow]:
     """Return the rows that the one member of a log took."""
     sensors = (log.shape[2] - 1 - len(channels)) // 2
     found = []
     for row in log[0][np.isfinite(log[0, :, 0])]:
         t, z, noise, inputs = np.split(row, [1, 1 + sensors, 1 + 2 * sensors])
         named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
-        found.append(_Row(float(t[0]), z, own_noise(noise), named))
+        found.append(_LogRow(float(t[0]), z, own_noise(noise), named))
     return found
 
 
 def first_interval(log: Array, channels: tuple[str, ...]) -> Interval:
-    """Return what one member measured in the first row, as an interval without length."""
+    """Return the first row of one member as an interval without length."""
     (row,) = _rows(log[:, :1], channels)
     return Interval(row.t, row.t, row.inputs, row.inputs, row.z, row.z, row.noise)
 
@@ -135,7 +135,7 @@ def following(log: Array, row: int) -> int:
 
 
 def span_between(log: Array, rows: IntArray, row: int, problem: Problem) -> Span:
-    """Return what members measured in one row, with one row before of each, as an interval."""
+    """Return one row of each member, with the row before it, as an interval."""
     sensors = problem.observed.size
     first, last = log[np.arange(len(log)), rows], log[:, row]
     inputs0, inputs1 = first[:, 1 + 2 * sensors :], last[:, 1 + 2 * sensors :]

@@ -292,7 +292,7 @@ class InformationMetric(MetricRule[Information]):
         return lambda c, h: Metric(spread / PULL, 0.0, load, held, PULL / h)
 
     def normal(self, forms: StageForms) -> NormalEquations:
-        """Return what samples of the sensors of a stage add to the normal equations."""
+        """Return the contribution of the samples of a stage to the normal equations."""
         return self._normal.get(forms.split.present.tobytes(), lambda: self._made(forms))
 
     def _made(self, forms: StageForms) -> NormalEquations:

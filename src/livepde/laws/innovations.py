@@ -91,6 +91,11 @@ class Innovations:
         return np.minimum(np.maximum(correlation, -LARGEST_CORRELATION), LARGEST_CORRELATION)
 
     @property
+    def notes(self) -> dict[str, Array]:
+        """Notes on the innovations, each of shape (members,)."""
+        return {"innovation_ratio": self.ratio, "innovation_correlation": self.correlation}
+
+    @property
     def persistence(self) -> Array:
         """Variance of the averaged innovations over that of an average of white noise of size 1.
 
@@ -121,13 +126,33 @@ class Innovations:
         return np.maximum(self.scatter, np.sqrt(slow))
 
     @property
+    def unbiased_correlation(self) -> Array:
+        """`correlation` of the process behind N samples of each sensor, at least 0, (members,).
+
+        The correlation r of N values about a mean that is fitted is too small by (1 + 3 r)/N
+        (Kendall 1954), 4/N for large r. Innovations of a right model are white and fit no mean, so
+        the correction is 4/N times the part of r beyond chance, as in `_beyond_chance`. At most
+        (N - 1)/(N + 1): then (1 + r)/(1 - r) is N, and a mean of the innovations is as uncertain
+        as each of them.
+        """
+        count, weight = self.sums[:, 0], self.sums[:, 1]
+        sensors = np.maximum(self.sensors[:, 0].sum(axis=1), 1.0)
+        N = np.maximum(count**2 / (weight + TINY) / sensors, 1.0)
+        rho = np.maximum(self.correlation, 0.0)
+        chance = SIGNIFICANT * np.sqrt(weight + TINY) / (count + TINY)
+        beyond = rho * (1.0 - np.minimum(chance / np.maximum(rho, TINY), 1.0) ** 2)
+        most = np.maximum((N - 1.0) / (N + 1.0), rho)
+        unbiased: Array = np.minimum(rho + 4.0 / N * beyond, most)
+        return unbiased
+
+    @property
     def scatter(self) -> Array:
         """The part of `inflation` that comes from the size of innovations and their correlation.
 
         Errors that hide below the noise are not: they hardly make the innovations larger.
         """
         count, weight = self.sums[:, 0], self.sums[:, 1]
-        rho = np.maximum(self.correlation, 0.0)
+        rho = self.unbiased_correlation
         following = self.ratio * (1.0 + rho) / (1.0 - rho)
         error = np.sqrt(6.0 * weight + TINY) / (count + TINY)
         return np.sqrt(_beyond_chance(following, error))

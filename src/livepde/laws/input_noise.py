@@ -85,7 +85,7 @@ def _moved(span: Span, name: str, change: float) -> Span:
 def initial_rows(
     problem: Problem, reduction: Reduction, noise: Array, q: Array, u: Array, moment: Moment
 ) -> tuple[Array, Array]:
-    """Return what the readings that u0 was made of leave uncertain: rows of U and of C.
+    """Return the uncertainty of a u0 made of readings: rows of U and of C.
 
     With u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise of each
     reading is a row of its own, and what the sensors see of the unknowns, an offset say, stands in

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
@@ -21,28 +21,20 @@ from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
-from livepde.laws.members import changed
-from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.laws.shadow_state import ShadowState
+from livepde.laws.members import changed, put, take
+from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
-__all__ = [
-    "apart",
-    "expecting",
-    "iterated_smoother",
-    "learns",
-    "missed",
-    "moved",
-    "without_shadows",
-]
+__all__ = ["expecting", "iterate_starts", "missed", "moved"]
 
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 4  # of a step that makes samples and prior less probable
 CONVERGED = 0.3  # standard deviations that a step moves the trajectory by, at the end of it
-HOLDS = 0.1  # the same, of the first step, for a linearisation that holds
-ENOUGH = 16  # samples that no other trajectory explains as well as one that is found
+HOLDS = 0.1  # the same in each direction, of the first step, for a linearisation that holds
+ENOUGH = 16  # samples that no other trajectory explains as well as one that is found, and with
+# which the start ends where the linearisation holds: what follows moves the estimate less
 STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
 
@@ -53,8 +45,6 @@ class _Pass:
 
     Attributes
     ----------
-    about
-        What was asked for, None for each estimate.
     trajectory, smoothed
         Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
         which the filter was linear, and those that it then estimates from all samples.
@@ -64,11 +54,43 @@ class _Pass:
         Minus twice the logarithm of the probability of the trajectory, up to a constant.
     """
 
-    about: Array | None
     trajectory: Array
     smoothed: Array
     x: FilterState
     misfit: float
+
+
+def iterate_starts(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityState, dict[str, Array]]:
+    """Return all members after the iteration of those that are due, and notes on these."""
+    due, moved = state.assimilated >= state.start_due, np.full(len(state), np.nan)
+    for k in np.flatnonzero(due).tolist() if due.any() else ():
+        one, moved[k] = _iterated(work, take(state, k))
+        state = put(state, k, one) if len(state) > 1 else one
+    if np.isnan(moved).all():
+        return state, {}
+    return state, {"smoother_moved": moved} | state.now.innovations.notes
+
+
+def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[SensitivityState, float]:
+    """Return one member about its most probable trajectory, and how far that has moved it, or NaN.
+
+    The start ends where samples have told all directions of unknowns that stay, and a trajectory
+    through their estimate leaves it where it is.
+    """
+    count, moved, shares = int(state.assimilated[0]), math.nan, _shares(state.start, state.now)
+    if shares[0] < HALF:
+        found = iterated_smoother(work, state)
+        moved = math.inf if found is None else _apart(work.filter, found, state.now)
+        if found is not None:
+            state = changed(state, now=work.filter.relinearised(found))
+        stays = shares[-1] < HALF and not work.filter.moves
+        if stays and count >= ENOUGH and moved <= HOLDS * math.sqrt(len(shares)):
+            return changed(state, start_due=np.array([NEVER])), moved
+    if count >= work.start_window:
+        return new_window(work, state.now, state), moved
+    return changed(state, start_due=2 * state.assimilated), moved
 
 
 def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterState | None:
@@ -80,24 +102,18 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     log = state.log[:, int(state.window[0]) :]
     opening = first_interval(log, problem.channels)
     intervals = intervals_since(log, problem.channels)
-    samples = _Samples(*without_shadows(work, state), opening, intervals)
-    shape = (1 + len(samples.intervals), state.now.C.shape[2])
-    ends = []
-    for trajectory in _beginnings(samples, shape):
+    samples = _Samples(work, state, opening, intervals)
+    ends: list[_Pass] = []
+    for trajectory in _beginnings(samples, (1 + len(intervals), state.now.C.shape[2])):
         one = samples.about(trajectory)
         if one is None:
             continue
         ends.append(_descended(samples, one))
-        if samples.explained(ends[-1]) and (len(samples.intervals) >= ENOUGH or _holds(one)):
+        if samples.explained(ends[-1]) and (len(intervals) >= ENOUGH or _holds(one)):
             break
     if not ends:
         return None
-    best: _Pass | None = min(ends, key=lambda one: one.misfit)
-    if best is not None and work.filter.shadows is not None:
-        # Shadows change no other number: they follow the last pass only.
-        best = _Samples(work, state, opening, samples.intervals).about(best.about)
-    if best is None:
-        return None
+    best = min(ends, key=lambda one: one.misfit)
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
 
 
@@ -105,29 +121,16 @@ def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
     """Return trajectories to begin at, the most promising one first."""
     if not samples.work.filter.moves:  # where the filter has come to, with its safeguards
         yield np.broadcast_to(samples.reached, shape)
-    plain = samples.relinearised()
+    plain = samples.about(None)
     if plain is not None:
         yield plain.smoothed
     yield np.zeros(shape)
 
 
-def without_shadows(
-    work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityWork, SensitivityState]:
-    """Return a filter that follows no discretisation error, and one member of it."""
-    if work.filter.shadows is None:
-        return work, state
-    start, now = (
-        changed(x, shadows=ShadowState.none(len(x), x.u.shape[1], x.C.shape[2]))
-        for x in (state.start, state.now)
-    )
-    plain = replace(work, filter=replace(work.filter, shadows=None))
-    return plain, changed(state, start=start, now=now)
-
-
 def _holds(one: _Pass) -> bool:
     """True if samples and prior together are most probable where the pass is linear."""
-    return _deviations(one.x, (one.smoothed - one.trajectory)[-1]) <= HOLDS
+    step = (one.smoothed - one.trajectory)[-1]
+    return _deviations(one.x, step) <= HOLDS * math.sqrt(len(step))
 
 
 def _descended(samples: _Samples, best: _Pass) -> _Pass:
@@ -140,15 +143,17 @@ def _descended(samples: _Samples, best: _Pass) -> _Pass:
         better = _damped(samples, best, step)
         if better is None:
             break
-        best = better
+        gained, best = best.misfit - better.misfit, better
+        if gained <= CONVERGED**2:  # what a step of so many standard deviations gains
+            break
     return best
 
 
-def learns(before: FilterState, now: FilterState) -> bool:
-    """True if samples have halved the variance of a direction of the unknowns of one member."""
+def _shares(before: FilterState, now: FilterState) -> Array:
+    """Return shares of the variance of the unknowns of one member that are left, rising."""
     earlier, later = before.C[0].T @ before.C[0], now.C[0].T @ now.C[0]
-    shares = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
-    return bool(shares[0] < HALF)
+    found: Array = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
+    return found
 
 
 def _damped(samples: _Samples, best: _Pass, step: Array) -> _Pass | None:
@@ -160,7 +165,7 @@ def _damped(samples: _Samples, best: _Pass, step: Array) -> _Pass | None:
     return None
 
 
-def apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
+def _apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
     """Return how far estimates of two filters are apart, in standard deviations of the first."""
     shift = filter_.reduction.reduced(filter_.estimate(x) - filter_.estimate(other))[0]
     return _deviations(x, shift)
@@ -171,20 +176,14 @@ def _deviations(x: FilterState, shift: Array) -> float:
     return float(np.linalg.norm(weights))
 
 
+@dataclass(frozen=True, eq=False)
 class _Samples:
     """The samples of one member since the start, ready to be assimilated again."""
 
-    def __init__(
-        self,
-        work: SensitivityWork,
-        state: SensitivityState,
-        opening: Interval,
-        intervals: Sequence[Interval],
-    ) -> None:
-        self.work = work
-        self.state = state
-        self.opening = opening
-        self.intervals = intervals
+    work: SensitivityWork
+    state: SensitivityState
+    opening: Interval
+    intervals: Sequence[Interval]
 
     def explained(self, one: _Pass) -> bool:
         """True if a pass misses the samples by no more than their noise makes usual.
@@ -204,14 +203,7 @@ class _Samples:
         return reached
 
     def about(self, trajectory: Array | None) -> _Pass | None:
-        """Assimilate the samples, linear about a trajectory; None if that fails."""
-        return self._run(trajectory)
-
-    def relinearised(self) -> _Pass | None:
-        """Assimilate the samples, linear about each estimate; None if that fails."""
-        return self._run(None)
-
-    def _run(self, trajectory: Array | None) -> _Pass | None:
+        """Assimilate the samples, linear about a trajectory or each estimate; None if it fails."""
         filter_, reduction = self.work.filter, self.work.filter.reduction
         prior = filter_.problem.model.latent.prior
         known = self.state.start.q[0]
@@ -242,7 +234,7 @@ class _Samples:
                 misfit += moved(filter_, followed[-2], followed[-1], h, gained)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
         smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
-        return _Pass(trajectory, np.array(followed), smoothed, x, misfit)
+        return _Pass(np.array(followed), smoothed, x, misfit)
 
     def _remembered(self, x: FilterState) -> FilterState:
         return self.work.filter.remembered(x) if self.work.filter.moves else x

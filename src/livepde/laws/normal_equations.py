@@ -48,7 +48,7 @@ class NormalEquations(ABC):
 
     @abstractmethod
     def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
-        """Return what a sample adds.
+        """Return the contribution of a sample.
 
         Parameters
         ----------

@@ -12,7 +12,7 @@ import numpy as np
 
 from livepde.laws.base import Problem
 from livepde.laws.metrics import NoState
-from livepde.laws.smoothing import Balance, NoiseDetector, Smoother
+from livepde.laws.smoothing import Balance, NoiseDetector, SmoothingOperator
 from livepde.linalg import Array, Memo
 from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval
@@ -127,7 +127,7 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self._detectors: Memo[bytes, NoiseDetector] = Memo(LARGEST_MEMO)
-        self._smoothers: Memo[bytes, Smoother] = Memo(LARGEST_MEMO)
+        self._smoothers: Memo[bytes, SmoothingOperator] = Memo(LARGEST_MEMO)
 
     def init(self) -> Balance:
         return Balance.none(self.problem.observed.size, self.problem.model.X.dim)
@@ -145,7 +145,7 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
             boundary = model.impose(np.zeros(model.X.dim), interval.at(t))
             state, noisy = detector.add(state, z, boundary)
             if noisy:
-                make = partial(Smoother, self.problem.observed, split.present)
+                make = partial(SmoothingOperator, self.problem.observed, split.present)
                 smoother = self._smoothers.get(key, make)
                 state = smoother.add(state, z, boundary)
                 alpha = smoother.alpha(state)
@@ -162,7 +162,7 @@ class _SmoothedPath(_InversePath):
         problem: Problem,
         interval: Interval,
         split: Split,
-        smoother: Smoother,
+        smoother: SmoothingOperator,
         alpha: float,
     ) -> None:
         super().__init__(problem, interval, split)

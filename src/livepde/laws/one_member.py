@@ -24,7 +24,6 @@ from livepde.laws.gauss_newton import (
 )
 from livepde.laws.guards import Guards
 from livepde.laws.history import intervals_since
-from livepde.laws.iterated_smoother import apart, iterated_smoother, learns
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import (
@@ -84,42 +83,14 @@ def _assimilated(
         if (guards := work.guards) is not None:
             x, notes = _iterated(work, guards, state, interval, x)
             if notes:
-                told = _noted(work, x)
+                told = {name: float(value[0]) for name, value in x.innovations.notes.items()}
                 report = replace(report, notes={**report.notes, **told, **notes})
         state = stored(work, state, work.filter.relinearised(x), span, one)
-        if state.assimilated[0] >= state.start_due[0]:
-            state, notes = _smoothed(work, state)
-            if notes:
-                report = replace(report, notes={**report.notes, **_noted(work, state.now), **notes})
         return state, report
     state = stored(work, state, x, span, one)
     if state.log.shape[1] - state.window[0] > work.most and not state.replay.active[0]:
         state = new_window(work, work.filter.relinearised(state.now), state)
     return state, report
-
-
-def _smoothed(
-    work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityState, dict[str, float]]:
-    """Return one member about the most probable trajectory of its window, and notes."""
-    notes: dict[str, float] = {}
-    if learns(state.start, state.now):
-        found = iterated_smoother(work, state)
-        moved = np.inf if found is None else apart(work.filter, found, state.now)
-        notes["smoother_moved"] = float(moved)
-        if found is not None:
-            state = changed(state, now=work.filter.relinearised(found))
-    if state.assimilated[0] >= work.start_window:
-        return new_window(work, state.now, state), notes
-    return changed(state, start_due=2 * state.assimilated), notes
-
-
-def _noted(work: SensitivityWork, x: FilterState) -> dict[str, float]:
-    """Return the notes on the innovations of one member."""
-    return {
-        "innovation_ratio": float(x.innovations.ratio[0]),
-        "innovation_correlation": float(x.innovations.correlation[0]),
-    }
 
 
 def _iterated(

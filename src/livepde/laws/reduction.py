@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from livepde.errors import LawError
-from livepde.fem import Evolution, FieldBlock
+from livepde.fem import Evolution, FieldBlock, base_name
 from livepde.laws.base import Problem
 from livepde.linalg import Array, Mask
 
@@ -47,7 +47,7 @@ class ReducedEvolution:
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
 
     def backward(self, h: float, drift: float) -> Array:
-        """Return what the coordinates are expected to have been a time h before: matrix on them."""
+        """Return the matrix of the backward prediction of the coordinates by a time h."""
         F, growth = self.transition(h), self.growth(h)
         growth = growth if self.model.moves else growth + drift * h
         return np.asarray(np.linalg.solve(F @ F.T + np.diag(growth), F).T)
@@ -118,7 +118,6 @@ class Reduction:
     @property
     def stay(self) -> list[tuple[str, int]]:
         """Coordinates of unknowns that stay, with what they are called: numbers before fields."""
-        space = self.problem.model.parameter_space
         numbers, modes = [], []
         for (name, item), evolution in zip(
             self.problem.model.latent.parts.items(), self.evolutions, strict=True
@@ -129,7 +128,7 @@ class Reduction:
             if isinstance(item.block, FieldBlock):
                 modes += [(f"{name}, mode {k + 1}", first + k) for k in range(count)]
                 continue
-            labels = [label for label in space.labels if label.split("[")[0] == name]
+            labels = item.block.labels(name)
             named = labels if len(labels) == count else [f"{name}, {k + 1}" for k in range(count)]
             numbers += [(label, first + k) for k, label in enumerate(named)]
         return numbers + modes
@@ -142,13 +141,14 @@ class Reduction:
         LawError
             There is no unknown of that name; the message begins with `who`.
         """
-        parts = list(self.problem.model.latent.parts)
-        missing = [name for name in names or () if name not in parts]
+        parts, space = list(self.problem.model.latent.parts), self.problem.model.parameter_space
+        missing = [name for name in names or () if name not in space.parts]
         if missing:
-            raise LawError(f"{who}: there is no unknown '{missing[0]}'; there are {parts}.")
+            known = list(space.parts)
+            raise LawError(f"{who}: there is no unknown '{missing[0]}'; there are {known}.")
         chosen = np.zeros(self.size, dtype=bool)
         for name, evolution in zip(parts, self.evolutions, strict=True):
-            chosen[evolution.part] = names is None or name in names
+            chosen[evolution.part] = names is None or bool({name, base_name(name)} & set(names))
         return chosen
 
     def moving(self, drift: float) -> int:

@@ -47,25 +47,32 @@ def _advanced(
     work: SensitivityWork, state: SensitivityState, most: float
 ) -> tuple[SensitivityState, dict[str, Array]]:
     """Return all members after at most so many stored samples of each, and notes."""
-    ended: dict[int, bool] = {}
-    taken = 0
-    while (active := state.replay.active).any():
-        if taken >= most and (state.replay.count[active] > AT_ONCE).all():
+    which = np.flatnonzero(state.replay.active)
+    if not len(which):
+        return state, {}
+    # Those that replay are apart, so that no stored sample copies the others, or the log.
+    part = take(state, which) if len(which) < len(state) else state
+    ended, taken = np.zeros(len(which), dtype=bool), 0
+    failures = ended.copy()
+    while (active := part.replay.active).any():
+        if taken >= most and (part.replay.count[active] > AT_ONCE).all():
             break
-        state, failed = _one_sample(work, state)
-        for k in np.flatnonzero(state.replay.active).tolist():
-            state, ends = _turned(work, state, k, k in failed)
-            if ends:
-                ended[k] = k in failed
+        part, failed = _one_sample(work, part)
+        for k in np.flatnonzero(part.replay.active).tolist():
+            part, ended[k] = _turned(work, part, k, k in failed)
+            failures[k] = ended[k] and k in failed
         taken += 1
+    told = {"replay_left": (ended, part.replay.distance), "replay_failed": (failures, 1.0 * ended)}
     notes = {}
-    if ended:
-        notes["replay_left"] = np.full(len(state), np.nan)
-        notes["replay_left"][list(ended)] = state.replay.distance[list(ended)]
-    if any(ended.values()):
-        notes["replay_failed"] = np.full(len(state), np.nan)
-        notes["replay_failed"][[k for k, failed in ended.items() if failed]] = 1.0
-    return state, notes
+    for name, (some, values) in told.items():
+        if some.any():
+            notes[name] = np.full(len(state), np.nan)
+            notes[name][which[some]] = values[some]
+    if len(which) == len(state):
+        return part, notes
+    log = state.log
+    part, state = (changed(one, log=one.log[:, :0]) for one in (part, state))
+    return changed(put(state, which, part), log=log), notes
 
 
 def _window(work: SensitivityWork, state: SensitivityState, now: FilterState) -> Window:
@@ -127,7 +134,8 @@ def _assimilated(
     filter_ = work.filter
     whole = len(members) == len(state)
     x = state.replay.x if whole else take(state.replay.x, members)
-    span = span_between(state.log[members], state.replay.row[members], row, filter_.problem)
+    log = state.log if whole else state.log[members]
+    span = span_between(log, state.replay.row[members], row, filter_.problem)
     new, told = assimilate(filter_, x, span, work.options)
     if told.status.ok:
         return new, [k for k, finite in zip(members, told.finite, strict=True) if not finite]

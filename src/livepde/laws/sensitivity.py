@@ -20,12 +20,13 @@ from livepde.laws.assimilation import (
 from livepde.laws.base import Belief, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter, MeanFilter
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import NO_LEDGER, FilterState, without_ledger
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
+from livepde.laws.iterated_smoother import iterate_starts
 from livepde.laws.jumps import Jumps
 from livepde.laws.members import changed, join, put, take, where
 from livepde.laws.one_member import step_alone
@@ -50,18 +51,16 @@ from livepde.stepping import (
     Alexander2,
     BandedStage,
     Interval,
-    KeptFactors,
     Scheme,
     Span,
     member_stage,
 )
-from livepde.verdict import Ledger, Verdict
+from livepde.verdict import Verdict
 
 __all__ = ["SensitivityLaw", "without_factors"]
 
 GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
-NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 GUESS = 2.0  # samples that the first guess of the noise counts for
 
 
@@ -116,8 +115,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
     start_window
         While the unknowns are learned the last samples, up to this many, are assimilated again
-        whenever their number has doubled, about the most probable trajectory of the unknowns: see
-        `livepde.laws.iterated_smoother`. 0: never. Not where a `Replay` does the like.
+        whenever their number has doubled, about the most probable trajectory of the unknowns, until
+        the linearisation holds: see `livepde.laws.iterated_smoother`. 0: never. Not where a
+        `Replay` does the like.
     guards
         What to do when a linearisation is overconfident or the estimate runs away; None: nothing.
     shadows
@@ -142,6 +142,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     verdict: bool | str = True
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
+    graded_start: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.drift) and self.drift >= 0):
@@ -370,16 +371,19 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def step_members(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, MemberReports]:
-        """Return state and reports of all members after a sample of each, and a slice of replays.
+        """Return state and reports of all members after a sample of each, replays and starts.
 
         They step as arrays; whoever meets something out of the ordinary, a safeguard, an alarm, a
         failure, or is late, steps alone.
         """
         new, reports = self._after(work, state, span)
-        if not any(status.ok for status in reports.statuses):
+        taken = np.array([status.ok for status in reports.statuses])
+        if not taken.any():
             return new, reports
         new, notes = replay_slice(work, new)
-        return shortened(work, new), reports.with_notes(notes)
+        new, started = iterate_starts(work, new)
+        told = {name: np.where(taken, values, np.nan) for name, values in started.items()}
+        return shortened(work, new), reports.with_notes({**notes, **told})
 
     def _after(
         self, work: SensitivityWork, state: SensitivityState, span: Span
@@ -421,8 +425,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             full = state.log.shape[1] + 1 - state.window > work.most
             usual = usual & ~(replays & full & ~state.replay.active)
         scale, watch = state.scale, state.watch
-        if work.start_window:
-            usual = usual & ~(state.assimilated + present >= state.start_due)
         if (guards := self.guards) is not None:
             usual = usual & (replays | guards.within_reach(x.da - before.da))
             d = span.z1 - told.predicted
@@ -488,7 +490,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return reported_factors(work.filter, x)
 
     def member_belief(self, work: SensitivityWork, now: FilterState, k: int) -> Belief:
-        """Return what is believed of one member, in latent coefficients."""
+        """Return the belief of one member, in latent coefficients."""
         filter_ = work.filter
         reduction, one = filter_.reduction, take(now, k)
         drift = float(filter_.drifts(one.member)[0])
@@ -508,11 +510,6 @@ def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
     return changed(state, start=x, now=x, older=x, newer=x, replay=ReplayState.none(x))
 
 
-def without_ledger(x: FilterState) -> FilterState:
-    """Return a filter without what only its verdict needs."""
-    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
-
-
 def without_factors(x: FilterState) -> FilterState:
     """Return a filter without what its last stages have left: what estimates hold."""
-    return changed(x, kept=KeptFactors.none(len(x)), shadows=x.shadows.without_stages())
+    return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())

@@ -1,4 +1,4 @@
-"""What the sensitivity law keeps of each member, and how a sample changes it."""
+"""State of the sensitivity law: filter, log of samples, replay and guards of each member."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.members import changed, where
 from livepde.laws.replay import Replay, ReplayState
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import KeptFactors, Span
+from livepde.stepping import Span
 
 __all__ = [
     "NEVER",
@@ -195,18 +195,15 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
 
 
 def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
-    """Return what the members report after a sample."""
+    """Return the reports of the members after a sample."""
     # Not all of the filter is kept for what may never be read.
     members, innovations, level, q, da = len(now), now.innovations, now.level, now.q, now.da
     reduction, shadows = work.filter.reduction, work.filter.shadows
     if shadows is not None:
-        now = changed(now, kept=KeptFactors.none(members))
+        now = changed(now, kept=now.kept.forgotten())
 
     def notes() -> dict[str, Array]:
-        found = {
-            "innovation_ratio": innovations.ratio,
-            "innovation_correlation": innovations.correlation,
-        }
+        found = innovations.notes
         if work.options.adaptive:
             found["noise_level"] = np.sqrt(level)
         if work.options.gate < np.inf:

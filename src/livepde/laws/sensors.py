@@ -1,4 +1,4 @@
-"""What sensors see of the states of several members."""
+"""Predicted readings and their Jacobians for the states of several members."""
 
 from __future__ import annotations
 

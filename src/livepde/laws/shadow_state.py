@@ -1,11 +1,12 @@
-"""What is known of the discretisation error of each member: see `livepde.laws.shadows`."""
+"""State of the discretisation shadows of each member: see `livepde.laws.shadows`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from livepde.laws.members import changed
 from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 
@@ -118,12 +119,12 @@ class ShadowState:
 
     def without_stages(self) -> ShadowState:
         """Return the shifts alone, without what the next steps need."""
-        kept, nothing = KeptFactors.none(len(self)), np.zeros((len(self), 0))
-        return replace(
+        nothing = np.zeros((len(self), 0))
+        return changed(
             self,
-            halves=kept,
-            blocks=kept,
-            fine_stage=kept,
+            halves=self.halves.forgotten(),
+            blocks=self.blocks.forgotten(),
+            fine_stage=self.fine_stage.forgotten(),
             u0=nothing,
             inputs0=nothing,
             gains=self.gains[:, :0],

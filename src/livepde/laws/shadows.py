@@ -142,7 +142,7 @@ class Shadow(ABC):
     def begun(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
-        """Return what is known before the first step, of one member.
+        """Return the state before the first step, of one member.
 
         Parameters
         ----------
@@ -152,14 +152,14 @@ class Shadow(ABC):
 
     @abstractmethod
     def found(self, s: ShadowState, steps: Steps) -> Found:
-        """Return what the shadow has found about some steps."""
+        """Return the discretisation error of some steps."""
 
     def read(self, s: ShadowState, span: Span) -> ShadowState:
-        """Return what is known after one more interval was read, before any shadow is taken."""
+        """Return the state after one more interval was read, before any shadow is taken."""
         return s
 
     def seen(self, s: ShadowState) -> Array | None:
-        """Return what sensors see of an error beside that in `ShadowState.u`; None if nothing."""
+        """Return the error in the readings beside that of `ShadowState.u`; None if zero."""
         return None
 
     def beside(self, s: ShadowState) -> Array | None:
@@ -235,7 +235,7 @@ class InputShadow(Shadow):
         return changed(s, slope=nothing, bend=nothing, missed=nothing)
 
     def read(self, s: ShadowState, span: Span) -> ShadowState:
-        """Return what straight lines, and values held in a gap, have missed by now."""
+        """Return the error of inputs by straight lines, and by values held in a gap."""
         length, slope = span.t1 - span.t0, span.inputs1 - span.inputs0
         if len(length) < len(s):  # the members of a bank have their samples in common
             length = np.repeat(length, len(s))
@@ -300,7 +300,7 @@ class HeldInputShadow(InputShadow):
         return changed(s, held=np.full((1, 4, channels), np.nan))
 
     def read(self, s: ShadowState, span: Span) -> ShadowState:
-        """Return what held values have missed of straight lines by now."""
+        """Return the difference of held inputs to straight lines."""
         last, before, changes, differences = s.held.transpose(1, 0, 2)
         change = np.where(np.isfinite(last), span.inputs1 - last, 0.0)
         changes = np.nan_to_num(changes) + change**2
@@ -548,15 +548,14 @@ class ShadowSet:
         seen, t
             By how much predictions were off, as `seen` says, and the time.
         """
-        s = x.shadows
+        s, left, weights = x.shadows, made.left.transpose(0, 2, 1), weights[:, None]
         if s.gains.size:
-            s = _recalled(s, x, new, made, weights, t)
-        used = (weights > 0.0)[:, None]
-        half = (np.where(used, seen, 0.0) * weights[:, None]) @ made.left.transpose(0, 2, 1)
+            s = _recalled(s, x, new, weights.transpose(0, 2, 1) * left, t)
+        half = (np.where(weights > 0.0, seen, 0.0) * weights) @ left
         return changed(s, u=s.u - half @ new.U, a=s.a - half @ new.C)
 
     def shifts(self, x: FilterState) -> tuple[Array, Array]:
-        """Return what the state and the reduced unknowns are off by, (members, rows, n or k)."""
+        """Return the shifts of state and reduced unknowns, (members, rows, n or k)."""
         s, u = x.shadows, x.shadows.u.copy()
         for row, shadow in enumerate(self.shadows):
             more = shadow.beside(s)
@@ -613,16 +612,21 @@ class ShadowSet:
 
 
 def _recalled(
-    s: ShadowState, x: FilterState, new: FilterState, made: Update, weights: Array, t: float
+    s: ShadowState, x: FilterState, new: FilterState, gain: Array, t: float
 ) -> ShadowState:
-    """Return members with the gain of one more sample, which makes those before count less."""
+    """Return members with the gain of one more sample, which makes those before count less.
+
+    Parameters
+    ----------
+    gain
+        Of the rows of the new square root, shape (members, sensors, r).
+    """
     since = (t - s.begun)[:, None, None]
     if not since.any():
         return s
-    gain = (weights[:, None] * made.left).transpose(0, 2, 1) @ new.C
     before, after = ((C * C).sum(axis=1, keepdims=True) for C in (x.C, new.C))
     left = np.divide(after, before, out=np.zeros_like(after), where=before > 0.0)
-    return changed(s, gains=left * s.gains + since * gain)
+    return changed(s, gains=left * s.gains + since * (gain @ new.C))
 
 
 def _watched(

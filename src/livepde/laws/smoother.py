@@ -29,11 +29,12 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.laws.assimilation import assimilate_at_once
 from livepde.laws.base import FixedInterval
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, without_ledger
 from livepde.laws.gauss_newton import Window, placed
-from livepde.laws.iterated_smoother import expecting, missed, moved, without_shadows
+from livepde.laws.iterated_smoother import expecting, missed, moved
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import KeptFactors
 
@@ -55,7 +56,7 @@ class _Point:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pass:
+class _SmootherPass:
     """The samples, filtered about a trajectory of reduced unknowns, shape (1 + intervals, k).
 
     `misfit` is minus twice the logarithm of the trajectory's probability, up to a constant.
@@ -79,7 +80,7 @@ def smoothed(
         The member before the first sample, and its filter after the last one in the run: its noise
         level and the statistics of its innovations are those of all samples.
     """
-    work, before = without_shadows(work, before)
+    work, before = _bare(work, before)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # not finite: not used
         best = _descended(_FixedInterval(work, before, after, data))
     return _backward(best, after)
@@ -92,7 +93,7 @@ def evidence(
 
     Minus infinity where they cannot be followed. Parameters as for `smoothed`.
     """
-    work, before = without_shadows(work, before)
+    work, before = _bare(work, before)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         samples = _FixedInterval(work, before, after, data)
         samples.work = replace(work, options=replace(work.options, adaptive=True))
@@ -100,9 +101,19 @@ def evidence(
     return float(found.points[-1].x.evidence[0]) if found is not None else -np.inf
 
 
-def _descended(samples: _FixedInterval) -> _Pass:
+def _bare(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityWork, SensitivityState]:
+    """Return a filter that follows no discretisation error and keeps no ledger, and one member."""
+    none = ShadowState.none(len(state), state.now.u.shape[1], state.now.C.shape[2])
+    start, now = (changed(without_ledger(x), shadows=none) for x in (state.start, state.now))
+    filter_ = replace(work.filter, shadows=None, judge=None)
+    return replace(work, filter=filter_), changed(state, start=start, now=now)
+
+
+def _descended(samples: _FixedInterval) -> _SmootherPass:
     """Return the pass about a most probable trajectory."""
-    best = samples.about(samples.estimated) or samples.relinearised()
+    best = samples.about(samples.estimated) or samples.about(None)
     if best is None:
         raise LawError(
             "smoothed: the samples cannot be followed about any trajectory of the unknowns; take a "
@@ -126,7 +137,7 @@ def _descended(samples: _FixedInterval) -> _Pass:
     return best
 
 
-def _backward(best: _Pass, after: FilterState) -> Iterator[FilterState]:
+def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
     """Iterate backward over the filters given all samples.
 
     Innovations are those of the run, and so is by how much discretisation has shifted the unknowns
@@ -191,15 +202,8 @@ class _FixedInterval:
             a[number] = np.where(self._gained(none, number, h) > 0.0, a[number], back)
         return a
 
-    def about(self, trajectory: Array) -> _Pass | None:
-        """Filter the samples, linear about a trajectory; None if that fails."""
-        return self._run(trajectory)
-
-    def relinearised(self) -> _Pass | None:
-        """Filter the samples, linear about each estimate; None if that fails."""
-        return self._run(None)
-
-    def _run(self, trajectory: Array | None) -> _Pass | None:
+    def about(self, trajectory: Array | None) -> _SmootherPass | None:
+        """Filter the samples, linear about a trajectory or each estimate; None if that fails."""
         x, misfit = self._started(trajectory)
         rows = x.C.shape[1]
         nothing = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))  # lies before
@@ -225,7 +229,7 @@ class _FixedInterval:
             misfit += moved(filter_, followed[-2], followed[-1], h, gained) if self.moves else 0.0
         if trajectory is None or not np.isfinite(misfit):
             misfit = np.inf  # of what follows no single trajectory
-        return _Pass(np.array(followed), points, misfit)
+        return _SmootherPass(np.array(followed), points, misfit)
 
     def _started(self, trajectory: Array | None) -> tuple[FilterState, float]:
         """Return the filter after a sample at the start, and the misfit of both."""

@@ -1,4 +1,4 @@
-"""How `GradientLaw(gain="auto")` smooths noisy samples of a function, with no level given.
+"""Smoothing of noisy samples for `GradientLaw(gain="auto")`, with no noise level given.
 
 The law differentiates what the sensors say: noise of w and noise of B(w) are correlated, and what
 smoothing takes from B(w) moves with w. Neither averages out, and both look like a wrong q. So alpha
@@ -39,7 +39,7 @@ from livepde.linalg import Array
 from livepde.observation import Observed, Split, Tikhonov
 from livepde.observation.reconstruction import Spectral, penalty_matrix
 
-__all__ = ["Balance", "NoiseDetector", "Smoother", "smooths"]
+__all__ = ["Balance", "NoiseDetector", "SmoothingOperator", "smooths"]
 
 ORDER = 4  # of the iterated Tikhonov method
 GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
@@ -147,7 +147,7 @@ class NoiseDetector:
         return balance, self.small or balance.turned > 0.0
 
 
-class Smoother:
+class SmoothingOperator:
     """G_alpha for one set of present sensors, and what a sample adds to the balance."""
 
     def __init__(self, observed: Observed, present: Array) -> None:

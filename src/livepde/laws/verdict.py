@@ -84,7 +84,7 @@ def _unseen() -> Finding:
 def _position(filter_: Filter, x: FilterState) -> Position:
     """Return where the estimates of one member stand."""
     problem, reduction = filter_.problem, filter_.reduction
-    space, latent = problem.model.parameter_space, problem.model.latent
+    latent = problem.model.latent
     _, C = reported_factors(filter_, x)
     std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
     std = np.where(std > 0.0, std, np.inf)
@@ -93,7 +93,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     found: dict[str, Array] = {}
     for name, item in latent.parts.items():
         rows = moved[item.part.start : item.part.start + item.size]
-        labels = [label for label in space.labels if label.split("[")[0] == name]
+        labels = item.block.labels(name)
         if len(labels) == len(rows):
             found |= {label: row.reshape(shape) for label, row in zip(labels, rows, strict=True)}
         else:

@@ -382,9 +382,9 @@ class Observed:
 def numbers(parameter: FunctionSpace, q: Array) -> Any:
     """Return the parameter in the form of sensor functions: numbers, arrays, mappings by name."""
     seen: dict[str, Any] = {}
-    for name in parameter.blocks:
+    for name in parameter.names:
         part = q[parameter.part(name)]
-        unknown = parameter.unknowns[name]
+        unknown = parameter.unknowns.get(name)
         if isinstance(unknown, Scalars):
             seen[name] = dict(zip(unknown.names, part, strict=True))
         else:

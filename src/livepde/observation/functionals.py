@@ -133,5 +133,5 @@ def _quadrature(field: Field) -> int:
 
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
     """Return state or parameter in the form of weak-form arguments."""
-    jets = {name: getattr(uq, prefix + name) for name in space.unknowns}
+    jets = {name: getattr(uq, prefix + name) for name in space.names}
     return next(iter(jets.values())) if space.single else Named(**jets)

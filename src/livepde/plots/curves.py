@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde.errors import ConfigurationError
-from livepde.plots.dataset import NORMAL_95, interval_95, labelled, time_scale
+from livepde.plots.dataset import NORMAL_95, interval_95, labelled, time_scale, time_text
 from livepde.plots.style import GREY, PALETTE, empty, finish, panel, shades_of
 
 if TYPE_CHECKING:
@@ -79,7 +79,6 @@ def profiles(
         raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
     ax = panel(ax)
     chosen = _snapshots(data, times)
-    factor, unit = time_scale(data)
     x = data["x"].values
     if observed is not None:
         ax.axvspan(*observed, color=GREY, alpha=0.12, linewidth=0, label="observed")
@@ -87,7 +86,7 @@ def profiles(
     shades = shades_of(len(chosen))
     for order, (k, colour) in enumerate(zip(chosen, shades, strict=True)):
         values = data[name].values[k]
-        label = f"t = {data['snapshot'].values[k] / factor:.4g} {unit}".rstrip()
+        label = time_text(data, data["snapshot"].values[k])
         style = {"marker": MARKERS[order % len(MARKERS)], "markersize": 3.5} if markers else {}
         if truth is not None and truth.ndim == 2:
             ax.plot(x, truth[order], color=colour, linewidth=1.0, label="_exact")

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from livepde.dates import instants, when
 from livepde.linalg import Array
 from livepde.records import NOTE
 
@@ -21,7 +23,10 @@ __all__ = [
     "note",
     "scalars",
     "scored_from",
+    "time_label",
     "time_scale",
+    "time_text",
+    "time_values",
 ]
 
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
@@ -87,6 +92,29 @@ def time_scale(data: xr.Dataset) -> tuple[float, str]:
             if span >= least:
                 return factor, name
     return 1.0, unit
+
+
+def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
+    """Return times as a time axis has them: dates if the run has them, else as `time_scale`."""
+    dates = instants(data, times)
+    if dates is None:
+        scaled: Array = np.asarray(times, dtype=float) / time_scale(data)[0]
+        return scaled
+    values: Array = dates.tz_localize(None).to_numpy()
+    return values
+
+
+def time_label(data: xr.Dataset) -> str:
+    """Return the label of a time axis; empty for dates, which say what they are."""
+    return "" if instants(data, []) is not None else labelled("t", time_scale(data)[1])
+
+
+def time_text(data: xr.Dataset, t: float) -> str:
+    """Return one time as text: a date, or a number with its unit."""
+    if instants(data, []) is not None:
+        return when(data, t)
+    factor, unit = time_scale(data)
+    return f"t = {t / factor:.4g} {unit}".rstrip()
 
 
 def scored_from(data: xr.Dataset) -> int:

@@ -18,9 +18,10 @@ from livepde.plots.dataset import (
     labelled,
     note,
     scored_from,
-    time_scale,
+    time_text,
+    time_values,
 )
-from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish
+from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, time_axis
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["overview"]
+
+WIDE = 30.0  # ratio of largest to smallest value from which an axis is logarithmic
+SLENDER = 6.0  # length over width from which a map has an axis of its own for each
 
 
 def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int = 5) -> Figure:
@@ -76,8 +80,7 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
 
 def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
     """Draw one unknown over time with its 95 % band; all its regions in one panel."""
-    factor, clock = time_scale(data)
-    t = data["time"].values / factor
+    t = time_values(data, data["time"].values)
     unit = str(data[labels[0]].attrs.get("units", ""))
     # The wide band of the prior would determine the scale and hide all later values.
     late = slice(max(len(t) // 10, scored_from(data) + len(t) // 20), None)
@@ -98,12 +101,16 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
             reach += [low[late], high[late]]
     finite = np.concatenate(reach)
     finite = finite[np.isfinite(finite)]
-    if len(finite) and finite.max() > finite.min():
+    if len(finite) and finite.min() > 0.0 and finite.max() > WIDE * finite.min():
+        ax.set_yscale("log")
+        margin = (finite.max() / finite.min()) ** 0.06
+        ax.set_ylim(finite.min() / margin, finite.max() * margin)
+    elif len(finite) and finite.max() > finite.min():
         margin = 0.06 * (finite.max() - finite.min())
         ax.set_ylim(finite.min() - margin, finite.max() + margin)
     _mark_failures(data, ax)
     _mark_jumps(data, ax)
-    ax.set_xlabel(labelled("t", clock))
+    time_axis(ax, data)
     ax.set_ylabel(labelled(name, unit))
     ax.set_title(f"{name}: estimate and 95 % band" if len(reach) > len(labels) else name)
     return finish(ax)
@@ -111,7 +118,7 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
 
 def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
     """Mark samples with a failed step."""
-    failed = data["time"].values[data["status"].values != 0] / time_scale(data)[0]
+    failed = time_values(data, data["time"].values[data["status"].values != 0])
     if len(failed):
         ax.plot(
             failed,
@@ -128,9 +135,10 @@ def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
     alarms = note(data, "jump")
     if alarms is None:
         return
-    times = data["time"].values[alarms > 0.0] / time_scale(data)[0]
-    for k, t in enumerate(times):
-        label = f"jump at {t:.4g}" if len(times) == 1 else f"{len(times)} jumps"
+    times = data["time"].values[alarms > 0.0]
+    for k, t in enumerate(time_values(data, times)):
+        text = time_text(data, times[k]).removeprefix("t = ")
+        label = f"jump at {text}" if len(times) == 1 else f"{len(times)} jumps"
         if k:
             label = "_jump"
         ax.axvline(t, label=label, color=PALETTE[1], linestyle="--", linewidth=1.0)
@@ -160,7 +168,6 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
         triangles = Triangulation(x, y, data["triangle"].values)
     else:
         triangles = Triangulation(x, y)
-    factor, unit = time_scale(data)
     spread = name.endswith("_std")
     drawn = ax.tripcolor(
         triangles,
@@ -170,25 +177,25 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     )
     what = labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
     ax.figure.colorbar(drawn, ax=ax, label=f"standard deviation of {what}" if spread else what)
-    when = f"t = {data['snapshot'].values[-1] / factor:.4g} {unit}".rstrip()
-    whose = f"{'deviation of ' if spread else ''}{name.removesuffix('_std')}"
+    when = time_text(data, data["snapshot"].values[-1])
+    whose = f"{'standard deviation of ' if spread else ''}{name.removesuffix('_std')}"
     ax.set_title(f"{whose} at {when}")
-    ax.set_aspect("equal")
+    width, height = np.ptp(x), np.ptp(y)
+    ax.set_aspect("equal" if max(width, height) < SLENDER * min(width, height) else "auto")
     ax.margins(0.0)
-    ax.set_xlabel("x")
-    ax.set_ylabel("y")
+    for axis, label in (("x", ax.set_xlabel), ("y", ax.set_ylabel)):
+        label(labelled(axis, str(data[axis].attrs.get("units", ""))))
     return ax
 
 
 def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
     """Draw smallest, median and largest value of a field in space over time."""
-    factor, unit = time_scale(data)
-    t, values = data["snapshot"].values / factor, data[name].values
+    t, values = time_values(data, data["snapshot"].values), data[name].values
     ax.fill_between(
         t, values.min(axis=1), values.max(axis=1), color=PALETTE[0], alpha=0.2, label="range"
     )
     ax.plot(t, np.median(values, axis=1), color=PALETTE[0], label="median")
-    ax.set_xlabel(labelled("t", unit))
+    time_axis(ax, data)
     ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
     ax.set_title(f"{name} in space")
     return finish(ax)
@@ -196,8 +203,7 @@ def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 
 def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, ax: Axes) -> Axes:
     """Draw measured minus predicted values of each channel, with the root mean square error."""
-    factor, clock = time_scale(data)
-    t = data["time"].values / factor
+    t = time_values(data, data["time"].values)
     errors = data[variable].transpose("time", dimension).values
     names = [str(name) for name in data[dimension].values]
     first = scored_from(data)
@@ -229,7 +235,7 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         ax.plot(
             t, root, color=PALETTE[0], label=f"root mean square; RMSE {_rms(errors[first:]):.3g}"
         )
-    ax.set_xlabel(labelled("t", clock))
+    time_axis(ax, data)
     ax.set_ylabel(labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
     ax.set_title(what)
     return finish(ax)

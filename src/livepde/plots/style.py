@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.errors import ConfigurationError
+from livepde.plots.dataset import time_label
 
 if TYPE_CHECKING:
+    import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -21,6 +23,7 @@ __all__ = [
     "finish",
     "panel",
     "shades_of",
+    "time_axis",
 ]
 
 # Palette of Okabe and Ito (2008), distinguishable with all common kinds of colour blindness. Yellow
@@ -68,6 +71,19 @@ def empty(rows: int, columns: int, title: str) -> Figure:
 def panel(ax: Axes | None) -> Axes:
     """Return the given axes, or the axes of a new figure."""
     return figure()[1][0] if ax is None else ax
+
+
+def time_axis(ax: Axes, data: xr.Dataset) -> None:
+    """Label the time axis of a panel whose times are those of `time_values`."""
+    label = time_label(data)
+    ax.set_xlabel(label)
+    if not label:
+        import matplotlib.dates
+
+        dates: Any = matplotlib.dates  # has no types
+        locator = dates.AutoDateLocator(maxticks=7)
+        ax.xaxis.set_major_locator(locator)
+        ax.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
 
 
 def finish(ax: Axes, *, legend: bool = True, outside: bool = False) -> Axes:

@@ -42,7 +42,7 @@ from livepde.reproduce.reference_settings import FULL, PAPER, SETTINGS, TWIN
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.stepping import Advance, Newton
 
-__all__ = ["EXACT", "Agreement", "LawRun", "Samples", "compare", "follow", "growth", "law"]
+__all__ = ["EXACT", "Agreement", "LawRun", "ReferenceSamples", "compare", "follow", "growth", "law"]
 
 
 class Loaded(Model):
@@ -70,7 +70,7 @@ class Loaded(Model):
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class ReferenceSamples:
     """Data of a setting from the reference; array rows are free and fixed coefficients.
 
     Attributes
@@ -95,7 +95,7 @@ class Samples:
     loads: Array
 
     @classmethod
-    def of(cls, setting: Setting) -> Samples:
+    def of(cls, setting: Setting) -> ReferenceSamples:
         """Return the data of a setting."""
         at = Discretisation(setting)
         times = setting.h * np.arange(setting.steps + 1.0)
@@ -182,7 +182,7 @@ def law(setting: Setting, newton: Newton) -> GradientLaw:
     )
 
 
-def follow(samples: Samples, law: GradientLaw, halvings: int = 0) -> LawRun:
+def follow(samples: ReferenceSamples, law: GradientLaw, halvings: int = 0) -> LawRun:
     """Run a law on the samples of a setting, from q0 and the true initial state."""
     model, observation = samples.build()
     q0 = samples.at.Q.extend(samples.at.Q.interpolate(samples.at.setting.q0))
@@ -214,7 +214,7 @@ class Agreement:
         The largest relative residual of a strict run in the equations of the reference.
     """
 
-    samples: Samples
+    samples: ReferenceSamples
     strict: LawRun
     default: LawRun
     of_strict: tuple[float, float]
@@ -241,7 +241,7 @@ class Agreement:
 def compare(setting: Setting) -> Agreement:
     """Run the reference and the law on the same data."""
     setting = replace(setting, cut=False)
-    samples, found = Samples.of(setting), reference.run(setting)
+    samples, found = ReferenceSamples.of(setting), reference.run(setting)
     strict = follow(samples, law(setting, paper.STRICT))
     default = follow(samples, law(setting, Newton()))
     left = reference.residuals(samples.at, strict.Q, strict.U, found.Z, found.F)
@@ -261,7 +261,7 @@ def _largest(*values: Array) -> float:
     return max(float(np.abs(part).max()) for part in values)
 
 
-def errors(samples: Samples, course: LawRun) -> tuple[float, float]:
+def errors(samples: ReferenceSamples, course: LawRun) -> tuple[float, float]:
     """Return the relative L2 errors of q and u at the end."""
     at = samples.at
     pairs = (
@@ -355,7 +355,7 @@ class OnMesh:
         """Return all results on one mesh."""
         mesh = fitted(nodes, PAPER.omega) if kind == FITTED else np.linspace(0, 1, nodes)
         setting = replace(PAPER, nodes=mesh, cut=False)
-        samples = Samples.of(setting)
+        samples = ReferenceSamples.of(setting)
         found = {}
         for nu in NU:
             course = follow(samples, law(replace(setting, nu=nu), paper.STRICT))
@@ -419,7 +419,7 @@ def mesh_checks(meshes: Sequence[OnMesh]) -> list[Check]:
 # --- energy --------------------------------------------------------------------------------------
 
 
-def growth(samples: Samples, course: LawRun) -> float:
+def growth(samples: ReferenceSamples, course: LawRun) -> float:
     """Return the largest growth of the energy in a step, relative to the energy at the start."""
     at = samples.at
     e = (course.Q - samples.q_true)[:, at.Q.free]
@@ -431,7 +431,7 @@ def growth(samples: Samples, course: LawRun) -> float:
     return max(0.0, float(np.diff(energy).max() / energy[0]))
 
 
-def rules(samples: Samples) -> dict[str, Damping]:
+def rules(samples: ReferenceSamples) -> dict[str, Damping]:
     """Return damping rules of every kind, with bounds from the constants of the model."""
     model, observation = samples.build()
     observed = observation.bind(model.state_space, model.X, model.parameter_space)
@@ -451,7 +451,7 @@ def energies(progress: bool = False) -> list[tuple[str, str, float, float]]:
     """Return (setting, rule, growth with strict solves, growth with default solves)."""
     found = []
     for name, setting in ENERGIES.items():
-        samples = Samples.of(setting)
+        samples = ReferenceSamples.of(setting)
         items = rules(samples).items()
         for what, rule in watched(items, len(items), f"energy, {name}") if progress else items:
             strict = replace(law(setting, paper.STRICT), damping=rule)

@@ -306,7 +306,8 @@ REACHED = 0.10
 WORSE = 2.0
 NOTES = [
     "Noise: Gaussian and white in L2, independent from sample to sample, of a size relative to the "
-    "L2 norm of each sample. nodal: every coefficient by itself, slopes with 1/h of the deviation.",
+    "L2 norm of each sample. nodal: every coefficient by itself, slopes with 1/h of the standard "
+    "deviation.",
     "Gain, c1, window and tau were fixed before these seeds were drawn, but found on this twin "
     "with other seeds: not tuned to this noise, yet not blind to the truth.",
     "sup |d~| is the noise part of the rate of the smoothed data's error in L2: times "

@@ -141,8 +141,8 @@ def _words(truth: str) -> str:
         return (
             f"The data are exact; the sensitivity law is told a noise level of {NOISE_LEVEL:g} "
             "(the state is of size 1), since a filter needs one; the smaller it is, the smaller "
-            "the error. The first sample moves q by several prior deviations and is iterated by "
-            "the law's guards."
+            "the error. The first sample moves q by several prior standard deviations and is "
+            "iterated by the law's guards."
         )
     return (
         "Data and estimator do not share the scheme here, so the truncation error of h = 0.05 "

@@ -22,7 +22,7 @@ BESIDE = {  # end of a name -> what such a variable says of the one without it
     "_std": "standard deviation of {}",
     "_low": "lower end of the 95 % interval of {}",
     "_high": "upper end of the 95 % interval of {}",
-    "_left": "share of the prior deviation of {} that is left",
+    "_left": "share of the prior standard deviation of {} that is left",
     "_modes": "number of modes of {} that the data have told of",
     "_left_out": "share of modes that the law leaves out in the variance of {}",
 }

@@ -180,7 +180,7 @@ def sound(path: Path) -> Iterator[None]:
 
 
 def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
-    """Return what failed, and what to do, in words."""
+    """Return a sentence on a failure, with its remedy."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     if code & 0xFF in CORRUPT:
         return damaged(path, str(error))
@@ -194,7 +194,7 @@ def remedy_of(error: Exception) -> str:
 
 
 def damaged(path: Path, why: str) -> str:
-    """Return what is wrong with a damaged journal, and what to do, in words."""
+    """Return a sentence on a damaged journal, with its remedy."""
     return f"{path} is damaged ({why}): {SALVAGE}."
 
 

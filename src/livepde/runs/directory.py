@@ -6,7 +6,7 @@
     RUN/case.toml         a copy of the case
     RUN/journal.sqlite    samples and estimates while they come: what survives a kill
     RUN/estimates.nc      the dataset (netCDF 3: any netCDF reader opens it)
-    RUN/checkpoint.npz    the identifier's state
+    RUN/checkpoint.bin    the identifier's state
     RUN/report.md         tables
     RUN/*.png             figures
 """
@@ -20,6 +20,7 @@ import json
 import math
 import os
 import re
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cached_property
@@ -52,7 +53,7 @@ __all__ = [
 FORMAT = 1
 RUNS = "runs"  # where the command line puts them
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
-CHECKPOINT, REPORT = "checkpoint.npz", "report.md"
+CHECKPOINT, REPORT = "checkpoint.bin", "report.md"
 JOURNAL = "journal.sqlite"
 LONGEST = 10_000_000  # bytes of a record
 MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
@@ -295,8 +296,17 @@ class Run:
         import xarray as xr
 
         try:
-            return xr.load_dataset(path, engine="scipy", mmap=False)
-        except (OSError, ValueError, TypeError, LookupError, MemoryError) as error:
+            # What is written here decodes in silence: a warning tells of bytes that changed.
+            with warnings.catch_warnings(action="error", category=xr.SerializationWarning):
+                return xr.load_dataset(path, engine="scipy", mmap=False)
+        except (
+            OSError,
+            ValueError,
+            TypeError,
+            LookupError,
+            MemoryError,
+            xr.SerializationWarning,
+        ) as error:
             raise RunError(f"{path} is damaged: {error}.") from error
 
     def salvage(self) -> list[str]:
@@ -479,7 +489,7 @@ def _markdown_table(table: Table) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold: NaN and infinity become null, NumPy numbers plain ones."""
+    """Return a value for JSON: NaN and infinity become null, NumPy numbers plain ones."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -13,7 +13,7 @@ from types import FrameType
 from livepde.errors import DataError
 from livepde.identifier import Identifier, Sample
 from livepde.result import Result, layout_of
-from livepde.runs.feeds import Samples
+from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live import Live
 
@@ -117,7 +117,7 @@ def drive(
 
     if journal is None:
         journal = journal_of(identifier)
-    feed = Samples(
+    feed = SampleFeed(
         watched(stream, total) if progress else stream, identifier.observed.names, journal.last
     )
     live = Live(

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from livepde.dates import instants
 from livepde.errors import ConfigurationError, RunError
 from livepde.records import STATUS_CODES
 from livepde.runs.conventions import (
@@ -27,7 +28,6 @@ from livepde.runs.conventions import (
     oriented,
     udunits,
 )
-from livepde.runs.dates import instants
 from livepde.runs.directory import Run, write_dataset
 
 __all__ = ["AT_ONE_TIME", "FORMATS", "NEEDS", "cf", "export", "into_place", "need", "refuse_file"]

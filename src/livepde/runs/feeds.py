@@ -1,4 +1,4 @@
-"""How samples come to a run: put in order, or as they are, or at the pace of their times."""
+"""Feeds of samples into a run: put in order, as they are, or at the pace of their times."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 
 from livepde.identifier import Sample
 from livepde.samples import by_name
-from livepde.streams.intake import Intake, Outcome, Ready, Remark, gather
+from livepde.streams.intake import Intake, IntakeOutcome, Ready, Remark, gather
 from livepde.streams.sources import Row, Source
 
-__all__ = ["Feed", "Gathered", "Paced", "Samples", "shifted"]
+__all__ = ["Feed", "Gathered", "Paced", "SampleFeed", "shifted"]
 
 SHIFTED = "shifted by "  # how a position begins where the clock was set back
 
@@ -42,7 +42,7 @@ class Feed(Protocol):
         """Return whether anything has come since this was asked last, be it of no use."""
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Return what has been worth counting since this was asked last.
+        """Return the counts of remarks since the last call.
 
         Only of what would not be read again from `position(waiting)`: so nothing is counted twice
         after a crash.
@@ -97,12 +97,14 @@ class Gathered:
             found += self._used(self.intake.flush())
         return found
 
-    def _outcome(self, row: Row, token: Any) -> Outcome:
+    def _outcome(self, row: Row, token: Any) -> IntakeOutcome:
         if row.broken:
-            return Outcome(remarks=[Remark("malformed", "", row.broken, row=token)], spent=[token])
+            return IntakeOutcome(
+                remarks=[Remark("malformed", "", row.broken, row=token)], spent=[token]
+            )
         return self.intake.take(row.values, token)
 
-    def _used(self, outcome: Outcome) -> list[Ready]:
+    def _used(self, outcome: IntakeOutcome) -> list[Ready]:
         self._remarks += outcome.remarks
         self.source.acknowledge(_given(outcome.spent))
         return outcome.ready
@@ -117,7 +119,7 @@ class Gathered:
         return heard
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Return what was refused, missing or out of order, each kind and channel once."""
+        """Return remarks on values refused, missing or out of order, each kind and channel once."""
         if not self._remarks:
             return ()
         first = min((number for number, _ in self._waiting(waiting)), default=math.inf)
@@ -160,11 +162,11 @@ class Gathered:
 
 
 def _given(tokens: Iterable[Any]) -> list[Any]:
-    """Return what the source gave, without the numbers of rows."""
+    """Return the rows of the source, without their numbers."""
     return [token for _, token in tokens]
 
 
-class Samples:
+class SampleFeed:
     """Samples that are in order already: a table, or any iterable that raises `DataError`.
 
     Parameters
@@ -278,7 +280,7 @@ class Paced:
         return self.feed.heard() or bool(self._held)
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Return what was worth counting."""
+        """Return the counts of remarks."""
         return self.feed.remarks([*waiting, *self._held])
 
     def position(self, waiting: Sequence[Ready]) -> str:

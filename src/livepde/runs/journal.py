@@ -443,7 +443,7 @@ class Journal:
     # --- reading -------------------------------------------------------------------------------
 
     def _meta(self) -> dict[str, str]:
-        """Return what the journal says about itself, if it is one."""
+        """Return the header of the journal, if it is one."""
         found = self._read("SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL")
         if {str(sql) for (sql,) in found} == set(SCHEMA):
             meta = dict(self._sound("meta", self._read("SELECT * FROM meta")))
@@ -626,7 +626,7 @@ class Journal:
             yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:
-        """Return what is kept of a sample by name: all channels, and the noise that is there."""
+        """Return the values of a sample by name: all channels, and the noise where given."""
         values = dict(zip(self.channels, row, strict=False))
         noise = zip(self.noise, row[len(self.channels) :], strict=False)
         return values | {name: std for name, std in noise if not math.isnan(std)}

@@ -1,4 +1,4 @@
-"""What an experiment, a benchmark or a run hands back: tables, checks, figures."""
+"""Outcome of an experiment, a benchmark or a run: tables, checks, figures."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Check:
         return self.value <= self.bound if self.sense == "<=" else self.value >= self.bound
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `--json` prints: name, value, bound, sense, ok."""
+        """Return the JSON object: name, value, bound, sense, ok."""
         bound = list(self.bound) if isinstance(self.bound, tuple) else self.bound
         return {
             "name": self.name,
@@ -88,7 +88,7 @@ class Table:
     rows: Sequence[Sequence[Any]]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the JSON object."""
         return {
             "title": self.title,
             "columns": list(self.columns),
@@ -122,7 +122,7 @@ class Outcome:
         return all(check.ok for check in self.checks)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `--json` prints: checks, tables, notes."""
+        """Return the JSON object: checks, tables, notes."""
         return {
             "checks": [check.to_dict() for check in self.checks],
             "tables": [table.to_dict() for table in self.tables],

@@ -1,4 +1,4 @@
-"""What a journal keeps of fields, as bytes, and how its layout is read, as text."""
+"""Encoding of the fields of a journal as bytes, and of its layout as text."""
 
 from __future__ import annotations
 

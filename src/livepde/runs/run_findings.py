@@ -1,4 +1,4 @@
-"""What the dataset and the journal of a run say against its estimates, as findings."""
+"""Findings from the dataset and the journal of a run, beside those of the law."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from livepde.dates import when
 from livepde.plots.dataset import note, scalars
-from livepde.runs.dates import when
 from livepde.runs.summary import digits, jumps
 from livepde.verdict import FLAT, REFINE, Finding, Severity, at_bound, discretised, flat
 
@@ -39,7 +39,7 @@ INPUT_KINDS = {
 
 
 def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
-    """Return what the dataset of a run says against its estimates.
+    """Return the findings from the dataset of a run.
 
     An unknown ends at a bound, or keeps more than 0.9 of its prior standard deviation: the data did
     not tell. The gate has refused more than 2 % of the readings. The last replay ended more than
@@ -165,8 +165,8 @@ def _held(data: xr.Dataset) -> list[str]:
     last = when(data, float(data["time"][at[-1]]))
     return [
         f"In {len(at)} samples, last at {last}, the data asked for unknowns farther from the prior "
-        "than its deviations allow (within, by default 10 of them), and they were held there: the "
-        "prior is much too narrow, or a unit, a sensor or the model is wrong."
+        "than its standard deviation allows (within, by default 10 of them), and they were held "
+        "there: the prior is much too narrow, or a unit, a sensor or the model is wrong."
     ]
 
 
@@ -326,7 +326,7 @@ def _discretised(data: xr.Dataset) -> list[Finding]:
 
 
 def _gain(data: xr.Dataset) -> list[str]:
-    """Return what there is to say of a law with a fixed gain, which has no covariance."""
+    """Return the findings on a law with a fixed gain, which has no covariance."""
     if note(data, "residual") is None or note(data, "gain") is not None:
         return []
     names = [*scalars(data), *str(data.attrs.get("fields", "")).split()]

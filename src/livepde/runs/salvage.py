@@ -1,4 +1,4 @@
-"""What is whole in a damaged journal."""
+"""Salvage of the whole records of a damaged journal."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Salvage(Journal):
             return None
 
     def sentences(self) -> list[str]:
-        """Return what is not whole, in words; known once all has been read."""
+        """Return sentences on the damaged parts; known once all has been read."""
         kept = self._last - len(self.lost)
         if not self.lost:
             return [f"All {kept} estimates are whole."]

@@ -1,4 +1,4 @@
-"""Where estimates go beside the journal."""
+"""Destinations of estimates beside the journal."""
 
 from __future__ import annotations
 

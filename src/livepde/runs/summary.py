@@ -1,17 +1,17 @@
-"""What a run's dataset says in numbers: estimates, errors of each channel, checks."""
+"""Summary of a run: estimates, errors of each channel, checks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from livepde.diagnostics.identifiability import TRADED, Known
+from livepde.dates import when
+from livepde.diagnostics.identifiability import TRADED, InformationGain
 from livepde.plots.dataset import interval_95, note, scalars
-from livepde.runs.dates import when
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
@@ -21,13 +21,15 @@ if TYPE_CHECKING:
 __all__ = [
     "ROLES",
     "TOTALS",
+    "ChannelErrors",
     "Jump",
+    "channel_errors",
     "checks_of",
     "digits",
     "jumps",
     "measures",
+    "rmse",
     "scalars",
-    "scored",
     "shown",
     "tables",
     "when",
@@ -74,8 +76,16 @@ def shown(value: float, form: str = ".3g", unit: str = "") -> str:
     return format(value, form) + unit if math.isfinite(value) else "–"
 
 
-def scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
-    """Return channel -> (role, errors) from the start of the assimilation on."""
+class ChannelErrors(NamedTuple):
+    """Errors of a channel: its role, those of all samples, and those of the second half."""
+
+    role: str
+    errors: np.ndarray[Any, Any]
+    later: np.ndarray[Any, Any]
+
+
+def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
+    """Return the errors of each channel from the start of the assimilation on."""
     start = float(data.attrs.get("assimilate_from", -math.inf))
     kept = data["time"].values >= start
     found = {}
@@ -84,26 +94,30 @@ def scored(data: xr.Dataset) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
             continue
         for k, name in enumerate(data[dimension].values):
             errors = data[variable].values[kept, k]
-            found[str(name)] = (role, errors[np.isfinite(errors)])
+            parts = (errors, errors[len(errors) // 2 :])
+            found[str(name)] = ChannelErrors(role, *(part[np.isfinite(part)] for part in parts))
     return found
 
 
-def _grouped(
-    scored: Mapping[str, tuple[str, np.ndarray[Any, Any]]],
-) -> dict[str, tuple[str, np.ndarray[Any, Any]]]:
+def _grouped(channels: Mapping[str, ChannelErrors]) -> dict[str, ChannelErrors]:
     """Return what is short enough for a table: of very many channels one row for each role."""
-    if len(scored) <= MOST_ROWS:
-        return dict(scored)
+    if len(channels) <= MOST_ROWS:
+        return dict(channels)
     roles: dict[str, list[str]] = {}
-    for name, (role, _) in scored.items():
-        roles.setdefault(role, []).append(name)
+    for name, item in channels.items():
+        roles.setdefault(item.role, []).append(name)
     return {
-        f"{names[0]} ... {names[-1]}": (role, np.concatenate([scored[name][1] for name in names]))
+        f"{names[0]} ... {names[-1]}": ChannelErrors(
+            role,
+            np.concatenate([channels[name].errors for name in names]),
+            np.concatenate([channels[name].later for name in names]),
+        )
         for role, names in roles.items()
     }
 
 
-def _rmse(errors: np.ndarray[Any, Any]) -> float:
+def rmse(errors: np.ndarray[Any, Any]) -> float:
+    """Return the root mean square, NaN of nothing."""
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else math.nan
 
 
@@ -183,15 +197,15 @@ def measures(data: xr.Dataset) -> dict[str, float]:
             if "reference" in data[label].attrs:
                 found[f"{label}.error"] = _error(data, label)
                 found[f"{label}.deviations"] = _deviations(data, label)
-    channels = scored(data)
-    parts = [errors for _, errors in channels.values()]
-    found["rmse"] = _rmse(np.concatenate(parts)) if parts else math.nan
+    channels = channel_errors(data)
+    parts = [item.errors for item in channels.values()]
+    found["rmse"] = rmse(np.concatenate(parts)) if parts else math.nan
     for role in ROLES:
-        some = [errors for kind, errors in channels.values() if kind == role]
+        some = [item.errors for item in channels.values() if item.role == role]
         if some:
-            found[f"rmse.{role}"] = _rmse(np.concatenate(some))
-    for name, (_, errors) in channels.items():
-        found[f"rmse.{name}"] = _rmse(errors)
+            found[f"rmse.{role}"] = rmse(np.concatenate(some))
+    for name, item in channels.items():
+        found[f"rmse.{name}"] = rmse(item.errors)
     ratios = note(data, "innovation_ratio")
     if ratios is not None and len(ratios):
         found["innovation_ratio"] = float(ratios[-1])
@@ -214,7 +228,8 @@ def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run.
 
     Estimates with references, errors of each channel, what the data have told, jumps, and the
-    verdict.
+    verdict. Errors of all samples have learning in them; those of the second half compare with the
+    noise.
     """
     result: list[Table] = []
     labels = scalars(data) if data.sizes["time"] else []
@@ -253,14 +268,15 @@ def tables(data: xr.Dataset) -> list[Table]:
         (
             name,
             role,
-            f"{_rmse(errors):.4g}",
+            f"{rmse(errors):.4g}",
+            shown(rmse(later), ".4g"),
             shown(float(errors.mean()) if len(errors) else math.nan, "+.3g"),
             len(errors),
             unit,
         )
-        for name, (role, errors) in _grouped(scored(data)).items()
+        for name, (role, errors, later) in _grouped(channel_errors(data)).items()
     ]
-    columns = ("channel", "role", "RMSE", "mean", "samples", "unit")
+    columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", "unit")
     result.append(Table("Measured minus predicted, one step ahead", columns, rows))
     return result + [table for table in (_told(data, labels), _jumped(data)) if table.rows]
 
@@ -280,7 +296,7 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
             continue
         value = float(data[label][-1])
         bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
-        known = Known(
+        known = InformationGain(
             label, share, bound=bounds[0] if bounds else math.nan, moves="prior_std" not in attrs
         )
         state = "moves" if known.moves and known.verdict == "partly" else known.verdict

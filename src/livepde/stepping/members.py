@@ -74,6 +74,10 @@ class KeptFactors:
         zero = np.zeros(members)
         return cls(np.zeros((members, m)), zero, zero, np.zeros((members, n)))
 
+    def forgotten(self) -> KeptFactors:
+        """Return empty warm-start data of the same members."""
+        return KeptFactors.none(len(self.h)) if self.q.shape[1] else self
+
     def member(self, k: int) -> Kept:
         """Return the warm-start data of one member."""
         if not self.h[k]:

@@ -262,7 +262,7 @@ class ForwardStage:
             system = self._system(q, h, moment)
             residual = system.matrix @ u - self._known(c, system, q, h, moment)
             return u - solved(self.factor(q, h, moment), residual * self.model.X.free)
-        equation = _Equation(self, c, self.model.latent.value(q), h, moment)
+        equation = _StageEquation(self, c, self.model.latent.value(q), h, moment)
         return self.newton.solve(equation, u).at.y
 
     def tangent(self, u: Array, q: Array, h: float, moment: Moment) -> Factor:
@@ -389,7 +389,7 @@ class _StateEvaluation:
 
 
 @dataclass(frozen=True, eq=False)
-class _Equation:
+class _StageEquation:
     """Nonlinear equation of a stage, a `StageEquation`."""
 
     stage: ForwardStage

@@ -1,4 +1,4 @@
-"""Where samples come from."""
+"""Sources of samples: files, brokers, joined tables, twin experiments."""
 
 from __future__ import annotations
 

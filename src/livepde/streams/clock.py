@@ -1,4 +1,4 @@
-"""How the times of data are read: numbers, or dates."""
+"""Conversion of the times of data: numbers, or dates."""
 
 from __future__ import annotations
 

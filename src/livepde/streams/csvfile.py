@@ -26,7 +26,7 @@ from livepde.streams.clock import (
 from livepde.streams.names import check_columns, is_data, no_file
 from livepde.streams.table import MISSING, Column, Table, cell_number, to_table
 
-__all__ = ["UTF_8", "Written", "how_written", "read_csv", "too_wide"]
+__all__ = ["UTF_8", "Written", "header_of", "how_written", "read_csv", "too_wide"]
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
 SEPARATORS = ("\t", ";", ",")  # in the order in which they are tried
@@ -130,6 +130,17 @@ def read_csv(
     return to_table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
 
 
+def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]:
+    """Return the names of the columns of a CSV file; raises `DataError`."""
+    _check_text(path)
+    try:
+        with path.open(newline="", encoding=encoding) as file:
+            rows = csv.reader(islice(file, skip, None), delimiter=separator, skipinitialspace=True)
+            return next((row for row in rows if row), [])
+    except (OSError, UnicodeError, csv.Error) as error:
+        raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
+
+
 def _check_text(path: Path) -> None:
     """Refuse a workbook, some of which can be taken for text."""
     with path.open("rb") as file:
@@ -204,7 +215,7 @@ def _places(header: Sequence[str]) -> Iterator[int]:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """Return what divides most lines: a tab or a semicolon, or else a comma."""
+    """Return the separator of most lines: a tab or a semicolon, or else a comma."""
     for mark in SEPARATORS:
         if max(multimode(line.count(mark) for line in lines if line.strip()), default=0):
             return mark

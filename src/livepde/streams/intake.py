@@ -1,4 +1,4 @@
-"""From rows as they come to samples in order: what is late, missing, doubled or broken is counted.
+"""Intake of rows into samples in order; late, missing, doubled and broken ones are counted.
 
 A source brings rows, column -> value, each with a time; one row need not hold all channels. Rows of
 one moment make one sample. A sample is ready when a row has come that is later by more than `wait`:
@@ -21,7 +21,7 @@ from livepde.streams.clock import Clock, is_naive, origin_at, since_1970
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
 from livepde.streams.table import Column, channel_value, row_time, without_noise
 
-__all__ = ["Habit", "Intake", "Outcome", "Past", "Policy", "Ready", "Remark", "gather"]
+__all__ = ["Habit", "Intake", "IntakeOutcome", "Past", "Policy", "Ready", "Remark", "gather"]
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Policy:
         return self.habit(channel).repeated or self.repeated
 
     def habit(self, channel: str) -> Habit:
-        """Return what is special about a channel."""
+        """Return the options of a channel."""
         return self.channels.get(channel, PLAIN)
 
 
@@ -161,7 +161,7 @@ class Ready:
 
 
 @dataclass
-class Outcome:
+class IntakeOutcome:
     """What has become of a row: samples that are ready, remarks, tokens that are done with.
 
     `row` is the token of the row, which remarks are about unless they say so.
@@ -282,9 +282,9 @@ class Intake:
         found = [token for sample in self._open.values() for token in sample.tokens]
         return found + [one.token for one in held]
 
-    def take(self, row: Mapping[str, Any], token: Any = None) -> Outcome:
+    def take(self, row: Mapping[str, Any], token: Any = None) -> IntakeOutcome:
         """Take a row; return what becomes of it and of those before it."""
-        found = Outcome(row=token)
+        found = IntakeOutcome(row=token)
         try:
             t = self._time(row)
         except DataError as error:
@@ -299,7 +299,7 @@ class Intake:
         self._release(found)
         return found
 
-    def _judged(self, held: _Held, found: Outcome) -> bool:
+    def _judged(self, held: _Held, found: IntakeOutcome) -> bool:
         """Return whether a row is used or waits; a leap and what is too late wait for others."""
         if self._leaps(held.t):
             self._doubt(held, found)
@@ -320,7 +320,7 @@ class Intake:
         """A hundred times the longest step but one; infinite if too few are known."""
         return LONG * sorted(self._steps)[-2] if len(self._steps) == STEPS else math.inf
 
-    def _doubt(self, held: _Held, found: Outcome) -> None:
+    def _doubt(self, held: _Held, found: IntakeOutcome) -> None:
         """Take a row that is too far ahead if the one before said so, too; else let it wait."""
         self._give_up(found)
         before = self._doubted
@@ -334,7 +334,7 @@ class Intake:
             self._refuse_leap(found)
         self._doubted = held
 
-    def _refuse_leap(self, found: Outcome) -> None:
+    def _refuse_leap(self, found: IntakeOutcome) -> None:
         held, self._doubted = self._doubted, None
         if held is not None:
             text = f"t = {held.t:g} is far ahead of the newest row at {self._newest:g}"
@@ -344,14 +344,14 @@ class Intake:
     def _late(self, t: float) -> bool:
         return self._moment(t) is None
 
-    def _pends(self, held: _Held, past: Past, found: Outcome) -> bool:
+    def _pends(self, held: _Held, past: Past, found: IntakeOutcome) -> bool:
         """Return whether a row that is too late is used or waits for others that agree with it.
 
         One that has been taken before is known by time and values: a source says again what it
         has said. Others that follow one another say that the clock had been wrong, or was set
         back.
         """
-        values = self._values(held.row, Outcome())
+        values = self._values(held.row, IntakeOutcome())
         near = past.between(held.t - self.policy.tolerance, held.t + self.policy.tolerance)
         if not values or any(_same(values, known) for _, known in near):
             self._give_up(found)
@@ -367,14 +367,14 @@ class Intake:
             self._anchor(past, found)
         return True
 
-    def _give_up(self, found: Outcome) -> None:
+    def _give_up(self, found: IntakeOutcome) -> None:
         """Refuse the rows that were too late and have not convinced."""
         pending, self._pending = self._pending, []
         for held in pending:
             if not self._placed(held, found):
                 found.spent.append(held.token)
 
-    def _anchor(self, past: Past, found: Outcome) -> None:
+    def _anchor(self, past: Past, found: IntakeOutcome) -> None:
         """Believe rows that agree with each other, if that is what they say."""
         first, count = self._pending[0].t, len({one.t for one in self._pending})
         earlier = [t for t in self._released if t < first]
@@ -410,13 +410,13 @@ class Intake:
 
     def _covered(self, past: Past) -> bool:
         """Return whether samples with these channels are as late as the rows that wait."""
-        named = {name for one in self._pending for name in self._values(one.row, Outcome())}
+        named = {name for one in self._pending for name in self._values(one.row, IntakeOutcome())}
         return any(
             not all(math.isnan(known.get(name, NAN)) for name in named)
             for _, known in past.between(self._pending[0].t, self._pending[-1].t)
         )
 
-    def _go_back(self, earlier: list[float], found: Outcome) -> None:
+    def _go_back(self, earlier: list[float], found: IntakeOutcome) -> None:
         """Forget all that is later than the first row that waits."""
         for sample in self._open.values():
             found.spent += sample.tokens
@@ -430,16 +430,16 @@ class Intake:
         while self._released and self._released[-1] > last:
             self._released.pop()
 
-    def flush(self) -> Outcome:
+    def flush(self) -> IntakeOutcome:
         """Release all samples that are still open: nothing more will come."""
-        found = Outcome()
+        found = IntakeOutcome()
         self._refuse_leap(found)
         self._give_up(found)
         self._newest = math.inf
         self._release(found)
         return found
 
-    def _placed(self, held: _Held, found: Outcome) -> bool:
+    def _placed(self, held: _Held, found: IntakeOutcome) -> bool:
         """Return whether a row became part of a sample."""
         t, token, said = held.t, held.token, len(found.remarks)
         about, found.row = found.row, token
@@ -462,7 +462,7 @@ class Intake:
         found.row = about
         return moment is not None and bool(values)
 
-    def _values(self, row: Mapping[str, Any], found: Outcome) -> dict[str, float]:
+    def _values(self, row: Mapping[str, Any], found: IntakeOutcome) -> dict[str, float]:
         """Return the values of a row that can be used."""
         values: dict[str, float] = {}
         for channel, column in self.columns.items():
@@ -507,7 +507,9 @@ class Intake:
             return min(near, key=lambda s: abs(s - t))
         return t if t > self._last + self.policy.tolerance else None
 
-    def _add(self, moment: float, values: Mapping[str, float], token: Any, found: Outcome) -> None:
+    def _add(
+        self, moment: float, values: Mapping[str, float], token: Any, found: IntakeOutcome
+    ) -> None:
         sample = self._open.setdefault(moment, _Open())
         sample.tokens.append(token)
         for channel, value in values.items():
@@ -520,7 +522,7 @@ class Intake:
             if math.isnan(known) or not math.isnan(value):
                 sample.values[channel] = value
 
-    def _release(self, found: Outcome) -> None:
+    def _release(self, found: IntakeOutcome) -> None:
         """Let go, in order, of the samples that are complete or have waited long enough."""
         for t in sorted(self._open):
             if not self._ripe(t):
@@ -552,7 +554,7 @@ class Intake:
         absent = math.isnan(values.get(channel, NAN))
         return absent and not (of and math.isnan(values.get(of, NAN)))
 
-    def _bridge(self, t: float, sample: _Open, found: Outcome) -> None:
+    def _bridge(self, t: float, sample: _Open, found: IntakeOutcome) -> None:
         """Interpolate gaps of a sample, and refuse its spikes, where later values are known."""
         for channel in self.columns:
             habit = self.policy.habit(channel)

@@ -1,4 +1,4 @@
-"""What names are near one that is not there: columns of data, and files."""
+"""Suggestions of similar names of columns and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where rows come from while a process runs: a growing file, standard input, any iterator."""
+"""Sources of rows of a live process: a growing file, standard input, any iterator."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def json_row(text: str | bytes, token: Any = None) -> Row:
 
 
 def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
-    """Return what waits in a queue, at most a batch, or after `wait` seconds nothing."""
+    """Return the items in a queue, at most a batch, or none after `wait` seconds."""
     found: list[T] = []
     while len(found) < BATCH:
         try:

@@ -88,8 +88,8 @@ class AbsoluteNoise(Noise):
         given = np.asarray(self.deviation, dtype=float)
         if given.shape not in ((), z.shape):
             raise ConfigurationError(
-                f"AbsoluteNoise: {given.size} deviations for {len(z)} channels; give one, or one "
-                "each."
+                f"AbsoluteNoise: {given.size} standard deviations for {len(z)} channels; give "
+                "one, or one each."
             )
         return np.broadcast_to(given, z.shape)
 

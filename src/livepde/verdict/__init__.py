@@ -1,7 +1,7 @@
 """Verdict of a run on itself: trusted, caution or do not trust, with what speaks against it."""
 
 from livepde.verdict.assess import Position, assess
-from livepde.verdict.directions import Dictionary, Direction
+from livepde.verdict.directions import Dictionary, ScoreDirection
 from livepde.verdict.findings import (
     FLAT,
     LEVELS,
@@ -31,12 +31,12 @@ __all__ = [
     "WINDOWS",
     "Cause",
     "Dictionary",
-    "Direction",
     "Finding",
     "InputLedger",
     "Judge",
     "Ledger",
     "Position",
+    "ScoreDirection",
     "Seen",
     "Severity",
     "Verdict",

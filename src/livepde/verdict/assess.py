@@ -1,7 +1,8 @@
-"""From the ledger of one member to its verdict."""
+"""Assessment of one member: findings and verdict from its ledger of score sums."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from livepde.linalg import Array
-from livepde.verdict.directions import DRIFT, LAG, OFFSET, Dictionary, Direction
+from livepde.verdict.directions import DRIFT, LAG, OFFSET, Dictionary, ScoreDirection
 from livepde.verdict.evidence import (
     CAUSES,
     RECORD,
@@ -23,7 +24,7 @@ from livepde.verdict.evidence import (
     mean_squares,
     quiet,
 )
-from livepde.verdict.findings import Cause, Finding, Severity, Verdict
+from livepde.verdict.findings import Cause, Finding, Severity, Verdict, channel_setting
 from livepde.verdict.ledger import Ledger
 
 __all__ = ["Position", "assess"]
@@ -108,6 +109,8 @@ def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
     found = []
     for d, direction in enumerate(dictionary.directions):
         if direction.kind not in ("offset", "gain", "lag", "position"):
+            continue
+        if f"{direction.kind}[{direction.subject}]" in at.moved:  # it is an unknown itself
             continue
         for name, moved in at.moved.items():
             shift = float(hidden[d] * abs(moved[0, d]))
@@ -217,21 +220,46 @@ def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
 
 
 def _cause(
-    direction: Direction, window: int, evidence: CauseEvidence, at: Position, number: int
+    direction: ScoreDirection, window: int, evidence: CauseEvidence, at: Position, number: int
 ) -> Cause:
     size, share = evidence.size[window, number], evidence.share[window, number]
     text, remedy = _words(direction, float(size), at)
     if window and direction.kind not in ("jump", "initial"):
         text += f" in the last {int(at.ledger.age[at.member, window])} samples"
     share = float(min(max(share, 0.0), 1.0))
-    return Cause(direction.kind, direction.subject, text, share, remedy)
+    setting = _setting(direction, float(size), at)
+    return Cause(direction.kind, direction.subject, text, share, remedy, setting)
 
 
-def _words(direction: Direction, size: float, at: Position) -> tuple[str, str]:
-    """Return a cause of a size, and its remedy, in words."""
-    name, amount = direction.subject, size * direction.size
+def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
+    """Return how large a cause is, in units of the model; a gain as a share."""
     if direction.kind in ("offset", "drift"):  # by the noise that was found, where that is so
-        amount = size * OFFSET * float(at.noise[list(at.sensors).index(name)])
+        return size * OFFSET * float(at.noise[list(at.sensors).index(direction.subject)])
+    return size * direction.size
+
+
+def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
+    """Return the setting of a case that frees a cause of a size, empty if there is none.
+
+    What is freed has a prior standard deviation of twice the size.
+    """
+    keys = {"offset": "offset", "gain": "gain", "position": "at_std"}
+    if direction.kind in keys:
+        width = 2.0 * abs(_amount(direction, size, at))
+        return channel_setting(direction.subject, keys[direction.kind], f"{width:.2g}")
+    if direction.kind == "jump":
+        return _jump(direction.subject)
+    return 'initial="interpolate"' if direction.kind == "initial" else ""
+
+
+def _jump(label: str) -> str:
+    """Return the setting of a case that lets an unknown jump."""
+    return f"law.jumps={json.dumps([label.partition('[')[0]])}"
+
+
+def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, str]:
+    """Return a cause of a size, and its remedy, in words."""
+    name, amount = direction.subject, _amount(direction, size, at)
     unit = f" {direction.unit}" if direction.unit else ""
     interval = float(at.ledger.times[at.member, 1])
     time = f" {at.time_unit}" if at.time_unit else ""
@@ -328,7 +356,8 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
         name = at.unknowns[int(np.argmax(np.abs(change.change)))]
         text = f"{name} has changed after {change.after:.0%} of the samples."
         remedy = "Let it: law.jumps = true, or an evolution of the unknown."
-        cause = Cause("jump", name, f"{name} has changed during the run", remedy=remedy)
+        said = f"{name} has changed during the run"
+        cause = Cause("jump", name, said, remedy=remedy, setting=_jump(name))
         p = change.p_value
         yield Finding("constancy", severity, text, name, p, "p-value", (cause,))
     found = disagreement(at.ledger, at.member, wider)

@@ -14,7 +14,7 @@ from livepde.model import Model
 from livepde.observation import Observed, Points
 from livepde.verdict.process import Process
 
-__all__ = ["Dictionary", "Direction"]
+__all__ = ["Dictionary", "ScoreDirection"]
 
 OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
 DRIFT = 64.0  # ... a drift in so many samples
@@ -28,7 +28,7 @@ MOST_DENSE = 10_000  # entries of a matrix that is cheaper when dense
 
 
 @dataclass(frozen=True)
-class Direction:
+class ScoreDirection:
     """A possible cause with an amplitude of one.
 
     Attributes
@@ -130,7 +130,7 @@ class Dictionary:
         while kinds and sum(wide[kind] for kind in kinds) > room:
             self.left_out.append(f"{kinds.pop()} of single sensors: there are {sensors}")
         self.kinds = kinds
-        self.directions: list[Direction] = []
+        self.directions: list[ScoreDirection] = []
         self.owner: list[int] = []  # sensor of each of the first directions
         unit = observed.observation.unit
         self.parts: dict[str, slice] = {}
@@ -145,7 +145,7 @@ class Dictionary:
                         size = GAIN
                     elif kind == "position" and position is not None:
                         size = position[1]
-                    self.directions.append(Direction(kind, name, size, of, axis))
+                    self.directions.append(ScoreDirection(kind, name, size, of, axis))
                     self.owner.append(k)
             self.parts[kind] = slice(start, len(self.directions))
         self.shifts: Shifts | None = None
@@ -153,10 +153,10 @@ class Dictionary:
             self.shifts = Shifts.of(position[0])
         start = len(self.directions)
         self.jumps = [place for _, place in jumps]
-        self.directions += [Direction("jump", label, JUMP) for label, _ in jumps]
+        self.directions += [ScoreDirection("jump", label, JUMP) for label, _ in jumps]
         self.parts["jump"] = slice(start, len(self.directions))
         start = len(self.directions)
-        self.directions += [Direction(term.kind, term.subject) for term in terms]
+        self.directions += [ScoreDirection(term.kind, term.subject) for term in terms]
         self.parts["process"] = slice(start, len(self.directions))
         self.own: IntArray = np.array(self.owner, dtype=np.int64)
 
@@ -172,7 +172,7 @@ class Dictionary:
     def signals(
         self, noise: Array, h: Array, first: Array, last: Array, share: Array, moved: Array
     ) -> Array:
-        """Return what each direction of a sensor does to it, (samples, directions of sensors).
+        """Return the change of a reading along each direction, (samples, directions of sensors).
 
         In units of the noise. That of a drift is its slope.
 

@@ -1,8 +1,10 @@
-"""What a verdict says: its level, and findings with evidence, causes, remedy and consequence."""
+"""Verdict: its level, and findings with evidence, causes, remedy and consequence."""
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
@@ -19,6 +21,7 @@ __all__ = [
     "Severity",
     "Verdict",
     "at_bound",
+    "channel_setting",
     "discretised",
     "flat",
     "held_inputs",
@@ -65,7 +68,10 @@ class Cause:
     share
         Part of the misfit beyond the noise that it explains, 0 to 1; NaN if not known.
     remedy
-        What to do, with the line of the case that would test it.
+        What to do.
+    setting
+        "key=value" of a case that frees it, as `livepde run --set` takes it; empty if there is
+        none.
     """
 
     kind: str
@@ -73,6 +79,7 @@ class Cause:
     text: str
     share: float = math.nan
     remedy: str = ""
+    setting: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cause as JSON can hold it."""
@@ -83,6 +90,7 @@ class Cause:
             "text": self.text,
             "share": share,
             "remedy": self.remedy,
+            "setting": self.setting,
         }
 
 
@@ -167,6 +175,12 @@ class Finding:
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
+
+
+def channel_setting(name: str, key: str, value: str) -> str:
+    """Return the setting of a key of a channel, as `Cause.setting` has it; the value is TOML."""
+    quoted = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+    return f"channels.{quoted}.{key}={value}"
 
 
 def at_bound(label: str, value: float) -> Finding:

@@ -1,4 +1,4 @@
-"""What a filter tells the ledger with each sample, and how the causes ride along with it.
+"""Scores of a sample for the ledger, and sensitivities to the causes of misfit.
 
 Let delta be by how much the truth and the estimate of [u; a] differ because of a cause of amplitude
 one, and f what that cause does to the readings directly. A Kalman filter that does not know of it

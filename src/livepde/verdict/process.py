@@ -178,7 +178,7 @@ class Process:
         return solved * free + lifts
 
     def shown(self, p: Array, now: Now) -> Array:
-        """Return what the sensors see of the responses, shape (terms, sensors)."""
+        """Return the readings of the responses, shape (terms, sensors)."""
         physical = self.model.latent.value(now.q)
         H, _ = self.observed.jacobian(now.u, physical, now.moment)
         return np.asarray((H @ p.T).T)

@@ -10,7 +10,7 @@ import numpy as np
 
 from livepde.linalg import Array
 from livepde.verdict.evidence import chance
-from livepde.verdict.findings import Cause, Finding
+from livepde.verdict.findings import Cause, Finding, channel_setting
 
 __all__ = ["WithheldLedger"]
 
@@ -105,6 +105,7 @@ class WithheldLedger:
                 name,
                 f"the model does not hold at {name}, or its place or calibration is wrong",
                 remedy=f"Look at {name}, or assimilate it: role = 'sensor'.",
+                setting=channel_setting(name, "role", '"sensor"'),
             )
             yield Finding("withheld", "do not trust", text, name, p, "p-value", (cause,))
 
@@ -121,5 +122,7 @@ class WithheldLedger:
             off = abs(mean_z - (scale * mean_p + origin))
             if abs(slope / scale - 1.0) < 4.0 * SIMILAR and off < rest:
                 text = f"{name} is in {unit} and taken for {taken}"
-                return Cause("unit", name, text, remedy=f'Say so: channels.{name}.unit = "{unit}".')
+                remedy = f'Say so: channels.{name}.unit = "{unit}".'
+                setting = channel_setting(name, "unit", f'"{unit}"')
+                return Cause("unit", name, text, remedy=remedy, setting=setting)
         return None

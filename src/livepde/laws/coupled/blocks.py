@@ -250,7 +250,7 @@ class BlockJacobian:
         return ApproximateFactor(solver, state, schur, self.forward, self.A)
 
     def _information(self, state: Factor) -> sp.csr_array:
-        """Return what stands for A_in^T R S^{-1} A in C."""
+        """Return the term of C that approximates A_in^T R S^{-1} A."""
         terms = self.solver.terms
         split = terms.forms.split
         parts = list(terms.forms.model.latent.parts.values())

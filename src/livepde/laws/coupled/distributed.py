@@ -134,7 +134,7 @@ class DistributedSolver(StageSolver):
         return _DistributedFactor(self.model, handle)
 
     def reached(self, y: Array) -> list[Array]:
-        """Return what each rank needs of a vector (u, q)."""
+        """Return the part of a vector (u, q) that each rank needs."""
         u, q = y[: self.terms.n], y[self.terms.n :]
         pairs = zip(self.model.u.reaches, self.model.q.reaches, strict=True)
         return [np.concatenate([u[a], q[b]]) for a, b in pairs]

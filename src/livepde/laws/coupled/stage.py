@@ -77,7 +77,7 @@ class KeptFactor:
 
 
 @dataclass(frozen=True, eq=False)
-class _Equation:
+class _CoupledEquation:
     """The equation of one stage, as `Newton` sees it."""
 
     solver: StageSolver
@@ -160,7 +160,7 @@ class CoupledStage:
         if predicted is not None:
             y, factor = self._imposed(predicted, problem.moment), self._factor(kept, problem)
             near = Near(y, factor, solver.refresh)
-        equation = _Equation(solver, data)
+        equation = _CoupledEquation(solver, data)
 
         def begin() -> Array:
             return self._imposed(start(), problem.moment)
@@ -173,7 +173,7 @@ class CoupledStage:
             solved = self._by_theta(equation, begin())
         return solved.at, self._kept(kept, data, solved)
 
-    def _by_theta(self, equation: _Equation, start: Array) -> Solution[StageIterate]:
+    def _by_theta(self, equation: _CoupledEquation, start: Array) -> Solution[StageIterate]:
         """Return the solution whose theta is nearest to that of the start; raises `StepFailed`.
 
         Where theta is given the stage is all but linear. So theta is found as the root of one
@@ -186,7 +186,7 @@ class CoupledStage:
             nonlocal y
             metric = replace(data.problem.metric, theta=theta)
             fixed = replace(data, problem=replace(data.problem, metric=metric))
-            at = newton.solve(_Equation(self.solver, fixed), y).at
+            at = newton.solve(_CoupledEquation(self.solver, fixed), y).at
             y = at.y
             return self.terms.damped(data, at.norms) - theta
 
@@ -229,7 +229,7 @@ class CoupledStage:
     def _kept(
         self, kept: KeptFactor, data: StageData, solved: Solution[StageIterate]
     ) -> KeptFactor:
-        """Return what becomes of the kept factor after a stage."""
+        """Return the cached factor to keep after a stage."""
         if not self.solver.keeps:
             return kept
         if solved.made is not None:

@@ -1,0 +1,136 @@
+"""Parts of a fleet in worker processes of a joblib backend; parts of dead workers are retried."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor
+from contextlib import AbstractContextManager, ExitStack
+from enum import StrEnum
+from typing import Any, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from livepde.errors import ConfigurationError, RunError
+
+__all__ = ["Backend", "in_parts"]
+
+Row = TypeVar("Row")
+Found = TypeVar("Found")
+
+LARGEST = 256  # members of a part: so many runs are interrupted if a worker dies
+ATTEMPTS = 5  # without a part that comes back in between
+DEAD_WORKER = {"KilledWorker", "ActorDiedError"}  # what Dask and Ray call it
+
+
+class Backend(StrEnum):
+    """Backends of joblib that livepde can set up by itself."""
+
+    loky = "loky"
+    dask = "dask"
+    ray = "ray"
+
+
+def in_parts(
+    run: Callable[[Sequence[Row]], Found],
+    rows: Sequence[Row],
+    jobs: int,
+    backend: Backend | None,
+    told: list[str],
+) -> Iterator[Found]:
+    """Run rows in parts of bounded size, and iterate over what they give, in any order.
+
+    A part whose worker died is run again; `run` has to find what it left and go on there.
+
+    Parameters
+    ----------
+    run
+        Is sent to workers, as are rows: all paths in it must hold there.
+    jobs
+        Processes at once; -1 for one on each processor. Dask takes all workers of its cluster.
+    backend
+        None: that of the surrounding `joblib.parallel_config`, else loky.
+    told
+        Gets a sentence for each loss of a worker.
+
+    Raises
+    ------
+    ConfigurationError
+        joblib or the backend is not installed.
+    RunError
+        Workers died `ATTEMPTS` times with no part that came back in between.
+    """
+    try:
+        from joblib import Parallel, delayed, effective_n_jobs
+        from joblib.parallel import get_active_backend
+    except ImportError as error:
+        raise ConfigurationError(
+            "--jobs needs joblib: pip install 'livepde[fleet]'; without it the runs follow each "
+            "other."
+        ) from error
+    with ExitStack() as stack:
+        if backend is not None:
+            _configure(backend, stack)
+        jobs = min(effective_n_jobs(jobs), len(rows))
+        count = max(jobs, -(-len(rows) // LARGEST))
+        parts = {k: rows[k::count] for k in range(count)}
+        lost = 0
+        while parts:
+            tasks = [delayed(_attempt)(run, k, part) for k, part in parts.items()]
+            soon = get_active_backend()[0].supports_return_generator  # Ray gives all at the end
+            how = "generator_unordered" if soon else "list"
+            parallel = Parallel(n_jobs=jobs, batch_size=1, return_as=how)
+            try:
+                for k, found in parallel(tasks):
+                    del parts[k]
+                    lost = 0
+                    yield found
+            except Exception as error:
+                if not _died(error):
+                    raise
+                lost += 1
+                members = sum(map(len, parts.values()))
+                what = f"A worker process died (killed, or out of memory), {members} members open"
+                if lost == ATTEMPTS:
+                    raise RunError(
+                        f"{what}; {lost} times in a row, with nothing done in between."
+                    ) from error
+                told.append(f"{what}: they went on from their run directories.")
+
+
+def _attempt(
+    run: Callable[[Sequence[Row]], Found], k: int, part: Sequence[Row]
+) -> tuple[int, Found]:
+    with threadpool_limits(1):
+        return k, run(part)
+
+
+def _died(error: Exception) -> bool:
+    """Return whether a worker died, in the words of a backend: killed, or out of memory."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ in DEAD_WORKER
+
+
+def _configure(backend: Backend, stack: ExitStack) -> None:
+    """Make a backend that of joblib until the stack is closed."""
+    from joblib import parallel_config
+
+    if backend is Backend.ray:
+        try:
+            from ray.util.joblib import register_ray
+        except ImportError as error:
+            raise ConfigurationError(
+                "--backend ray needs Ray: pip install ray, here and on its nodes."
+            ) from error
+        register_ray()
+    if backend is Backend.dask:
+        try:
+            import distributed
+        except ImportError as error:
+            raise ConfigurationError(
+                "--backend dask needs Dask: pip install 'dask[distributed]', here and on its "
+                "workers."
+            ) from error
+        dask: Any = distributed  # without types
+        # Of DASK_SCHEDULER_ADDRESS, or of its own.
+        client: AbstractContextManager[Any] = dask.Client()
+        stack.enter_context(client)
+    stack.enter_context(parallel_config(backend=backend.value))

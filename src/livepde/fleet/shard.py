@@ -1,0 +1,300 @@
+"""A fleet for live streams: members with sample times of their own, and an offset."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from livepde import checkpoint
+from livepde.errors import DataError, OffsetError, RunError, SampleError
+from livepde.fleet.fleet import Fleet
+from livepde.fleet.member_states import states_of
+from livepde.fleet.shard_estimates import ShardEstimates
+from livepde.identifier import Identifier
+from livepde.laws import AnyLaw
+from livepde.linalg import IntArray
+from livepde.model import Model
+from livepde.observation import Observation
+from livepde.samples import number
+
+__all__ = ["Shard"]
+
+FORMAT = 1  # of `dump`
+BLOCK = 256  # members that step at once: more need more memory and are no faster
+
+Item: TypeAlias = Sequence[Any]  # (member, t, z) or (member, t, z, inputs)
+
+
+class Shard:
+    """Identifies many processes of one model from a stream of samples that carry an offset.
+
+    The offset of a sample is its place in the log of record, counted from 0. A shard takes every
+    sample of the log once and in order: `step` refuses a batch that does not begin at `offset`. A
+    state that was restored from an older `dump` therefore takes the same samples again, and comes
+    to the same numbers, or says that it cannot.
+
+    Members are those of a `Fleet`, but each has sample times of its own. Samples of one batch are
+    stepped as blocks where the members' last two sample times agree. Estimates are those of one
+    `Identifier` for each member, to rounding.
+
+    Parameters
+    ----------
+    model, observation, law, members
+        As for `Fleet`.
+    options
+        Further parameters of `Fleet`: q0, u0, t0, withheld, and so on.
+
+    Attributes
+    ----------
+    offset
+        Of the next sample.
+
+    Raises
+    ------
+    ConfigurationError
+        Parts that do not fit together.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> model = heat(lp.interval(0, 1, 20), lp.Scalar(0.5, 0.2), {"left": 0.0, "right": 0.0})
+    >>> rods = ["north", "south"]
+    >>> shard = Shard(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), rods, u0=1.0)
+    >>> shard.step(0, [("south", 0.1, [0.9]), ("north", 0.3, [0.7]), ("south", 0.2, [0.8])]).status
+    ['ok', 'ok', 'ok']
+    >>> shard.step(2, [("south", 0.2, [0.8])])
+    Traceback (most recent call last):
+    ...
+    livepde.errors.OffsetError: samples 2 to 2 were taken already, the shard is at 3: skip them.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        observation: Observation,
+        law: AnyLaw,
+        members: int | Sequence[str],
+        **options: Any,
+    ) -> None:
+        self._fleet = Fleet(model, observation, law, members, **options)
+        self.offset = 0
+        self._places = {name: k for k, name in enumerate(self._fleet.members)}
+        self._states = states_of(self._fleet)
+        self._taken: IntArray = np.zeros(len(self._fleet), dtype=np.int64)  # samples of each member
+        self._torn = False
+
+    def __len__(self) -> int:
+        return len(self._fleet)
+
+    @property
+    def members(self) -> tuple[str, ...]:
+        """Their names."""
+        return self._fleet.members
+
+    @property
+    def note(self) -> str:
+        """Why members are stepped one by one; empty if they are stepped as blocks."""
+        return self._fleet.note
+
+    def step(self, offset: int, batch: Iterable[Item]) -> ShardEstimates:
+        """Take the next samples of the log and return an estimate for each.
+
+        A sample that cannot be used (an unknown member, a time that is not later than the member's
+        last one, a text in the place of a number) changes nothing and is told in its row: its
+        status is "refused". So is a step that fails numerically, as in `Identifier.step`.
+
+        Parameters
+        ----------
+        offset
+            Place of the first sample of the batch in the log.
+        batch
+            Samples (member, t, z) or (member, t, z, inputs), in the order of the log; z and inputs
+            as for `Identifier.step`. A member may come more than once.
+
+        Raises
+        ------
+        OffsetError
+            The batch does not begin at `offset` of the shard; nothing was changed.
+        RunError
+            An earlier step was broken off by an exception: the state is between two batches.
+        """
+        self._refuse_torn()
+        items = [item if isinstance(item, tuple | list) else () for item in batch]
+        self._refuse_elsewhere(offset, len(items))
+        space, sensors = self._fleet.model.parameter_space, self._fleet.observed.names
+        estimates = ShardEstimates.blank(offset, items, space, sensors)
+        self._torn = True
+        for wave in self._waves(items, estimates):
+            for rows in self._blocks(items, wave):
+                self._take(items, rows, estimates)
+        self._torn = False
+        self.offset += len(items)
+        return estimates
+
+    def _refuse_torn(self) -> None:
+        if self._torn:
+            raise RunError(
+                f"the step at offset {self.offset} was broken off by an exception, and some "
+                "members have taken their samples: load the last dump."
+            )
+
+    def _refuse_elsewhere(self, offset: int, count: int) -> None:
+        """Raise `OffsetError` unless the batch continues at the offset of the shard."""
+        last, here = offset + count - 1, self.offset
+        if offset == here:
+            return
+        if offset > here:
+            raise OffsetError(
+                f"the batch begins at {offset}, the shard is at {here}: samples {here} to "
+                f"{offset - 1} are missing; read the log again from {here} on."
+            )
+        if last < here:
+            raise OffsetError(
+                f"samples {offset} to {last} were taken already, the shard is at {here}: skip them."
+            )
+        raise OffsetError(
+            f"samples {offset} to {here - 1} of the batch were taken already, {here} to {last} "
+            f"were not: read the log again from {here} on."
+        )
+
+    def _waves(self, items: Sequence[Item], estimates: ShardEstimates) -> Iterator[list[int]]:
+        """Yield rows in waves, in each of which a member has one sample at most."""
+        waves: list[list[int]] = []
+        counts: dict[str, int] = {}
+        for row, item in enumerate(items):
+            try:
+                name = self._checked(item)
+            except DataError as error:
+                estimates.refuse(row, str(error))
+                continue
+            k = counts[name] = counts.get(name, -1) + 1
+            if k == len(waves):
+                waves.append([])
+            waves[k].append(row)
+        yield from waves
+
+    def _checked(self, item: Item) -> str:
+        """Return the name of the member of a sample that has the right parts."""
+        if not 3 <= len(item) <= 4:
+            raise SampleError(f"a sample has {len(item)} parts; give (member, t, z, inputs).")
+        if not isinstance(item[0], str) or item[0] not in self._places:
+            raise SampleError(f"there is no member {item[0]!r} in this shard.")
+        number(item[1], "time t")
+        if len(item) == 4 and not isinstance(item[3], Mapping | None):
+            raise SampleError(f"inputs are {item[3]!r:.80}; give channel -> number.")
+        return str(item[0])
+
+    def _blocks(self, items: Sequence[Item], wave: Sequence[int]) -> Iterator[list[int]]:
+        """Yield rows whose members have their last two sample times in common."""
+        alike: dict[tuple[Any, ...], list[int]] = {}
+        for row in wave:
+            name, t, z, *_ = items[row]
+            k = self._places[name]
+            ends = float(self._fleet.ends["t"][k]), float(t), self._taken[k] > 0
+            key = *ends, self._states.rows(k), isinstance(z, Mapping)
+            alike.setdefault(key, []).append(row)
+        for rows in alike.values():
+            for first in range(0, len(rows), BLOCK):
+                yield rows[first : first + BLOCK]
+
+    def _take(self, items: Sequence[Item], rows: Sequence[int], estimates: ShardEstimates) -> None:
+        """Step the members of some samples together; if one cannot be used, one by one."""
+        which = np.array([self._places[items[row][0]] for row in rows])
+        block = self._subset(which)
+        try:
+            estimate = block.step(*_joined([items[row] for row in rows]))
+        except DataError as error:
+            if len(rows) == 1:
+                estimates.refuse(rows[0], str(error))
+                return
+            for row in rows:
+                self._take(items, [row], estimates)
+            return
+        self._states.put(which, self._fleet.adopt(which, block))
+        self._taken[which] += 1
+        estimates.put(rows, estimate)
+
+    def _subset(self, which: IntArray) -> Fleet:
+        """Return a fleet of some members that have taken as many samples, or begun."""
+        samples = int(self._taken[which[0]])
+        state = self._states.take(which) if samples else None
+        return self._fleet.subset(which, state, samples)
+
+    def identifier(self, member: str) -> Identifier:
+        """Return an identifier that goes on from where a member is; for forecasts and fields.
+
+        The shard does not notice what becomes of it.
+        """
+        # A copy, as states of the shard are written in place.
+        return copy.deepcopy(self._subset(np.array([self._places[member]])).identifier(0))
+
+    def dump(self) -> bytes:
+        """Return offset and states of all members as one buffer with a checksum.
+
+        Raises
+        ------
+        RunError
+            A step was broken off by an exception.
+        """
+        self._refuse_torn()
+        header = {**self._fleet.fingerprint, "shard": FORMAT}
+        leaves = {"offset": self.offset, "taken": self._taken, **self._fleet.ends}
+        leaves |= {f"state/{path}": leaf for path, leaf in self._states.leaves().items()}
+        return checkpoint.packed(header, leaves)
+
+    def load(self, content: bytes) -> None:
+        """Continue from what `dump` returned, with identical numbers, at its offset.
+
+        The shard must be built as the one that was dumped.
+
+        Raises
+        ------
+        RunError
+            The content is damaged, or of another shard; nothing was changed.
+        """
+        header, leaves = checkpoint.unpacked(content, "the dump")
+        for key, value in {**self._fleet.fingerprint, "shard": FORMAT}.items():
+            if header.get(key) != value:
+                raise RunError(f"the dump is of a shard with another {key}: build it as that was.")
+        try:
+            offset, taken = int(leaves["offset"]), leaves["taken"].astype(np.int64)
+            ends = {name: leaves[name] for name in self._fleet.ends}
+            inner = {path.removeprefix("state/"): leaf for path, leaf in leaves.items()}
+            states = self._states.restored(inner)
+            for name, values in self._fleet.ends.items():
+                if ends[name].shape != values.shape:
+                    raise ValueError(f"{name} has shape {ends[name].shape}, needs {values.shape}")
+        except (KeyError, ValueError) as error:
+            raise RunError(
+                f"the dump does not fit this shard ({error}): build it with the law's options as "
+                "they were."
+            ) from error
+        for name, values in self._fleet.ends.items():
+            values[:] = ends[name]
+        self.offset, self._taken, self._states, self._torn = offset, taken, states, False
+
+
+def _joined(items: Sequence[Item]) -> tuple[float, Any, dict[str, Any]]:
+    """Return time, measurements and inputs of several samples as `Fleet.step` takes them."""
+    t, z = float(items[0][1]), [item[2] for item in items]
+    inputs = [(item[3] or {}) if len(item) == 4 else {} for item in items]
+    measured = _columns(z) if isinstance(z[0], Mapping) else _rows(z)
+    return t, measured, _columns(inputs)
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return numbers by name, NaN where a row has none."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name, np.nan) for row in rows] for name in names}
+
+
+def _rows(rows: Sequence[Any]) -> Any:
+    """Return measurements, shape (members, sensors), or with noise (members, sensors, 2)."""
+    try:
+        return np.array([np.asarray(row) for row in rows])
+    except ValueError:
+        raise SampleError("the samples have different numbers of values.") from None
