@@ -510,7 +510,7 @@ def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
         wait(page, lambda p: len(p.find_elements("css selector", panel)) >= 3)
         wait(page, lambda p: "field, mean" in text(p, ".card"))
         drawn = ".panel:nth-child(2) .js-plotly-plot"
-        wait(page, lambda p: colours(p, drawn) > colours(p, drawn, "hidden") + 500)
+        wait(page, lambda p: colours(p, drawn) > colours(p, drawn, "hidden") + 200)
         assert "three cuts at 50%" in text(page, ".panel figcaption")
         page.find_element("css selector", "#cut [role=slider]").send_keys(Keys.ARROW_LEFT)
         wait(page, lambda p: "three cuts at 45%" in text(p, ".panel figcaption"))

@@ -362,7 +362,8 @@ def as_nobody(code: str, *arguments: object) -> str:
 READ = """
 import os, sys
 from pathlib import Path
-import livepde, pydantic, xarray  # nobody may read packages of root
+sys.modules["dask"] = None  # xarray looks for it late, and nobody may read packages of root
+import livepde, pydantic, xarray
 from livepde.runs import Journal
 with Journal.create(None, (), livepde.records.Layout("", "", {}, {}, [], None, {}, {}, [], [], [])):
     pass
