@@ -265,3 +265,65 @@ def test_a_case_may_leave_the_heat_capacity_unknown() -> None:
     )
     with pytest.raises(ModelError, match="far away"):
         equation.build(mesh, unknowns, {"right": 1.0}, **options)
+
+
+SHORT = """
+equation = "grouted_borehole"
+initial = "10 degC"
+
+[mesh]
+x = ["2 cm", "12 m"]      # radius
+y = ["5 cm", "10.05 m"]   # height, from the end of the borehole to its middle
+cells = [40, 12]
+spacing = ["geometric", "geometric"]
+
+[options]
+H = "20 m"
+r_p = "23.6 mm"
+r_b = "63 mm"
+C_f = 4900
+C_p = 1000
+C_g = 3.8e6
+T0 = "10 degC"
+
+[unknowns]
+k = { prior = 2, std = 1, transform = "log" }
+rho_c = { prior = 2.3e6, std = 1e5, transform = "log" }
+R_b = { prior = 0.12, std = 0.05, transform = "log" }
+share = { prior = 0.3, std = 0.05, transform = "logit", bounds = [0, 1] }
+
+[data]
+file = "test.csv"
+time = "t"
+
+[channels]
+Q = { role = "input", column = "Q", unit = "W" }
+T_fluid = { role = "sensor", column = "T", unit = "degC", over = "left", noise = 0.01 }
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("finite", [True, False])
+def test_a_short_borehole_from_a_case(tmp_path: Path, finite: bool) -> None:
+    """Its ends cool it: a case of radius and height finds k, one of the radius alone does not."""
+    times = np.concatenate([[0.0], np.geomspace(300.0, 150 * HOUR, 60)])
+    process, advance = plane(cells=60), Advance(Alexander2())
+    start = process.initial_parameter(TRUTH)
+    sensor = lp.Averages({"T": "left"}).bind(
+        process.state_space, process.X, process.parameter_space
+    )
+    heated, q = lp.Moment(0.0, {"Q": POWER}), process.latent.value(start)
+    states = simulate(process, start, 10.0, times, advance, lambda t: {"Q": POWER})
+    noise = np.random.default_rng(3).normal(0.0, 0.01, len(times))
+    shown = [sensor.predict(u, q, heated)[0] for _, u in states]
+    rows = [f"{t},{POWER},{T + e}" for t, T, e in zip(times, shown, noise, strict=True)]
+    (tmp_path / "test.csv").write_text("\n".join(["t,Q,T", *rows]))
+    case = SHORT
+    if not finite:
+        low, high = SHORT.index("x = ["), SHORT.index("\n[options]")
+        mesh = 'from = "2 cm"\nto = "12 m"\ncells = 40\nspacing = "geometric"\n'
+        case = (case[:low] + mesh + case[high:]).replace('over = "left"', 'at = "2 cm"')
+    (tmp_path / "case.toml").write_text(case)
+    prepared = cases.load(tmp_path / "case.toml").prepare()
+    found = prepared.identifier.run(prepared.stream).last["k"]
+    assert (abs(found.mean - TRUTH["k"]) < 2 * found.std) == finite

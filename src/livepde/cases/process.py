@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -57,6 +57,9 @@ def mesh_of(frame: Frame) -> Any:
         if isinstance(spec.cells, tuple):
             number = spec.cells
             check_cells(float(number[0]) * number[1], frame.where("mesh.cells"))
+            if isinstance(spec.spacing, tuple):
+                graded = [one == "geometric" for one in spec.spacing]
+                return _built(frame, "mesh", lambda: _graded(frame, (x, y), number, graded))
             return _built(frame, "mesh", lambda: rectangle((x[0], x[1]), (y[0], y[1]), number))
         check_cells(float(len(x)) * len(y), frame.where("mesh"))
         return _built(frame, "mesh", lambda: grid(x, y))
@@ -67,14 +70,29 @@ def mesh_of(frame: Frame) -> Any:
     if not start < stop:
         raise frame.error("mesh", f"got from {start:g} to {stop:g} {unit}; needs from < to.")
     geometric = spec.spacing == "geometric"
-    if geometric and not start > 0:
-        raise frame.error("mesh.spacing", "'geometric' needs from > 0.")
+    _check_graded(frame, start, geometric)
     plain = interval(start, stop, cells, geometric=geometric)
     edges = [edge for _, edge in layer_edges(frame)]
     through = _fitted(plain.p[0], edges)
     mesh = interval(start, stop, cells, geometric=geometric, through=through)
     own = {edge for edge in edges if _inside(mesh.p[0], edge)} - set(through)
     return line(sorted({*mesh.p[0].tolist(), *own})) if own else mesh
+
+
+def _graded(
+    frame: Frame, sides: Iterable[Sequence[float]], cells: Iterable[int], graded: Iterable[bool]
+) -> Any:
+    """Return a rectangle whose nodes are spaced geometrically or not along each side."""
+    nodes = []
+    for (start, stop), number, geometric in zip(sides, cells, graded, strict=True):
+        _check_graded(frame, start, geometric)
+        nodes.append(interval(start, stop, number, geometric=geometric).p[0])
+    return grid(*nodes)
+
+
+def _check_graded(frame: Frame, start: float, geometric: bool) -> None:
+    if geometric and not start > 0:
+        raise frame.error("mesh.spacing", "'geometric' needs from > 0.")
 
 
 def layer_edges(frame: Frame) -> list[tuple[str, float]]:

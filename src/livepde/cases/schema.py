@@ -59,6 +59,9 @@ class Spec(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=False)
 
 
+Spacing = Literal["uniform", "geometric"]
+
+
 class MeshSpec(Spec):
     """An interval (from, to, cells; or nodes), a rectangle (x, y, cells; or nodes), or a file."""
 
@@ -70,20 +73,21 @@ class MeshSpec(Spec):
     file: Name | None = None
     unit: str | None = None
     cells: PositiveInt | tuple[PositiveInt, PositiveInt] | None = None
-    spacing: Literal["uniform", "geometric"] = "uniform"
+    spacing: Spacing | tuple[Spacing, Spacing] = "uniform"
 
     @model_validator(mode="after")
     def _one_kind(self) -> MeshSpec:
         given = self.model_fields_set - {"spacing", "unit"}
+        pair = isinstance(self.spacing, tuple)
         if given in ({"nodes"}, {"file"}, {"x", "y"}):
             if "spacing" in self.model_fields_set:
                 raise ValueError("spacing belongs to an interval with cells")
         elif given == {"start", "stop", "cells"}:
-            if not isinstance(self.cells, int):
-                raise ValueError("cells: expected one number for an interval")
+            if not isinstance(self.cells, int) or pair:
+                raise ValueError("cells, spacing: expected one each for an interval")
         elif given == {"x", "y", "cells"}:
-            if isinstance(self.cells, int) or self.spacing != "uniform":
-                raise ValueError("expected cells = [nx, ny] and uniform spacing for a rectangle")
+            if isinstance(self.cells, int) or (self.spacing != "uniform" and not pair):
+                raise ValueError("expected cells = [nx, ny], spacing = [of x, of y] of a rectangle")
             if any(side is None or len(side) != 2 for side in (self.x, self.y)):
                 raise ValueError("x and y: expected [from, to] each; or nodes, and no cells")
         else:
