@@ -112,7 +112,7 @@ def test_every_kind_of_run_has_its_panels(kind, field):
         assert panel.about
         json.loads(panel.figure.to_json())
     drawn = {"line": "scatter", "triangle": "heatmap", "quad": "heatmap"}.get(kind, "mesh3d")
-    assert {trace.type for trace in found["field:u"].figure.data} == {drawn}
+    assert found["field:u"].figure.data[0].type == drawn
 
 
 def test_a_run_of_one_sample_and_one_without_covariance():
@@ -190,6 +190,13 @@ def test_a_map_is_exact_for_what_is_linear(kind):
     values = found.of(2.0 * data["x"].values - 3.0 * data["y"].values)
     assert found.inside.all()
     assert np.allclose(values, 2.0 * found.x - 3.0 * found.y[:, None])
+
+
+def test_sensors_are_on_the_map():
+    data = dataset("triangle", count=1)
+    sensor, withheld = fields.field_map(data, "u").data[1:]
+    assert [*sensor.text, *sensor.x, *sensor.y] == ["a", 0.6, 0.4]
+    assert [*withheld.text, *withheld.x, *withheld.y] == ["b", 0.3, 0.4]
 
 
 def test_a_hole_stays_open():

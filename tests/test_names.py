@@ -102,7 +102,7 @@ def test_directions_of_a_vector_and_cells_are_refused():
         A = lambda q, u, v, x: getattr(q, name) * lp.dot(u, v)  # noqa: E731
         return lp.Model(state, {name: lp.Scalar()}, A)
 
-    for name in ("u_x", "u_y_std", "y", "cell", *cells(mesh)):
+    for name in ("u_x", "u_y_std", "y", "cell", "sensor_x", *cells(mesh)):
         with pytest.raises(lp.ModelError, match=f"'{name}' would be"):
             model(name)
     assert model("z")

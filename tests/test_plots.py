@@ -197,6 +197,16 @@ def test_a_field_in_the_plane_is_a_map_with_its_deviation() -> None:
     assert len(given.get_array()) == 5
 
 
+def test_sensors_are_on_maps() -> None:
+    points = np.array([[0, 1, 0, 1, 0.5], [0, 0, 1, 1, 0.5]], dtype=float)
+    data = dataset(fields=("q",), points=points)
+    count = data.sizes["sensor"]
+    x, y = np.linspace(0.1, 0.9, count), np.full(count, 0.5)
+    data = data.assign_coords(sensor_x=("sensor", x), sensor_y=("sensor", y))
+    (shown,) = panel(drawn(plots.overview(data)), "u at").lines
+    assert np.array_equal(shown.get_xydata(), np.stack([x, y], axis=1))
+
+
 def test_a_field_in_space_is_its_range() -> None:
     data = dataset(fields=("q",), points=np.random.default_rng(0).random((3, 8)))
     assert texts(panel(drawn(plots.overview(data)), "q in space")) == ["range", "median"]

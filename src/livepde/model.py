@@ -112,6 +112,8 @@ class Model:
         them a complex step is taken (exact for analytic integrands).
     inputs
         Names of the channels that forms read as x.inputs["name"].
+    time_unit, length_unit
+        Units of times and coordinates, for tables, figures and sentences.
     initial
         Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
         projection is where u begins. Unknowns in it belong to the initial state.
@@ -141,6 +143,7 @@ class Model:
         dB: Integrand | Sequence[Integrand] | None = None,
         inputs: Sequence[str] = (),
         time_unit: str = "",
+        length_unit: str = "",
         initial: Integrand | On | Sequence[Integrand | On] | None = None,
     ) -> None:
         self._parts: dict[str, Any] = {
@@ -149,7 +152,8 @@ class Model:
         }
         self.state = state
         self.parameter = parameter
-        self.time_unit = time_unit
+        self.time_unit, self.length_unit = time_unit, length_unit
+        self._units: dict[str, Any] = {"time_unit": time_unit, "length_unit": length_unit}
         self.state_space = FunctionSpace.of(state, "u")
         self.mesh = _common_mesh(self.state_space)
         self.parameter_space = FunctionSpace.of(parameter, "q")
@@ -202,7 +206,7 @@ class Model:
             what = f"the name '{taken[0]}' is taken" if taken else "its one unknown has no name"
             raise ModelError(f"with_unknowns: {what}; write parameter={{name: unknown, ...}}.")
         unknowns = {**cast(Mapping[str, Unknown], self.parameter), **more}
-        return Model(self.state, unknowns, **self._parts, time_unit=self.time_unit)
+        return Model(self.state, unknowns, **self._parts, **self._units)
 
     def with_terms(
         self,
@@ -231,7 +235,7 @@ class Model:
             given = parts[name] if isinstance(parts[name], Sequence) else [parts[name]]
             parts[name] = [*given, *more]
         parts["inputs"] = tuple(dict.fromkeys([*self.inputs, *inputs]))
-        return Model(self.state, self.parameter, **parts, time_unit=self.time_unit)
+        return Model(self.state, self.parameter, **parts, **self._units)
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
         """Return the same process with constants in the place of some of its inputs.
@@ -258,7 +262,7 @@ class Model:
 
         parts = {name: bound(part) for name, part in self._parts.items() if name != "inputs"}
         left = [name for name in self.inputs if name not in values]
-        return Model(self.state, self.parameter, **parts, inputs=left, time_unit=self.time_unit)
+        return Model(self.state, self.parameter, **parts, inputs=left, **self._units)
 
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
@@ -281,7 +285,7 @@ class Model:
             return finer(parts)
 
         state, parameter = of(self.state), of(self.parameter)
-        return Model(state, parameter, **self._parts, time_unit=self.time_unit)
+        return Model(state, parameter, **self._parts, **self._units)
 
     def _check_parameter(self) -> None:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)

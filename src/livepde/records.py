@@ -338,6 +338,8 @@ class Layout:
         Labels of scalar unknowns, names of unknown fields and of variables of the state.
     length_unit
         Unit of coordinates.
+    places
+        Sensor, withheld or not, that is at one point -> its coordinates.
     attrs
         Attributes of the dataset: title, origin (the date of t = 0), equation.
     """
@@ -354,6 +356,7 @@ class Layout:
     fields: Sequence[str]
     state: Sequence[str]
     length_unit: str = ""
+    places: Mapping[str, Sequence[float]] = field(default_factory=dict)
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -389,6 +392,8 @@ class Layout:
                 axis: ("vertex", np.array(x), {"units": self.length_unit})
                 for axis, x in self.coordinates.items()
             },
+            **self._places("sensor", self.sensors),
+            **self._places("withheld", self.withheld or ()),
         }
         data: dict[str, Any] = {
             kind: (("cell", "corner"), np.array(corners, dtype=np.int32))
@@ -418,6 +423,16 @@ class Layout:
         }
         return data, coords, about
 
+    def _places(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
+        """Return the coordinates of sensors, NaN for those that are not at one point."""
+        if not any(name in self.places for name in names):
+            return {}
+        nowhere = [np.nan] * len(self.coordinates)
+        at = np.array([self.places.get(name, nowhere) for name in names])
+        unit = {"units": self.length_unit}
+        axes = zip(self.coordinates, at.T, strict=True)
+        return {f"{dimension}_{axis}": (dimension, x, unit) for axis, x in axes}
+
     @classmethod
     def own_names(cls, axes: Iterable[str], cells: Iterable[str]) -> set[str]:
         """Return the names of dimensions, coordinates and variables that every dataset has.
@@ -429,7 +444,8 @@ class Layout:
         """
         pair = ["1", "2"]  # two unknown numbers, so that they have a correlation
         grid, none = {axis: [0.0] for axis in axes}, {kind: [[0]] for kind in cells}
-        blank = cls("", "", grid, none, ["z"], ["w"], {}, {}, pair, [], [])
+        at = {name: [0.0] * len(grid) for name in ("z", "w")}
+        blank = cls("", "", grid, none, ["z"], ["w"], {}, {}, pair, [], [], places=at)
         rows, snapshot = RecordArrays(), Snapshot({}, {}, np.eye(2))
         rows.append(Record(0.0, np.zeros(0), np.zeros(1), np.zeros(1), 0, 1, {}, snapshot))
         data, coords, _ = blank._contents(rows, None)

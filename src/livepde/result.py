@@ -437,6 +437,7 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
     points = model.mesh.p[:, vertex_order(model)]
     components = model.state_space.fields.items()
+    places = {**observed.places, **({} if withheld is None else withheld.places)}
     return Layout(
         time_unit=model.time_unit,
         sensor_unit=observed.observation.unit,
@@ -449,6 +450,8 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         scalars=list(model.parameter_space.labels),
         fields=list(model.parameter_space.fields),
         state=[key for name, block in components for key in block.variables(name)],
+        length_unit=model.length_unit,
+        places={name: at.tolist() for name, at in places.items()},
     )
 
 

@@ -14,7 +14,7 @@ from livepde.dashboard import cuts
 from livepde.dashboard.canvas import GRID, band, empty, show, text, unit_label, unit_of
 from livepde.dashboard.times import at_time
 from livepde.linalg import Array
-from livepde.plots import GREY, PALETTE, interval_95, labelled
+from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
 
 __all__ = ["drawn_by", "field_map", "field_profile", "field_solid"]
 
@@ -82,8 +82,20 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
         z=drawn.of(values).astype(np.float32),
         colorscale=_colours(name),
         colorbar=_bar(data, name),
+        zsmooth="best",
         hovertemplate="x %{x:.4g}, y %{y:.4g}: %{z:.4g}<extra></extra>",
     )
+    for kind, sensors in sensor_places(data).items():
+        inside, edge = ("white", "black") if kind == "sensor" else ("black", "white")
+        figure.add_scatter(
+            x=sensors.x,
+            y=sensors.y,
+            text=sensors.names,
+            mode="markers",
+            marker={"size": 7, "color": inside, "line": {"color": edge, "width": 1.2}},
+            showlegend=False,
+            hovertemplate=f"{kind} %{{text}}<extra></extra>",
+        )
     figure.update_layout(hovermode="closest", yaxis={"scaleanchor": "x", "constrain": "domain"})
     figure.update_xaxes(constrain="domain", showgrid=False, zeroline=False)
     figure.update_yaxes(showgrid=False, zeroline=False)

@@ -111,6 +111,7 @@ def advection_diffusion(
         A=transport,
         inputs=["dH"] if K is not None else [],
         time_unit="s",
+        length_unit="m",
     )
 
 

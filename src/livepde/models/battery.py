@@ -94,6 +94,7 @@ def battery_particle(
         f=On("right", lambda x, t: -x.inputs["I"] / (FARADAY * area)),
         inputs=["I"],
         time_unit="s",
+        length_unit="m",
     )
 
 

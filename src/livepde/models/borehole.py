@@ -124,6 +124,7 @@ def grouted_borehole(
         f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
         inputs=["Q"],
         time_unit="s",
+        length_unit="m",
     )
 
 

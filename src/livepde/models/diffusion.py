@@ -154,6 +154,7 @@ def _model(
         M=lambda u, v, x: capacity(x) * u * v,
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
         time_unit="s",
+        length_unit="m",
     )
 
 

@@ -56,6 +56,7 @@ def fisher_kpp(
         {"D": D, "r": r},
         A=lambda q, u, v, x: q.D * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v,
         time_unit="d",
+        length_unit="mm",
     )
 
 
@@ -99,6 +100,7 @@ def porous_fisher(
             q.D * positive(u / K) ** m * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v
         ),
         time_unit="d",
+        length_unit="mm",
     )
 
 

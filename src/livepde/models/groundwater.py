@@ -59,6 +59,7 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
         time_unit="s",
+        length_unit="m",
     )
 
 
@@ -138,7 +139,14 @@ def groundwater(
     state = Field(
         mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit="m", quadrature=4
     )
-    return Model(state, {"T": T, "S": S}, A=[flow, taken], inputs=tuple(sources), time_unit="s")
+    return Model(
+        state,
+        {"T": T, "S": S},
+        A=[flow, taken],
+        inputs=tuple(sources),
+        time_unit="s",
+        length_unit="m",
+    )
 
 
 def well(x: Place, at: Sequence[float], radius: float) -> Array:

@@ -58,6 +58,7 @@ def borehole(
             f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
             inputs=["Q"],
             time_unit="s",
+            length_unit="m",
         )
     # The mass term must not contain unknowns, so the equation is divided by the heat capacity.
     return Model(
@@ -70,6 +71,7 @@ def borehole(
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
         time_unit="s",
+        length_unit="m",
     )
 
 

@@ -76,6 +76,7 @@ def advection_dispersion(
         M=lambda c, w, x: R * c * w,
         inputs=["c_in"],
         time_unit="h",
+        length_unit="cm",
     )
 
 
@@ -133,6 +134,7 @@ def mobile_immobile(
         A=[transport, exchange, *_ends(lambda q: q.v / q.phi, lambda u: u.c, inlet)],
         inputs=["c_in"],
         time_unit="h",
+        length_unit="cm",
     )
 
 

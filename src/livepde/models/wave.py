@@ -88,6 +88,7 @@ def wave(
         B=lambda u, v, x: -u.p * v.w + level * u.p * v.p,
         f={"p": f},
         time_unit="s",
+        length_unit="m",
     )
 
 

@@ -97,6 +97,11 @@ class Observation:
         return tuple(f"z{k}" for k in range(count))
 
     @property
+    def places(self) -> Array | None:
+        """Coordinates of the sensors, shape (sensors, d), if each is at one point."""
+        return None
+
+    @property
     def directs(self) -> Mapping[str, Direct]:
         """Direct dependence on the parameter, linear in q, by sensor name."""
         return {}
@@ -160,6 +165,12 @@ class Observed:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
         self._splits: Memo[bytes, Split] = Memo(LARGEST_MEMO)
         self._reconstructors: Memo[bytes, Reconstructor] = Memo(LARGEST_MEMO)
+
+    @property
+    def places(self) -> Mapping[str, Array]:
+        """Coordinates of the sensors that are at one point each, by name."""
+        at = self.observation.places
+        return {} if at is None else dict(zip(self.names, at, strict=True))
 
     @property
     def nodal(self) -> bool:

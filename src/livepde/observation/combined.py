@@ -109,6 +109,10 @@ class CombinedObserved(Observed):
     def _names(self) -> tuple[str, ...]:
         return tuple(name for part in self.parts for name in part.names)
 
+    @property
+    def places(self) -> Mapping[str, Array]:
+        return {name: at for part in self.parts for name, at in part.places.items()}
+
     @cached_property
     def noise(self) -> Array | None:
         own = super().noise
@@ -217,6 +221,10 @@ class CalibratedObserved(Observed):
 
     def _names(self) -> tuple[str, ...]:
         return self.base.names
+
+    @property
+    def places(self) -> Mapping[str, Array]:
+        return self.base.places
 
     @property
     def linear(self) -> bool:

@@ -99,6 +99,10 @@ class Transformed(Observation):
         return self.base.directs
 
     @property
+    def places(self) -> Array | None:
+        return self.base.places
+
+    @property
     def nodal(self) -> bool:
         return self.base.nodal
 

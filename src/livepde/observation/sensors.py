@@ -107,6 +107,10 @@ class Points(Observation):
         return super().names(count)
 
     @property
+    def places(self) -> Array:
+        return self.positions
+
+    @property
     def directs(self) -> Mapping[str, Direct]:
         return self.direct
 

@@ -8,7 +8,14 @@ changed.
 from __future__ import annotations
 
 from livepde.plots.curves import ensemble, history, loops, profiles
-from livepde.plots.dataset import NORMAL_95, interval_95, labelled, scored_from, time_scale
+from livepde.plots.dataset import (
+    NORMAL_95,
+    interval_95,
+    labelled,
+    scored_from,
+    sensor_places,
+    time_scale,
+)
 from livepde.plots.run import overview
 from livepde.plots.style import GREY, PALETTE, figure
 
@@ -25,5 +32,6 @@ __all__ = [
     "overview",
     "profiles",
     "scored_from",
+    "sensor_places",
     "time_scale",
 ]

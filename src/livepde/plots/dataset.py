@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,12 +17,14 @@ if TYPE_CHECKING:
 __all__ = [
     "MOST_LINES",
     "NORMAL_95",
+    "SensorPlaces",
     "groups",
     "interval_95",
     "labelled",
     "note",
     "scalars",
     "scored_from",
+    "sensor_places",
     "time_label",
     "time_scale",
     "time_text",
@@ -124,3 +126,24 @@ def scored_from(data: xr.Dataset) -> int:
         return 0
     first = int(np.searchsorted(data["time"].values, float(start)))
     return first if first < data.sizes["time"] else 0
+
+
+class SensorPlaces(NamedTuple):
+    """Names and coordinates of sensors on a plane domain."""
+
+    names: list[str]
+    x: Array
+    y: Array
+
+
+def sensor_places(data: xr.Dataset) -> dict[str, SensorPlaces]:
+    """Return the places of sensors on a plane domain, under "sensor" and "withheld"."""
+    return {
+        kind: SensorPlaces(
+            [str(name) for name in data[kind].values],
+            data[f"{kind}_x"].values,
+            data[f"{kind}_y"].values,
+        )
+        for kind in ("sensor", "withheld")
+        if f"{kind}_y" in data.coords
+    }

@@ -18,6 +18,7 @@ from livepde.plots.dataset import (
     labelled,
     note,
     scored_from,
+    sensor_places,
     time_text,
     time_values,
 )
@@ -175,6 +176,9 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
         shading="gouraud",
         cmap="cividis" if spread else "viridis",
     )
+    for kind, sensors in sensor_places(data).items():
+        inside, edge = ("white", "black") if kind == "sensor" else ("black", "white")
+        ax.plot(sensors.x, sensors.y, "o", ms=4, mec=edge, mfc=inside)
     what = labelled(name.removesuffix("_std"), str(data[name].attrs.get("units", "")))
     ax.figure.colorbar(drawn, ax=ax, label=f"standard deviation of {what}" if spread else what)
     when = time_text(data, data["snapshot"].values[-1])

@@ -286,7 +286,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
             f"Check the clock, the averaging and the response time of {name}.",
         ),
         "position": (
-            f"sensor {name} sits {abs(amount):.2g} away from where it is said to be, towards "
+            f"sensor {name} sits {abs(amount):.2g}{unit} away from where it is said to be, towards "
             f"{'larger' if size > 0 else 'smaller'} {'xyz'[direction.axis]}",
             f"Free it: channels.{name}.at_std.",
         ),

@@ -144,7 +144,7 @@ class Dictionary:
                     elif kind == "gain":
                         size = GAIN
                     elif kind == "position" and position is not None:
-                        size = position[1]
+                        size, of = position[1], model.length_unit
                     self.directions.append(ScoreDirection(kind, name, size, of, axis))
                     self.owner.append(k)
             self.parts[kind] = slice(start, len(self.directions))
