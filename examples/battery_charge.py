@@ -14,7 +14,7 @@ PERIOD, NOISE, LIMIT = 30.0, 2e-3, 0.85  # s, V, filling at the surface
 
 def particle(cells: int) -> lp.Model:
     """Return the particle, on a mesh that is finer towards the surface."""
-    mesh = lp.line((R * (1.0 - np.linspace(1.0, 0.0, cells + 1) ** 2)).tolist())
+    mesh = lp.fem.line((R * (1.0 - np.linspace(1.0, 0.0, cells + 1) ** 2)).tolist())
     D = lp.Scalar(6e-15, std=3e-15, transform="log", bounds=(0.0, np.inf))
     return battery_particle(mesh, D, area=AREA, c_max=FULL)
 
@@ -51,12 +51,12 @@ class Cell:
 def main(D: float = 3e-15) -> dict[str, float]:
     """Charge a cell from 30 to 75 %; return what was reached, and the estimate over the truth."""
     model, cell = particle(24), Cell(D)
-    sensor = lp.Transformed(lp.Points({"V": R}), voltage, noise=NOISE)
+    sensor = lp.observation.Transformed(lp.Points({"V": R}), voltage, noise=NOISE)
     identifier = lp.Identifier(
         model, sensor, lp.SensitivityLaw(), u0=0.3 * FULL, scheme=lp.Alexander2(), hold=True
     )
 
-    seen = lp.Functionals(
+    seen = lp.observation.Functionals(
         {
             "mean": lambda q, c, x: 3.0 * x[0] ** 2 / R**3 * c / FULL,
             "surface": lp.On("right", lambda q, c, x: c / FULL),

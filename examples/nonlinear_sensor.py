@@ -13,7 +13,7 @@ model = lp.Model(
     parameter={"k": lp.Scalar(0.5, std=0.3, bounds=(0.01, 5.0)), "s": lp.Scalar(0.0, std=2.0)},
     A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
 )
-sensors = lp.Transformed(
+sensors = lp.observation.Transformed(
     lp.Points({"T_1": 0.2, "T_2": 0.5, "T_3": 1.0}),
     function=lambda T: T**4,
     derivative=lambda T: 4 * T**3,  # may be left out: T**4 is analytic

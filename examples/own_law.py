@@ -20,7 +20,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class ExplicitLaw(lp.Law):
+class ExplicitLaw(lp.laws.Law):
     """Step u with the old q, pull R u to the data, then q += h gain A(u)* r."""
 
     gain: float = 1.0
@@ -46,11 +46,11 @@ class ExplicitLaw(lp.Law):
         r = split.R @ u - split.reconstruct(interval.z1, boundary)
         q = state.q + h * self.gain * model.A(u, interval.end).adjoint(r)
         new = State(u - h * self.pull / (1 + h * self.pull) * r, q)
-        return new, lp.Report(lp.Status(), predicted, steps=1)
+        return new, lp.laws.Report(lp.laws.Status(), predicted, steps=1)
 
     def belief(self, work, state):
         """Return the estimates; a law with a covariance gives its square roots too."""
-        return lp.Belief(state.q, state.u)
+        return lp.laws.Belief(state.q, state.u)
 
 
 def problem() -> tuple[lp.Model, lp.Subdomain]:

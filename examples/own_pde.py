@@ -27,7 +27,7 @@ def main():
     k = lp.Scalar(15.0, std=10.0, unit="W/(m K)", transform="log")
     eps = lp.Scalar(0.5, std=0.2, bounds=(0.0, 1.0), transform="logit")
     model = radiating_rod(lp.interval(0.0, 0.2, 40), {"k": k, "eps": eps}, {"left": 900.0})
-    lp.check_model(model, u=600.0, inputs={"a": 300.0}).raise_if_failed()
+    lp.diagnostics.check_model(model, u=600.0, inputs={"a": 300.0}).raise_if_failed()
     sensors = lp.Points({"T_2": 0.02, "T_5": 0.05, "T_9": 0.09}, noise=1.0, unit="K")
     truth = {"q_true": {"k": 21.0, "eps": 0.8}, "u0": 300.0, "inputs": lambda t: {"a": 300.0}}
     times, noise = 10.0 * np.arange(121), AbsoluteNoise(1.0)

@@ -11,7 +11,7 @@ from livepde.fem import FunctionSpace
 
 
 @dataclass(frozen=True, eq=False)
-class Differences(lp.Observation):
+class Differences(lp.observation.Observation):
     """Differences of the state between pairs of points."""
 
     pairs: tuple[tuple[float, float], ...]

@@ -33,7 +33,9 @@ def each(x, values, names=tuple(LAYERS)):
 def room(cells: int) -> lp.Model:
     """Return room and wall; unknown are the conductivities of the wall over the data sheets'."""
     nodes = [np.linspace(a, b, cells + 1)[1:] for a, b in zip([0.0, *ENDS], ENDS, strict=False)]
-    mesh = lp.line([0.0, *np.concatenate(nodes)]).with_subdomains({"air": lambda x: x[0] < 0.02})
+    mesh = lp.fem.line([0.0, *np.concatenate(nodes)]).with_subdomains(
+        {"air": lambda x: x[0] < 0.02}
+    )
     regions = {name: (lambda x, name=name: layer(x, name)) for name in WALL}
     k = lp.Piecewise(regions, prior=1.0, std=0.6, transform="log", bounds=(0.0, np.inf))
     return lp.Model(

@@ -58,7 +58,7 @@ def main() -> dict[str, tuple[float, float]]:
         "Tikhonov in X": Tikhonov("X", Discrepancy(tau=1.1)),
         "Tikhonov in V~": Tikhonov("V", Discrepancy(tau=1.1)),
     }.items():
-        sensors = lp.Matrix(G, noise=NOISE, reconstruction=reconstruction)
+        sensors = lp.observation.Matrix(G, noise=NOISE, reconstruction=reconstruction)
         twin = Twin(
             scheme=lp.ImplicitEuler(),
             model=model,
@@ -68,7 +68,7 @@ def main() -> dict[str, tuple[float, float]]:
             times=0.1 * np.arange(201),
             noise=AbsoluteNoise(NOISE),
         )
-        law = lp.GradientLaw(gain=1e3, damping=lp.ResidualDamping(100.0))
+        law = lp.GradientLaw(gain=1e3, damping=lp.laws.ResidualDamping(100.0))
         identifier = lp.Identifier(model, sensors, law, u0=lambda x: u_true(x, 0.0))
         errors = []
         for sample in twin:

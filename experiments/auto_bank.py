@@ -55,7 +55,7 @@ def data_of(problem: Problem, level: float, seed: int) -> Data:
     return replace(data, process=replace(data.process, model=model))
 
 
-def try_out(data: Data, law: lp.Law, noise: float | None = 1.0) -> Tried:
+def try_out(data: Data, law: lp.laws.Law, noise: float | None = 1.0) -> Tried:
     """Run a law that is told a multiple of the noise level, or nothing."""
     told = None if noise is None else (noise * data.noise).tolist()
     start = process_time()

@@ -58,7 +58,7 @@ def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = STEPS) -
         u_true=seed.u_true,
         times=seed.TIMES[:samples],
     )
-    laws = {c1: lp.GradientLaw(gain, lp.ResidualDamping(c1)) for c1 in steps}
+    laws = {c1: lp.GradientLaw(gain, lp.laws.ResidualDamping(c1)) for c1 in steps}
     return [try_out(twin, law, (c1,)) for c1, law in laws.items()]
 
 
@@ -85,7 +85,7 @@ def noisy(
     )
     found = []
     for mu, nu in product(steps, steps):
-        law = lp.GradientLaw(gain, lp.ConstantDamping(mu), nu=nu)
+        law = lp.GradientLaw(gain, lp.laws.ConstantDamping(mu), nu=nu)
         found.append(try_out(twin, law, (mu, nu)))
     return found
 

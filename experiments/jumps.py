@@ -41,15 +41,15 @@ def states() -> list[tuple[float, Any]]:
     forward, u = ForwardStage(model), model.initial(0.0)
     found = [(0.0, u)]
     for t0, t1 in pairwise(TIMES.tolist()):
-        u = forward.solve(u, np.array([truth(t1)]), t1 - t0, lp.Moment(t1))
+        u = forward.solve(u, np.array([truth(t1)]), t1 - t0, lp.fem.Moment(t1))
         found.append((t1, u))
     return found
 
 
-def measured(law: lp.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: int) -> Any:
+def measured(law: lp.laws.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: int) -> Any:
     """Return error before the jump, time until nine tenths of it are followed, error at the end."""
     rng, model = np.random.default_rng(seed), rod(unknown)
-    sensors: lp.Observation = lp.Points(POINTS, noise=NOISE)
+    sensors: lp.observation.Observation = lp.Points(POINTS, noise=NOISE)
     noise = NOISE
     if isinstance(law, lp.GradientLaw):
         sensors, noise = lp.Full(), 0.0
@@ -80,7 +80,7 @@ def main() -> None:
         "random walk 0.02, wide factor": (S(rank=30), walk[0.02]),
         **{
             f"gradient law, u exact, gain {gain:g}": (
-                lp.GradientLaw(gain, lp.ResidualDamping(10.0)),
+                lp.GradientLaw(gain, lp.laws.ResidualDamping(10.0)),
                 constant,
             )
             for gain in (1.0, 10.0)

@@ -23,7 +23,7 @@ FLOOR = 1e-8
 
 
 @dataclass(frozen=True)
-class Oracle(lp.Damping):
+class Oracle(lp.laws.Damping):
     """The least theta of the paper for the true errors of the sample before.
 
     Only r is of now: r_alpha in place of r, as the bound asks, where the data are exact. Below
@@ -36,7 +36,7 @@ class Oracle(lp.Damping):
     noisy: bool = False
     theta_max: float = 1e3
 
-    def theta(self, r: lp.Residual) -> float:
+    def theta(self, r: lp.laws.Residual) -> float:
         size = Norms(float(np.sqrt(r.X)), float(np.sqrt(r.VX)))
         if self.noisy:
             t = self.truth
@@ -101,8 +101,8 @@ def run(gain: float = 100.0, samples: int = 41, level: float = 0.0) -> list[Foun
     spaces = Spaces(model, twin.observed)
     c = constants(spaces, twin.q, twin.states[::10], gain=gain)
     nothing = Errors(0.0, 0.0, *([Norms()] * 4), Pu=0.0, rate=0.0, theta=0.0)
-    rules: dict[str, tuple[lp.Damping, bool]] = {
-        "c1 alone (ResidualDamping)": (lp.ResidualDamping(1.0), False),
+    rules: dict[str, tuple[lp.laws.Damping, bool]] = {
+        "c1 alone (ResidualDamping)": (lp.laws.ResidualDamping(1.0), False),
         "ExactBound, ||p|| <= 0.01": (ExactBound(c, 0.01, 1.0, FLOOR), False),
         "oracle mu": (Oracle(c, nothing, noisy=level > 0), False),
         "oracle mu and nu": (Oracle(c, nothing, noisy=level > 0), True),

@@ -70,7 +70,7 @@ def twin(setting: Setting, seed: int, samples: int) -> Twin:
 def run(setting: Setting, seed: int, samples: int | None = None) -> tuple[float, float]:
     """Return (T*, its surrogate) of one seed; infinity if not reached."""
     data = twin(setting, seed, samples or setting.samples)
-    law = lp.GradientLaw(gain=1000.0, damping=lp.ResidualDamping(setting.c1))
+    law = lp.GradientLaw(gain=1000.0, damping=lp.laws.ResidualDamping(setting.c1))
     identifier = lp.Identifier(data.model, data.observation, law, q0=0.0, u0=0.0)
     noise = RelativeNoise(setting.level)
     online = OnlineTracker(identifier, 0.1, noise=lambda z: noise.std(z, data.weights))

@@ -92,9 +92,9 @@ class DenseStage:
         reach[:-1][outside] = reach[1:][outside] = True
         tests = np.flatnonzero(~reach & (np.arange(n) > 0) & (np.arange(n) < n - 1))
 
-        def norms(v: np.ndarray, *seen: Any) -> lp.Residual:
+        def norms(v: np.ndarray, *seen: Any) -> lp.laws.Residual:
             Mv = M_op @ v
-            return lp.Residual(
+            return lp.laws.Residual(
                 v @ mass_in @ v, v @ Mv, lambda: self.dual(Mv, mass, tests) ** 2, *seen
             )
 

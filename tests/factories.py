@@ -142,7 +142,7 @@ def truth(
     q: np.ndarray,
     u0: Any,
     times: Any,
-    scheme: lp.Scheme | None = None,
+    scheme: lp.stepping.Scheme | None = None,
     inputs: Any = None,
 ) -> list[np.ndarray]:
     """Return the states of the forward model at all times."""
@@ -156,19 +156,19 @@ def advanced(
     q: Any,
     t0: float,
     t1: float,
-    scheme: lp.Scheme = lp.SensitivityLaw.scheme,
+    scheme: lp.stepping.Scheme = lp.SensitivityLaw.scheme,
 ) -> np.ndarray:
     """Return the state of the forward model at t1; q are coefficients, or a function of time."""
 
     def stage(c: np.ndarray, t: float, h: float) -> np.ndarray:
-        return forward.solve(c, q(t) if callable(q) else q, h, lp.Moment(t))
+        return forward.solve(c, q(t) if callable(q) else q, h, lp.fem.Moment(t))
 
     u, _, failure = advance(lp.Advance(scheme), stage, u, t0, t1)
     assert failure is None
     return u
 
 
-def observe(model: lp.Model, observation: lp.Observation) -> Any:
+def observe(model: lp.Model, observation: lp.observation.Observation) -> Any:
     return observation.bind(model.state_space, model.X, model.parameter_space)
 
 
@@ -180,12 +180,12 @@ def rates(errors: Any) -> np.ndarray:
 
 def readings(
     model: lp.Model,
-    sensors: lp.Observation,
+    sensors: lp.observation.Observation,
     q: Callable[[float], float],
     times: Iterable[float],
     noise: float,
     seed: int = 0,
-    scheme: lp.Scheme = lp.SensitivityLaw.scheme,
+    scheme: lp.stepping.Scheme = lp.SensitivityLaw.scheme,
 ) -> list[tuple[float, np.ndarray]]:
     """Return noisy samples of a process that starts at zero, with one unknown q(t)."""
     rng, observed = np.random.default_rng(seed), observe(model, sensors)

@@ -46,7 +46,7 @@ def run(scale, noise, strict):
     newton = lp.stepping.Newton()
     if strict:
         newton = replace(newton, tolerance=1e-12, share=0.0)
-    damping = lp.ConstantDamping(0.1 * scale)
+    damping = lp.laws.ConstantDamping(0.1 * scale)
     law = lp.GradientLaw(1 / scale**2, damping, newton=newton, gate=None)
     identifier = lp.Identifier(model, lp.Full(), law, q0=0.0, u0=lambda x: scale * state(x, 0.0))
     G = observe(model, lp.Full()).G
@@ -83,7 +83,7 @@ def test_the_run_is_the_same_in_every_unit(scale, noise):
 def test_a_state_of_which_nothing_is_seen_yet():
     """Where u_alpha = 0 the floor of a constant mu is zero: the stage is solved all the same."""
     model = heat(1.0)
-    law = lp.GradientLaw(1.0, lp.ConstantDamping(10.0))
+    law = lp.GradientLaw(1.0, lp.laws.ConstantDamping(10.0))
     identifier = lp.Identifier(model, lp.Full(), law, q0=0.0, u0=1e-9)
     for t in TIMES[:3]:
         estimate = identifier.step(t, np.zeros(identifier.observed.size))

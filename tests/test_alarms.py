@@ -101,7 +101,7 @@ def test_settings_of_the_test_reach_the_law(tmp_path: Path):
     for k, (bad, what) in enumerate(
         {"{ window = 3 }": "power of two", "{ windows = 8 }": "windows"}.items()
     ):
-        with pytest.raises(lp.CaseError, match=what):
+        with pytest.raises(lp.errors.CaseError, match=what):
             cases.load(rod(tmp_path / str(k), jumps=bad))
 
 
@@ -189,7 +189,7 @@ def learned(unknowns: dict[str, Any], rate: Any) -> tuple[Any, Any]:
 def test_shares_over_time_end_where_identifiability_says():
     unknowns = {
         "a": lp.Scalar(1.0, 0.5, transform="log"),
-        "b": lp.Scalar(0.0, 1.0, evolution=lp.Periodic(5.0)),
+        "b": lp.Scalar(0.0, 1.0, evolution=lp.fem.Periodic(5.0)),
         "f": lp.Field(MESH, ElementLineP1(), inner="H1", std=1.0),
     }
     data, known = learned(unknowns, lambda q: q.a + q.b + q.f)

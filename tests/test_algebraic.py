@@ -47,7 +47,7 @@ def test_only_components_without_a_mass_are_algebraic():
 
 
 def test_a_model_with_an_algebraic_component_passes_its_check():
-    report = lp.check_model(electrolyte(), u=0.5)
+    report = lp.diagnostics.check_model(electrolyte(), u=0.5)
     report.raise_if_failed()
     names = [line.name for line in report.lines]
     assert "M positive definite (failures)" in names
@@ -62,7 +62,7 @@ def test_a_model_with_an_algebraic_component_passes_its_check():
     ],
 )
 def test_what_does_not_determine_the_state_fails(options: Any, failed: list[str]):
-    report = lp.check_model(electrolyte(**options), u=0.5)
+    report = lp.diagnostics.check_model(electrolyte(**options), u=0.5)
     assert [line.name for line in report.failed] == failed
 
 
@@ -73,7 +73,7 @@ def test_the_potential_is_that_of_the_concentration_at_every_moment():
     space = model.state_space
     nodes = MESH.p[0]
     for k in range(5):
-        u = forward.solve(u, np.log([D, SIGMA]), 0.3, lp.Moment(0.3 * (k + 1)))
+        u = forward.solve(u, np.log([D, SIGMA]), 0.3, lp.fem.Moment(0.3 * (k + 1)))
         c, phi = u[space.part("c")], u[space.part("phi")]
         fine = np.linspace(0.0, 1.0, 4001)
         inner = (1.0 - fine) * np.interp(fine, nodes, c)
@@ -81,13 +81,13 @@ def test_the_potential_is_that_of_the_concentration_at_every_moment():
         assert phi[np.argmin(nodes)] == pytest.approx(expected, rel=1e-5)
 
 
-def samples(sensors: lp.Observation, noise: float) -> list[tuple[float, Any]]:
+def samples(sensors: lp.observation.Observation, noise: float) -> list[tuple[float, Any]]:
     model, rng = electrolyte(), np.random.default_rng(0)
     observed = sensors.bind(model.state_space, model.X, model.parameter_space)
     forward, u, found = ForwardStage(model), model.initial(0.0), []
     for k in range(80):
         for j in range(10):  # the truth takes ten steps for each of the filter's
-            moment = lp.Moment(0.1 * k + 0.01 * (j + 1))
+            moment = lp.fem.Moment(0.1 * k + 0.01 * (j + 1))
             u = forward.solve(u, np.log([D, SIGMA]), 0.01, moment)
         z = observed.G @ u
         found.append((0.1 * (k + 1), z + noise * rng.standard_normal(len(z))))
@@ -116,5 +116,5 @@ def test_both_unknowns_are_identified_from_the_potential(law: Any, of: str):
 
 def test_the_gradient_law_needs_a_mass_everywhere():
     potential = lp.Points([0.2, 0.6], of="phi")
-    with pytest.raises(lp.LawError, match="no mass term, so that M is no inner product"):
+    with pytest.raises(lp.errors.LawError, match="no mass term, so that M is no inner product"):
         lp.Identifier(electrolyte(), potential, lp.GradientLaw())

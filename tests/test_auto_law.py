@@ -234,7 +234,9 @@ def test_the_mesh_hardly_matters():
 
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_it_keeps_the_contract_of_a_law(noise: float | None):
-    lp.check_law(lp.AutoLaw(), lambda law: build(law, noise=noise), still()[:30]).raise_if_failed()
+    lp.diagnostics.check_law(
+        lp.AutoLaw(), lambda law: build(law, noise=noise), still()[:30]
+    ).raise_if_failed()
 
 
 @pytest.mark.parametrize("noise", [NOISE, None])
@@ -271,8 +273,8 @@ def test_a_member_that_fails_leaves_the_others_to_go_on(monkeypatch: pytest.Monk
         drifts = work.filter.drifts(state.now.member) > 0.0
         if span.t1 <= 3.0 or not drifts.any():
             return new, reports
-        status = lp.Status("not_finite", "the prediction is not finite")
-        failed = {int(k): lp.Report(status, np.zeros(3)) for k in np.flatnonzero(drifts)}
+        status = lp.laws.Status("not_finite", "the prediction is not finite")
+        failed = {int(k): lp.laws.Report(status, np.zeros(3)) for k in np.flatnonzero(drifts)}
         return new, reports.with_members(failed)
 
     monkeypatch.setattr(lp.SensitivityLaw, "step_members", fails)
@@ -288,7 +290,7 @@ def test_a_step_that_fails_for_all_changes_nothing(monkeypatch: pytest.MonkeyPat
 
     def fails(self: Any, work: Any, state: Any, span: Any) -> Any:
         count = len(state)
-        statuses = (lp.Status("singular", "no factor"),) * count
+        statuses = (lp.laws.Status("singular", "no factor"),) * count
         return state, MemberReports(statuses, np.zeros((count, 3)), np.zeros(count, dtype=int))
 
     with monkeypatch.context() as patched:
@@ -305,13 +307,15 @@ def test_an_unknown_with_an_evolution_of_its_own_keeps_it():
 
 
 def test_what_makes_no_sense_is_refused():
-    with pytest.raises(lp.LawError, match=r"AutoLaw: noise must be a positive number; got -1"):
+    with pytest.raises(
+        lp.errors.LawError, match=r"AutoLaw: noise must be a positive number; got -1"
+    ):
         lp.AutoLaw(noise=-1.0)
-    with pytest.raises(lp.LawError, match="gate must be positive"):
+    with pytest.raises(lp.errors.LawError, match="gate must be positive"):
         lp.AutoLaw(gate=0.0)
-    with pytest.raises(lp.LawError, match=r"got 'auto'\. The law finds the level by itself"):
+    with pytest.raises(lp.errors.LawError, match=r"got 'auto'\. The law finds the level by itself"):
         lp.AutoLaw(noise="auto")  # type: ignore[arg-type]
-    with pytest.raises(lp.LawError, match="replay must be a Replay; got True"):
+    with pytest.raises(lp.errors.LawError, match="replay must be a Replay; got True"):
         lp.AutoLaw(replay=True)  # type: ignore[arg-type]
 
 
@@ -376,5 +380,5 @@ def test_a_case_says_auto(tmp_path: Any, noise: bool):
 
 
 def test_keys_of_other_laws_are_errors_that_name_the_keys_of_this_one(tmp_path: Any):
-    with pytest.raises(lp.CaseError, match=r"law\.drift.*noise, modes|law\.drift"):
+    with pytest.raises(lp.errors.CaseError, match=r"law\.drift.*noise, modes|law\.drift"):
         load(_case(tmp_path, 'kind = "auto"\ndrift = 1.0'))

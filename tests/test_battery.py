@@ -147,7 +147,7 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
     model = particle(20, evolution=lp.RandomWalk(0.1 / 60.0), std=D).with_unknowns(
         {"R_0": lp.Scalar(0.03, 0.02, transform="log")}
     )
-    voltage = lp.Calibrated(
+    voltage = lp.observation.Calibrated(
         lp.Points({"V": R}),
         lambda c, q, x: graphite(c / FULL) + q.R_0 * x.inputs["I"],
         inputs=("I",),
@@ -166,7 +166,7 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
         inputs, control = lambda t, now=now: now, Advance(lp.SensitivityLaw.scheme)
         steps = simulate(model, latent, c, [before, t], control, inputs)
         *_, (_, c) = steps
-        z = observed.predict(c, model.latent.value(latent), lp.Moment(t, now))
+        z = observed.predict(c, model.latent.value(latent), lp.fem.Moment(t, now))
         estimate = identifier.step(t, {"V": z[0] + noise * rng.normal()}, now)
         ratios.append(estimate.parameters["D"][0] / q["D"])
     late = np.array(ratios[len(ratios) // 2 :])

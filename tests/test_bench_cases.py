@@ -116,13 +116,13 @@ def test_only_some(project):
     code, output = call("--only", "rod", "--folder", str(project.parent))
     assert "five seeds" in output
     assert code == 0  # as every command without --json
-    with pytest.raises(lp.ConfigurationError, match="did you mean 'rod'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="did you mean 'rod'"):
         call("--only", "rodd")
 
 
 def test_no_cases(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(lp.CaseError, match="add --folder DIR"):
+    with pytest.raises(lp.errors.CaseError, match="add --folder DIR"):
         call()
-    with pytest.raises(lp.CaseError, match="there are no case files"):
+    with pytest.raises(lp.errors.CaseError, match="there are no case files"):
         call("--folder", str(tmp_path))

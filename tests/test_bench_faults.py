@@ -177,7 +177,7 @@ def test_soak_in_small(monkeypatch):
     assert checks["steps that failed"].ok
     assert checks["estimates that a reader does not find"].ok
     assert checks["relative error of k at the end"].ok
-    with pytest.raises(lp.RunError, match="at least 600"):
+    with pytest.raises(lp.errors.RunError, match="at least 600"):
         soak.soak(100)
 
 
@@ -204,7 +204,7 @@ def test_the_journal_has_a_price(monkeypatch, tmp_path, data_dir):
     assert all(0.0 < cell < 1e3 for row in times.rows for cell in row[1:])
     assert ratios.rows[0][1] > 0.0
     (tmp_path / "other.toml").touch()
-    with pytest.raises(lp.ConfigurationError, match="soil_uniform"):
+    with pytest.raises(lp.errors.ConfigurationError, match="soil_uniform"):
         journal(tmp_path)
 
 
@@ -229,5 +229,5 @@ def test_the_commands_print_json(monkeypatch):
     assert json.loads(out)["command"].endswith(
         "--kills 7 --samples 2000 --malformed 100000 --flips 200 --seed 0 --only file --workers 1"
     )
-    with pytest.raises(lp.ConfigurationError, match="there is no part 'nothing'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="there is no part 'nothing'"):
         bench("faults", "--only", "nothing")

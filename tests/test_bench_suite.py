@@ -112,7 +112,7 @@ def test_coverage_counts_intervals_that_hold_the_truth(data):
 
 def test_a_contender_that_fails_is_a_row(data):
     def broken(data):
-        raise lp.LawError("no")
+        raise lp.errors.LawError("no")
 
     score = scoring.scored(broken, data)
     assert score is not None

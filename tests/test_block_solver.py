@@ -19,7 +19,7 @@ from livepde.laws.coupled.blocks import BlockJacobian, BlockSolver
 from livepde.laws.metrics import ConstantMetric
 from livepde.linalg import choice
 
-EXACT = lp.Newton(tolerance=1e-11, share=0.0)
+EXACT = lp.stepping.Newton(tolerance=1e-11, share=0.0)
 
 
 def inside(x):
@@ -73,7 +73,7 @@ CASES = {
     "constant mu, nu, sigma": (
         {},
         lp.Subdomain(inside),
-        {"damping": lp.ConstantDamping(0.5, floor=0.1), "nu": 0.1, "sigma": 0.1},
+        {"damping": lp.laws.ConstantDamping(0.5, floor=0.1), "nu": 0.1, "sigma": 0.1},
     ),
     "a diffusivity": (
         {"A": lambda q, u, v, x: (0.1 + q) * lp.dot(lp.grad(u), lp.grad(v)), "diffusion": 0.0},
@@ -145,7 +145,7 @@ def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
     """Return the solver by blocks, the first stage, and a point."""
     monkeypatch.setattr(blocks, "LARGE", 1)
     monkeypatch.setattr(choice, "WIDEST_BAND", 10)
-    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(c1))
+    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(c1))
     ident = lp.Identifier(model, sensors or lp.Full(), law, q0=0.5, u0=2.0)
     stage = ident._work.stage(np.ones(ident.observed.size, dtype=bool))
     assert isinstance(stage.solver, BlockSolver)

@@ -186,7 +186,7 @@ def plane(far: float = 12.0, cells: int = 60, **more: float) -> lp.Model:
     r = np.geomspace(0.02, far, cells + 1)
     z = np.concatenate([[0.0], np.geomspace(0.05, half, 14)])
     return grouted_borehole(
-        lp.grid(r, z), **{name: unknown(name) for name in TRUTH}, **(KNOWN | more)
+        lp.fem.grid(r, z), **{name: unknown(name) for name in TRUTH}, **(KNOWN | more)
     )
 
 
@@ -198,7 +198,7 @@ def fluid(process: lp.Model, times: Any) -> float:
     sensor = lp.Averages({"T": "left"}).bind(
         process.state_space, process.X, process.parameter_space
     )
-    moment = lp.Moment(float(times[-1]), heated(0.0))
+    moment = lp.fem.Moment(float(times[-1]), heated(0.0))
     return float(sensor.predict(u, process.latent.value(start), moment)[0])
 
 
@@ -312,7 +312,7 @@ def test_a_short_borehole_from_a_case(tmp_path: Path, finite: bool) -> None:
     sensor = lp.Averages({"T": "left"}).bind(
         process.state_space, process.X, process.parameter_space
     )
-    heated, q = lp.Moment(0.0, {"Q": POWER}), process.latent.value(start)
+    heated, q = lp.fem.Moment(0.0, {"Q": POWER}), process.latent.value(start)
     states = simulate(process, start, 10.0, times, advance, lambda t: {"Q": POWER})
     noise = np.random.default_rng(3).normal(0.0, 0.01, len(times))
     shown = [sensor.predict(u, q, heated)[0] for _, u in states]

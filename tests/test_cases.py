@@ -71,7 +71,9 @@ def test_quantities(value, unit, expected):
 
 
 def test_decibels_are_no_unit_of_a_case():
-    with pytest.raises(lp.CaseError, match="here: 'dB' has no linear scale; expected a number"):
+    with pytest.raises(
+        lp.errors.CaseError, match="here: 'dB' has no linear scale; expected a number"
+    ):
         convert("3 dB", "", "here")
 
 
@@ -89,7 +91,7 @@ def test_deviations_of_temperatures_are_differences():
     ],
 )  # fmt: skip
 def test_wrong_quantities_name_the_key(value, unit):
-    with pytest.raises(lp.CaseError, match=r"case.toml: mesh.to"):
+    with pytest.raises(lp.errors.CaseError, match=r"case.toml: mesh.to"):
         convert(value, unit, "case.toml: mesh.to")
 
 
@@ -134,11 +136,11 @@ def test_sensors_that_one_cell_does_not_tell_apart_are_named(rod):
 def test_template_is_not_written_over(tmp_path):
     write_template(tmp_path)
     (tmp_path / "case.toml").unlink()
-    with pytest.raises(lp.RunError, match="nothing was written"):
+    with pytest.raises(lp.errors.RunError, match="nothing was written"):
         write_template(tmp_path)
     assert not (tmp_path / "case.toml").exists()
     (tmp_path / "file").write_text("")
-    with pytest.raises(lp.RunError, match="cannot be written"):
+    with pytest.raises(lp.errors.RunError, match="cannot be written"):
         write_template(tmp_path / "file" / "below")
 
 
@@ -203,7 +205,7 @@ def test_layers_with_priors_of_their_own(rod):
     ],
 )  # fmt: skip
 def test_layers_that_are_refused(rod, region, named):
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(rod((LAYERS[0], f"regions = {{ a = {region} }}\nbounds = [")))
     assert named.replace("{}", "unknowns.alpha.regions.a") in str(error.value)
 
@@ -290,17 +292,20 @@ left = {{ role = "boundary", column = "left", at = "left" }}
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
-        ("true", lp.Tikhonov("V", lp.Discrepancy(1.1))),
-        ('{ norm = "X", tau = 1.5 }', lp.Tikhonov("X", lp.Discrepancy(1.5))),
-        ("{ alpha = 1e-3 }", lp.Tikhonov("V", 1e-3)),
-        ("false", lp.Pseudoinverse()),
+        ("true", lp.observation.Tikhonov("V", lp.observation.Discrepancy(1.1))),
+        (
+            '{ norm = "X", tau = 1.5 }',
+            lp.observation.Tikhonov("X", lp.observation.Discrepancy(1.5)),
+        ),
+        ("{ alpha = 1e-3 }", lp.observation.Tikhonov("V", 1e-3)),
+        ("false", lp.observation.Pseudoinverse()),
     ],
 )
 def test_tikhonov_from_a_case(rod, keys, expected):
     kind = ('kind = "sensitivity" ', f'kind = "gradient"\ngain = 1e-12\ntikhonov = {keys}\n#')
     prepared = cases.load(rod(kind, NO_REPLAY)).prepare()
     assert prepared.identifier.observed.observation.reconstruction == expected
-    assert prepared.identifier.withheld.observation.reconstruction == lp.Pseudoinverse()
+    assert prepared.identifier.withheld.observation.reconstruction == lp.observation.Pseudoinverse()
     for sample in list(prepared.stream)[:4]:
         estimate = prepared.identifier.step(sample.t, sample.z, sample.inputs)
     assert estimate.status.ok
@@ -309,18 +314,20 @@ def test_tikhonov_from_a_case(rod, keys, expected):
 
 def test_tikhonov_by_discrepancy_needs_the_noise(rod):
     kind = ('kind = "sensitivity" ', 'kind = "gradient"\ntikhonov = true\n#')
-    with pytest.raises(lp.CaseError, match="noise of every sensor"):
+    with pytest.raises(lp.errors.CaseError, match="noise of every sensor"):
         cases.load(rod(kind, NO_REPLAY, (', noise = "0.05 K"', ""))).prepare()
 
 
 def test_gradient_law_on_points_gets_a_note(rod):
     case = cases.load(rod(GRADIENT, NO_REPLAY))
     assert "point sensors mislead" in case.notes[0]
-    assert isinstance(cases.load(rod(("gain = 1e-12", "mu = 2"))).law.damping, lp.ConstantDamping)
+    assert isinstance(
+        cases.load(rod(("gain = 1e-12", "mu = 2"))).law.damping, lp.laws.ConstantDamping
+    )
 
 
 def test_two_damping_rules(rod):
-    with pytest.raises(lp.CaseError, match="c1 and mu are two damping rules"):
+    with pytest.raises(lp.errors.CaseError, match="c1 and mu are two damping rules"):
         cases.load(rod(GRADIENT, NO_REPLAY, ("gain = 1e-12", "c1 = 1\nmu = 1")))
 
 
@@ -335,10 +342,10 @@ def test_sensitivity_options(rod):
 
 
 def test_guards(rod):
-    assert cases.load(rod(("replay = true", "guards = true"))).law.guards == lp.Guards()
+    assert cases.load(rod(("replay = true", "guards = true"))).law.guards == lp.laws.Guards()
     assert cases.load(rod(("guards = true", "guards = false"))).law.guards is None
     some = cases.load(rod(("guards = false", "guards = { reach = 2 }")))
-    assert some.law.guards == lp.Guards(reach=2.0)
+    assert some.law.guards == lp.laws.Guards(reach=2.0)
 
 
 @pytest.mark.slow
@@ -353,7 +360,7 @@ def test_the_level_of_the_noise_is_found(rod):
     assert float(result["alpha"][-1]) == pytest.approx(9.7e-5, rel=0.02)
     path.write_text(re.sub(r', noise = "[^"]*"', "", path.read_text()))
     with pytest.raises(
-        lp.CaseError, match=r"law\.noise: got 'auto', .* give every sensor its noise"
+        lp.errors.CaseError, match=r"law\.noise: got 'auto', .* give every sensor its noise"
     ):
         cases.load(path)
 
@@ -415,7 +422,7 @@ def own_code(rod, body: str) -> Path:
 
 def test_own_equation_needs_permission(rod):
     path = own_code(rod, "raise SystemExit(3)\n")
-    with pytest.raises(lp.CaseError, match="--allow-code"):
+    with pytest.raises(lp.errors.CaseError, match="--allow-code"):
         cases.load(path)
 
 
@@ -446,10 +453,10 @@ def test_own_equation_object_keeps_units(rod):
         ("other = 3", "no function 'build'"),
         ("def build(mesh, unknowns, dirichlet):\n    return 3", "returned int"),
         ("def build(mesh, unknowns, dirichlet):\n    return 1 / 0", "ZeroDivisionError"),
-        ("import livepde\nraise livepde.ModelError('mine')", "mine"),
+        ("import livepde\nraise livepde.errors.ModelError('mine')", "mine"),
         (
             "import livepde\ndef build(mesh, unknowns, dirichlet):\n"
-            "    raise livepde.ModelError('mine')",
+            "    raise livepde.errors.ModelError('mine')",
             "mine",
         ),
     ],
@@ -468,11 +475,13 @@ def test_own_module(rod):
     path = rod(('equation = "heat"  ', 'equation = "livepde.models.diffusion:HEAT"  '))
     assert cases.load(path, allow_code=True).frame.equation.name == "heat"
     path = rod(("livepde.models.diffusion:HEAT", "missing.py:build"))
-    with pytest.raises(lp.CaseError, match=r"there is no file '.*missing\.py'"):
+    with pytest.raises(lp.errors.CaseError, match=r"there is no file '.*missing\.py'"):
         cases.load(path, allow_code=True)
     path.with_name("broken.py").write_text("import missing_module")
     path = rod(("missing.py:build", "broken.py:build"))
-    with pytest.raises(lp.CaseError, match=r"loading 'broken\.py' failed with ModuleNotFound"):
+    with pytest.raises(
+        lp.errors.CaseError, match=r"loading 'broken\.py' failed with ModuleNotFound"
+    ):
         cases.load(path, allow_code=True)
 
 
@@ -480,7 +489,9 @@ def test_code_where_the_user_is_and_not_the_case(rod, monkeypatch):
     path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
     monkeypatch.chdir(path.parents[1])
     Path("mine.py").write_text("")
-    with pytest.raises(lp.CaseError, match=r"beside the case; did you mean '\.\./mine\.py'\?"):
+    with pytest.raises(
+        lp.errors.CaseError, match=r"beside the case; did you mean '\.\./mine\.py'\?"
+    ):
         cases.load(path, allow_code=True)
 
 
@@ -488,7 +499,7 @@ def test_a_unit_where_a_function_has_none(rod):
     path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
     path.with_name("mine.py").write_text("def rod(mesh, unknowns, dirichlet):\n    pass\n")
     with pytest.raises(
-        lp.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* say unknowns\.alpha\.unit"
+        lp.errors.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* say unknowns\.alpha\.unit"
     ):
         cases.load(path, allow_code=True)
 
@@ -577,7 +588,7 @@ REFUSED = [
 @pytest.mark.parametrize(("old", "new", "named"), REFUSED)
 def test_what_is_refused_gets_one_sentence(rod, old, new, named):
     path = rod((old, new))
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(path)
     message = str(error.value)
     assert named in message
@@ -611,18 +622,18 @@ def test_interpolation_needs_a_value_in_the_first_sample(rod):
     lines = (path.parent / "rod.csv").read_text().splitlines()
     lines[1] = "0,,,,,"
     (path.parent / "rod.csv").write_text("\n".join(lines))
-    with pytest.raises(lp.DataError, match="found no sensor or boundary"):
+    with pytest.raises(lp.errors.DataError, match="found no sensor or boundary"):
         cases.load(path).prepare()
 
 
 def test_missing_case(tmp_path):
-    with pytest.raises(lp.CaseError, match="livepde init"):
+    with pytest.raises(lp.errors.CaseError, match="livepde init"):
         cases.load(tmp_path / "case.toml")
     (tmp_path / "case.toml").write_text("")
-    with pytest.raises(lp.CaseError, match=r"did you mean '.*case\.toml'"):
+    with pytest.raises(lp.errors.CaseError, match=r"did you mean '.*case\.toml'"):
         cases.load(tmp_path / "cas.toml")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(lp.CaseError, match="row 1 is not UTF-8 text; save it as UTF-8"):
+    with pytest.raises(lp.errors.CaseError, match="row 1 is not UTF-8 text; save it as UTF-8"):
         cases.load(tmp_path / "bytes.toml")
 
 
@@ -646,7 +657,7 @@ def test_dates(rod):
     other.write_text(text.replace("time_unit = ", "assimilate_from = 2025-04-02\ntime_unit = "))
     assert cases.load(other).prepare().assimilate_from == 15 * 3600.0
     other.write_text(text.replace("time_unit = ", 'assimilate_from = "2025-04-99"\ntime_unit = '))
-    with pytest.raises(lp.CaseError, match="expected a date"):
+    with pytest.raises(lp.errors.CaseError, match="expected a date"):
         cases.load(other).prepare()
 
 
@@ -655,11 +666,11 @@ def test_lines_instead_of_a_file(rod):
     prepared = cases.load(rod()).prepare(iter(lines))
     data = prepared.identifier.run(prepared.stream).to_xarray()
     assert data.sizes["time"] == 5
-    with pytest.raises(lp.DataError, match="no sample"):
+    with pytest.raises(lp.errors.DataError, match="no sample"):
         cases.load(rod()).prepare(iter(()))
     path = rod().with_name("lines.jsonl")
     path.write_text("\n".join(lines))
-    with pytest.raises(lp.DataError, match="there is no column 'T_10'"):
+    with pytest.raises(lp.errors.DataError, match="there is no column 'T_10'"):
         cases.load(rod()).prepare(str(path))
     lines[2] = lines[2].replace("}", ', "T_10": 20, "T_20": 20, "T_30": null}')
     path.write_text("\n".join(lines))
@@ -679,7 +690,7 @@ def test_borehole_needs_its_options_and_input(tmp_path):
         assert old in text
         other = tmp_path / "case.toml"
         other.write_text(text.replace(old, new))
-        with pytest.raises(lp.CaseError) as error:
+        with pytest.raises(lp.errors.CaseError) as error:
             cases.load(other)
         assert named in str(error.value)
 
@@ -712,7 +723,7 @@ def test_nodes(rod):
 )
 def test_meshes_that_are_refused(rod, mesh, named):
     path = rod(('from = 0\nto = "40 cm"\ncells = 40', f"{mesh} #"))
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(path)
     assert named in str(error.value)
 
@@ -745,7 +756,7 @@ def test_regions_of_a_rectangle(tmp_path, regions, named):
     if not named:
         assert set(cases.load(path).model.parameter_space.labels) == {"q[a]", "q[b]"}
         return
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(path)
     assert named in str(error.value)
 
@@ -756,7 +767,7 @@ def test_regions_of_a_rectangle(tmp_path, regions, named):
     [
         ('kind = "random-walk", rate = "6e-6 m^2/s/min^0.5"', lp.RandomWalk(6e-6 / 60**0.5)),
         ('kind = "mean-reverting", time = "2 h"', lp.MeanReverting(7200.0)),
-        ('kind = "periodic", period = "1 day", harmonics = 2', lp.Periodic(86400.0, 2)),
+        ('kind = "periodic", period = "1 day", harmonics = 2', lp.fem.Periodic(86400.0, 2)),
     ],
 )
 def test_unknowns_that_move(rod, evolution, expected):
@@ -793,7 +804,7 @@ def test_positive_unknowns(rod):
     ],
 )
 def test_evolutions_that_are_refused(rod, text, named):
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(rod(("bounds = [", f"{text}\nbounds = [" if "#" not in text else f"{text}[")))
     assert named in str(error.value)
 
@@ -803,7 +814,7 @@ def test_gate(rod):
 
 
 def test_the_initial_state_is_said_once(rod):
-    with pytest.raises(lp.CaseError, match="initial is missing"):
+    with pytest.raises(lp.errors.CaseError, match="initial is missing"):
         cases.load(rod(('initial = "interpolate"', ""))).prepare()
 
 
@@ -818,7 +829,7 @@ def test_families(rod):
     assert case.withheld.names(5) == ("T_0", "T_1", "T_2", "T_3", "T_4")
     np.testing.assert_allclose(list(case.withheld.points.values()), [0.0, 0.1, 0.2, 0.3, 0.4])
     assert case.columns["T_3"].names == ("T_30",)
-    with pytest.raises(lp.CaseError, match="there is a channel 'T_1' already"):
+    with pytest.raises(lp.errors.CaseError, match="there is a channel 'T_1' already"):
         cases.load(rod(("first =", "T_1 =")))
 
 
@@ -885,7 +896,7 @@ OFFSET = ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm", noise = "0.05 K", off
 def test_unknowns_of_sensors_share_a_prior(rod):
     more = ', offset = "0.5 K", gain = 0.05, correlated = { time = "1 h", std = "0.1 K" }'
     path = rod((OFFSET[0], f'at = "10 cm", noise = "0.05 K"{more}'))
-    with pytest.raises(lp.CaseError, match=r"T_30.offset: differs from that of 'T_10'"):
+    with pytest.raises(lp.errors.CaseError, match=r"T_30.offset: differs from that of 'T_10'"):
         cases.load(rod(('at = "30 cm", noise', 'at = "30 cm", offset = "0.4 K", noise')))
     model = cases.load(rod(('offset = "0.4 K", noise', "noise"))).model
     assert set(model.parameter_space.labels) == {
@@ -927,7 +938,7 @@ def test_means_along_a_line(rod):
     prepared, data = result_of(path)
     assert prepared.identifier.observed.names == ("T_10", "T_30")
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
-    with pytest.raises(lp.CaseError, match=r"channels.T_30.along: 1 m lies outside"):
+    with pytest.raises(lp.errors.CaseError, match=r"channels.T_30.along: 1 m lies outside"):
         cases.load(rod(('along = ["28 cm", 0.32]', 'along = ["28 cm", "1 m"]')))
 
 
@@ -949,7 +960,7 @@ def test_a_sensor_that_moves(rod):
     _, data = result_of(path)
     assert np.isnan(data.innovation.sel(sensor="T_30").values[5])
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
-    with pytest.raises(lp.CaseError, match="there is no channel 'wehre' of role position"):
+    with pytest.raises(lp.errors.CaseError, match="there is no channel 'wehre' of role position"):
         cases.load(rod(('follows = "where"', 'follows = "wehre"')))
 
 
@@ -979,7 +990,7 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
     _, first = result_of(rod())
     path = with_reader(rod, READER)
     monkeypatch.setenv("LIVEPDE_DATA", str(path.parent))
-    with pytest.raises(lp.CaseError, match=r"data\.reader: .* add --allow-code"):
+    with pytest.raises(lp.errors.CaseError, match=r"data\.reader: .* add --allow-code"):
         cases.load(path)
     _, second = result_of(path, allow_code=True)
     assert float(second.alpha[-1]) == float(first.alpha[-1])
@@ -1024,7 +1035,7 @@ def test_readers_that_fail(rod, monkeypatch, old, new, named):
     ],
 )
 def test_one_source_of_data(rod, old, new, named):
-    with pytest.raises(lp.CaseError, match=named):
+    with pytest.raises(lp.errors.CaseError, match=named):
         cases.load(rod((old, new)))
 
 
@@ -1032,7 +1043,7 @@ def test_semicolons(rod):
     path = rod()
     data = path.with_name("rod.csv")
     data.write_text(data.read_text().replace(",", ";"))
-    with pytest.raises(lp.DataError, match="say separator = ';'"):
+    with pytest.raises(lp.errors.DataError, match="say separator = ';'"):
         cases.load(path).prepare()
     prepared = cases.load(rod(("time_unit", 'separator = ";"\ntime_unit'))).prepare()
     assert len(prepared.stream) == 181
@@ -1062,7 +1073,7 @@ build = replace(EQUATIONS["heat"], build=make, options=options)
     ):
         path.write_text(text.replace("[law]", f"[options]\n{given}\n[law]"))
         if named:
-            with pytest.raises(lp.CaseError, match=named.replace("?", r"\?")):
+            with pytest.raises(lp.errors.CaseError, match=named.replace("?", r"\?")):
                 cases.load(path, allow_code=True)
         else:
             cases.load(path, allow_code=True)
@@ -1127,14 +1138,14 @@ def test_keys_are_taken_away(rod):
 )
 def test_settings_that_are_refused(rod, key, value, named):
     path = rod()
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(path, settings={key: value})
     assert named in str(error.value)
     assert str(error.value).startswith(f"{path}: ")
 
 
 def test_settings_need_an_equals_sign():
-    with pytest.raises(lp.CaseError, match=r"--set law: expected key=value"):
+    with pytest.raises(lp.errors.CaseError, match=r"--set law: expected key=value"):
         parse(["law"])
 
 
@@ -1179,7 +1190,7 @@ def test_references(rod):
     ],
 )
 def test_references_that_are_refused(rod, old, new, named):
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(rod((REFERENCE[0], REFERENCE[1].replace(old, new))))
     assert named in str(error.value)
 
@@ -1211,7 +1222,7 @@ def test_variants(rod):
     ],
 )
 def test_variants_that_are_refused(rod, old, new, named):
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(rod(("[expect]", VARIANTS.replace(old, new))))
     assert named in str(error.value)
 
@@ -1295,7 +1306,7 @@ def test_decimal_commas_are_not_cut(rod):
     data = path.with_name("rod.csv")
     header, *rows = data.read_text().splitlines()
     data.write_text("\n".join([header, *(row.replace(".", ",") for row in rows)]) + "\n")
-    with pytest.raises(lp.DataError, match=r"row 2: .* fields, but the header has 6"):
+    with pytest.raises(lp.errors.DataError, match=r"row 2: .* fields, but the header has 6"):
         cases.load(path).prepare()
 
 

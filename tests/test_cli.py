@@ -268,7 +268,7 @@ def test_standard_input(rod):
 @pytest.mark.slow
 def test_a_bad_line_ends_a_run_that_is_kept(rod, here):
     stdin = lines(5) + '{"time_s": 100, "T_left": "warm"}\n'
-    with pytest.raises(livepde.SampleError, match="line 6, 'T_left': got 'warm'"):
+    with pytest.raises(livepde.errors.SampleError, match="line 6, 'T_left': got 'warm'"):
         call("run", rod, "--data", "-", "--out", "out", stdin=stdin)
     record = json.loads((here / "out" / "run.json").read_text())
     assert record["status"] == "failed"

@@ -119,15 +119,15 @@ def test_a_boundary_value_may_be_a_control_that_jumps():
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
     )
     small = ct.reduce(model, lp.Points({"middle": 0.5, "end": 0.0}), ["hot"], modes=13)
-    x = small.project(model.impose(np.ones(17), lp.Moment(0.0, {"hot": 1.0})))
+    x = small.project(model.impose(np.ones(17), lp.fem.Moment(0.0, {"hot": 1.0})))
     step, q = small.matrices(np.array([0.7]), 0.05), np.array([0.7])
     forward, scheme = ForwardStage(model), lp.Alexander2()
-    u = model.impose(np.ones(17), lp.Moment(0.0, {"hot": 1.0}))
+    u = model.impose(np.ones(17), lp.fem.Moment(0.0, {"hot": 1.0}))
     for k in range(8):
         hot = 3.0 if k < 4 else -1.0
         held = {"hot": hot}
 
-        def stage(c: Any, t: float, h: float, moment: Any = lp.Moment(0.0, held)) -> Any:  # noqa: B008
+        def stage(c: Any, t: float, h: float, moment: Any = lp.fem.Moment(0.0, held)) -> Any:  # noqa: B008
             return forward.solve(c, q, h, moment)
 
         for _ in range(100):
@@ -152,7 +152,7 @@ def test_a_boundary_value_may_be_a_control_that_jumps():
     ],
 )
 def test_what_has_no_reduced_model_is_told(options, says):
-    with pytest.raises(lp.ModelError, match=says):
+    with pytest.raises(lp.errors.ModelError, match=says):
         ct.reduce(rod(**options), OUTPUTS, ["heater"])
 
 
@@ -194,23 +194,25 @@ def test_a_mesh_of_few_cells_is_reduced_to_itself():
 
 
 def test_names_that_do_not_exist_are_told():
-    with pytest.raises(lp.ConfigurationError, match="each once"):
+    with pytest.raises(lp.errors.ConfigurationError, match="each once"):
         ct.reduce(rod(), OUTPUTS, ["heater", "heater"])
-    with pytest.raises(lp.ConfigurationError, match="inputs names 'wind'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="inputs names 'wind'"):
         ct.reduce(rod(), OUTPUTS, ["heater"], inputs={"wind": 1.0})
-    with pytest.raises(lp.ConfigurationError, match="q names 'c'; the unknown numbers are \\['k'"):
+    with pytest.raises(
+        lp.errors.ConfigurationError, match="q names 'c'; the unknown numbers are \\['k'"
+    ):
         reduced().error({"c": 1.0}, h=PERIOD)
-    with pytest.raises(lp.ConfigurationError, match="h must be positive"):
+    with pytest.raises(lp.errors.ConfigurationError, match="h must be positive"):
         reduced().error(h=-1.0)
-    with pytest.raises(lp.ConfigurationError, match="q names 'c'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="q names 'c'"):
         ct.Kalman(reduced(), PERIOD, drive={}, q={"c": 1.0})
-    with pytest.raises(lp.ConfigurationError, match=r"controls='heater'.*give a list"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"controls='heater'.*give a list"):
         ct.reduce(rod(), OUTPUTS, "heater")
-    with pytest.raises(lp.ConfigurationError, match="before names 'valve'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="before names 'valve'"):
         ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"valve": 1.0})
-    with pytest.raises(lp.ConfigurationError, match="controls=\\['valve'\\]; the channels"):
+    with pytest.raises(lp.errors.ConfigurationError, match="controls=\\['valve'\\]; the channels"):
         ct.reduce(rod(), OUTPUTS, ["valve"])
-    with pytest.raises(lp.ConfigurationError, match="track names 'end'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="track names 'end'"):
         ct.LQ(reduced(), replace(GOAL, track={"end": 1.0}), PERIOD)
 
 
@@ -227,7 +229,7 @@ def test_names_that_do_not_exist_are_told():
     ],
 )
 def test_goals_that_make_no_sense_are_told(changes, says):
-    with pytest.raises(lp.ConfigurationError, match=says):
+    with pytest.raises(lp.errors.ConfigurationError, match=says):
         replace(GOAL, **changes)
 
 
@@ -241,7 +243,7 @@ def test_goals_that_make_no_sense_are_told(changes, says):
     ],
 )
 def test_numbers_of_a_reduction_that_make_no_sense_are_told(options, says):
-    with pytest.raises(lp.ConfigurationError, match=says):
+    with pytest.raises(lp.errors.ConfigurationError, match=says):
         ct.reduce(rod(), OUTPUTS, ["heater"], **options)
 
 
@@ -256,7 +258,7 @@ def test_numbers_of_a_reduction_that_make_no_sense_are_told(options, says):
     ],
 )
 def test_numbers_of_the_filter_that_make_no_sense_are_told(options, says):
-    with pytest.raises(lp.ConfigurationError, match=says):
+    with pytest.raises(lp.errors.ConfigurationError, match=says):
         ct.Kalman(reduced(modes=1), **{"period": PERIOD, "drive": {}, **options})
 
 
@@ -290,16 +292,16 @@ def test_a_late_sample_is_stepped_to_as_long_as_it_took():
         one = ct.Kalman(model, PERIOD, drive={"heater": 0.1}, offset={"room": 0.1})
         ends.append([one.step(t, nothing, inputs).x for t in times][-1])
     np.testing.assert_allclose(ends[1], ends[0], rtol=1e-9)
-    with pytest.raises(lp.TimeOrderError, match="not later"):
+    with pytest.raises(lp.errors.TimeOrderError, match="not later"):
         one.step(180.0, nothing, inputs)
 
 
 def test_samples_of_the_filter_are_checked():
     one, inputs = ct.Kalman(reduced(), PERIOD, drive={}), {"heater": 0.3, "room": ROOM}
-    with pytest.raises(lp.SampleError, match="unknown sensor 'T_6'"):
+    with pytest.raises(lp.errors.SampleError, match="unknown sensor 'T_6'"):
         one.step(0.0, {"T_6": 20.0}, inputs)
     for z in ([1.0, 2.0, 3.0], ["hot", 1.0]):
-        with pytest.raises(lp.SampleError, match="z"):
+        with pytest.raises(lp.errors.SampleError, match="z"):
             one.step(0.0, z, inputs)
     by_name = one.step(0.0, {"T_10": 20.0}, inputs).x
     other = ct.Kalman(reduced(), PERIOD, drive={})
@@ -440,7 +442,7 @@ def test_a_control_does_the_work_of_another_that_is_at_its_end():
 
 def test_prices_alone_are_not_for_the_linear_quadratic_controller():
     priced = replace(GOAL, track={}, price={"heater": 1.0})
-    with pytest.raises(lp.ConfigurationError, match="no positive weight"):
+    with pytest.raises(lp.errors.ConfigurationError, match="no positive weight"):
         ct.LQ(reduced(modes=1), priced, PERIOD)
 
 
@@ -517,7 +519,7 @@ def test_scenarios_are_deviations_of_what_is_gaussian():
     ],
 )
 def test_settings_of_the_controller_that_make_no_sense_are_told(options, says):
-    with pytest.raises(lp.ConfigurationError, match=says):
+    with pytest.raises(lp.errors.ConfigurationError, match=says):
         ct.MPC(reduced(modes=2), GOAL, **{"period": PERIOD, **options})
 
 
@@ -536,7 +538,7 @@ def test_a_search_that_fails_holds_the_inputs_and_says_so():
 
 def test_do_mpc_that_is_missing_is_told(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "do_mpc", None)
-    with pytest.raises(lp.ConfigurationError, match=r"pip install 'livepde\[control\]'"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"pip install 'livepde\[control\]'"):
         ct.MPC(reduced(), GOAL, PERIOD)
 
 
@@ -546,7 +548,7 @@ def test_do_mpc_that_is_missing_is_told(monkeypatch):
 def told(**changes: Any) -> Any:
     """Return an estimate as trust looks at it."""
     given = {
-        "status": lp.Status(),
+        "status": lp.laws.Status(),
         "notes": {"innovation_ratio": 1.2},
         "q": np.array([26.0]),
         "q_std": np.array([1.0]),
@@ -559,7 +561,7 @@ def told(**changes: Any) -> Any:
     ("changes", "says"),
     [
         ({}, ""),
-        ({"status": lp.Status("singular", "no way")}, "the step failed"),
+        ({"status": lp.laws.Status("singular", "no way")}, "the step failed"),
         (
             {"notes": {"innovation_ratio": 9.0}},
             "innovations are 3.0 times as large as expected; look at dt_max",
@@ -595,7 +597,7 @@ def test_what_may_be_negative_is_measured_by_its_prior():
     "levels", [{"spread": np.nan}, {"misfit": 0.0}, {"patience": 0}, {"patience": 1.5}]
 )
 def test_levels_of_trust_that_make_no_sense_are_told(levels):
-    with pytest.raises(lp.ConfigurationError, match=f"Trust: {next(iter(levels))} must be"):
+    with pytest.raises(lp.errors.ConfigurationError, match=f"Trust: {next(iter(levels))} must be"):
         ct.Trust(**levels)
 
 
@@ -648,7 +650,7 @@ def test_a_loop_goes_on_where_it_was_saved(kind, tmp_path):
     assert [a.inputs for a in found] == [a.inputs for a in expected]
     assert [a.known.q.tolist() for a in found] == [a.known.q.tolist() for a in expected]
     smaller = ct.Loop(identifier(), ct.LQ(reduced(modes=1), GOAL, PERIOD))
-    with pytest.raises(lp.RunError, match="another"):
+    with pytest.raises(lp.errors.RunError, match="another"):
         smaller.load(tmp_path / "loop")
 
 
@@ -671,7 +673,7 @@ def test_what_is_not_a_number_is_missing():
         ends.append((action.inputs["heater"], action.outputs))
     assert ends[0] == ends[1]
     assert np.isfinite(ends[1][0])
-    with pytest.raises(lp.SampleError, match="input 'room': got inf"):
+    with pytest.raises(lp.errors.SampleError, match="input 'room': got inf"):
         loop.step(2 * PERIOD, [ROOM] * 2, {"room": np.inf}, reference={"tip": 45.0})
 
 
@@ -766,7 +768,9 @@ def test_a_controller_that_raises_leaves_a_loop_that_goes_on():
     action = loop.step(PERIOD, [ROOM] * 2, reference={"tip": 45.0})
     assert action.inputs == {"heater": 0.3}
     loop.controller.answer = [0.1, 0.2]
-    with pytest.raises(lp.ConfigurationError, match=r"Own.decide returned inputs of shape \(2,\)"):
+    with pytest.raises(
+        lp.errors.ConfigurationError, match=r"Own.decide returned inputs of shape \(2,\)"
+    ):
         loop.step(2 * PERIOD, [ROOM] * 2, reference={"tip": 45.0})
 
 
@@ -775,9 +779,9 @@ def test_a_sample_that_is_refused_changes_nothing():
     for loop in loops:
         loop.step(0.0, [ROOM] * 2, {"room": ROOM}, reference={"tip": 45.0})
     for z in ([ROOM] * 3, {"T_6": ROOM}):
-        with pytest.raises(lp.SampleError):
+        with pytest.raises(lp.errors.SampleError):
             loops[0].step(PERIOD, z, reference={"tip": 45.0})
-    with pytest.raises(lp.TimeOrderError):
+    with pytest.raises(lp.errors.TimeOrderError):
         loops[0].step(-PERIOD, [ROOM] * 2, reference={"tip": 45.0})
     mine, theirs = (one.step(PERIOD, [21.0, 20.0], reference={"tip": 45.0}) for one in loops)
     assert mine.known.x.tolist() == theirs.known.x.tolist()
@@ -787,17 +791,17 @@ def test_a_sample_that_is_refused_changes_nothing():
 def test_a_reduced_model_of_another_process_is_told():
     swapped = lp.Points({"T_10": 0.10, "T_5": 0.05}, noise=0.2)
     other = ct.reduce(rod(), OUTPUTS, ["heater"], sensors=swapped, u=ROOM)
-    with pytest.raises(lp.ConfigurationError, match="the identifier has the sensors"):
+    with pytest.raises(lp.errors.ConfigurationError, match="the identifier has the sensors"):
         ct.Loop(identifier(), ct.LQ(other, GOAL, PERIOD))
     coarse = ct.reduce(rod(10), OUTPUTS, ["heater"], sensors=SENSORS, u=ROOM)
-    with pytest.raises(lp.ConfigurationError, match="21 coefficients"):
+    with pytest.raises(lp.errors.ConfigurationError, match="21 coefficients"):
         ct.Loop(identifier(), ct.LQ(coarse, GOAL, PERIOD))
 
 
 def test_a_loop_of_another_estimator_is_not_loaded(tmp_path):
     controller = ct.LQ(reduced(), GOAL, PERIOD)
     ct.Loop(ct.Kalman(reduced(), PERIOD, drive={}), controller).save(tmp_path / "loop")
-    with pytest.raises(lp.RunError, match="of another estimator"):
+    with pytest.raises(lp.errors.RunError, match="of another estimator"):
         ct.Loop(identifier(), controller).load(tmp_path / "loop")
 
 
@@ -806,16 +810,16 @@ def test_a_limit_that_the_goal_does_not_have_is_not_dropped():
     limited = replace(GOAL, limits={"face": (-np.inf, 75.0)})
     loop = ct.Loop(identifier(), ct.LQ(reduced(), limited, PERIOD))
     step = {"z": [ROOM] * 2, "inputs": {"room": ROOM}, "reference": {"tip": 45.0}}
-    with pytest.raises(lp.SampleError, match="least value, and the goal has none"):
+    with pytest.raises(lp.errors.SampleError, match="least value, and the goal has none"):
         loop.step(0.0, **step, limits={"face": (10.0, 75.0)})
-    with pytest.raises(lp.SampleError, match=r"must be \(least, largest\)"):
+    with pytest.raises(lp.errors.SampleError, match=r"must be \(least, largest\)"):
         loop.step(0.0, **step, limits={"face": 75.0})
     for ends in ((-np.inf, "hot"), (-np.inf, np.nan)):
-        with pytest.raises(lp.SampleError, match=r"limits\['face'\]"):
+        with pytest.raises(lp.errors.SampleError, match=r"limits\['face'\]"):
             loop.step(0.0, **step, limits={"face": ends})
     loop.step(0.0, **step, limits={"face": (-np.inf, np.inf)})
     held = replace(GOAL, limits={"face": (10.0, 75.0)})
-    with pytest.raises(lp.SampleError, match="the least value is above the largest"):
+    with pytest.raises(lp.errors.SampleError, match="the least value is above the largest"):
         ct.Loop(identifier(), ct.LQ(reduced(), held, PERIOD)).step(
             0.0, **step, limits={"face": (80.0, 70.0)}
         )
@@ -824,24 +828,24 @@ def test_a_limit_that_the_goal_does_not_have_is_not_dropped():
 def test_references_and_forecasts_are_checked():
     loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD))
     z = [ROOM, ROOM]
-    with pytest.raises(lp.SampleError, match="'room' has no value yet"):
+    with pytest.raises(lp.errors.SampleError, match="'room' has no value yet"):
         loop.step(0.0, z, reference={"tip": 45.0})
-    with pytest.raises(lp.SampleError, match="'tip' has none"):
+    with pytest.raises(lp.errors.SampleError, match="'tip' has none"):
         loop.step(0.0, z, {"room": ROOM})
-    with pytest.raises(lp.SampleError, match="forecast names 'heater'"):
+    with pytest.raises(lp.errors.SampleError, match="forecast names 'heater'"):
         loop.step(0.0, z, {"room": ROOM}, reference={"tip": 1.0}, forecast={"heater": 1.0})
     for given in ("hot", np.inf, [], None, [[45.0]]):
-        with pytest.raises(lp.SampleError, match=r"reference\['tip'\]"):
+        with pytest.raises(lp.errors.SampleError, match=r"reference\['tip'\]"):
             loop.step(0.0, z, {"room": ROOM}, reference={"tip": given})
-    with pytest.raises(lp.SampleError, match="reference must be a mapping"):
+    with pytest.raises(lp.errors.SampleError, match="reference must be a mapping"):
         loop.step(0.0, z, {"room": ROOM}, reference=45.0)
-    with pytest.raises(lp.SampleError, match=r"forecast\['room'\]"):
+    with pytest.raises(lp.errors.SampleError, match=r"forecast\['room'\]"):
         loop.step(0.0, z, {"room": ROOM}, reference={"tip": 1.0}, forecast={"room": np.inf})
-    with pytest.raises(lp.ConfigurationError, match=r"before\['heater'\] must be a number"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"before\['heater'\] must be a number"):
         ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"heater": np.inf})
-    with pytest.raises(lp.SampleError, match="unknown input 'wind'"):
+    with pytest.raises(lp.errors.SampleError, match="unknown input 'wind'"):
         loop.step(0.0, z, {"wind": ROOM}, reference={"tip": 45.0})
-    with pytest.raises(lp.ConfigurationError, match="hold=True"):
+    with pytest.raises(lp.errors.ConfigurationError, match="hold=True"):
         ct.Loop(identifier(hold=False), ct.LQ(reduced(), GOAL, PERIOD))
 
 

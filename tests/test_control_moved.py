@@ -65,7 +65,7 @@ def driven(kind: str, using: str, count: int = 60) -> tuple[float, ct.Action]:
     if kind == "field":
         q = np.log(np.where(x < 0.05, 12.0, 30.0))
     rng, t, inputs = np.random.default_rng(0), 0.0, {"heat": 0.0, "sink": ROOM}
-    u = model.initial(ROOM, lp.Moment(0.0, inputs))
+    u = model.initial(ROOM, lp.fem.Moment(0.0, inputs))
     for _ in range(count):
         z = np.interp([0.02, 0.05, 0.08], x, u) + rng.normal(0.0, 0.1, 3)
         action = loop.step(t, z, {"sink": ROOM}, reference={"face": 600.0})
@@ -97,7 +97,7 @@ def test_what_is_handed_over_is_the_model_about_the_estimate():
 def test_a_controller_acts_on_the_model_that_it_is_handed(using):
     """As one that was built for it would; and goes back to its own."""
     model = reduced("radiating")
-    hot = rod("radiating").initial(600.0, lp.Moment(0.0, {"sink": ROOM}))
+    hot = rod("radiating").initial(600.0, lp.fem.Moment(0.0, {"sink": ROOM}))
     moved = model.about(u=hot, inputs={"heat": 1.0})
     known = ct.Known(model.project(hot), np.array([25.0]), np.zeros((1, 0)))
     plan = ct.Plan(np.full((8, 1), 600.0), np.full((8, 1), ROOM), *np.zeros((2, 8, 0)))
@@ -115,13 +115,15 @@ def test_a_controller_acts_on_the_model_that_it_is_handed(using):
 def test_where_to_move_a_model_is_checked():
     model = reduced("radiating")
     assert model.about(inputs={"heat": 1.0}).frame.inputs == {"heat": 1.0, "sink": ROOM}
-    with pytest.raises(lp.ConfigurationError, match=r"about: u has shape \(3,\)"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"about: u has shape \(3,\)"):
         model.about(u=np.zeros(3))
-    with pytest.raises(lp.ConfigurationError, match="about: inputs names 'wind'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="about: inputs names 'wind'"):
         model.about(inputs={"wind": 1.0})
-    with pytest.raises(lp.ConfigurationError, match=r"inputs\['heat'\] must be a finite number"):
+    with pytest.raises(
+        lp.errors.ConfigurationError, match=r"inputs\['heat'\] must be a finite number"
+    ):
         model.about(inputs={"heat": np.nan})
-    with pytest.raises(lp.ConfigurationError, match=r"\['sink'\] have no value"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"\['sink'\] have no value"):
         model.lift(np.zeros(model.size), {"heat": 1.0})
     assert "coordinates" in repr(model)
     assert len(repr(model)) < 300

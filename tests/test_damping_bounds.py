@@ -29,7 +29,7 @@ P = Norms(X=0.03, VX=0.1, V=0.7)
 SEEN = Norms(X=1.0, VX=3.0, V=10.0)  # of u_alpha
 
 
-def residual(n: Norms) -> lp.Residual:
+def residual(n: Norms) -> lp.laws.Residual:
     return n.residual(SEEN)
 
 
@@ -98,7 +98,7 @@ def test_the_noisy_rule_asks_for_at_least_what_the_true_residual_would(size, sig
 def test_rules_are_bounded_at_vanishing_residuals():
     zero = residual(Norms())
     assert ExactBound(C, 0.1, 1.0, 1e-2).theta(zero) == pytest.approx(2 * 3 / 0.5 * 0.1 / 1e-2)
-    assert ExactBound(C, 0.0, 1.0).theta(zero) == lp.ResidualDamping(1.0).theta(zero)
+    assert ExactBound(C, 0.0, 1.0).theta(zero) == lp.laws.ResidualDamping(1.0).theta(zero)
     assert SmoothedBound(C, 0, 0, 0, c1=2.0).theta(zero) == 2.0
     assert NoisyBound(C, 0.1, 0.3, D, theta_max=7.0).theta(zero) == 7.0
     nothing = Norms().residual(Norms())
@@ -137,5 +137,5 @@ def test_floors_are_relative_to_the_observed_state(scale):
     ],
 )
 def test_rules_refuse(make, words):
-    with pytest.raises(lp.LawError, match=words):
+    with pytest.raises(lp.errors.LawError, match=words):
         make()

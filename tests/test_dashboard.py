@@ -47,7 +47,7 @@ MESHES = {
     "line": lambda: lp.interval(0.0, 1.0, 10),
     "triangle": lambda: sided(MeshTri().refined(2)),
     "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 3)),
-    "tetra": lambda: lp.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (3, 2, 2)),
+    "tetra": lambda: lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (3, 2, 2)),
     "hexahedron": lambda: sided(MeshHex().refined(1)),
 }
 
@@ -117,7 +117,7 @@ def test_every_kind_of_run_has_its_panels(kind, field):
 
 def test_a_run_of_one_sample_and_one_without_covariance():
     assert len(panels.panels(dataset(count=1))) > 3
-    law = lp.GradientLaw(gain=1e-3, damping=lp.ResidualDamping(c1=1.0))
+    law = lp.GradientLaw(gain=1e-3, damping=lp.laws.ResidualDamping(c1=1.0))
     plain = dataset(law=law)
     assert not {"told", "correlation"} & {panel.name for panel in panels.panels(plain)}
     assert "no covariance" in str(cards.cards(plain, None))
@@ -331,7 +331,7 @@ def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):
 
 def test_watch_needs_a_run(tmp_path):
     result = CliRunner().invoke(cli.app, ["watch", str(tmp_path / "none")])
-    assert isinstance(result.exception, lp.RunError)
+    assert isinstance(result.exception, lp.errors.RunError)
     assert "holds no run" in str(result.exception)
 
 

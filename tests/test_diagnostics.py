@@ -42,7 +42,7 @@ def test_a_wrong_derivative_is_found():
     report = check_model(model, u=1.0)
     assert not report.ok
     assert any("B'(u)" in name for name in failed(report))
-    with pytest.raises(lp.ModelError, match="B'"):
+    with pytest.raises(lp.errors.ModelError, match="B'"):
         report.raise_if_failed()
 
 
@@ -88,7 +88,7 @@ def test_an_unsymmetric_mass_is_refused():
         A=lambda q, u, v, x: q * u * v,
         M=lambda u, v, x: u * v + 0.1 * lp.grad(u)[0] * v,
     )
-    with pytest.raises(lp.SpaceError, match="not symmetric"):
+    with pytest.raises(lp.errors.SpaceError, match="not symmetric"):
         check_model(model, u=1.0)
 
 
@@ -137,7 +137,7 @@ class State:
 
 
 @dataclass(frozen=True)
-class OpenLoop(lp.Law):
+class OpenLoop(lp.laws.Law):
     """Learns nothing, correctly."""
 
     def prepare(self, problem):
@@ -151,10 +151,10 @@ class OpenLoop(lp.Law):
         h = interval.t1 - interval.t0
         u = forward.solve(state.u, state.q, h, interval.end)
         predicted = problem.observed.predict(u, state.q, interval.end)
-        return State(u, state.q), lp.Report(lp.Status(), predicted, steps=1)
+        return State(u, state.q), lp.laws.Report(lp.laws.Status(), predicted, steps=1)
 
     def belief(self, work, state):
-        return lp.Belief(state.q, state.u)
+        return lp.laws.Belief(state.q, state.u)
 
 
 class Dice(OpenLoop):
@@ -201,12 +201,12 @@ def test_a_good_law_passes():
 def test_bad_laws_are_found(law, words):
     report = check_law(law, build, SAMPLES)
     assert any(words in name for name in failed(report))
-    with pytest.raises(lp.LawError):
+    with pytest.raises(lp.errors.LawError):
         report.raise_if_failed()
 
 
 def test_a_law_needs_some_samples():
-    with pytest.raises(lp.LawError, match="four samples"):
+    with pytest.raises(lp.errors.LawError, match="four samples"):
         check_law(OpenLoop(), build, SAMPLES[:2])
 
 

@@ -94,12 +94,12 @@ def test_meshes_and_elements():
     for name, axis, value in (("left", 0, 0.0), ("back", 1, 2.0), ("top", 2, 3.0)):
         ends = mesh.p[axis, mesh.facets[:, mesh.boundaries[name]]]
         np.testing.assert_array_equal(ends, value)
-    with pytest.raises(lp.SpaceError, match="needs increasing coordinates and cells >= 1"):
+    with pytest.raises(lp.errors.SpaceError, match="needs increasing coordinates and cells >= 1"):
         box((0.0, 1.0), (0.0, 0.0), (0.0, 1.0), (1, 1, 1))
     assert isinstance(quadratic(MeshTri()), ElementTriP2)
     assert isinstance(smooth(lp.interval(0, 1, 3)), ElementLineHermite)
     assert isinstance(smooth(lp.rectangle((0, 1), (0, 1), (1, 1))), ElementQuadBFS)
-    with pytest.raises(lp.SpaceError, match=r"class C\^1 for a mesh of type MeshTri1"):
+    with pytest.raises(lp.errors.SpaceError, match=r"class C\^1 for a mesh of type MeshTri1"):
         smooth(MeshTri())
 
 

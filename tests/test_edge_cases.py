@@ -127,7 +127,7 @@ def test_a_checkpoint_of_other_options_is_refused_and_changes_nothing(tmp_path):
     few.save(tmp_path / "few.bin")
     many.step(0.05, [0.1])
     before = many.t, many._state
-    with pytest.raises(lp.RunError, match="does not fit"):
+    with pytest.raises(lp.errors.RunError, match="does not fit"):
         many.load(tmp_path / "few.bin")
     assert (many.t, many._state) == before
 
@@ -158,7 +158,7 @@ def test_the_users_matrix_is_his_own():
     model = conduction()
     G = sp.csr_array(np.eye(3, model.X.dim) + 1e-18)
     before = G.nnz
-    observed = observe(model, lp.Matrix(G))
+    observed = observe(model, lp.observation.Matrix(G))
     assert G.nnz == before
     G.data[:] = 7.0
     assert abs(observed.G).max() == 1.0
@@ -166,14 +166,14 @@ def test_the_users_matrix_is_his_own():
 
 def test_text_and_nothing_are_no_numbers():
     ident = lp.Identifier(conduction(), lp.Points([0.5]), lp.GradientLaw())
-    with pytest.raises(lp.SampleError, match="not an array of numbers"):
+    with pytest.raises(lp.errors.SampleError, match="not an array of numbers"):
         ident.step(0.1, ["1.5"])
-    with pytest.raises(lp.ModelError, match="not finite"):
+    with pytest.raises(lp.errors.ModelError, match="not finite"):
         lp.Identifier(conduction(), lp.Points([0.5]), lp.GradientLaw(), q0=np.nan)
 
 
 def test_a_direct_sensor_that_reads_an_input_is_refused_by_its_law():
     model = conduction(inputs=("Q",))
     sensors = lp.Points({"a": 0.5}, direct={"a": lambda q, x: q * x.inputs["Q"]})
-    with pytest.raises(lp.LawError, match="SensitivityLaw"):
+    with pytest.raises(lp.errors.LawError, match="SensitivityLaw"):
         lp.Identifier(model, sensors, lp.GradientLaw())

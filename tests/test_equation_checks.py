@@ -50,7 +50,7 @@ TYPICAL = {
     "mobile_immobile": Typical(ranges={"phi": (0.2, 0.8)}),
 }
 
-EVOLUTIONS = (lp.RandomWalk(0.1), lp.MeanReverting(2.0), lp.Periodic(3.0, harmonics=2))
+EVOLUTIONS = (lp.RandomWalk(0.1), lp.MeanReverting(2.0), lp.fem.Periodic(3.0, harmonics=2))
 
 
 def number(name: str, typical: Typical) -> st.SearchStrategy[float]:
@@ -112,7 +112,7 @@ def test_every_equation_passes_the_checks(name: str, data: Any, seed: int) -> No
     model = data.draw(models(name))
     u = 0.7 if model.state_space.single else dict.fromkeys(model.state_space.blocks, 0.7)
     inputs = {channel: data.draw(st.floats(-2.0, 2.0)) for channel in model.channels}
-    lp.check_model(model, u=u, t=0.5, inputs=inputs, seed=seed).raise_if_failed()
+    lp.diagnostics.check_model(model, u=u, t=0.5, inputs=inputs, seed=seed).raise_if_failed()
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,9 @@ def test_every_equation_passes_the_checks(name: str, data: Any, seed: int) -> No
     ],
 )
 def test_equations_with_their_own_boundary_values_refuse_others(name: str) -> None:
-    with pytest.raises(lp.ModelError, match=rf"^{name} is .*: leave out the values on \['left'\]"):
+    with pytest.raises(
+        lp.errors.ModelError, match=rf"^{name} is .*: leave out the values on \['left'\]"
+    ):
         EQUATIONS[name].build(line([0.0, 1.0]), {}, {"left": 1.0})
 
 
@@ -186,7 +188,7 @@ def test_every_unknown_passes_the_checks_and_stays_inside(
         return term(q.k["a"] + q.k["b"] if kind == "by name" else q.k, u, v, x)
 
     model = lp.Model(lp.Field(MESH, linear(MESH)), {"k": KINDS[kind](**options)}, A)
-    lp.check_model(model, u=0.7, seed=seed).raise_if_failed()
+    lp.diagnostics.check_model(model, u=0.7, seed=seed).raise_if_failed()
     if transform:
         latent = model.latent
         a = 20.0 * np.random.default_rng(seed).standard_normal(latent.dim)

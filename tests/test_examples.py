@@ -120,12 +120,12 @@ def test_the_case_of_a_new_pde_finds_the_truth(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(data, vars(load("own_pde")))
     (tmp_path / "less.toml").write_text(re.sub(r"^a = .*\n", "", case, flags=re.MULTILINE))
-    with pytest.raises(lp.CaseError, match=r"channels\.a is missing: the equation reads it"):
+    with pytest.raises(lp.errors.CaseError, match=r"channels\.a is missing: the equation reads it"):
         CliRunner().invoke(
             app, ["run", str(tmp_path / "less.toml"), "--allow-code"], catch_exceptions=False
         )
     command = ["run", str(tmp_path / "rod.toml"), "--json", "--out", str(tmp_path / "run")]
-    with pytest.raises(lp.CaseError, match="add --allow-code"):
+    with pytest.raises(lp.errors.CaseError, match="add --allow-code"):
         CliRunner().invoke(app, command, catch_exceptions=False)
     result = CliRunner().invoke(app, [*command, "--allow-code"], catch_exceptions=False)
     found = json.loads(result.output)["measures"]

@@ -427,7 +427,7 @@ def test_a_case_with_code_asks_for_leave_and_takes_its_files_along(rod, tmp_path
     case = tmp_path / "case.toml"
     text = rod.read_text().replace('equation = "heat"', 'equation = "inside/pde.py:mine"')
     case.write_text(text)
-    with pytest.raises(lp.CaseError, match="--allow-code"):
+    with pytest.raises(lp.errors.CaseError, match="--allow-code"):
         export_fmu(case, tmp_path / "a.fmu")
     unit = export_fmu(case, tmp_path / "a.fmu", allow_code=True)
     expected = load(case, allow_code=True)
@@ -476,7 +476,7 @@ def test_files_of_one_name_do_not_fit_into_a_unit(rod, tmp_path):
     text = re.sub(r"^file = .*$", 'reader = "b/own.py:read"', text, flags=re.MULTILINE)
     case = tmp_path / "case.toml"
     case.write_text(text)
-    with pytest.raises(lp.ConfigurationError, match="holds another file of that name"):
+    with pytest.raises(lp.errors.ConfigurationError, match="holds another file of that name"):
         recipe_of(load(case, allow_code=True))
 
 
@@ -488,7 +488,7 @@ def test_a_case_without_data_becomes_a_unit(rod, tmp_path):
     with running(unit, 400.0) as instance:  # it begins when the other program does
         found = [taken(instance, 400.0 + t, z) for t, z in history(3)]
     assert [row[-1] for row in found] == [0.0, 0.0, 0.0]
-    with pytest.raises(lp.CaseError, match=r"data\.file is missing"):
+    with pytest.raises(lp.errors.CaseError, match=r"data\.file is missing"):
         compare_fmu(unit, load(case))
 
 
@@ -520,21 +520,31 @@ def test_bad_input_is_one_sentence(rod, tmp_path, monkeypatch):
     Path("own.py").write_text(OWN)
     Path("there.fmu").write_text("")
     for source, options, error, words in [
-        (rod, {"target": "a.zip"}, lp.ConfigurationError, "ends with .fmu"),
-        (rod, {"target": "there.fmu"}, lp.RunError, "exists: name another file"),
-        (rod, {"target": "a.fmu", "fmi": 1}, lp.ConfigurationError, "expected 2 .FMI 2.0. or 3"),
-        ("nix.toml", {}, lp.CaseError, "no such case file"),
-        ("own.py:nix", {}, lp.CaseError, "has no function 'nix'"),
-        ("nix.py:build", {}, lp.CaseError, "there is no file 'nix.py'"),
-        ("own.py:fails", {}, lp.ConfigurationError, "failed with ValueError: no rod today"),
-        ("own.py:other", {}, lp.ConfigurationError, r"returned int; expected \(\) -> livepde"),
+        (rod, {"target": "a.zip"}, lp.errors.ConfigurationError, "ends with .fmu"),
+        (rod, {"target": "there.fmu"}, lp.errors.RunError, "exists: name another file"),
+        (
+            rod,
+            {"target": "a.fmu", "fmi": 1},
+            lp.errors.ConfigurationError,
+            "expected 2 .FMI 2.0. or 3",
+        ),
+        ("nix.toml", {}, lp.errors.CaseError, "no such case file"),
+        ("own.py:nix", {}, lp.errors.CaseError, "has no function 'nix'"),
+        ("nix.py:build", {}, lp.errors.CaseError, "there is no file 'nix.py'"),
+        ("own.py:fails", {}, lp.errors.ConfigurationError, "failed with ValueError: no rod today"),
+        (
+            "own.py:other",
+            {},
+            lp.errors.ConfigurationError,
+            r"returned int; expected \(\) -> livepde",
+        ),
     ]:
         with pytest.raises(error, match=words):
             export_fmu(source, **options)
     for name in ("pythonfmu", "pythonfmu.builder"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(
-        lp.ConfigurationError, match=r"needs pythonfmu: pip install 'livepde\[fmu\]'"
+        lp.errors.ConfigurationError, match=r"needs pythonfmu: pip install 'livepde\[fmu\]'"
     ):
         export_fmu(rod, "a.fmu")
     assert not list(Path().glob("*.fmu.*"))
@@ -544,7 +554,7 @@ def test_variables_need_names_of_their_own(rod, tmp_path):
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
     case = tmp_path / "case.toml"
     case.write_text(rod.read_text().replace("T_left = {", "alpha_std = {"))
-    with pytest.raises(lp.ConfigurationError, match=r"two variables .* 'alpha_std'; rename"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"two variables .* 'alpha_std'; rename"):
         export_fmu(case, tmp_path / "a.fmu")
 
 
@@ -561,7 +571,7 @@ def test_a_unit_that_does_not_run_says_why(rod, tmp_path, monkeypatch):
             if name.startswith("resources/livepde_unit"):
                 name = name.replace(".py", "_broken.py")
             new.writestr(name, content)
-    with pytest.raises(lp.RunError, match="did you mean 'heat'"), running(broken, 0.0):
+    with pytest.raises(lp.errors.RunError, match="did you mean 'heat'"), running(broken, 0.0):
         pass
 
 
@@ -640,7 +650,7 @@ def test_the_command_writes_compares_and_tells(rod, tmp_path, monkeypatch):
     assert done.exit_code == 0
     assert "Written: own.fmu (2 inputs, 5 outputs)" in done.stdout
     done = run.invoke(app, ["fmu", "own.py:build", "--set", "law.noise=1"])
-    assert isinstance(done.exception, lp.ConfigurationError)
+    assert isinstance(done.exception, lp.errors.ConfigurationError)
     assert "--set belongs to a case" in str(done.exception)
 
 
@@ -710,12 +720,12 @@ def test_a_regressor_of_one_sensor_takes_numbers():
     for x, y in measured(5):
         assert isinstance(model.predict_one(x), float)
         model.learn_one(x, y["a"])
-    with pytest.raises(lp.SampleError, match="have no 't', the time"):
+    with pytest.raises(lp.errors.SampleError, match="have no 't', the time"):
         model.predict_one({"T_left": 0.0})
-    with pytest.raises(lp.SampleError, match="unknown input 'colour'"):
+    with pytest.raises(lp.errors.SampleError, match="unknown input 'colour'"):
         model.predict_one({"t": 3.0, "colour": 1.0})
     several = OnlineRegressor(slab({"a": 0.3, "b": 0.6}))
-    with pytest.raises(lp.SampleError, match="expected a mapping"):
+    with pytest.raises(lp.errors.SampleError, match="expected a mapping"):
         several.learn_one({"t": 0.0, "T_left": 0.0}, 1.0)
 
 

@@ -46,7 +46,7 @@ MESHES = {
     "line": lambda: lp.interval(0.0, 1.0, 4),
     "triangle": lambda: unit_mesh(MeshTri().refined(2)),
     "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 2)),
-    "tetra": lambda: lp.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (2, 1, 1)),
+    "tetra": lambda: lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (2, 1, 1)),
     "hexahedron": lambda: unit_mesh(MeshHex().refined(1)),
 }
 

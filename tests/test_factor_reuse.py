@@ -25,7 +25,9 @@ def plate():
 
 def test_a_kept_factor_changes_no_number(plate, monkeypatch):
     given, samples = plate
-    law = lp.GradientLaw(1.0, lp.ResidualDamping(0.1), newton=lp.Newton(tolerance=1e-9, share=0.0))
+    law = lp.GradientLaw(
+        1.0, lp.laws.ResidualDamping(0.1), newton=lp.stepping.Newton(tolerance=1e-9, share=0.0)
+    )
     made = []
     factorise = SuperLUSolver.factorise
 
@@ -50,7 +52,9 @@ def test_a_kept_factor_changes_no_number(plate, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "law", [lp.GradientLaw(1.0, lp.ResidualDamping(0.1)), lp.GradientLaw("auto")], ids=["1", "auto"]
+    "law",
+    [lp.GradientLaw(1.0, lp.laws.ResidualDamping(0.1)), lp.GradientLaw("auto")],
+    ids=["1", "auto"],
 )
 def test_a_kept_factor_is_made_again_after_a_restart(law, plate, tmp_path):
     given, samples = plate
@@ -73,23 +77,23 @@ def test_a_kept_factor_is_made_again_after_a_restart(law, plate, tmp_path):
 
 
 ROD = problem(31)
-EXACT = lp.Newton(share=0.0, tolerance=1e-10)
+EXACT = lp.stepping.Newton(share=0.0, tolerance=1e-10)
 
 
 def rod(newton, scheme=None, gain=1e4, given=ROD):
     """Return estimates and updates of each step of the paper's example."""
     G = ROD.omega.matrix(ROD.model.state_space)
-    law = lp.GradientLaw(gain, lp.ResidualDamping(0.1), newton=newton)
+    law = lp.GradientLaw(gain, lp.laws.ResidualDamping(0.1), newton=newton)
     identifier = lp.Identifier(ROD.model, ROD.omega, law, q0=0.0, u0=ROD.u0, scheme=scheme)
     estimates, updates = [], []
     with pytest.MonkeyPatch.context() as patch:
         solved = []
 
-        def counted(self, *args, solve=lp.Newton.solve):
+        def counted(self, *args, solve=lp.stepping.Newton.solve):
             solved.append(solve(self, *args))
             return solved[-1]
 
-        patch.setattr(lp.Newton, "solve", counted)
+        patch.setattr(lp.stepping.Newton, "solve", counted)
         for t, u in given.forward(given.q_true):
             if t > 0.0:
                 solved.clear()
@@ -99,7 +103,7 @@ def rod(newton, scheme=None, gain=1e4, given=ROD):
 
 
 def test_one_update_or_two_are_enough():
-    few, updates = rod(lp.Newton())
+    few, updates = rod(lp.stepping.Newton())
     exact, more = rod(EXACT)
     assert updates[10:].mean() < 1.6 < 2.5 < more[10:].mean()
     assert np.mean(updates[10:] == 1) > 0.5
@@ -111,14 +115,17 @@ def test_one_update_or_two_are_enough():
 def test_a_start_that_suddenly_misses_more_is_followed_further():
     """A factor of another theta serves badly then: theta has turned."""
     given = replace(ROD, width=0.55)
-    few, _ = rod(lp.Newton(), gain=1e2, given=given)
+    few, _ = rod(lp.stepping.Newton(), gain=1e2, given=given)
     exact, _ = rod(EXACT, gain=1e2, given=given)
     for one, other in zip(few, exact, strict=True):
         assert np.linalg.norm(one.u - other.u) < 0.01 * np.linalg.norm(other.u)
 
 
 def test_a_scheme_of_second_order_solves_its_stages_to_the_end():
-    one, other = (rod(newton, lp.Alexander2()) for newton in (lp.Newton(), lp.Newton(share=0.0)))
+    one, other = (
+        rod(newton, lp.Alexander2())
+        for newton in (lp.stepping.Newton(), lp.stepping.Newton(share=0.0))
+    )
     assert np.array_equal(one[1], other[1])
     assert all(np.array_equal(a.q, b.q) for a, b in zip(one[0], other[0], strict=True))
 
@@ -134,7 +141,7 @@ def test_most_steps_make_no_factor(plate, monkeypatch):
         return factor(self, data, at)
 
     monkeypatch.setattr(BilinearSolver, "factor", counted)
-    law = lp.GradientLaw(1.0, lp.ResidualDamping(0.1))
+    law = lp.GradientLaw(1.0, lp.laws.ResidualDamping(0.1))
     identifier = lp.Identifier(given.model, given.omega, law, q0=0.0, u0=given.u0)
     counts = []
     for sample in samples[1:]:

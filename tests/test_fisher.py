@@ -83,9 +83,9 @@ def test_the_equations_build_by_region_and_in_the_plane(name):
 
 def test_what_is_refused():
     mesh = lp.interval(0.0, 1.0, 4)
-    with pytest.raises(lp.ModelError, match="K must be a positive number"):
+    with pytest.raises(lp.errors.ModelError, match="K must be a positive number"):
         fisher_kpp(mesh, ONE, ONE, K=0.0)
-    with pytest.raises(lp.ModelError, match="m must be at least 1"):
+    with pytest.raises(lp.errors.ModelError, match="m must be at least 1"):
         porous_fisher(mesh, ONE, ONE, m=0.5)
 
 

@@ -61,7 +61,7 @@ def walks():
     evolutions = {
         "a": lp.RandomWalk(0.1),
         "b": lp.MeanReverting(2.0),
-        "c": lp.Periodic(3.0),
+        "c": lp.fem.Periodic(3.0),
         "d": None,
     }
     unknowns = {
@@ -244,7 +244,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
 
     for model, guards in (
         (rod(), None),
-        (rod(), lp.Guards()),
+        (rod(), lp.laws.Guards()),
         (rod(bounds=(0.45, 0.55)), None),
     ):
         fleet, estimate = compare(model, lp.SensitivityLaw(guards=guards), stream)
@@ -341,7 +341,7 @@ def test_goes_on_from_a_checkpoint_with_the_same_numbers(law, tmp_path):
         np.testing.assert_array_equal(mine.u, restored.u)
     assert fleet.dump() == other.dump()
     strange = lp.Fleet(model, SENSORS, law, ["a", "c"])
-    with pytest.raises(lp.RunError, match="another members"):
+    with pytest.raises(lp.errors.RunError, match="another members"):
         strange.load(tmp_path / "fleet.bin")
 
 
@@ -388,17 +388,21 @@ INPUTS = {"T_0": 0.1, "ambient": 0.0}
 @pytest.mark.parametrize(
     ("sample", "error", "match"),
     [
-        ((0.1, np.zeros((3, 3)), INPUTS), lp.SampleError, r"z has shape \(3, 3\)"),
-        ((0.1, [["a", 1, 2]] * 2, INPUTS), lp.SampleError, "not a number"),
-        ((0.1, [[0, 1, np.inf]] * 2, INPUTS), lp.SampleError, "'T_3' of member 'north'"),
-        ((np.nan, np.zeros((2, 3)), INPUTS), lp.SampleError, "time t is nan"),
-        ((0.1, {"T_9": 1.0}, INPUTS), lp.SampleError, "unknown channel 'T_9'"),
-        ((0.1, {"T_1": [1.0] * 3}, INPUTS), lp.SampleError, r"channel 'T_1' has shape \(3,\)"),
-        ((0.1, np.zeros((2, 3)), {"T_9": 1.0}), lp.SampleError, "unknown input 'T_9'"),
-        ((-0.1, np.zeros((2, 3)), INPUTS), lp.TimeOrderError, "not later"),
+        ((0.1, np.zeros((3, 3)), INPUTS), lp.errors.SampleError, r"z has shape \(3, 3\)"),
+        ((0.1, [["a", 1, 2]] * 2, INPUTS), lp.errors.SampleError, "not a number"),
+        ((0.1, [[0, 1, np.inf]] * 2, INPUTS), lp.errors.SampleError, "'T_3' of member 'north'"),
+        ((np.nan, np.zeros((2, 3)), INPUTS), lp.errors.SampleError, "time t is nan"),
+        ((0.1, {"T_9": 1.0}, INPUTS), lp.errors.SampleError, "unknown channel 'T_9'"),
+        (
+            (0.1, {"T_1": [1.0] * 3}, INPUTS),
+            lp.errors.SampleError,
+            r"channel 'T_1' has shape \(3,\)",
+        ),
+        ((0.1, np.zeros((2, 3)), {"T_9": 1.0}), lp.errors.SampleError, "unknown input 'T_9'"),
+        ((-0.1, np.zeros((2, 3)), INPUTS), lp.errors.TimeOrderError, "not later"),
         (
             (0.1, np.zeros((2, 3)), {"T_0": [0.1, np.nan], "ambient": 0.0}),
-            lp.MissingInputError,
+            lp.errors.MissingInputError,
             "'T_0' of member 'south'",
         ),
     ],
@@ -409,16 +413,16 @@ def test_bad_samples_change_nothing(sample, error, match):
         fleet.step(*sample)
     fleet.step(0.1, np.zeros((2, 3)), INPUTS)
     assert fleet.t.tolist() == [0.1, 0.1]
-    with pytest.raises(lp.TimeOrderError, match="not later"):
+    with pytest.raises(lp.errors.TimeOrderError, match="not later"):
         fleet.step(0.1, np.zeros((2, 3)), INPUTS)
 
 
 def test_bad_members():
-    with pytest.raises(lp.ConfigurationError, match="at least one"):
+    with pytest.raises(lp.errors.ConfigurationError, match="at least one"):
         lp.Fleet(rod(), SENSORS, LAWS["plain"], 0)
-    with pytest.raises(lp.ConfigurationError, match="must differ"):
+    with pytest.raises(lp.errors.ConfigurationError, match="must differ"):
         lp.Fleet(rod(), SENSORS, LAWS["plain"], ["a", "a"])
-    with pytest.raises(lp.ConfigurationError, match="a list of 3 for 2 members"):
+    with pytest.raises(lp.errors.ConfigurationError, match="a list of 3 for 2 members"):
         lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, u0=[0.0, 0.0, 0.0])
 
 
@@ -500,7 +504,7 @@ def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
 def test_members_that_step_separately_are_not_kept_as_arrays():
     fleet = lp.Fleet(rod(), SENSORS, lp.GradientLaw(), 2)
     estimate = fleet.step(*samples(fleet, 5)[0])
-    with pytest.raises(lp.ConfigurationError, match="separately"):
+    with pytest.raises(lp.errors.ConfigurationError, match="separately"):
         FleetRecords(fleet.model).add(estimate)
 
 
@@ -536,7 +540,7 @@ def test_a_leap_of_too_many_substeps_is_refused():
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, dt_max=0.1)
     t, z, inputs = samples(fleet, 5)[0]
     fleet.step(t, z, inputs)
-    with pytest.raises(lp.SampleError, match="longer dt_max"):
+    with pytest.raises(lp.errors.SampleError, match="longer dt_max"):
         fleet.step(1e6, z, inputs)
 
 

@@ -15,7 +15,7 @@ from livepde.models import heat
 SENSORS = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
 HIDDEN = lp.Points({"c": 0.8})
 LAWS = {
-    "gradient": lp.GradientLaw(gain=10.0, damping=lp.ResidualDamping(c1=1.0)),
+    "gradient": lp.GradientLaw(gain=10.0, damping=lp.laws.ResidualDamping(c1=1.0)),
     "sensitivity": lp.SensitivityLaw(drift=0.01, jumps=lp.Jumps()),
     "replay": lp.SensitivityLaw(replay=lp.Replay(first=2)),
     "auto": lp.AutoLaw(),
@@ -116,12 +116,12 @@ def test_nothing_is_learned_from_a_forecast_or_a_copy(law, build):
 
 def test_a_forecast_begins_where_nothing_was_measured_yet():
     identifier = rod(LAWS["sensitivity"])
-    with pytest.raises(lp.MissingInputError, match="'T_end' has no value"):
+    with pytest.raises(lp.errors.MissingInputError, match="'T_end' has no value"):
         identifier.forecast(1.0, {"heat": 1.0})
     inputs = {"T_end": 1.0, "heat": 1.0}
     found = identifier.forecast(0.5, inputs)
     assert not identifier._inputs
-    with pytest.raises(lp.MissingInputError):
+    with pytest.raises(lp.errors.MissingInputError):
         identifier.estimate()
     identifier.step(0.0, inputs)
     assert np.array_equal(identifier.forecast(0.5).z, found.z)
@@ -130,7 +130,7 @@ def test_a_forecast_begins_where_nothing_was_measured_yet():
 def test_a_sensor_that_moves_is_where_the_last_sample_had_it():
     fixed = rod(LAWS["sensitivity"])
     moving = lp.Identifier(
-        fixed.model, SENSORS, fixed.law, withheld=lp.Moving({"c": "x"}, noise=0.1)
+        fixed.model, SENSORS, fixed.law, withheld=lp.observation.Moving({"c": "x"}, noise=0.1)
     )
     for t, z in samples(5):
         moving.step(t, {**z, "x": 0.8})
@@ -173,15 +173,15 @@ def test_deviations_grow_as_an_unknown_moves():
 @pytest.mark.parametrize(
     ("times", "inputs", "error", "words"),
     [
-        ([], {}, lp.TimeOrderError, "must increase"),
-        ([-1.0], {}, lp.TimeOrderError, "last sample at t = 0.5"),
-        ([1.0, 1.0], {}, lp.TimeOrderError, "must increase"),
-        ([[1.0]], {}, lp.SampleError, "finite numbers"),
-        (np.nan, {}, lp.SampleError, "finite numbers"),
-        ("soon", {}, lp.SampleError, "not a number"),
-        ([1.0, 2.0], {"heat": [1.0, 2.0, 3.0]}, lp.SampleError, r"'heat' has shape \(3,\)"),
-        (1.0, {"heat": np.inf}, lp.SampleError, "'heat': got inf"),
-        (1.0, {"cold": 1.0}, lp.SampleError, "unknown input 'cold'"),
+        ([], {}, lp.errors.TimeOrderError, "must increase"),
+        ([-1.0], {}, lp.errors.TimeOrderError, "last sample at t = 0.5"),
+        ([1.0, 1.0], {}, lp.errors.TimeOrderError, "must increase"),
+        ([[1.0]], {}, lp.errors.SampleError, "finite numbers"),
+        (np.nan, {}, lp.errors.SampleError, "finite numbers"),
+        ("soon", {}, lp.errors.SampleError, "not a number"),
+        ([1.0, 2.0], {"heat": [1.0, 2.0, 3.0]}, lp.errors.SampleError, r"'heat' has shape \(3,\)"),
+        (1.0, {"heat": np.inf}, lp.errors.SampleError, "'heat': got inf"),
+        (1.0, {"cold": 1.0}, lp.errors.SampleError, "unknown input 'cold'"),
     ],
 )
 def test_a_bad_forecast_is_one_sentence(times, inputs, error, words):
@@ -194,14 +194,14 @@ def test_a_bad_forecast_is_one_sentence(times, inputs, error, words):
 def test_a_forecast_too_far_away_says_so():
     model = heat(line(10), lp.Scalar(0.1, std=0.05))
     identifier = lp.Identifier(model, SENSORS, lp.GradientLaw(), dt_max=1e-3)
-    with pytest.raises(lp.SampleError, match="substeps"):
+    with pytest.raises(lp.errors.SampleError, match="substeps"):
         identifier.forecast(1e6)
 
 
 def test_a_sensor_that_does_not_exist_is_told():
     model = heat(line(10), lp.Scalar(0.1, std=0.05))
     found = lp.Identifier(model, SENSORS, lp.GradientLaw()).forecast(1.0)
-    with pytest.raises(lp.SampleError, match="no sensor is called 'T_99'; there are"):
+    with pytest.raises(lp.errors.SampleError, match="no sensor is called 'T_99'; there are"):
         found["T_99"]
 
 

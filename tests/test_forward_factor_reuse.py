@@ -70,7 +70,7 @@ def go(model, parameters, tolerance=1e-8, kept_from_start=True):
     forward, kept, found = Counted(model), Kept.none(), []
     c, directions = begun(model)
     for k, q in enumerate(parameters):
-        moment = lp.Moment(H * (k + 1))
+        moment = lp.fem.Moment(H * (k + 1))
         c, kept = forward.advance(c, q, directions, H, moment, kept, tolerance)
         found.append(c)
         kept = kept if kept_from_start else Kept.none()
@@ -124,7 +124,7 @@ def test_a_factor_is_made_again_once_it_has_cost_a_new_one(model):
     c, directions = begun(model)
     parameters = [bump(model, 1.0), *[bump(model, 1.2)] * 20]
     for k, q in enumerate(parameters):
-        c, kept = forward.advance(c, q, directions, H, lp.Moment(H * (k + 1)), kept)
+        c, kept = forward.advance(c, q, directions, H, lp.fem.Moment(H * (k + 1)), kept)
         spent.append(kept.spent)
     renewed = spent.index(0.0, 2)
     assert np.all(np.diff(spent[:renewed]) >= 0)
@@ -141,7 +141,7 @@ def test_a_factor_is_kept_while_the_process_rests():
     c[:, 0] = 1.0
     for k in range(6):
         q = bump(steady, 1.0 + 0.1 * k)
-        c, kept = forward.advance(c, q, directions, H, lp.Moment(H * (k + 1)), kept)
+        c, kept = forward.advance(c, q, directions, H, lp.fem.Moment(H * (k + 1)), kept)
         assert kept.spent == 0.0
     assert forward.made == 1
     np.testing.assert_allclose(c[:, 0], 1.0, atol=1e-12)
@@ -156,7 +156,7 @@ def test_errors_are_small_beside_slow_changes():
         A=lambda q, u, v, x: q * (u - 1.0) * v,
         B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
     )
-    h, moment, directions = 1e-4, lp.Moment(1e-4), np.zeros((model.Q.dim, 1))
+    h, moment, directions = 1e-4, lp.fem.Moment(1e-4), np.zeros((model.Q.dim, 1))
     q = 1e3 * np.ones(model.Q.dim)
     forward = Counted(model)
     c = np.column_stack([1.0 + 1e-7 * bump(model, 1.0), np.zeros(model.X.dim)])
@@ -273,7 +273,7 @@ def test_only_symmetric_matrices_are_factorised_as_such(engine, share, claimed, 
     forward = ForwardStage(moving)
     assert forward.symmetric is claimed
     c = moving.initial(lambda x: np.sin(3.0 * x[0]) + x[1])
-    u = forward.solve(c, q, h, lp.Moment(h))
+    u = forward.solve(c, q, h, lp.fem.Moment(h))
     rate, wind = moving.mass @ (u - c) / h, moving.form_A.vector("v", q=q, u=u)
     residual = (rate + wind + moving.B(u)) * moving.X.free
     np.testing.assert_allclose(residual, 0.0, atol=1e-10 * np.abs(wind).max())
@@ -305,7 +305,7 @@ def test_a_state_may_fade_until_its_squares_underflow(model, size):
     forward, c = ForwardStage(calm), size * np.column_stack([model.X.free] * 2)
     for k in range(3):
         q = bump(calm, 1.0 + 0.1 * k)
-        c, kept = forward.advance(c, q, directions, H, lp.Moment(H * (k + 1)), kept)
+        c, kept = forward.advance(c, q, directions, H, lp.fem.Moment(H * (k + 1)), kept)
     assert 0.0 < np.abs(c[:, 0]).max() < size
 
 
@@ -314,8 +314,10 @@ def test_a_matrix_that_is_not_positive_definite_is_still_solved(model):
     q = bump(model, -400.0)
     c, _ = begun(model)
     forward = ForwardStage(model)
-    u = forward.solve(c[:, 0], q, H, lp.Moment(H))
-    residual = model.mass @ (u - c[:, 0]) / H + model.B(u) + model.A(u)(q) - model.F(lp.Moment(H))
+    u = forward.solve(c[:, 0], q, H, lp.fem.Moment(H))
+    residual = (
+        model.mass @ (u - c[:, 0]) / H + model.B(u) + model.A(u)(q) - model.F(lp.fem.Moment(H))
+    )
     np.testing.assert_allclose(residual * model.X.free, 0.0, atol=1e-10)
 
 

@@ -112,7 +112,7 @@ def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
     ],
 )
 def test_a_table_that_cannot_be_used_is_one_sentence(here, text, told):
-    with pytest.raises(lp.DataError, match=re.escape(told)) as error:
+    with pytest.raises(lp.errors.DataError, match=re.escape(told)) as error:
         begun(text)
     assert str(error.value).startswith("my.csv")
     assert not Path("mine").exists()
@@ -120,15 +120,17 @@ def test_a_table_that_cannot_be_used_is_one_sentence(here, text, told):
 
 def test_only_tables_with_a_header(here):
     Path("my.jsonl").write_text('{"time": 0}')
-    with pytest.raises(lp.DataError, match=r"my\.jsonl: a case is begun from a CSV file"):
+    with pytest.raises(lp.errors.DataError, match=r"my\.jsonl: a case is begun from a CSV file"):
         write_template(Path("mine"), Path("my.jsonl"))
-    with pytest.raises(lp.DataError, match=r"there is no file 'my\.csv'"):
+    with pytest.raises(lp.errors.DataError, match=r"there is no file 'my\.csv'"):
         write_template(Path("mine"), Path("my.csv"))
 
 
 def test_a_table_is_no_folder(here):
     Path("my.csv").write_text("time_s,T\n0,20\n")
-    with pytest.raises(lp.RunError, match=r"my\.csv is a file: 'livepde init DIR --data my\.csv'"):
+    with pytest.raises(
+        lp.errors.RunError, match=r"my\.csv is a file: 'livepde init DIR --data my\.csv'"
+    ):
         write_template(Path("my.csv"))
 
 
@@ -145,7 +147,7 @@ def test_what_loggers_write_for_no_value_is_missing(here):
     ],
 )
 def test_an_order_of_day_and_month_that_cannot_be_known_is_asked_for(here, first, second, told):
-    with pytest.raises(lp.DataError, match=re.escape(told)) as error:
+    with pytest.raises(lp.errors.DataError, match=re.escape(told)) as error:
         begun(f"time,T\n{first},20\n{second},20\n")
     assert f"the order of day, month and year in '{first}' cannot be known" in str(error.value)
     table = measured(Path("my.csv"), "s", choose=lambda column, cell, formats: formats[-1])
@@ -197,9 +199,13 @@ def test_days_and_times_of_day_in_two_columns(here, day, hour, form):
     filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
     stream = cases.load("mine/case.toml", settings=filled).prepare().stream
     assert np.allclose(stream.t, [0.0, 600.0])
-    with pytest.raises(lp.CaseError, match="skip and a time in two columns belong to a file"):
+    with pytest.raises(
+        lp.errors.CaseError, match="skip and a time in two columns belong to a file"
+    ):
         cases.load("mine/case.toml", settings={**filled, "data.follow": True})
-    with pytest.raises(lp.CaseError, match="times in two columns are read from CSV files only"):
+    with pytest.raises(
+        lp.errors.CaseError, match="times in two columns are read from CSV files only"
+    ):
         cases.load("mine/case.toml", settings=filled).prepare("rows.parquet")
 
 
@@ -220,9 +226,9 @@ def test_title_lines_before_the_header(here):
     case = cases.load("mine/case.toml", settings=filled)
     assert len(case.prepare().stream) == 2
     Path("my.csv").write_text(title + table.replace("21,5", "ERR"))
-    with pytest.raises(lp.DataError, match="row 6, column 'T_5cm': got 'ERR'"):
+    with pytest.raises(lp.errors.DataError, match="row 6, column 'T_5cm': got 'ERR'"):
         case.prepare()
-    with pytest.raises(lp.DataError, match="line 1 is no header, but a title: say skip = 3"):
+    with pytest.raises(lp.errors.DataError, match="line 1 is no header, but a title: say skip = 3"):
         cases.load("mine/case.toml", settings={**filled, "data.skip": 0}).prepare()
 
 
@@ -244,7 +250,7 @@ def test_numbered_columns_with_a_table_of_places(here):
     assert places.read_text().splitlines()[:2] == ["name,x", "T 1,?"]
     filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
     filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
-    with pytest.raises(lp.CaseError, match=r"places\.csv, row 2: still to be filled in"):
+    with pytest.raises(lp.errors.CaseError, match=r"places\.csv, row 2: still to be filled in"):
         cases.load("mine/case.toml", settings=filled)
     rows = [f"{name},{0.02 * k}" for k, name in enumerate(names)]
     places.write_text("\n".join(["name,x", *rows]) + "\n")
@@ -343,7 +349,7 @@ def test_a_case_of_every_equation_has_what_it_needs(here, name):
         if option.default is None or any(key in equation.alternatives[one] for one in chosen)
     }
     sides = r"mesh\.x, mesh\.y," if equation.dimension > 1 else r"mesh\.from, mesh\.to,"
-    with pytest.raises(lp.CaseError, match=rf"still to be filled in, .* {sides}"):
+    with pytest.raises(lp.errors.CaseError, match=rf"still to be filled in, .* {sides}"):
         cases.load("mine/case.toml")
 
 
@@ -469,7 +475,7 @@ def test_an_equation_belongs_to_a_table(here):
         (["--data", "my.csv", "--equation", "own.py:rod"], "write 'own.py:rod' into the case."),
     ):
         error = runner.invoke(app, ["init", "mine", *arguments]).exception
-        assert isinstance(error, lp.ConfigurationError)
+        assert isinstance(error, lp.errors.ConfigurationError)
         assert told in str(error)
     assert not Path("mine").exists()
 
@@ -536,7 +542,7 @@ def test_from_a_table_to_estimates(here):
         in done.stdout
     )
     case = Path("mine/case.toml")
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load(case)
     named = "mesh.from, mesh.to, unknowns.alpha.prior, unknowns.alpha.std, law.noise, "
     assert str(error.value) == (
@@ -667,10 +673,10 @@ def test_tables_that_cannot_be_joined(here, files, channel, told):
 
 def test_several_tables_are_not_followed(here):
     CliRunner().invoke(app, ["init", "mine", *two_tables()])
-    with pytest.raises(lp.CaseError, match="follow belongs to one file that grows"):
+    with pytest.raises(lp.errors.CaseError, match="follow belongs to one file that grows"):
         cases.load("mine/case.toml", settings={**FILES, "data.follow": True})
     case = cases.load("mine/case.toml", settings=FILES)
-    with pytest.raises(lp.CaseError, match="a process is followed in one: name it"):
+    with pytest.raises(lp.errors.CaseError, match="a process is followed in one: name it"):
         source_of(case.frame, None, "")
 
 
@@ -685,5 +691,5 @@ def test_tables_that_init_refuses(here, text, told):
     arguments = two_tables()
     Path("heater.csv").write_text(text)
     error = CliRunner().invoke(app, ["init", "mine", *arguments]).exception
-    assert isinstance(error, lp.DataError)
+    assert isinstance(error, lp.errors.DataError)
     assert told in str(error)

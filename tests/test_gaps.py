@@ -177,12 +177,12 @@ def test_values_stay_where_they_stood():
     ],
 )
 def test_a_stage_that_makes_no_sense_says_so(options, text):
-    with pytest.raises(lp.ConfigurationError, match=text):
+    with pytest.raises(lp.errors.ConfigurationError, match=text):
         FillGaps(**{"channels": ["left"], **options})
 
 
 def test_a_stage_needs_samples_in_order():
-    with pytest.raises(lp.SampleError, match="not later than the one before"):
+    with pytest.raises(lp.errors.SampleError, match="not later than the one before"):
         list(FillGaps(["left"])([(1.0, {"left": 1.0}), (1.0, {"left": 1.0})]))
 
 
@@ -335,7 +335,7 @@ def test_a_channel_may_keep_its_gaps_and_spikes(tmp_path):
 
 @pytest.mark.parametrize("key", ['missing = "interpolate"', 'spikes = "keep"'])
 def test_sensors_are_neither_interpolated_nor_screened(tmp_path, key):
-    with pytest.raises(lp.CaseError, match="belong to boundary and input channels"):
+    with pytest.raises(lp.errors.CaseError, match="belong to boundary and input channels"):
         cases.load(plant(tmp_path, sensor=f", {key}"))
 
 

@@ -29,7 +29,7 @@ from livepde.laws.metrics import ConstantMetric
 from livepde.model import h1_form
 from livepde.stepping import ForwardStage, Near, StepFailed
 
-EXACT = lp.Newton(tolerance=1e-13, share=0.0)
+EXACT = lp.stepping.Newton(tolerance=1e-13, share=0.0)
 
 
 def identifier(model, law, sensors=None, **options):
@@ -53,7 +53,8 @@ def energies(model, law, q_true, states, times, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize("gain", [1.0, 1e1, 1e2, 1e3, 1e4, 1e5])
 @pytest.mark.parametrize(
-    "damping", [lp.ResidualDamping(0.0), lp.ResidualDamping(1.0), lp.ConstantDamping(2.0)]
+    "damping",
+    [lp.laws.ResidualDamping(0.0), lp.laws.ResidualDamping(1.0), lp.laws.ConstantDamping(2.0)],
 )
 def test_energy_never_grows(gain, damping):
     """The terms with A cancel in every step: DESIGN.md, section 1, and (align:neplusnr).
@@ -87,7 +88,7 @@ def test_energy_of_the_papers_example(gain):
     times = 0.6 * np.arange(101)
     q_true = model.initial_parameter(q_exact)
     states = truth(model, q_true, lambda x: np.sin(np.pi * x[0]), times)
-    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(1.0), newton=EXACT)
+    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(1.0), newton=EXACT)
     energy = energies(model, law, q_true, states, times, u0=lambda x: 1.1 * np.sin(np.pi * x[0]))
     assert np.diff(energy).max() <= 1e-13 * energy[0]
 
@@ -146,7 +147,7 @@ def partly_observed(scheme, steps, h_total=1.0, **options):
     )
     sensors = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.8))
     law = lp.GradientLaw(
-        gain=30.0, damping=lp.ResidualDamping(0.5), nu=0.3, sigma=0.2, newton=EXACT
+        gain=30.0, damping=lp.laws.ResidualDamping(0.5), nu=0.3, sigma=0.2, newton=EXACT
     )  # where r passes zero theta jumps, by up to c_1: a larger one hides the orders
     ident = identifier(model, law, sensors, q0=1.0, u0=lambda x: x[0] * (1 - x[0]), scheme=scheme)
     nodes = ident.observed.G @ model.state.mesh.p[0]
@@ -224,10 +225,10 @@ def a_stage(rule, gain=50.0, nu=0.4, sigma=0.3, size=1.0, h=0.3, seed=0, newton=
 
 
 RULES = [
-    lp.ResidualDamping(0.0),
-    lp.ResidualDamping(3.0),
-    lp.ConstantDamping(2.0, floor=0.1),
-    lp.ConstantDamping(0.5, floor=1e-3),
+    lp.laws.ResidualDamping(0.0),
+    lp.laws.ResidualDamping(3.0),
+    lp.laws.ConstantDamping(2.0, floor=0.1),
+    lp.laws.ConstantDamping(0.5, floor=1e-3),
 ]
 
 
@@ -244,11 +245,13 @@ def test_stage_solves_its_equations(rule, nu):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3, 1e5])
-@pytest.mark.parametrize("rule", [lp.ResidualDamping(1.0), lp.ConstantDamping(0.5, floor=1e-3)])
+@pytest.mark.parametrize(
+    "rule", [lp.laws.ResidualDamping(1.0), lp.laws.ConstantDamping(0.5, floor=1e-3)]
+)
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 def test_an_accepted_stage_is_solved_in_every_unit(size, rule, gain):
     """The residual counts, whatever the size of the state: acceptance has no unit."""
-    newton = lp.Newton(share=0.0)
+    newton = lp.stepping.Newton(share=0.0)
     for halvings in range(9):
         h = 0.3 / 2**halvings
         stage, problem, dense, given = a_stage(rule, gain=gain, size=size, h=h, newton=newton)
@@ -272,8 +275,8 @@ def test_a_wrong_factor_is_never_accepted(spoiled):
         def solve(self, b):
             return self.inner.solve(b) / spoiled
 
-    newton = lp.Newton(share=0.0)
-    stage, problem, dense, given = a_stage(lp.ResidualDamping(1.0), newton=newton)
+    newton = lp.stepping.Newton(share=0.0)
+    stage, problem, dense, given = a_stage(lp.laws.ResidualDamping(1.0), newton=newton)
     other = 10.0 * np.random.default_rng(5).standard_normal(len(problem.c))
     p = problem
     data = stage.solver.data(p)
@@ -285,8 +288,8 @@ def test_a_wrong_factor_is_never_accepted(spoiled):
 
 
 def test_a_share_is_one_of_the_residual_that_the_prediction_had():
-    newton = lp.Newton(share=0.03)
-    stage, problem, dense, given = a_stage(lp.ResidualDamping(1.0), newton=newton)
+    newton = lp.stepping.Newton(share=0.03)
+    stage, problem, dense, given = a_stage(lp.laws.ResidualDamping(1.0), newton=newton)
     exact = solved(stage, problem, problem.c.copy)
     assert dense.relative(exact, *given) <= 3 * newton.tolerance  # without a prediction: none
     predicted = exact + 1e-4 * np.random.default_rng(1).standard_normal(len(exact))
@@ -299,7 +302,11 @@ def test_a_share_is_one_of_the_residual_that_the_prediction_had():
 def test_a_strict_tolerance_below_rounding_is_reached_as_far_as_numbers_go():
     for seed in range(5):
         stage, problem, dense, given = a_stage(
-            lp.ResidualDamping(1.0), gain=1e4, size=1e4, seed=seed, newton=lp.Newton(1e-17)
+            lp.laws.ResidualDamping(1.0),
+            gain=1e4,
+            size=1e4,
+            seed=seed,
+            newton=lp.stepping.Newton(1e-17),
         )
         y = solved(stage, problem, problem.c.copy)
         assert dense.relative(y, *given) <= 1e-12
@@ -389,44 +396,46 @@ def test_bounds_of_numbers_are_kept():
 class TestDamping:
     def test_residual_damping(self):
         """theta = c1 ||r||_X^2 / ||r||_VX^2: smooth, bounded by c1, never 0/0."""
-        rule = lp.ResidualDamping(2.0)
-        assert rule.theta(lp.Residual(4.0, 16.0, lambda: np.nan)) == 0.5
-        assert rule.theta(lp.Residual(0.0, 0.0, lambda: np.nan)) == 2.0
-        assert rule.slopes(lp.Residual(0.0, 0.0, lambda: np.nan)) == (0.0, 0.0, 0.0)
+        rule = lp.laws.ResidualDamping(2.0)
+        assert rule.theta(lp.laws.Residual(4.0, 16.0, lambda: np.nan)) == 0.5
+        assert rule.theta(lp.laws.Residual(0.0, 0.0, lambda: np.nan)) == 2.0
+        assert rule.slopes(lp.laws.Residual(0.0, 0.0, lambda: np.nan)) == (0.0, 0.0, 0.0)
 
     def test_constant_damping(self):
         """theta = mu / ||r||_V~ with a floor that is relative to ||u_alpha||_V~."""
-        rule = lp.ConstantDamping(3.0, floor=0.5)
+        rule = lp.laws.ConstantDamping(3.0, floor=0.5)
         for size in (1.0, 1e5):
-            seen = lp.Residual(0.0, 0.0, lambda size=size: size**2)
-            zero = lp.Residual(0.0, 0.0, lambda: 0.0, lambda seen=seen: seen)
+            seen = lp.laws.Residual(0.0, 0.0, lambda size=size: size**2)
+            zero = lp.laws.Residual(0.0, 0.0, lambda: 0.0, lambda seen=seen: seen)
             assert rule.theta(zero) == pytest.approx(6.0 / size)
             assert rule.theta(zero.replaced(1.0, 1.0, lambda size=size: 6.0 * size**2)) == (
                 pytest.approx(3 / 2.5 / size)
             )
-        nothing = lp.Residual(0.0, 0.0, lambda: 0.0)
+        nothing = lp.laws.Residual(0.0, 0.0, lambda: 0.0)
         assert (rule.theta(nothing), rule.slopes(nothing)) == (0.0, (0.0, 0.0, 0.0))
 
-    @pytest.mark.parametrize("rule", [lp.ResidualDamping(2.0), lp.ConstantDamping(3.0, floor=0.1)])
+    @pytest.mark.parametrize(
+        "rule", [lp.laws.ResidualDamping(2.0), lp.laws.ConstantDamping(3.0, floor=0.1)]
+    )
     def test_slopes_are_derivatives(self, rule):
         at = np.array([0.7, 1.9, 2.3])
-        seen = lp.Residual(1.0, 2.0, lambda: 4.0)
+        seen = lp.laws.Residual(1.0, 2.0, lambda: 4.0)
 
         def theta(x):
-            return rule.theta(lp.Residual(x[0], x[1], lambda: x[2], lambda: seen))
+            return rule.theta(lp.laws.Residual(x[0], x[1], lambda: x[2], lambda: seen))
 
-        slopes = rule.slopes(lp.Residual(at[0], at[1], lambda: at[2], lambda: seen))
+        slopes = rule.slopes(lp.laws.Residual(at[0], at[1], lambda: at[2], lambda: seen))
         for k, slope in enumerate(slopes):
             step = 1e-6 * np.eye(3)[k]
             assert slope == pytest.approx((theta(at + step) - theta(at - step)) / 2e-6, abs=1e-5)
 
     def test_default_slopes_serve_any_rule(self):
         @dataclass(frozen=True)
-        class Steep(lp.Damping):
+        class Steep(lp.laws.Damping):
             def theta(self, r):
                 return 0.5 * r.X + r.VX**2 + 0.1 * r.V
 
-        slopes = Steep().slopes(lp.Residual(0.7, 2.0, lambda: 3.0))
+        slopes = Steep().slopes(lp.laws.Residual(0.7, 2.0, lambda: 3.0))
         np.testing.assert_allclose(slopes, [0.5, 4.0, 0.1], rtol=1e-4)
         model = excited(8)
         ident = identifier(model, lp.GradientLaw(gain=10.0, damping=Steep()))
@@ -435,7 +444,7 @@ class TestDamping:
     def test_norms_of_the_residual(self):
         """||r||_V~ is the X-norm of the operator M_op r."""
         model = excited(8)
-        problem = lp.Problem(model, observe(model, lp.Full()), lp.Advance(lp.ImplicitEuler()))
+        problem = lp.laws.Problem(model, observe(model, lp.Full()), lp.Advance(lp.ImplicitEuler()))
         law = lp.GradientLaw()
         stage = law.prepare(problem).stage(np.ones(problem.observed.size, dtype=bool))
         r = np.random.default_rng(0).standard_normal(model.X.dim) * model.X.free
@@ -448,32 +457,32 @@ class TestDamping:
 
     def test_bad_rules(self):
         for c1 in (-1.0, np.nan, np.inf):
-            with pytest.raises(lp.LawError, match="c1 must be a number >= 0"):
-                lp.ResidualDamping(c1)
+            with pytest.raises(lp.errors.LawError, match="c1 must be a number >= 0"):
+                lp.laws.ResidualDamping(c1)
         for bad in ({"mu": -1.0}, {"mu": np.inf}, {"floor": 0.0}):
-            with pytest.raises(lp.LawError, match="mu >= 0 and floor > 0"):
-                lp.ConstantDamping(**bad)
+            with pytest.raises(lp.errors.LawError, match="mu >= 0 and floor > 0"):
+                lp.laws.ConstantDamping(**bad)
 
 
 def test_bad_gains():
     for gain in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(lp.LawError, match="gain must be a positive number"):
+        with pytest.raises(lp.errors.LawError, match="gain must be a positive number"):
             lp.GradientLaw(gain=gain)
     for name in ("nu", "sigma"):
-        with pytest.raises(lp.LawError, match=f"{name} must be a number >= 0"):
+        with pytest.raises(lp.errors.LawError, match=f"{name} must be a number >= 0"):
             lp.GradientLaw(**{name: -0.1})
 
 
 def test_sensors_that_see_the_parameter_are_refused():
     model = lp.Model(lp.Field(line(), ElementLineP1()), lp.Scalar(), lambda q, u, v, x: q * u * v)
     sensors = lp.Points({"a": 0.5}, direct={"a": lambda q, x: q})
-    with pytest.raises(lp.LawError, match="use SensitivityLaw"):
+    with pytest.raises(lp.errors.LawError, match="use SensitivityLaw"):
         identifier(model, lp.GradientLaw(), sensors)
 
 
 def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
     model = excited(10)
-    law = lp.GradientLaw(gain=1e4, newton=lp.Newton(iterations=0))
+    law = lp.GradientLaw(gain=1e4, newton=lp.stepping.Newton(iterations=0))
     ident = identifier(model, law, q0=1.0, halvings=0)
     before = ident.estimate()
     z = np.full(ident.observed.size, 0.3)
@@ -490,7 +499,7 @@ def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("damping", [lp.ResidualDamping(0.0), lp.ConstantDamping(1.0)])
+@pytest.mark.parametrize("damping", [lp.laws.ResidualDamping(0.0), lp.laws.ConstantDamping(1.0)])
 def test_a_reaction_that_blows_up(damping):
     """u_t = exp(u) - ... reaches infinity in finite time wherever nothing is observed."""
     model = reaction(line(10), ElementLineP1(), B=lambda u, v, x: -10 * np.exp(u) * v, dirichlet={})
@@ -516,7 +525,7 @@ def test_checked_contract():
     size = observe(model, lp.Full()).size
     samples = [(t, rng.standard_normal(size)) for t in times]
     for scheme in (lp.ImplicitEuler(), lp.Alexander2()):
-        lp.check_law(
+        lp.diagnostics.check_law(
             lp.GradientLaw(gain=100.0),
             lambda law, scheme=scheme: identifier(model, law, scheme=scheme, dt_max=0.08),
             samples,
@@ -526,7 +535,7 @@ def test_checked_contract():
 def free_stage(model, rule=None):
     """Return a stage of a model without sensors, and its problem from c on."""
     split = observe(model, lp.Full()).split(np.zeros(14, dtype=bool))
-    stage = stage_of(model, split, rule or lp.ResidualDamping())
+    stage = stage_of(model, split, rule or lp.laws.ResidualDamping())
 
     def problem(c, h=0.1):
         metric = ConstantMetric(model, 1.0, 0.0).stage(c[model.X.dim :], h, 1.0, 0.0)

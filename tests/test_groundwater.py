@@ -125,7 +125,7 @@ def test_a_constant_field_of_storativity_is_a_number():
     model = groundwater(mesh, positive(1e-2), S, {"left": 0.0}, **given)
     known = groundwater(mesh, positive(1e-2), positive(1e-3), {"left": 0.0}, **given)
     u = model.initial(lambda x: np.sin(x[0] / 20) * x[1] / 80)
-    moment = lp.Moment(0.0, {"Q": 1e-3})
+    moment = lp.fem.Moment(0.0, {"Q": 1e-3})
     values = [m.form_A.vector("v", moment, u=u, q=m.initial_parameter()) for m in (model, known)]
     assert np.allclose(*values)
 

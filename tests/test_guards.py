@@ -92,7 +92,7 @@ def test_an_overconfident_linearisation_is_iterated(noise: float):
     error, inflation = end(None)
     assert error > 0.5
     assert inflation > 50
-    for error, inflation in (end(lp.Guards()), end(None, 64), end(lp.Guards(), 64)):
+    for error, inflation in (end(lp.laws.Guards()), end(None, 64), end(lp.laws.Guards(), 64)):
         assert error < 0.05
         assert inflation < 1.2
 
@@ -168,7 +168,7 @@ def test_no_burst_follows_a_rest():
     """
     model = rod(lambda t: float(t < 1.975 or t > 11.975), evolution=lp.RandomWalk(0.2))
     process, scheme = rod(lambda t: float(t < 1.975 or t > 12.025)), lp.ImplicitEuler()
-    ends = {guards: [] for guards in (None, lp.Guards())}
+    ends = {guards: [] for guards in (None, lp.laws.Guards())}
     for seed in (3, 4, 5):
         stream = samples(process, 0.3, 320, seed, scheme=scheme)
         for guards, found in ends.items():
@@ -178,8 +178,8 @@ def test_no_burst_follows_a_rest():
             found.append([e.parameters["a"][0] for e in estimates[240:]])
     assert np.min(ends[None]) < 0.0  # a burst, and then negative and sure of it
     assert np.min([values[-1] for values in ends[None]]) < 0.0
-    assert np.min(ends[lp.Guards()]) > 0.1
-    assert [values[-1] for values in ends[lp.Guards()]] == pytest.approx([0.3] * 3, abs=0.05)
+    assert np.min(ends[lp.laws.Guards()]) > 0.1
+    assert [values[-1] for values in ends[lp.laws.Guards()]] == pytest.approx([0.3] * 3, abs=0.05)
 
 
 @pytest.mark.slow
@@ -194,7 +194,7 @@ def test_nothing_winds_up_while_nothing_is_excited():
 
 @pytest.mark.slow
 def test_the_log_reaches_back_far_enough_and_stays_short():
-    law = lp.SensitivityLaw(guards=lp.Guards(past=8))
+    law = lp.SensitivityLaw(guards=lp.laws.Guards(past=8))
     identifier = lp.Identifier(rod(), POINTS, law, u0=0.0)
     for k in range(200):
         identifier.step(0.1 * (k + 1), np.zeros(3))
@@ -244,7 +244,7 @@ def test_a_gain_too_large_for_the_noise_is_said(gain: float):
     identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=gain), u0=0.0)
     stream = []
     for t0, t1 in pairwise((0.05 * np.arange(301)).tolist()):
-        u = forward.solve(u, q, t1 - t0, lp.Moment(t1))
+        u = forward.solve(u, q, t1 - t0, lp.fem.Moment(t1))
         stream.append((t1, (u + 0.01 * rng.standard_normal(len(u)))[model.X.free > 0]))
     said = doubts(identifier.run(stream).to_xarray())
     assert any("the gain is too large for the noise" in s for s in said) == (gain > 1.0)
@@ -268,12 +268,12 @@ def full(model: lp.Model, count: int, h: float = 0.05, noise: float = 0.01) -> A
     rng, forward, u = np.random.default_rng(0), ForwardStage(model), model.initial(0.0)
     q = model.initial_parameter({"c": lambda x: 2 + np.sin(np.pi * x[0])})
     for t0, t1 in pairwise((h * np.arange(count + 1)).tolist()):
-        u = forward.solve(u, q, t1 - t0, lp.Moment(t1))
+        u = forward.solve(u, q, t1 - t0, lp.fem.Moment(t1))
         yield t1, (u + noise * rng.standard_normal(len(u)))[model.X.free > 0]
 
 
 def learned(model: lp.Model, stream: Any, gain: float = 100.0, **options: Any) -> Any:
-    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(1.0), **options)
+    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(1.0), **options)
     return lp.Identifier(model, lp.Full(), law, u0=0.0).run(stream).to_xarray()
 
 
@@ -332,7 +332,7 @@ def test_an_exact_excitation_that_dies_out_is_none():
 
 
 def test_a_rest_is_told_from_noise_alone():
-    rng, gate = np.random.default_rng(0), lp.ExcitationGate()
+    rng, gate = np.random.default_rng(0), lp.laws.ExcitationGate()
     slow, noise = np.sin(0.1 * np.arange(300))[:, None], rng.standard_normal((300, 16))
 
     def after(seen: np.ndarray, followed: np.ndarray) -> ExcitationLevel:
@@ -385,7 +385,7 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
         list(np.flatnonzero(model.X.free)).index(k) for k in sensors.selected(model.state_block)
     ]
     stream = [(t, z[seen]) for t, z in full(model, 400, h=h, noise=0.0)]
-    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(1.0))
+    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(1.0))
     identifier = lp.Identifier(model, sensors, law, u0=0.0)
     for t, z in stream:
         assert "at_rest" not in identifier.step(t, z).notes
@@ -399,7 +399,7 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
 @pytest.mark.parametrize("c1", [0.1, 1.0])
 def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):
     model = reaction(lambda t: 1.0 * (t < 50.0))
-    law = lp.GradientLaw(gain=gain, damping=lp.ResidualDamping(c1))
+    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(c1))
     identifier = lp.Identifier(model, lp.Full(), law, u0=0.0)
     held = ["at_rest" in identifier.step(*sample).notes for sample in full(model, 400, h=0.5)]
     first = held.index(True)
@@ -413,11 +413,11 @@ def test_probes_see_the_same_by_assembly_in_every_unit():
     probes = Probes(model, split)
     q, *states = np.random.default_rng(0).standard_normal((3, model.X.dim))
     w = np.transpose(states)
-    seen = probes(w, q, lp.Moment(0.0))
+    seen = probes(w, q, lp.fem.Moment(0.0))
     assert seen.shape == (16, 2)
     assert probes.fixed is not None
     probes.fixed, probes.pairs = None, pairs(model, split)
-    np.testing.assert_allclose(probes(w, q, lp.Moment(0.0)), seen, rtol=1e-10)
+    np.testing.assert_allclose(probes(w, q, lp.fem.Moment(0.0)), seen, rtol=1e-10)
     np.testing.assert_allclose([e @ model.Q.dual(e) for e in probes.pairs[1].T], 1.0)
 
 
@@ -439,11 +439,11 @@ def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
     "options", [{"window": 0.5}, {"correlation": 1.0}, {"energy": 0.0}, {"noise": 1.0}]
 )
 def test_rests_that_cannot_be_meant_are_refused(options: Any):
-    with pytest.raises(lp.LawError, match=next(iter(options))):
-        lp.ExcitationGate(**options)
+    with pytest.raises(lp.errors.LawError, match=next(iter(options))):
+        lp.laws.ExcitationGate(**options)
 
 
 @pytest.mark.parametrize("options", [{"reach": 0.0}, {"runaway": -1.0}, {"past": 0}])
 def test_settings_that_cannot_be_meant_are_refused(options: Any):
-    with pytest.raises(lp.LawError, match=next(iter(options))):
-        lp.Guards(**options)
+    with pytest.raises(lp.errors.LawError, match=next(iter(options))):
+        lp.laws.Guards(**options)

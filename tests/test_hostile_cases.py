@@ -21,7 +21,7 @@ from livepde.streams.table import Column
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_case_is_one_sentence(tmp_path, name):
     path = hostile_case(tmp_path, name)
-    with pytest.raises(lp.CaseError) as caught:
+    with pytest.raises(lp.errors.CaseError) as caught:
         cases.load(path)
     text = str(caught.value)
     assert "\n" not in text
@@ -67,9 +67,9 @@ def test_hostile_cases_need_little_memory(tmp_path):
     ["m^9^9^9^9", "9**9**9 m", "(m^2)^9", "((m^9)^9)^9", "m^1000", "m" * 101, "1" * 10 + " m"],
 )
 def test_units_that_are_none(unit):
-    with pytest.raises(lp.CaseError):
+    with pytest.raises(lp.errors.CaseError):
         check_unit(unit, "here")
-    with pytest.raises(lp.CaseError):
+    with pytest.raises(lp.errors.CaseError):
         conversion(unit, "m", "here")
     assert in_si(unit) is None
 
@@ -92,13 +92,13 @@ def test_the_largest_mesh_is_no_hostile_one(tmp_path):
 def test_digits_with_a_line_between_them_are_no_number(tmp_path, cell):
     assert number_of(cell) is None
     (tmp_path / "a.csv").write_text(f"t,a\n0,1\n1,{cell}\n")
-    with pytest.raises(lp.SampleError, match="expected a number"):
+    with pytest.raises(lp.errors.SampleError, match="expected a number"):
         read_csv(tmp_path / "a.csv", {"a": Column(("a",))}, Clock("t"))
 
 
 def test_a_file_that_is_no_data_is_not_shown(tmp_path):
     for name, shown in (("shadow", False), ("data.csv", True)):
         (tmp_path / name).write_text("root:secret,b\n1,2\n")
-        with pytest.raises(lp.SampleError, match="there is no column 't'") as caught:
+        with pytest.raises(lp.errors.SampleError, match="there is no column 't'") as caught:
             read_csv(tmp_path / name, {"a": Column(("b",))}, Clock("t"))
         assert ("secret" in str(caught.value)) == shown

@@ -104,5 +104,5 @@ def test_the_width_counts():
 
 def test_a_law_without_covariance():
     model, belief = learned({"a": lp.Scalar(0.0, 1.0)}, lambda q: q.a)
-    with pytest.raises(lp.ConfigurationError, match="run SensitivityLaw or AutoLaw"):
+    with pytest.raises(lp.errors.ConfigurationError, match="run SensitivityLaw or AutoLaw"):
         identifiability(model, replace(belief, q_factor=None))

@@ -49,20 +49,24 @@ def frozen(ident):
 @pytest.mark.parametrize(
     ("item", "error", "words"),
     [
-        ((0.1, [1.0, 2.0, 3.0], {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "needs"),
-        ((0.1, "warm", {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "number"),
-        ((0.1, [[1.0], [2.0, 3.0]], {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "number"),
-        ((0.1, [1.0, np.inf], {"heat": 1.0, "T_end": 0.0}), lp.SampleError, "'b' is infinite"),
-        ((*sample(a="warm"),), lp.SampleError, "channel 'a': got 'warm'"),
-        ((*sample(a=True),), lp.SampleError, "channel 'a'"),
-        ((*sample(a=object()),), lp.SampleError, "channel 'a'"),
-        ((*sample(heat=np.inf),), lp.SampleError, "heat"),
-        ((*sample(d=1.0),), lp.SampleError, "unknown channel 'd'"),
-        ((0.1, [1.0, 2.0], {"cold": 1.0}), lp.SampleError, "unknown input 'cold'"),
-        ((*sample(heat=np.nan),), lp.MissingInputError, "'heat' has no value"),
-        ((*sample(t=-1.0),), lp.TimeOrderError, "not later"),
-        ((*sample(t=np.nan),), lp.SampleError, "time"),
-        ((*sample(t="noon"),), lp.SampleError, "time"),
+        ((0.1, [1.0, 2.0, 3.0], {"heat": 1.0, "T_end": 0.0}), lp.errors.SampleError, "needs"),
+        ((0.1, "warm", {"heat": 1.0, "T_end": 0.0}), lp.errors.SampleError, "number"),
+        ((0.1, [[1.0], [2.0, 3.0]], {"heat": 1.0, "T_end": 0.0}), lp.errors.SampleError, "number"),
+        (
+            (0.1, [1.0, np.inf], {"heat": 1.0, "T_end": 0.0}),
+            lp.errors.SampleError,
+            "'b' is infinite",
+        ),
+        ((*sample(a="warm"),), lp.errors.SampleError, "channel 'a': got 'warm'"),
+        ((*sample(a=True),), lp.errors.SampleError, "channel 'a'"),
+        ((*sample(a=object()),), lp.errors.SampleError, "channel 'a'"),
+        ((*sample(heat=np.inf),), lp.errors.SampleError, "heat"),
+        ((*sample(d=1.0),), lp.errors.SampleError, "unknown channel 'd'"),
+        ((0.1, [1.0, 2.0], {"cold": 1.0}), lp.errors.SampleError, "unknown input 'cold'"),
+        ((*sample(heat=np.nan),), lp.errors.MissingInputError, "'heat' has no value"),
+        ((*sample(t=-1.0),), lp.errors.TimeOrderError, "not later"),
+        ((*sample(t=np.nan),), lp.errors.SampleError, "time"),
+        ((*sample(t="noon"),), lp.errors.SampleError, "time"),
     ],
 )
 def test_a_bad_sample_is_one_sentence_and_changes_nothing(item, error, words):
@@ -80,7 +84,7 @@ def test_time_must_go_on():
     ident.step(*sample(0.1))
     before = frozen(ident)
     for t in (0.1, 0.05, 0.0):
-        with pytest.raises(lp.TimeOrderError, match="not later"):
+        with pytest.raises(lp.errors.TimeOrderError, match="not later"):
             ident.step(*sample(t))
     assert frozen(ident) == before
 
@@ -124,15 +128,15 @@ def test_before_assimilation_begins_data_are_only_scored():
 
 
 def test_configurations_that_do_not_fit():
-    with pytest.raises(lp.ConfigurationError, match="both assimilated and withheld"):
+    with pytest.raises(lp.errors.ConfigurationError, match="both assimilated and withheld"):
         identifier(withheld=lp.Points({"a": 0.5}))
-    with pytest.raises(lp.ConfigurationError, match="dt_max"):
+    with pytest.raises(lp.errors.ConfigurationError, match="dt_max"):
         identifier(dt_max=0.0)
-    with pytest.raises(lp.ConfigurationError, match="t0"):
+    with pytest.raises(lp.errors.ConfigurationError, match="t0"):
         identifier(t0=np.nan)
-    with pytest.raises(lp.ModelError, match="bounds"):
+    with pytest.raises(lp.errors.ModelError, match="bounds"):
         identifier(q0={"k": 100.0})
-    with pytest.raises(lp.MissingInputError, match="first sample"):
+    with pytest.raises(lp.errors.MissingInputError, match="first sample"):
         identifier().estimate()
 
 
@@ -149,8 +153,8 @@ def cubic_decay(law, u0=1.0, **options):
 
 def limited(iterations):
     """Return a law that may not iterate often, with a linear pull: it has no other way."""
-    newton = lp.Newton(iterations=iterations, tolerance=1e-3, share=0.0)
-    return lp.GradientLaw(damping=lp.ResidualDamping(0.0), newton=newton, gate=None)
+    newton = lp.stepping.Newton(iterations=iterations, tolerance=1e-3, share=0.0)
+    return lp.GradientLaw(damping=lp.laws.ResidualDamping(0.0), newton=newton, gate=None)
 
 
 def test_a_failed_step_reports_and_the_stream_goes_on():
@@ -197,7 +201,9 @@ def test_without_halvings_solved_steps_are_the_same():
 
 @pytest.mark.parametrize("halvings", [-1, 1.5, "8", None, True, 31])
 def test_halvings_that_cannot_be_meant(halvings):
-    with pytest.raises(lp.ConfigurationError, match="halvings must be a whole number from 0 to 30"):
+    with pytest.raises(
+        lp.errors.ConfigurationError, match="halvings must be a whole number from 0 to 30"
+    ):
         cubic_decay(lp.GradientLaw(), halvings=halvings)
 
 
@@ -248,7 +254,7 @@ def test_a_checkpoint_of_an_earlier_format_is_refused(monkeypatch):
     ident.step(*sample())
     content = ident.dump()
     monkeypatch.setattr("livepde.identifier.FORMAT", 99)
-    with pytest.raises(lp.RunError, match="another version of livepde, in another format"):
+    with pytest.raises(lp.errors.RunError, match="another version of livepde, in another format"):
         identifier().restore(content)
 
 
@@ -258,17 +264,17 @@ def test_checkpoints_that_cannot_be_used(tmp_path):
     path = tmp_path / "state.bin"
     ident.save(path)
     other = lp.Identifier(rod(), lp.Points({"d": 0.5}, noise=0.1), lp.SensitivityLaw())
-    with pytest.raises(lp.RunError, match="sensors"):
+    with pytest.raises(lp.errors.RunError, match="sensors"):
         other.load(path)
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(lp.RunError, match="damaged"):
+    with pytest.raises(lp.errors.RunError, match="damaged"):
         ident.load(path)
     (tmp_path / "text").write_text("no archive")
-    with pytest.raises(lp.RunError, match="damaged"):
+    with pytest.raises(lp.errors.RunError, match="damaged"):
         ident.load(tmp_path / "text")
-    with pytest.raises(lp.RunError, match="not a checkpoint"):
+    with pytest.raises(lp.errors.RunError, match="not a checkpoint"):
         ident.load(tmp_path / "nowhere")
-    with pytest.raises(lp.RunError, match="Cannot write"):
+    with pytest.raises(lp.errors.RunError, match="Cannot write"):
         ident.save(tmp_path / "no" / "folder" / "state.bin")
 
 
@@ -342,7 +348,7 @@ def test_progress_is_silent_where_nobody_watches(capsys):
 def test_substeps_are_those_made_by_hand():
     model = excited(8)
     z = np.zeros(lp.Full().bind(model.state_space, model.X, model.parameter_space).size)
-    law = lp.GradientLaw(newton=lp.Newton(tolerance=1e-12, share=0.0))
+    law = lp.GradientLaw(newton=lp.stepping.Newton(tolerance=1e-12, share=0.0))
     divided = lp.Identifier(model, lp.Full(), law, q0=1.0, dt_max=0.1)
     estimate = divided.step(0.4, z)
     assert estimate.steps == 4
@@ -372,7 +378,7 @@ def test_samples_of_other_tables():
     import pandas as pd
 
     twice = pd.Series([1.0, 2.0, 3.0], index=["a", "b", "b"])
-    with pytest.raises(lp.SampleError, match="two values of the sample have the same name"):
+    with pytest.raises(lp.errors.SampleError, match="two values of the sample have the same name"):
         identifier(withheld=None).step(0.1, twice, {"heat": 1.0, "T_end": 0.0})
     _, named = sample()
     expected = identifier().step(0.1, named).u
@@ -390,19 +396,23 @@ def test_a_stream_that_gives_no_samples(kind):
     table = pd.DataFrame([{"t": t, **values} for t, values in (sample(0.1), sample(0.2))])
     streams = {"columns": table, "tuples": table.itertuples(), "records": table.to_dict("records")}
     streams["two channels"] = table[["a", "b"]].itertuples()
-    with pytest.raises(lp.SampleError, match=r"a stream gives \(t, z\).* by \.iterrows\(\)"):
+    with pytest.raises(lp.errors.SampleError, match=r"a stream gives \(t, z\).* by \.iterrows\(\)"):
         identifier().run(streams[kind])
 
 
 def test_numbers_where_something_else_is_expected():
     mesh = lp.interval(0.0, 1.0, 4)
-    with pytest.raises(lp.SpaceError, match=r"got 0\.5 as an unknown; expected Scalar"):
+    with pytest.raises(lp.errors.SpaceError, match=r"got 0\.5 as an unknown; expected Scalar"):
         lp.Model(lp.Field(mesh, ElementLineP1()), {"k": 0.5}, A=lambda q, u, v, x: q.k * u * v)
-    with pytest.raises(lp.SpaceError, match=r"cells >= 1, whole"):
+    with pytest.raises(lp.errors.SpaceError, match=r"cells >= 1, whole"):
         lp.interval(0.0, 1.0, 2.5)
-    with pytest.raises(lp.SpaceError, match="got 'interpolate'; expected a number, or a function"):
+    with pytest.raises(
+        lp.errors.SpaceError, match="got 'interpolate'; expected a number, or a function"
+    ):
         identifier(u0="interpolate")
-    with pytest.raises(lp.ObservationError, match=r"noise: got \{'a': 0\.1\}; expected one number"):
+    with pytest.raises(
+        lp.errors.ObservationError, match=r"noise: got \{'a': 0\.1\}; expected one number"
+    ):
         lp.Identifier(rod(), lp.Points({"a": 0.3}, noise={"a": 0.1}), lp.SensitivityLaw())
 
 
@@ -419,5 +429,5 @@ def test_numbers_where_something_else_is_expected():
     ],
 )
 def test_what_is_no_part_of_an_identifier_is_said(parts, words):
-    with pytest.raises(lp.ConfigurationError, match=words):
+    with pytest.raises(lp.errors.ConfigurationError, match=words):
         lp.Identifier(*parts)

@@ -72,7 +72,9 @@ def run(
     by the discrepancy principle.
     """
     rng = np.random.default_rng(3)
-    smooth = lp.Full(reconstruction=lp.Tikhonov("V", lp.Discrepancy(level=noise or 1.0)))
+    smooth = lp.Full(
+        reconstruction=lp.observation.Tikhonov("V", lp.observation.Discrepancy(level=noise or 1.0))
+    )
     observation = smooth if noise and not own else twin.observation
     if told:
         size = np.sqrt(np.mean([(z**2).mean() for z in twin.exact_data]))
@@ -333,7 +335,7 @@ def test_divided_steps_learn_the_same() -> None:
 
 def test_what_cannot_be_is_one_sentence() -> None:
     with pytest.raises(LawError, match="leave them out"):
-        lp.GradientLaw(gain="auto", damping=lp.ResidualDamping(2.0))
+        lp.GradientLaw(gain="auto", damping=lp.laws.ResidualDamping(2.0))
     with pytest.raises(LawError, match="'auto'"):
         lp.GradientLaw(gain="best")  # type: ignore[arg-type]
     mesh = lp.interval(0, 1, 4)
@@ -486,7 +488,10 @@ def test_probes_give_traces(size: int) -> None:
 def test_what_the_data_taught_does_not_depend_on_how_well_a_stage_is_solved() -> None:
     model, twin = rod(observation=lp.Subdomain(lambda x: x[0] > 0.4))
     found = []
-    for newton in (lp.Newton(share=0.0, tolerance=1e-10), lp.Newton(share=0.3, ceiling=1e-2)):
+    for newton in (
+        lp.stepping.Newton(share=0.0, tolerance=1e-10),
+        lp.stepping.Newton(share=0.3, ceiling=1e-2),
+    ):
         law = lp.GradientLaw(gain="auto", newton=newton)
         identifier = lp.Identifier(model, twin.observation, law, q0=0.0, u0=0.0)
         for s in twin:

@@ -255,7 +255,7 @@ def test_the_case_runs_as_written(here, name):
     runner = CliRunner()
     begin = ["init", "--data", "my.csv", "--equation", name]
     assert runner.invoke(app, [*begin, "open"]).exit_code == 0
-    with pytest.raises(lp.CaseError) as error:
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load("open/case.toml")
     told = str(error.value).split("'?': ")[1].rstrip(".").split(", ")
     assert set(told) <= set(given)  # nothing else is open

@@ -219,12 +219,12 @@ def test_a_wrong_start_does_not_end_in_the_unknowns(law):
 )
 def test_what_makes_no_sense_is_refused(options, text):
     points = lp.Points(SENSORS, noise=1.0)
-    with pytest.raises(lp.ConfigurationError, match=text):
+    with pytest.raises(lp.errors.ConfigurationError, match=text):
         lp.Identifier(rod(), points, lp.SensitivityLaw(), **options)
 
 
 def test_the_gradient_law_has_no_covariance():
-    with pytest.raises(lp.LawError, match="has no covariance"):
+    with pytest.raises(lp.errors.LawError, match="has no covariance"):
         lp.Identifier(rod(), lp.Points(SENSORS), lp.GradientLaw(), input_noise={"left": 0.1})
 
 

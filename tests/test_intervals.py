@@ -114,9 +114,9 @@ def test_an_unknown_is_read_by_its_label():
 
 def test_bad_questions():
     estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1)))
-    with pytest.raises(lp.ConfigurationError, match=r"no unknown 'b'; there are \['a'\]"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"no unknown 'b'; there are \['a'\]"):
         estimate["b"].interval()
-    with pytest.raises(lp.SpaceError, match="level must lie between 0 and 1"):
+    with pytest.raises(lp.errors.SpaceError, match="level must lie between 0 and 1"):
         estimate["a"].interval(95)
     belief = estimate.belief
     replaced = replace(estimate, belief=replace(belief, q_factor=2.0 * belief.q_factor))

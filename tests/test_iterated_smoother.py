@@ -181,7 +181,7 @@ def test_a_settled_run_iterates_no_more():
 
 
 def test_a_window_that_is_negative_is_refused():
-    with pytest.raises(lp.LawError, match="start_window"):
+    with pytest.raises(lp.errors.LawError, match="start_window"):
         lp.SensitivityLaw(start_window=-1)
 
 

@@ -180,9 +180,11 @@ def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path)
     finished(whole, 600)
     run = started(full, 600)
     limit_pages(run.journal, 20)
-    with pytest.raises(lp.RunError, match=r"full.*What was written before is safe; make room"):
+    with pytest.raises(
+        lp.errors.RunError, match=r"full.*What was written before is safe; make room"
+    ):
         run.run()
-    with pytest.raises(lp.RunError, match="full"):  # it takes nothing more
+    with pytest.raises(lp.errors.RunError, match="full"):  # it takes nothing more
         run.journal.commit()
     kept = len(run.journal)
     run.journal.close()
@@ -201,10 +203,10 @@ def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path)
 def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
     run = started(tmp_path, 100)
     limit_pages(run.journal, 10)
-    with pytest.raises(lp.RunError):
+    with pytest.raises(lp.errors.RunError):
         run.run()
     run.journal._db.execute("PRAGMA max_page_count = 100000")  # room again, too late
-    with pytest.raises(lp.RunError, match="full"):
+    with pytest.raises(lp.errors.RunError, match="full"):
         run.journal.checkpoint(run.identifier.dump())
     run.journal.close()
     with Journal.open(tmp_path / NAME) as kept:
@@ -300,7 +302,9 @@ def test_a_disk_that_does_not_come_back_is_no_health_until_the_run_is_stopped(
 
     said: list[dict] = []
     run = live(tmp_path, Leaving(rows(40)), patient=True, stopping=Stopping())
-    with pytest.raises(lp.RunError, match=r"What was written before is safe; make room or mend"):
+    with pytest.raises(
+        lp.errors.RunError, match=r"What was written before is safe; make room or mend"
+    ):
         run.run()
     run.journal.close()
     why = "the journal cannot be written (disk I/O error): make room or mend the disk"
@@ -321,7 +325,7 @@ run = started(Path(sys.argv[1]), 400)
 run.resume()
 try:
     run.run()
-except livepde.RunError as error:
+except livepde.errors.RunError as error:
     print(error)
 """
 
@@ -372,7 +376,7 @@ if os.getuid() == 0:
 try:
     with Journal.open(Path(sys.argv[1]), write=len(sys.argv) > 2) as kept:
         print(len(kept), len(kept.dataset().time))
-except livepde.RunError as error:
+except livepde.errors.RunError as error:
     print(error)
 """
 
@@ -419,7 +423,7 @@ def test_a_journal_appears_whole_or_not_at_all(tmp_path):
     kept = journal(path)
     assert [*kept] == []
     kept.close()
-    with pytest.raises(lp.RunError, match="already; go on with it"):
+    with pytest.raises(lp.errors.RunError, match="already; go on with it"):
         journal(path)
     Journal.open(path, write=True).close()  # the lock is free
 
@@ -439,9 +443,9 @@ def test_whether_a_journal_is_written_and_when(tmp_path):
 
 def test_two_writers(tmp_path):
     first = journal(tmp_path / NAME)
-    with pytest.raises(lp.RunError, match="written by another process"):
+    with pytest.raises(lp.errors.RunError, match="written by another process"):
         Journal.open(tmp_path / NAME, write=True)
-    with pytest.raises(lp.RunError, match="written by another process"):
+    with pytest.raises(lp.errors.RunError, match="written by another process"):
         journal(tmp_path / NAME)
     first.close()
 
@@ -469,7 +473,9 @@ def test_a_journal_that_is_held_is_not_read_as_if_nobody_wrote(tmp_path, monkeyp
     with closing(sqlite3.connect(path)) as holder:
         holder.execute("PRAGMA journal_mode = DELETE")
         holder.execute("BEGIN EXCLUSIVE")
-        with pytest.raises(lp.RunError, match=r"locked.*stop the other program that holds it"):
+        with pytest.raises(
+            lp.errors.RunError, match=r"locked.*stop the other program that holds it"
+        ):
             Journal.open(path)
 
 
@@ -487,7 +493,7 @@ def reads(path: Path) -> None:
 
 def refused(path: Path, match: str = "damaged|not a journal|malformed|not a database") -> None:
     """Reading ends in one sentence that names the file."""
-    with pytest.raises(lp.RunError, match=match) as caught:
+    with pytest.raises(lp.errors.RunError, match=match) as caught:
         reads(path)
     text = str(caught.value)
     assert str(path.parent) in text
@@ -640,7 +646,7 @@ def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kin
         raw.execute("UPDATE checkpoints SET state = ?", (state,))
     raw.close()
     signed(path)
-    with pytest.raises(lp.RunError) as caught:
+    with pytest.raises(lp.errors.RunError) as caught:
         reads(path)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "evil").exists()
@@ -875,13 +881,13 @@ def test_a_folder_whose_making_was_ended_is_made_again(tmp_path):
         (folder / "run.json.partial").write_text("{")
         create()
         assert (folder / "case.toml").read_text() == "abc = 1\n"
-        with pytest.raises(lp.RunError, match="already holds a run"):
+        with pytest.raises(lp.errors.RunError, match="already holds a run"):
             create()
         shutil.rmtree(folder)
     for name, text in (("case.toml", "other"), ("mine.txt", "")):
         folder.mkdir()
         (folder / name).write_text(text)
-        with pytest.raises(lp.RunError, match="is not empty"):
+        with pytest.raises(lp.errors.RunError, match="is not empty"):
             create()
         shutil.rmtree(folder)
 
@@ -892,7 +898,7 @@ def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
     RunWriter.create(path, command=["x"], title="A run", **options)
     monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
     (path / "run.json.0.partial").mkdir()
-    with pytest.raises(lp.RunError, match="cannot be written: File exists; make room"):
+    with pytest.raises(lp.errors.RunError, match="cannot be written: File exists; make room"):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
 
 
@@ -906,10 +912,10 @@ def test_an_error_has_an_exit_code(tmp_path):
 
 def test_an_error_while_a_journal_is_opened_is_told_once(tmp_path, monkeypatch):
     def full(path):
-        raise lp.RunError("the disk is full; make room.")
+        raise lp.errors.RunError("the disk is full; make room.")
 
     monkeypatch.setattr("livepde.runs.journal.writer", full)
-    with pytest.raises(lp.RunError, match=r"^the disk is full; make room\.$"):
+    with pytest.raises(lp.errors.RunError, match=r"^the disk is full; make room\.$"):
         journal(tmp_path / NAME)
 
 
@@ -978,7 +984,7 @@ def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
     raw.close()
     with (
         Journal.open(tmp_path / NAME, write=True) as kept,
-        pytest.raises(lp.RunError, match="no checkpoint is as it was"),
+        pytest.raises(lp.errors.RunError, match="no checkpoint is as it was"),
     ):
         kept.rewind()
 
@@ -1005,9 +1011,9 @@ def test_what_is_whole_is_salvaged(tmp_path):
     with sqlite3.connect(path) as raw:
         raw.execute("UPDATE meta SET crc = 0 WHERE key = 'layout'")
     raw.close()
-    with pytest.raises(lp.RunError, match="damaged"):
+    with pytest.raises(lp.errors.RunError, match="damaged"):
         Salvage(path)
-    with pytest.raises(lp.RunError, match="there is no journal"):
+    with pytest.raises(lp.errors.RunError, match="there is no journal"):
         Salvage(tmp_path / "none")
 
 

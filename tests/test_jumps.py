@@ -124,7 +124,7 @@ def test_the_rate_of_false_alarms_is_about_the_stated_one():
 
 @pytest.mark.parametrize("options", [{"probability": 0.0}, {"window": 3}, {"size": 0.0}])
 def test_settings_that_cannot_be_meant_are_refused(options: Any):
-    with pytest.raises(lp.LawError, match=next(iter(options))):
+    with pytest.raises(lp.errors.LawError, match=next(iter(options))):
         Jumps(**options)
 
 
@@ -138,5 +138,5 @@ def test_the_noise_is_found_from_any_first_guess(guess: float):
 
 
 def test_what_noise_cannot_be_is_one_sentence():
-    with pytest.raises(lp.LawError, match="a positive number or 'auto'; got 'white'"):
+    with pytest.raises(lp.errors.LawError, match="a positive number or 'auto'; got 'white'"):
         lp.SensitivityLaw(noise="white")

@@ -40,7 +40,7 @@ def samples(levels: tuple[float, ...], noise: float) -> list[tuple[float, Any]]:
     for k in range(800):
         q = np.array([np.log(RATE), levels[int(np.searchsorted(JUMPS, k, side="right"))]])
         for j in range(FINER):
-            u = forward.solve(u, q, h, lp.Moment((k * FINER + j + 1) * h))
+            u = forward.solve(u, q, h, lp.fem.Moment((k * FINER + j + 1) * h))
         found.append(((k + 1) * STEP, observed.G @ u + noise * rng.standard_normal(len(POINTS))))
     return found
 
@@ -105,7 +105,7 @@ def test_names_that_cannot_be_meant_are_refused(unknowns: Any, match: str):
         law = lp.SensitivityLaw(jumps=lp.Jumps(unknowns=unknowns))
         return lp.Identifier(rod(4), lp.Points(POINTS, noise=0.1), law)
 
-    with pytest.raises(lp.LawError, match=match):
+    with pytest.raises(lp.errors.LawError, match=match):
         build()
 
 
@@ -161,5 +161,5 @@ def test_a_case_names_what_may_jump(tmp_path: Path, law: str, names: Sequence[st
     ],
 )
 def test_what_a_case_cannot_mean_is_one_sentence(tmp_path: Path, law: str, message: str):
-    with pytest.raises(lp.CaseError, match=f"case.toml: {message}"):
+    with pytest.raises(lp.errors.CaseError, match=f"case.toml: {message}"):
         of_case(tmp_path, law)

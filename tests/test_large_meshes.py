@@ -247,7 +247,7 @@ def test_vector_fields_and_points_on_large_meshes(pieces):
     close(large.interpolate(twist), small.interpolate(twist))
     close(large.probe(points).toarray(), small.basis.probes(points).toarray())
     close(large.doflocs, small.basis.doflocs)
-    with pytest.raises(lp.ObservationError, match=r"point 1 at \[1.5, 0.5\]"):
+    with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[1.5, 0.5\]"):
         large.probe(np.array([[0.5, 1.5], [0.5, 0.5]]))
 
 
@@ -260,7 +260,7 @@ def square(cells=12):
     ("law", "sensors"),
     [
         (
-            lp.GradientLaw(10.0, newton=lp.Newton(tolerance=1e-11, share=0.0)),
+            lp.GradientLaw(10.0, newton=lp.stepping.Newton(tolerance=1e-11, share=0.0)),
             lp.Subdomain(lambda x: x[0] < 0.6),
         ),
         (lp.SensitivityLaw(modes=4, noise=1e-3), lp.Points([(0.3, 0.4), (0.7, 0.6)])),
@@ -290,18 +290,18 @@ def test_what_would_be_a_dense_matrix_of_a_field_is_refused(monkeypatch):
     model = square()
     averages = lp.Averages({"left": lambda x: x[0] < 0.5, "right": lambda x: x[0] >= 0.5})
     monkeypatch.setattr(information, "MOST_DENSE", 100)
-    with pytest.raises(lp.LawError, match="169 are too many, up to 100"):
+    with pytest.raises(lp.errors.LawError, match="169 are too many, up to 100"):
         lp.Identifier(model, averages, lp.GradientLaw("auto"))
     lp.Identifier(model, lp.Full(), lp.GradientLaw("auto"))
     monkeypatch.setattr(base, "LARGEST_PROJECTION", 10_000)
-    with pytest.raises(lp.ObservationError, match="169 rows with 121 entries each"):
+    with pytest.raises(lp.errors.ObservationError, match="169 rows with 121 entries each"):
         lp.Identifier(model, averages, lp.GradientLaw(1.0))
     lp.Identifier(model, averages, lp.SensitivityLaw(noise=0.1, modes=3))
     monkeypatch.setattr(reconstruction, "MOST_SENSORS", 100)
     smooth = lp.Full(reconstruction=lp.observation.Tikhonov("V", 0.1)).bind(
         model.state_space, model.X, model.parameter_space
     )
-    with pytest.raises(lp.ObservationError, match=r"121 sensors; .* up to 100"):
+    with pytest.raises(lp.errors.ObservationError, match=r"121 sensors; .* up to 100"):
         smooth.reconstruct(np.ones(smooth.size))
 
 
@@ -317,5 +317,5 @@ def test_the_noise_of_many_sensors_is_sampled(monkeypatch):
         assert getattr(found, name) == pytest.approx(getattr(exact, name), rel=0.03)
     assert found.X != exact.X
     monkeypatch.setattr(stopping, "MOST_COLUMNS", 100)
-    with pytest.raises(lp.ConfigurationError, match="529 sensors, up to 100"):
+    with pytest.raises(lp.errors.ConfigurationError, match="529 sensors, up to 100"):
         stopping.reconstruction_matrix(observed)

@@ -140,7 +140,7 @@ def test_the_gradient_law_knows_no_such_ends():
 
 @pytest.mark.parametrize("within", [0.0, -1.0, np.nan])
 def test_a_number_that_is_not_positive_is_refused(within: float):
-    with pytest.raises(lp.SpaceError, match="Scalar: within must be a positive number"):
+    with pytest.raises(lp.errors.SpaceError, match="Scalar: within must be a positive number"):
         lp.Scalar(within=within)
 
 

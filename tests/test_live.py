@@ -132,11 +132,11 @@ def test_one_writer_many_readers(tmp_path):
     write(tmp_path, 20)
     run = live(tmp_path)
     run.run()
-    with pytest.raises(lp.RunError, match="written by another process"):
+    with pytest.raises(lp.errors.RunError, match="written by another process"):
         Journal.open(tmp_path / "journal.sqlite", write=True)
     with Journal.open(tmp_path / "journal.sqlite") as reader:
         assert len(reader) == 20
-        with pytest.raises(lp.RunError, match="readonly"):
+        with pytest.raises(lp.errors.RunError, match="readonly"):
             reader.note(Event(0.0, "x", "", ""))
     run.journal.close()
     Journal.open(tmp_path / "journal.sqlite", write=True).close()
@@ -272,7 +272,7 @@ def test_a_refused_sample_does_not_let_known_ones_come_again(tmp_path):
 
     def refusing(t, z):
         if t == 0.05:
-            raise lp.SampleError("refused")
+            raise lp.errors.SampleError("refused")
         return step(t, z)
 
     run.identifier.step = refusing
@@ -571,7 +571,7 @@ def test_health_and_metrics(tmp_path):
         ask("/health")
     with pytest.raises(urllib.error.HTTPError, match="404"):
         ask("/")
-    with pytest.raises(lp.RunError, match="choose another port"):
+    with pytest.raises(lp.errors.RunError, match="choose another port"):
         Monitor(Address(port=monitor.port), dict, metrics)
     monitor.close()
 

@@ -187,7 +187,7 @@ def test_a_bank_goes_on_where_the_step_of_a_member_fails():
 
 def test_a_fleet_whose_withheld_sensors_read_channels_of_their_own():
     model = rod({"left": lp.Channel("T_0"), "right": 0.0})
-    sensors, hidden = lp.Points([0.3, 0.6], noise=0.01), lp.Moving({"probe": "x_p"})
+    sensors, hidden = lp.Points([0.3, 0.6], noise=0.01), lp.observation.Moving({"probe": "x_p"})
     fleet = lp.Fleet(model, sensors, lp.SensitivityLaw(), 2, withheld=hidden)
     for k in range(4):
         inputs = {"T_0": 1.0, "x_p": 0.5}
@@ -252,7 +252,7 @@ def test_a_bank_that_learns_of_no_noise_waits_anew(monkeypatch: pytest.MonkeyPat
 
 
 def test_what_a_replay_leaves_is_what_the_law_goes_back_to():
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8), guards=lp.Guards(past=8))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8), guards=lp.laws.Guards(past=8))
     model, rng = rod({"left": 1.0, "right": 0.0}), np.random.default_rng(0)
     identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law, u0=0.0)
     for k in range(8):

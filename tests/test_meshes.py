@@ -133,7 +133,7 @@ def test_a_model_on_a_file(gmsh):
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         B=lp.On("wall", lambda u, v, x: u * v),
     )
-    lp.check_model(model).raise_if_failed()
+    lp.diagnostics.check_model(model).raise_if_failed()
     assert len(model.X.fixed) == 2
 
 
@@ -146,27 +146,27 @@ def test_other_formats(tmp_path):
 
 
 def test_clear_errors(tmp_path, gmsh, monkeypatch):
-    with pytest.raises(lp.SpaceError, match="there is no file"):
+    with pytest.raises(lp.errors.SpaceError, match="there is no file"):
         lp.read_mesh(tmp_path / "nothing.msh")
-    with pytest.raises(lp.SpaceError, match="scale must be a positive number; got -1"):
+    with pytest.raises(lp.errors.SpaceError, match="scale must be a positive number; got -1"):
         lp.read_mesh(gmsh, scale=-1)
     for name in ("broken.msh", "notes.txt"):
         (tmp_path / name).write_text("hello")
-        with pytest.raises(lp.SpaceError, match="cannot be read"):
+        with pytest.raises(lp.errors.SpaceError, match="cannot be read"):
             lp.read_mesh(tmp_path / name)
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1.0], [2, 0, 0], [2, 1, 0]])
     meshio.Mesh(points, [("triangle", [[0, 1, 2], [1, 2, 3]])]).write(tmp_path / "bent.vtk")
-    with pytest.raises(lp.SpaceError, match="dimension 2 but bend in space"):
+    with pytest.raises(lp.errors.SpaceError, match="dimension 2 but bend in space"):
         lp.read_mesh(tmp_path / "bent.vtk")
     cells = [("triangle", [[0, 1, 2]]), ("quad", [[1, 4, 5, 3]])]
     meshio.Mesh(points * [1, 1, 0], cells).write(tmp_path / "mixed.vtk")
-    with pytest.raises(lp.SpaceError, match="several kinds"):
+    with pytest.raises(lp.errors.SpaceError, match="several kinds"):
         lp.read_mesh(tmp_path / "mixed.vtk")
     meshio.Mesh(points, [("vertex", [[0]])]).write(tmp_path / "points.vtk")
-    with pytest.raises(lp.SpaceError, match="holds no mesh"):
+    with pytest.raises(lp.errors.SpaceError, match="holds no mesh"):
         lp.read_mesh(tmp_path / "points.vtk")
     monkeypatch.setitem(__import__("sys").modules, "meshio", None)
-    with pytest.raises(lp.SpaceError, match=r"pip install 'livepde\[mesh\]'"):
+    with pytest.raises(lp.errors.SpaceError, match=r"pip install 'livepde\[mesh\]'"):
         lp.read_mesh(gmsh)
 
 
@@ -198,7 +198,7 @@ def test_the_size_of_cells():
     )
     assert model.F().sum() == pytest.approx(5.0 * 12.0)
     with pytest.raises(AttributeError, match=r"x\.h exists where"):
-        _ = lp.Place(np.zeros((0,)), None, lp.Moment()).h
+        _ = lp.fem.Place(np.zeros((0,)), None, lp.fem.Moment()).h
 
 
 def test_a_penalty_imposes_an_unknown_boundary_value():

@@ -74,7 +74,7 @@ def test_fluid_sees_the_resistance():
     model = borehole(mesh, lp.Scalar(2.0, 1.0), lp.Scalar(0.1, 0.1), H=20.0, rho_c=2e6, T0=10.0)
     points = lp.Points({"T": 0.05}, direct={"T": fluid(20.0)})
     observed = points.bind(model.state_space, model.X, model.parameter_space)
-    moment = lp.Moment(0.0, {"Q": 1000.0})
+    moment = lp.fem.Moment(0.0, {"Q": 1000.0})
     u = model.initial(10.0)
     assert observed.predict(u, np.array([2.0, 0.1]), moment) == pytest.approx([10.0 + 0.1 * 50.0])
 
@@ -103,7 +103,7 @@ def test_geometric_interval():
     mesh = lp.interval(0.1, 10.0, 4, geometric=True)
     x = np.sort(mesh.p[0])
     assert np.allclose(x[1:] / x[:-1], 10**0.5)
-    with pytest.raises(lp.SpaceError, match="start > 0"):
+    with pytest.raises(lp.errors.SpaceError, match="start > 0"):
         lp.interval(0.0, 1.0, 4, geometric=True)
-    with pytest.raises(lp.SpaceError, match="rectangle"):
+    with pytest.raises(lp.errors.SpaceError, match="rectangle"):
         lp.rectangle((0, 1), (1, 0), (2, 2))

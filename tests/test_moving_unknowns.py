@@ -30,7 +30,7 @@ EVOLUTIONS = {
     "constant": CONSTANT,
     "walk": lp.RandomWalk(0.4),
     "reverting": lp.MeanReverting(0.8),
-    "periodic": lp.Periodic(2.0, 2),
+    "periodic": lp.fem.Periodic(2.0, 2),
 }
 mesh = lp.interval(0.0, 1.0, 6)
 
@@ -79,7 +79,7 @@ class Dense:
         self.prior = np.linalg.inv(model.Q.gram.toarray())
         J = np.vstack([model.initial_directions(q, np.eye(k)), np.eye(k)])
         self.P = J @ self.prior @ J.T
-        H_u, H_q = observed.jacobian(self.x[:n], model.latent.value(q), lp.Moment(0.0))
+        H_u, H_q = observed.jacobian(self.x[:n], model.latent.value(q), lp.fem.Moment(0.0))
         self.H = np.hstack([H_u.toarray(), H_q @ model.latent.V.toarray()])
 
     def predict(self, t0: float, t1: float, substeps: int) -> None:
@@ -95,8 +95,8 @@ class Dense:
                 gained[p.part, p.part] = grown[:, None] * self.prior[p.part, p.part]
             prior = model.latent.prior
             a = prior + F @ (self.x[n:] - prior)
-            S, u = M / h + B, model.impose(self.x[:n], lp.Moment(t))
-            load = M @ self.x[:n] / h - A @ a + model.F(lp.Moment(t)) - S @ u
+            S, u = M / h + B, model.impose(self.x[:n], lp.fem.Moment(t))
+            load = M @ self.x[:n] / h - A @ a + model.F(lp.fem.Moment(t)) - S @ u
             step = np.zeros((n, n))
             step[np.ix_(free, free)] = np.linalg.inv(S[np.ix_(free, free)])
             J = np.block([[step @ M / h, -step @ A @ F], [np.zeros((k, n)), F]])
@@ -169,7 +169,7 @@ def test_a_checkpoint_of_other_modes_is_refused_whatever_its_width(tmp_path: Pat
     for t, z in samples(4):
         first.step(t, z)
     first.save(tmp_path / "state.bin")
-    with pytest.raises(lp.RunError, match=r"state\.now\.da|state\.now\.C"):
+    with pytest.raises(lp.errors.RunError, match=r"state\.now\.da|state\.now\.C"):
         other.load(tmp_path / "state.bin")
 
 
@@ -219,7 +219,7 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
     def rod(unknown: lp.Scalar) -> lp.Model:
         return driven_rod({"a": unknown}, lambda t: np.sin(3.0 * t), line(20))
 
-    model = rod(lp.Scalar(0.2, 0.2, evolution=lp.Periodic(10.0)))
+    model = rod(lp.Scalar(0.2, 0.2, evolution=lp.fem.Periodic(10.0)))
     points = lp.Points(SENSORS, noise=0.01)
     law = lp.SensitivityLaw(replay=lp.Replay(first=8))
     identifier = lp.Identifier(model, points, law)
@@ -274,7 +274,7 @@ def theory(model: lp.Model) -> Any:
 
 def test_the_theory_of_a_periodic_unknown_is_that_of_its_visible_part():
     _, plain = theory(reacting(lp.Scalar(0.4, 0.2)))
-    twin, report = theory(reacting(lp.Scalar(0.4, 0.2, evolution=lp.Periodic(1.0, 2))))
+    twin, report = theory(reacting(lp.Scalar(0.4, 0.2, evolution=lp.fem.Periodic(1.0, 2))))
     assert report.constants is not None
     assert report.constants.C_A > 0.99 * plain.constants.C_A
     (sheet,) = (table for table in report.tables if "Excitation" in table.title)
@@ -303,13 +303,13 @@ def test_a_twin_starts_where_its_model_says():
     model, times = starting(lp.Scalar(1.0, 1.0)), [0.0, 0.1, 0.2]
     twin = Twin(model=model, observation=lp.Points([0.3]), q_true={"u0": 5.0}, times=times)
     assert next(iter(twin)).z == pytest.approx([5.0])
-    with pytest.raises(lp.ConfigurationError, match="leave out u0"):
+    with pytest.raises(lp.errors.ConfigurationError, match="leave out u0"):
         Twin(model=model, observation=lp.Points([0.3]), q_true=5.0, times=times, u0=1.0)
 
 
-@pytest.mark.parametrize("law", [lp.GradientLaw(), lp.KueglerLaw(), lp.BaumeisterLaw()])
+@pytest.mark.parametrize("law", [lp.GradientLaw(), lp.laws.KueglerLaw(), lp.laws.BaumeisterLaw()])
 def test_an_unknown_initial_state_is_not_for_the_gradient_law(law: Any):
-    with pytest.raises(lp.LawError, match="which this law cannot learn: use SensitivityLaw"):
+    with pytest.raises(lp.errors.LawError, match="which this law cannot learn: use SensitivityLaw"):
         lp.Identifier(starting(lp.Scalar(1.0, 1.0)), lp.Full(), law)
 
 
@@ -392,7 +392,7 @@ def test_replays_find_the_most_probable_parameter():
         u, rows = model.initial_state(a), []
         for k, t in enumerate(times):
             u = advanced(forward, u, a, t - 0.02, t) if k else u
-            rows.append(identifier.observed.predict(u, latent.value(a), lp.Moment(t)))
+            rows.append(identifier.observed.predict(u, latent.value(a), lp.fem.Moment(t)))
         return np.array(rows)
 
     truth = {"a": 0.1, "w": 1.6, "off": [0.05, -0.08]}

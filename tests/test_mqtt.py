@@ -289,7 +289,7 @@ def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch
     monkeypatch.setattr("livepde.streams.mqtt.PATIENCE", 2.0)
     stuck = Gathered(heard, Intake(COLUMNS, Clock("t"), Policy(wait=1e6), origin=0.0))
     publish(server, messages)
-    with pytest.raises(lp.DataError, match="messages wait for later ones"):
+    with pytest.raises(lp.errors.DataError, match="messages wait for later ones"):
         polled(stuck)
     heard.close()
 
@@ -349,7 +349,7 @@ def test_two_runs_need_two_names(server, caplog):
 
     reason = ReasonCode(PacketTypes.DISCONNECT, "Session taken over")
     first._client.on_disconnect(first._client, None, None, reason, None)  # others say it
-    with pytest.raises(lp.DataError, match="another client has taken the session 'livepde'"):
+    with pytest.raises(lp.errors.DataError, match="another client has taken the session 'livepde'"):
         polled(first)
     first.close()
 
@@ -366,7 +366,7 @@ def test_a_broker_that_refuses_later_is_heard_of(server, caplog):
         time.sleep(0.1)
     assert "lost: " in caplog.text
     assert "refuses: Not authorized" in caplog.text
-    with pytest.raises(lp.DataError, match="Not authorized"):
+    with pytest.raises(lp.errors.DataError, match="Not authorized"):
         source(server, client_id="another")
     server.stop()
     server.config.write_text(settings)
@@ -418,7 +418,7 @@ def test_topics_that_bring_a_message_twice(one, other, overlap):
         _check_overlap(other, one)
         return
     for topics in ({one: None, other: "a"}, {other: "a", one: None}):
-        with pytest.raises(lp.DataError, match="some messages twice"):
+        with pytest.raises(lp.errors.DataError, match="some messages twice"):
             MqttSource(Broker(), topics, "t")
 
 
@@ -474,27 +474,29 @@ def test_a_connection_is_encrypted_with_a_certificate_of_ones_own(server, tmp_pa
     heard.close()
     client.disconnect()
     client.loop_stop()
-    with pytest.raises(lp.DataError, match="certificate verify failed"):  # the system's do not know
+    with pytest.raises(
+        lp.errors.DataError, match="certificate verify failed"
+    ):  # the system's do not know
         MqttSource(Broker("localhost", server.port, tls=True), {"rod": None}, "t")
     gc.collect()  # here, and not in another test
 
 
 @pytest.mark.parametrize("topic", ["", "a/#/b", "a+/b", "a/b#"])
 def test_topics_that_no_broker_takes(topic):
-    with pytest.raises(lp.DataError, match="got the topic"):
+    with pytest.raises(lp.errors.DataError, match="got the topic"):
         MqttSource(Broker(), {topic: None}, "t")
 
 
 def test_what_cannot_be_reached_is_one_sentence(server, tmp_path):
-    with pytest.raises(lp.DataError, match=r"ca_file .*none.pem cannot be used"):
+    with pytest.raises(lp.errors.DataError, match=r"ca_file .*none.pem cannot be used"):
         source(server, ca_file=str(tmp_path / "none.pem"))
-    with pytest.raises(lp.DataError, match="topic 'a/\\+' to publish to"):
+    with pytest.raises(lp.errors.DataError, match="topic 'a/\\+' to publish to"):
         MqttSink(Broker("127.0.0.1", server.port), "a/+")
-    with pytest.raises(lp.DataError, match="ahead must be"):
+    with pytest.raises(lp.errors.DataError, match="ahead must be"):
         Broker(ahead=70000)
     assert "secret" not in repr(Broker(username="u", password="secret"))
 
 
 def test_a_broker_that_is_not_there_is_one_sentence():
-    with pytest.raises(lp.DataError, match="no broker at 127"):
+    with pytest.raises(lp.errors.DataError, match="no broker at 127"):
         MqttSource(Broker("127.0.0.1", 1), {"x": None}, "t")

@@ -60,7 +60,7 @@ def run(model: lp.Model, law: Any = None) -> lp.Result:
 )
 def test_a_name_of_the_dataset_is_refused(name: str):
     expected = f"'{name}' would be a name of the dataset itself and the unknown '{name}': give"
-    with pytest.raises(lp.ModelError, match=expected):
+    with pytest.raises(lp.errors.ModelError, match=expected):
         decay([name, "k"])
 
 
@@ -68,7 +68,7 @@ def test_a_name_of_the_dataset_is_refused(name: str):
 @pytest.mark.parametrize("turned", [False, True])
 def test_what_stands_beside_an_unknown_is_refused_for_another(end: str, turned: bool):
     names = [f"k{end}", "k"] if turned else ["k", f"k{end}"]
-    with pytest.raises(lp.ModelError, match=r"would be .* of 'k'.*: give the unknown"):
+    with pytest.raises(lp.errors.ModelError, match=r"would be .* of 'k'.*: give the unknown"):
         decay(names)
     assert decay([f"k{end}"])  # alone it is a name as any other
 
@@ -79,18 +79,22 @@ def test_what_stands_beside_a_field_is_refused(end: str):
         return (q.c + getattr(q, f"c{end}")) * u * v
 
     field = lp.Field(MESH, ElementLineP1())
-    with pytest.raises(lp.ModelError, match=f"'c{end}' would be"):
+    with pytest.raises(lp.errors.ModelError, match=f"'c{end}' would be"):
         lp.Model(field, {"c": field, f"c{end}": lp.Scalar()}, A)
 
 
 @pytest.mark.parametrize(("state", "name"), [("", "u"), ("", "u_std"), ("T", "T")])
 def test_the_state_and_its_deviation_are_refused(state: str, name: str):
-    with pytest.raises(lp.ModelError, match=f"'{name}' would be .*state|of '{state or 'u'}'"):
+    with pytest.raises(
+        lp.errors.ModelError, match=f"'{name}' would be .*state|of '{state or 'u'}'"
+    ):
         decay([name], state)
 
 
 def test_a_state_with_a_name_of_the_dataset_is_refused():
-    with pytest.raises(lp.ModelError, match="the state 'time': give the component another name"):
+    with pytest.raises(
+        lp.errors.ModelError, match="the state 'time': give the component another name"
+    ):
         decay(["k"], "time")
 
 
@@ -103,14 +107,14 @@ def test_directions_of_a_vector_and_cells_are_refused():
         return lp.Model(state, {name: lp.Scalar()}, A)
 
     for name in ("u_x", "u_y_std", "y", "cell", "sensor_x", *cells(mesh)):
-        with pytest.raises(lp.ModelError, match=f"'{name}' would be"):
+        with pytest.raises(lp.errors.ModelError, match=f"'{name}' would be"):
             model(name)
     assert model("z")
     assert model("u_z")
 
 
 def test_unknowns_of_sensors_are_checked_too():
-    with pytest.raises(lp.ModelError, match="'k_std' would be"):
+    with pytest.raises(lp.errors.ModelError, match="'k_std' would be"):
         decay(["k"]).with_unknowns({"k_std": lp.Scalar()})
 
 
@@ -148,14 +152,14 @@ def test_a_note_of_the_same_name_stands_beside_the_unknown():
 
 
 def test_no_unknown_is_called_like_a_note_that_had_to_move():
-    with pytest.raises(lp.ModelError, match=r"'note_jump' would be .* a note of the law"):
+    with pytest.raises(lp.errors.ModelError, match=r"'note_jump' would be .* a note of the law"):
         decay(["note_jump"])
 
 
 def test_a_fleet_has_one_dimension_more():
     model, points = decay(["member"]), lp.Points([0.5], noise=0.1)
     fleet = lp.Fleet(model, points, lp.SensitivityLaw(), members=2, u0=1.0)
-    with pytest.raises(lp.ConfigurationError, match="'member' would be the dimension"):
+    with pytest.raises(lp.errors.ConfigurationError, match="'member' would be the dimension"):
         fleet.run([])
 
 
@@ -198,7 +202,7 @@ def case(folder: Path, name: str = "k", sensor: str = "T") -> cases.Case:
 )
 def test_a_case_says_which_key_has_such_a_name(tmp_path: Path, names: dict[str, str], message: str):
     assert case(tmp_path).model
-    with pytest.raises(lp.CaseError, match=f"case.toml: {message}"):
+    with pytest.raises(lp.errors.CaseError, match=f"case.toml: {message}"):
         case(tmp_path, **names)
 
 

@@ -19,7 +19,7 @@ WAVE = (lambda T: np.sin(3 * T), lambda T: 3 * np.cos(3 * T))  # not monotone
 def bound(function, derivative=None, base=None, **options):
     model = reaction(lp.interval(0.0, 1.0, 12), ElementLineP1(), dirichlet={})
     base = base or lp.Points([0.2, 0.5, 0.9])
-    return observe(model, lp.Transformed(base, function, derivative, **options))
+    return observe(model, lp.observation.Transformed(base, function, derivative, **options))
 
 
 @pytest.mark.parametrize("reading", [RADIATION, THERMISTOR, WAVE])
@@ -27,7 +27,7 @@ def bound(function, derivative=None, base=None, **options):
 def test_taylor(reading, given):
     """With the derivative given, and by a complex step."""
     observed = bound(reading[0], reading[1] if given else None)
-    lp.check_observation(observed).raise_if_failed()
+    lp.diagnostics.check_observation(observed).raise_if_failed()
     u = 1.0 + 0.1 * np.random.default_rng(0).standard_normal(13)
     H_u, H_q = observed.jacobian(u, np.zeros(13), START)
     slope = reading[1](observed.G @ u)
@@ -36,9 +36,9 @@ def test_taylor(reading, given):
 
 
 def test_a_wrong_derivative_is_found():
-    report = lp.check_observation(bound(lambda T: T**4, lambda T: 3 * T**3))
+    report = lp.diagnostics.check_observation(bound(lambda T: T**4, lambda T: 3 * T**3))
     assert [line.name for line in report.lines if not line.ok] == ["G'(u) by differences"]
-    with pytest.raises(lp.ObservationError, match="must be that of function="):
+    with pytest.raises(lp.errors.ObservationError, match="must be that of function="):
         report.raise_if_failed()
 
 
@@ -79,13 +79,15 @@ def test_reach_bounds_the_newton_step():
 
 
 def test_bad_sensors():
-    with pytest.raises(lp.ObservationError, match="reach must be positive; got 0"):
+    with pytest.raises(lp.errors.ObservationError, match="reach must be positive; got 0"):
         bound(*RADIATION, reach=0)
-    with pytest.raises(lp.ObservationError, match="iterations must be at least 1; got 0"):
+    with pytest.raises(lp.errors.ObservationError, match="iterations must be at least 1; got 0"):
         bound(*RADIATION, iterations=0)
-    with pytest.raises(lp.ObservationError, match="give noise= to it and not to its base"):
+    with pytest.raises(lp.errors.ObservationError, match="give noise= to it and not to its base"):
         bound(*RADIATION, base=lp.Points([0.2], noise=0.1))
-    with pytest.raises(lp.ObservationError, match=r"shape \(2,\) for values of shape \(3,\)"):
+    with pytest.raises(
+        lp.errors.ObservationError, match=r"shape \(2,\) for values of shape \(3,\)"
+    ):
         bound(lambda T: T[:2]).predict(np.ones(13), np.zeros(13), START)
 
 
@@ -94,7 +96,7 @@ def test_bad_sensors():
 def test_gradient_law(reading):
     """With z = exp(u/2) it finds q as well as with z = u, and with g = id it is the same law."""
     model = excited(12, ElementLineP1())
-    sensors = lp.Transformed(lp.Full(), *reading)
+    sensors = lp.observation.Transformed(lp.Full(), *reading)
     shared = {
         "model": model,
         "q_true": excited_q,
@@ -124,7 +126,7 @@ def test_sensitivity_law_with_a_sensor_that_sees_the_parameter():
         f=1.0,
     )
     base = lp.Points({"a": 0.4, "b": 1.0}, direct={"b": lambda q, x: 2.0 * q.R})
-    sensors = lp.Transformed(base, lambda y: y**2, noise=1e-3)
+    sensors = lp.observation.Transformed(base, lambda y: y**2, noise=1e-3)
     q_true = {"k": 0.8, "R": 0.4}
     twin = Twin(
         model=model, observation=sensors, q_true=q_true, u0=1.0, times=0.02 * np.arange(101)

@@ -152,7 +152,7 @@ def test_the_equations_build_and_a_ring_has_no_ends():
     known = EQUATIONS["burgers"].build(mesh, {"nu": ONE}, {"left": 0.0, "right": 0.0})
     assert known.form_initial is None
     assert list(known.parameter_space.unknowns) == ["nu"]
-    with pytest.raises(lp.ModelError, match=r"kdv is periodic: leave out .*'left'"):
+    with pytest.raises(lp.errors.ModelError, match=r"kdv is periodic: leave out .*'left'"):
         EQUATIONS["kdv"].build(mesh, given, {"left": 0.0})
 
 

@@ -33,10 +33,10 @@ KINDS = {
         points(model.state.mesh.dim(), (0.0, 0.4, 1.0))
     ),
     "averages": lambda model: lp.Averages({"in": inside, "all": lambda x: x[0] >= 0}),
-    "matrix": lambda model: lp.Matrix(
+    "matrix": lambda model: lp.observation.Matrix(
         np.random.default_rng(0).standard_normal((4, model.X.dim)), labels=list("abcd")
     ),
-    "matrix repeated": lambda model: lp.Matrix(
+    "matrix repeated": lambda model: lp.observation.Matrix(
         sp.csr_array(np.vstack([np.eye(model.X.dim)[[1, 1]], np.ones((1, model.X.dim))]))
     ),
 }
@@ -49,11 +49,11 @@ KINDS = {
 def test_projections(kind, name, dirichlet):
     """P P = P, R R = R, G P = 0, ... to 1e-12, for every element and every kind of sensor."""
     model = CASES[name].model(dirichlet=None if dirichlet else {})
-    lp.check_observation(KINDS[kind](model), model).raise_if_failed()
+    lp.diagnostics.check_observation(KINDS[kind](model), model).raise_if_failed()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Nodal(lp.Matrix):
+class Nodal(lp.observation.Matrix):
     """A matrix whose inverse is taken in coefficients."""
 
     @property
@@ -65,7 +65,7 @@ class Nodal(lp.Matrix):
 def test_nodal_matrices_that_select_nothing(G):
     model = reaction(line(), ElementLineP1())
     observed = observe(model, Nodal(G=G))
-    lp.check_observation(observed).raise_if_failed()
+    lp.diagnostics.check_observation(observed).raise_if_failed()
     tangent = G * model.X.free
     np.testing.assert_allclose(
         observed.split().inverse.toarray(), np.linalg.pinv(tangent), atol=1e-14
@@ -75,7 +75,7 @@ def test_nodal_matrices_that_select_nothing(G):
 @pytest.mark.parametrize("distance", [1e-1, 1e-3, 1e-4, 1e-5])
 def test_sensors_that_nearly_repeat_each_other(distance):
     model = reaction(line(30), ElementLineHermite())
-    lp.check_observation(lp.Points([0.5, 0.5 + distance, 0.9]), model).raise_if_failed()
+    lp.diagnostics.check_observation(lp.Points([0.5, 0.5 + distance, 0.9]), model).raise_if_failed()
 
 
 def test_inverse_is_the_moore_penrose_inverse_in_X():
@@ -177,7 +177,7 @@ def test_regions_that_are_none_are_refused_in_a_sentence():
         ({}, "at least one region"),
     ]
     for regions, message in bad:
-        with pytest.raises(lp.ObservationError, match=message):
+        with pytest.raises(lp.errors.ObservationError, match=message):
             lp.Averages(regions)
 
 
@@ -260,10 +260,12 @@ def test_sensors_that_see_the_parameter():
 
 def test_direct_parts_are_checked():
     model = borehole()
-    with pytest.raises(lp.ObservationError, match="no sensor is called 'x'"):
+    with pytest.raises(lp.errors.ObservationError, match="no sensor is called 'x'"):
         observe(model, lp.Points({"a": 0.5}, direct={"x": lambda q, x: q.k}))
     affine = observe(model, lp.Points({"a": 0.5}, direct={"a": lambda q, x: q.k + 1}))
-    with pytest.raises(lp.ObservationError, match=r"must be linear in q; at q = 0 it gives 1\.0"):
+    with pytest.raises(
+        lp.errors.ObservationError, match=r"must be linear in q; at q = 0 it gives 1\.0"
+    ):
         affine.predict(np.zeros(11), np.zeros(3), Moment())
 
 
@@ -272,15 +274,15 @@ def test_names_and_noise():
     named = observe(model, lp.Points({"a": 0.2, "b": 0.3}, noise=0.5, unit="K"))
     assert named.names == ("a", "b")
     np.testing.assert_array_equal(named.noise, [0.5, 0.5])
-    each = observe(model, lp.Matrix(np.eye(13)[:2], noise=[0.1, 0.2]))
+    each = observe(model, lp.observation.Matrix(np.eye(13)[:2], noise=[0.1, 0.2]))
     assert each.names == ("z0", "z1")
     np.testing.assert_array_equal(each.noise, [0.1, 0.2])
     assert observe(model, lp.Full()).noise is None
     for noise in ([0.1, 0.2, 0.3], [[0.1]]):
-        with pytest.raises(lp.ObservationError, match="values for 2 sensors"):
+        with pytest.raises(lp.errors.ObservationError, match="values for 2 sensors"):
             _ = observe(model, lp.Points([0.2, 0.3], noise=noise)).noise
     for noise in (0.0, -1.0, np.nan, np.inf, [0.1, 0.0]):
-        with pytest.raises(lp.ObservationError, match="must be positive numbers"):
+        with pytest.raises(lp.errors.ObservationError, match="must be positive numbers"):
             _ = observe(model, lp.Points([0.2, 0.3], noise=noise)).noise
 
 
@@ -295,10 +297,10 @@ def test_sensors_that_do_not_fit():
         (plane, lambda: lp.Points([[0.2, np.nan]]), "lies outside"),
         (model, lambda: lp.Averages({}), "at least one region"),
         (model, lambda: lp.Averages({"r": lambda x: x[0] > 2}), "region 'r' holds no part"),
-        (model, lambda: lp.Matrix(np.eye(5)), "5 columns; the state has 13"),
-        (model, lambda: lp.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
-        (model, lambda: lp.Matrix(np.full((1, 13), np.nan)), "not finite"),
-        (model, lambda: lp.Matrix(np.eye(13)[:2], labels=["a", "a"]), "must differ"),
+        (model, lambda: lp.observation.Matrix(np.eye(5)), "5 columns; the state has 13"),
+        (model, lambda: lp.observation.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
+        (model, lambda: lp.observation.Matrix(np.full((1, 13), np.nan)), "not finite"),
+        (model, lambda: lp.observation.Matrix(np.eye(13)[:2], labels=["a", "a"]), "must differ"),
         (
             model,
             lambda: lp.Subdomain(lambda x: x[0] > 30),
@@ -311,15 +313,15 @@ def test_sensors_that_do_not_fit():
         ),
     ]
     for owner, build, message in bad:
-        with pytest.raises(lp.ObservationError, match=message):
+        with pytest.raises(lp.errors.ObservationError, match=message):
             observe(owner, build())
 
 
 def test_an_observation_of_ones_own_must_fit():
     @dataclass(frozen=True, eq=False, kw_only=True)
-    class Wrong(lp.Observation):
+    class Wrong(lp.observation.Observation):
         def matrix(self, state):
             return sp.eye_array(4)
 
-    with pytest.raises(lp.ObservationError, match="4 columns; the state has 13"):
+    with pytest.raises(lp.errors.ObservationError, match="4 columns; the state has 13"):
         observe(reaction(line(), ElementLineP1()), Wrong())

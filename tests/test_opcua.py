@@ -180,7 +180,7 @@ def test_a_connection_that_breaks_down_ends_the_run(server):
     heard._thread.join(PATIENCE)
     while not heard._rows.empty():
         heard.poll(0.0)
-    with pytest.raises(lp.DataError, match="has broken down"):
+    with pytest.raises(lp.errors.DataError, match="has broken down"):
         heard.poll(0.0)
 
 
@@ -199,7 +199,7 @@ def test_the_last_rows_of_a_connection_that_breaks_down_are_taken(server, monkey
 
     monkeypatch.setattr("livepde.streams.opcua.drained", breaks_down)
     assert row in [*heard.poll(0.0), *heard.poll(0.0)]
-    with pytest.raises(lp.DataError, match="has broken down"):
+    with pytest.raises(lp.errors.DataError, match="has broken down"):
         heard.poll(0.0)
 
 
@@ -243,18 +243,18 @@ def test_a_run_takes_them(server, tmp_path):
 
 
 def test_what_cannot_be_reached_is_one_sentence(server):
-    with pytest.raises(lp.DataError, match="node 'ns=2;s=none': BadNodeIdUnknown"):
+    with pytest.raises(lp.errors.DataError, match="node 'ns=2;s=none': BadNodeIdUnknown"):
         OpcuaSource(server.url, {"ns=2;s=none": "x", "ns=2;s=a": "a"}, "t")
-    with pytest.raises(lp.DataError, match="not a node"):
+    with pytest.raises(lp.errors.DataError, match="not a node"):
         OpcuaSource(server.url, {"not a node": "x"}, "t")
     source(server, username="operator", password="right").close()
-    with pytest.raises(lp.DataError, match="BadUserAccessDenied") as refused:
+    with pytest.raises(lp.errors.DataError, match="BadUserAccessDenied") as refused:
         source(server, username="operator", password="wrong")
     assert "wrong" not in str(refused.value)
-    with pytest.raises(lp.DataError, match="use username instead"):
+    with pytest.raises(lp.errors.DataError, match="use username instead"):
         OpcuaSource("opc.tcp://me:secret@localhost:4840", COLUMNS, "t")
-    with pytest.raises(lp.DataError, match="interval must be"):
+    with pytest.raises(lp.errors.DataError, match="interval must be"):
         OpcuaSource(server.url, COLUMNS, "t", interval=0.0)
     server.stop()
-    with pytest.raises(lp.DataError, match=r"opc.tcp://127.0.0.1.*failed"):
+    with pytest.raises(lp.errors.DataError, match=r"opc.tcp://127.0.0.1.*failed"):
         source(server)

@@ -74,7 +74,7 @@ def test_the_law_takes_them():
     MN = diffusion_operator(-1.0)
     law = lp.GradientLaw(nu=1.0, M_op=MN, N_op=MN)
     work = law.prepare(
-        lp.Problem(model, observe(model, lp.Subdomain(left)), Advance(ImplicitEuler()))
+        lp.laws.Problem(model, observe(model, lp.Subdomain(left)), Advance(ImplicitEuler()))
     )
     forms = work.stage(np.ones(work.problem.observed.size, dtype=bool)).terms.forms
     x = model.state.mesh.p[0]

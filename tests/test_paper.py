@@ -44,7 +44,7 @@ def test_nothing_is_held_halved_or_left() -> None:
     law = lp.paper.law(100.0, D=-0.5, nu=2.0, sigma=0.1)
     assert law.gate is None
     assert (law.newton.share, law.newton.tolerance) == (0.0, 1e-12)
-    assert law.M_op == law.N_op == lp.diffusion_operator(-0.5)
+    assert law.M_op == law.N_op == lp.laws.diffusion_operator(-0.5)
     assert (law.gain, law.nu, law.sigma) == (100.0, 2.0, 0.1)
     model, omega = seed.build(clamped=True)
     assert lp.paper.identifier(model, omega).problem.control.halvings == 0
@@ -76,5 +76,5 @@ def test_every_step_is_solved_to_rounding() -> None:
 @pytest.mark.parametrize("values", [{}, {"boundary": 1.0}, {"left": lambda x, t: t}])
 def test_clamped_wants_zero_values(values: dict) -> None:
     mesh = lp.interval(0, 1, 4)
-    with pytest.raises(lp.SpaceError, match="clamped=True fixes values and slopes to zero"):
-        lp.Field(mesh, lp.hermite(mesh), dirichlet=values, clamped=True)
+    with pytest.raises(lp.errors.SpaceError, match="clamped=True fixes values and slopes to zero"):
+        lp.Field(mesh, lp.fem.hermite(mesh), dirichlet=values, clamped=True)

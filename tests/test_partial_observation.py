@@ -128,7 +128,7 @@ def test_what_modes_leave_out_moves_like_the_rest():
             identifier.step(t, [0.0])
         return np.asarray(identifier.estimate().q_std)
 
-    for evolution in (lp.RandomWalk(0.7), lp.MeanReverting(2.0), lp.Periodic(4.0)):
+    for evolution in (lp.RandomWalk(0.7), lp.MeanReverting(2.0), lp.fem.Periodic(4.0)):
         few, all_ = deviation(3, evolution), deviation(11, evolution)
         assert few == pytest.approx(all_, rel=1e-3)
     log = {"prior": 1.0, "transform": "log"}
@@ -149,7 +149,7 @@ def test_auto_takes_as_many_modes_as_a_field_needs():
     long, short = (count(lp.Sobolev(2, length)) for length in (1.0, 0.2))
     assert 3 <= long < 12 < short < 60
     assert count("L2") == 60
-    with pytest.raises(lp.LawError, match=r"modes must be a number, 'auto'"):
+    with pytest.raises(lp.errors.LawError, match=r"modes must be a number, 'auto'"):
         lp.Identifier(
             reaction(CELLS), lp.Points([0.5], noise=1.0), lp.SensitivityLaw(modes="all"), u0=0.0
         )

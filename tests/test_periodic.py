@@ -135,28 +135,28 @@ def test_a_periodic_parameter_and_the_observation_of_all():
     state = lp.Field(field.mesh, ElementLineP2(), periodic=RING)
     model = lp.Model(state, field, A=lambda q, u, v, x: q * u * v)
     assert model.Q.dim == 24
-    lp.check_model(model).raise_if_failed()
-    lp.check_observation(lp.Full(noise=0.1), model).raise_if_failed()
-    lp.check_observation(
+    lp.diagnostics.check_model(model).raise_if_failed()
+    lp.diagnostics.check_observation(lp.Full(noise=0.1), model).raise_if_failed()
+    lp.diagnostics.check_observation(
         lp.Averages({"a": lambda x: x[0] < 0.1}, noise=0.1), model
     ).raise_if_failed()
 
 
 def test_clear_errors():
-    with pytest.raises(lp.SpaceError, match="no boundary 'top'"):
+    with pytest.raises(lp.errors.SpaceError, match="no boundary 'top'"):
         lp.Field(lp.interval(0, 1, 4), ElementLineP1(), periodic=(("left", "top"),))
-    with pytest.raises(lp.SpaceError, match="'left' is periodic and has a Dirichlet value"):
+    with pytest.raises(lp.errors.SpaceError, match="'left' is periodic and has a Dirichlet value"):
         ring(ElementLineP1(), dirichlet={"left": 0.0})
-    with pytest.raises(lp.SpaceError, match="ElementLineP0 has no coefficients there"):
+    with pytest.raises(lp.errors.SpaceError, match="ElementLineP0 has no coefficients there"):
         FunctionSpace.of(ring(ElementLineP0()), "u").dim  # noqa: B018
-    with pytest.raises(lp.SpaceError, match="normal derivatives"):
+    with pytest.raises(lp.errors.SpaceError, match="normal derivatives"):
         FunctionSpace.of(square(ElementTriMorley(), "tri"), "u").dim  # noqa: B018
     uneven = lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4))
     p = uneven.p.copy()
     p[1, (p[0] == 1.0) & (p[1] == 0.5)] = 0.55
     uneven = type(uneven)(p, uneven.t).with_boundaries(uneven.boundaries)
-    with pytest.raises(lp.SpaceError, match=r"do not match.*0\.0[345]"):
+    with pytest.raises(lp.errors.SpaceError, match=r"do not match.*0\.0[345]"):
         FunctionSpace.of(lp.Field(uneven, ElementQuad1(), periodic=RING), "u").dim  # noqa: B018
     pair, mesh = (("bottom", "left"),), lp.rectangle((0.0, 1.0), (0.0, 2.0), (6, 5))
-    with pytest.raises(lp.SpaceError, match="have 7 and 6 coefficients"):
+    with pytest.raises(lp.errors.SpaceError, match="have 7 and 6 coefficients"):
         FunctionSpace.of(lp.Field(mesh, ElementQuad1(), periodic=pair), "u").dim  # noqa: B018

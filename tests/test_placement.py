@@ -102,7 +102,7 @@ def test_of_unknowns_that_move_hardly_another_vertex_is_better(rod: Path):
 
 def test_what_it_cannot_say(rod: Path):
     rod.write_text(rod.read_text().replace('"sensitivity"', '"gradient"').replace("replay =", "# "))
-    with pytest.raises(lp.ConfigurationError, match="needs a law with a covariance"):
+    with pytest.raises(lp.errors.ConfigurationError, match="needs a law with a covariance"):
         advice(rod)
 
 

@@ -102,7 +102,7 @@ def test_without_matplotlib_one_sentence_tells_the_remedy(monkeypatch: pytest.Mo
         lambda: plots.profiles(dataset(), "u"),
         lambda: plots.history({}),
     ):
-        with pytest.raises(lp.ConfigurationError, match=r"pip install 'livepde\[plots\]'"):
+        with pytest.raises(lp.errors.ConfigurationError, match=r"pip install 'livepde\[plots\]'"):
             draw()
 
 
@@ -270,7 +270,7 @@ def test_history() -> None:
     ],
 )
 def test_refusals(draw: Any, message: str) -> None:
-    with pytest.raises(lp.ConfigurationError, match=message):
+    with pytest.raises(lp.errors.ConfigurationError, match=message):
         draw()
 
 

@@ -118,10 +118,10 @@ def test_calibrated_sensors_keep_their_positions():
         parameter={"k": lp.Scalar(0.1, std=0.03), "gain": lp.Scalar(1.0, std=0.1)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
-    shown = lp.Calibrated(base, lambda y, q, x: q.gain * y, noise=0.005)
+    shown = lp.observation.Calibrated(base, lambda y, q, x: q.gain * y, noise=0.005)
     one = lp.Identifier(model, lp.Combined([shown]), lp.SensitivityLaw(), u0=0.0)
     assert "position[T_2]" in one.model.parameter_space.labels
-    lp.check_observation(one.observed, inputs={"left": 1.0}).raise_if_failed()
+    lp.diagnostics.check_observation(one.observed, inputs={"left": 1.0}).raise_if_failed()
 
 
 @pytest.mark.parametrize(
@@ -134,22 +134,22 @@ def test_calibrated_sensors_keep_their_positions():
     ],
 )
 def test_a_deviation_that_makes_no_sense(std, text):
-    with pytest.raises(lp.ObservationError, match=text):
+    with pytest.raises(lp.errors.ObservationError, match=text):
         lp.Points(AT, position_std=std)
 
 
 def test_what_does_not_go_together_is_refused():
     base = lp.Points(AT, position_std=0.1)
-    with pytest.raises(lp.ObservationError, match="write the function into Calibrated"):
-        lp.Transformed(base, lambda y: y**2)
-    with pytest.raises(lp.ObservationError, match="two parts have the unknown 'position'"):
+    with pytest.raises(lp.errors.ObservationError, match="write the function into Calibrated"):
+        lp.observation.Transformed(base, lambda y: y**2)
+    with pytest.raises(lp.errors.ObservationError, match="two parts have the unknown 'position'"):
         lp.Identifier(
             rod(),
             lp.Combined([base, lp.Points({"z": 0.1}, position_std=0.1)], noise=0.1),
             lp.SensitivityLaw(),
         )
     model = rod()
-    with pytest.raises(lp.ObservationError, match="no unknown 'position"):
+    with pytest.raises(lp.errors.ObservationError, match="no unknown 'position"):
         base.bind(model.state_space, model.X, model.parameter_space)
 
 
@@ -179,7 +179,7 @@ def test_a_case_states_it(tmp_path):
 
 
 def test_at_std_belongs_to_a_position(tmp_path):
-    with pytest.raises(lp.CaseError, match="at_std belongs to at"):
+    with pytest.raises(lp.errors.CaseError, match="at_std belongs to at"):
         case(tmp_path, 'over = "left", at_std = "1 cm"')
-    with pytest.raises(lp.CaseError, match="at_std: got '0 cm'"):
+    with pytest.raises(lp.errors.CaseError, match="at_std: got '0 cm'"):
         case(tmp_path, 'at = "30 cm", at_std = "0 cm"')

@@ -44,7 +44,7 @@ def sensors(noise=None, reconstruction=None):
         "averages": lp.Averages(
             {"a": lambda x: x[0] < 0.3, "b": lambda x: x[0] > 0.2, "c": lambda x: x[0] > 0.6}, **how
         ),
-        "matrix": lp.Matrix(kernel(), **how),
+        "matrix": lp.observation.Matrix(kernel(), **how),
     }
 
 
@@ -131,7 +131,7 @@ def test_nothing_pulls_to_zero_at_the_border_of_omega(element, alpha):
 def test_known_boundary_values_count(element):
     model = rod(element, dirichlet={"left": 1.0, "right": 3.0})
     observed = bind(model, lp.Full(reconstruction=Tikhonov("V", 10.0)))
-    boundary = model.impose(np.zeros(model.X.dim), lp.Moment())
+    boundary = model.impose(np.zeros(model.X.dim), lp.fem.Moment())
     u = model.initial(lambda x: 1.0 + 2.0 * x[0])
     found = observed.reconstruct(observed.G @ u, boundary=boundary)
     np.testing.assert_allclose(found.u + boundary, u, atol=1e-8)
@@ -244,7 +244,7 @@ def test_a_range_that_is_not_closed():
     for noise in (1e-2, 1e-4):
         n = noise * rng.standard_normal(21)
         for how in (Pseudoinverse(), Tikhonov("X"), Tikhonov("V")):
-            observed = bind(model, lp.Matrix(kernel(), noise=noise, reconstruction=how))
+            observed = bind(model, lp.observation.Matrix(kernel(), noise=noise, reconstruction=how))
             z = observed.G @ u + n
             errors.append(model.X.norm(observed.reconstruct(z).u - u) / model.X.norm(u))
     assert errors[0] > 10
@@ -266,24 +266,24 @@ def test_a_range_that_is_not_closed():
     ],
 )
 def test_wrong_settings(make, words):
-    with pytest.raises(lp.ObservationError, match=words):
+    with pytest.raises(lp.errors.ObservationError, match=words):
         make()
 
 
 def test_wrong_use():
     model = rod()
     points = bind(model, lp.Points([0.5], reconstruction=Tikhonov()))
-    with pytest.raises(lp.ObservationError, match="Discrepancy needs the noise level"):
+    with pytest.raises(lp.errors.ObservationError, match="Discrepancy needs the noise level"):
         points.reconstruct([1.0])
-    with pytest.raises(lp.ObservationError, match="shape"):
+    with pytest.raises(lp.errors.ObservationError, match="shape"):
         points.reconstruct([1.0, 2.0])
-    with pytest.raises(lp.ObservationError, match="delta must be a positive"):
+    with pytest.raises(lp.errors.ObservationError, match="delta must be a positive"):
         points.reconstruct([1.0], -1.0)
     skew = Tikhonov(lambda u, v, x: u * lp.grad(v)[0], 1.0)
-    with pytest.raises(lp.ObservationError, match="not symmetric"):
+    with pytest.raises(lp.errors.ObservationError, match="not symmetric"):
         bind(model, lp.Points([0.5], reconstruction=skew)).reconstruct([1.0])
     moving = Tikhonov(lambda u, v, x: x.t * u * v, 1.0)
-    with pytest.raises(lp.ObservationError, match="may not depend on time"):
+    with pytest.raises(lp.errors.ObservationError, match="may not depend on time"):
         bind(model, lp.Points([0.5], reconstruction=moving)).reconstruct([1.0])
 
 
@@ -311,7 +311,7 @@ def test_the_gradient_law_uses_and_reports_it():
 
 @pytest.mark.slow
 def test_checked_contract_of_the_law():
-    lp.check_law(
+    lp.diagnostics.check_law(
         lp.GradientLaw(gain=100.0),
         lambda law: identifier(Tikhonov("V"), dt_max=0.04),
         samples(),
@@ -354,5 +354,5 @@ def test_the_noisy_excited_twin_shows_what_smoothing_is_good_for(monkeypatch):
 
 
 def test_a_noise_level_is_positive():
-    with pytest.raises(lp.ConfigurationError, match="level must be a positive"):
+    with pytest.raises(lp.errors.ConfigurationError, match="level must be a positive"):
         noisy.noisy_run(0.0)

@@ -23,7 +23,7 @@ H = 0.1
 TIMES = H * np.arange(60)
 
 
-def twin(model: lp.Model, observation: lp.Observation) -> Twin:
+def twin(model: lp.Model, observation: lp.observation.Observation) -> Twin:
     return Twin(
         scheme=lp.ImplicitEuler(),
         model=model,
@@ -34,7 +34,7 @@ def twin(model: lp.Model, observation: lp.Observation) -> Twin:
     )
 
 
-def identifier(model: lp.Model, observation: lp.Observation, law: Any) -> lp.Identifier:
+def identifier(model: lp.Model, observation: lp.observation.Observation, law: Any) -> lp.Identifier:
     return lp.Identifier(model, observation, law, q0=0.0, u0=lambda x: excited_u(x, 0.0))
 
 
@@ -42,15 +42,15 @@ def identifier(model: lp.Model, observation: lp.Observation, law: Any) -> lp.Ide
 @pytest.mark.parametrize(
     ("law", "observation"),
     [
-        (lp.BaumeisterLaw(100.0), lp.Full()),
-        (lp.KueglerLaw(100.0), lp.Full()),
-        (lp.KueglerLaw(100.0), PART),
+        (lp.laws.BaumeisterLaw(100.0), lp.Full()),
+        (lp.laws.KueglerLaw(100.0), lp.Full()),
+        (lp.laws.KueglerLaw(100.0), PART),
     ],
 )
-def test_contract(law: Any, observation: lp.Observation) -> None:
+def test_contract(law: Any, observation: lp.observation.Observation) -> None:
     model = excited(10)
     samples = list(twin(model, observation))[:8]
-    report = lp.check_law(law, lambda law: identifier(model, observation, law), samples)
+    report = lp.diagnostics.check_law(law, lambda law: identifier(model, observation, law), samples)
     assert report.ok, str(report)
 
 
@@ -66,15 +66,15 @@ def test_energy_falls_with_exact_data(name: str) -> None:
 
 
 def test_baumeister_refuses_partial_data() -> None:
-    with pytest.raises(lp.LawError, match=r"all of the state; .* Use GradientLaw"):
-        identifier(excited(10), PART, lp.BaumeisterLaw())
+    with pytest.raises(lp.errors.LawError, match=r"all of the state; .* Use GradientLaw"):
+        identifier(excited(10), PART, lp.laws.BaumeisterLaw())
 
 
 def test_baumeister_is_the_papers_law_with_a_linear_pull() -> None:
     """With R = I, (est_exact_q) and (est_exact_u) with theta = mu."""
     model = excited(10)
     paper = identifier(model, lp.Full(), lp.GradientLaw(100.0, _Linear(2.0)))
-    other = identifier(model, lp.Full(), lp.BaumeisterLaw(100.0, 2.0))
+    other = identifier(model, lp.Full(), lp.laws.BaumeisterLaw(100.0, 2.0))
     for sample in twin(model, lp.Full()):
         one, two = paper.step(sample.t, sample.z), other.step(sample.t, sample.z)
     assert np.array_equal(one.q, two.q)
@@ -98,7 +98,7 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     c[:n] *= model.X.free
     u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
     metric = ConstantMetric(model, gain, 0.0).stage(c[n:], h, gain, 0.0)
-    problem = StageProblem(c, h, lp.Moment(0.2), u_alpha, metric)
+    problem = StageProblem(c, h, lp.fem.Moment(0.2), u_alpha, metric)
     y = stage.solve(problem, lambda: np.zeros_like(c))[0].y
     u, q = y[:n], y[n:]
     r = split.R @ u - u_alpha
@@ -107,20 +107,20 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     A_in, A_out = (model.form_A.on(part).matrix("v", "q", u=u) for part in (inside, outside))
     assert abs(A_in + A_out - model.A(u).matrix).max() < 1e-13
     state = model.mass @ (u - c[:n]) / h + model.B(u) + model.A(u).matrix @ q
-    state += mu * (split.R.T @ (omega @ r)) - model.F(lp.Moment(0.2))
+    state += mu * (split.R.T @ (omega @ r)) - model.F(lp.fem.Moment(0.2))
     learned = model.Q.gram @ (q - c[n:]) / (gain * h) - A_in.T @ r
     assert np.abs(state * model.X.free).max() < 1e-10
     assert np.abs(learned * model.Q.free).max() < 1e-10
 
 
-@pytest.mark.parametrize("kind", [lp.BaumeisterLaw, lp.KueglerLaw])
+@pytest.mark.parametrize("kind", [lp.laws.BaumeisterLaw, lp.laws.KueglerLaw])
 @pytest.mark.parametrize("options", [{"gain": 0.0}, {"gain": np.inf}, {"mu": -1.0}, {"mu": np.nan}])
 def test_bad_weights(kind: Any, options: dict[str, float]) -> None:
-    with pytest.raises(lp.LawError, match="must be a number"):
+    with pytest.raises(lp.errors.LawError, match="must be a number"):
         kind(**options)
 
 
-@pytest.mark.parametrize("kind", [lp.BaumeisterLaw, lp.KueglerLaw])
+@pytest.mark.parametrize("kind", [lp.laws.BaumeisterLaw, lp.laws.KueglerLaw])
 def test_no_sensor_of_the_parameter(kind: Any) -> None:
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 2), ElementLineP1()),
@@ -128,7 +128,7 @@ def test_no_sensor_of_the_parameter(kind: Any) -> None:
         A=lambda q, u, v, x: q * u * v,
     )
     sensors = lp.Points([0.0, 0.5, 1.0], direct={"z0": lambda q, x: q})
-    with pytest.raises(lp.LawError, match="sees a parameter directly: use SensitivityLaw"):
+    with pytest.raises(lp.errors.LawError, match="sees a parameter directly: use SensitivityLaw"):
         lp.Identifier(model, sensors, kind())
 
 

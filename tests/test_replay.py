@@ -112,5 +112,5 @@ def test_a_fleet_ends_as_its_members_do():
 
 
 def test_a_slice_too_small_is_refused():
-    with pytest.raises(lp.LawError, match="slice"):
+    with pytest.raises(lp.errors.LawError, match="slice"):
         lp.Replay(slice=4)

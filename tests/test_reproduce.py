@@ -159,7 +159,9 @@ def test_seed_excited_with_exact_data_checks_nothing() -> None:
 
 
 def test_unknown_truth() -> None:
-    with pytest.raises(lp.ConfigurationError, match="expected one of discrete, analytic, fine"):
+    with pytest.raises(
+        lp.errors.ConfigurationError, match="expected one of discrete, analytic, fine"
+    ):
         EXPERIMENTS["seed"].run("real")
 
 
@@ -193,7 +195,7 @@ def test_track_counts_failed_and_divided_steps() -> None:
         model, omega, lp.GradientLaw(), u0=lambda x: seed.u_true(x, 0.0), dt_max=0.3
     )
     assert track(divided, stream, "").divided == 5
-    never = lp.Newton(tolerance=0.0, iterations=1)
+    never = lp.stepping.Newton(tolerance=0.0, iterations=1)
     failing = lp.Identifier(model, omega, lp.GradientLaw(newton=never), u0=1.0)
     found = track(failing, stream, "")
     assert np.isnan(found.errors[1:]).all()

@@ -77,11 +77,11 @@ def test_checks():
     assert Check("a", 1, (0, 2), "in").to_dict() == {
         "name": "a", "value": 1, "bound": [0, 2], "sense": "in", "ok": True,
     }  # fmt: skip
-    with pytest.raises(lp.ConfigurationError, match="sense"):
+    with pytest.raises(lp.errors.ConfigurationError, match="sense"):
         Check("a", 1.0, 1.0, "<")  # type: ignore[arg-type]
-    with pytest.raises(lp.ConfigurationError, match="a pair"):
+    with pytest.raises(lp.errors.ConfigurationError, match="a pair"):
         Check("a", 1.0, 1.0, "in")
-    with pytest.raises(lp.ConfigurationError, match="one number"):
+    with pytest.raises(lp.errors.ConfigurationError, match="one number"):
         Check("a", 1.0, (0.0, 1.0), "<=")
 
 
@@ -105,7 +105,7 @@ def test_drive_keeps_what_it_has_when_a_sample_is_bad():
     stream = [*samples(), lp.Sample(2.0, {"T0": 1.0, "a": 0.0})]
     driven = drive(identifier(), stream, progress=True)
     assert driven.status == "failed"
-    assert isinstance(driven.error, lp.TimeOrderError)
+    assert isinstance(driven.error, lp.errors.TimeOrderError)
     assert len(driven.result) == len(TIMES)
 
 
@@ -191,16 +191,16 @@ def test_a_run_without_samples(tmp_path):
 def test_nothing_is_written_over(tmp_path, driven):
     written(tmp_path / "run", driven)
     before = (tmp_path / "run" / "run.json").read_text()
-    with pytest.raises(lp.RunError, match="already holds a run"):
+    with pytest.raises(lp.errors.RunError, match="already holds a run"):
         written(tmp_path / "run", driven)
     assert (tmp_path / "run" / "run.json").read_text() == before
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("mine")
-    with pytest.raises(lp.RunError, match="is not empty"):
+    with pytest.raises(lp.errors.RunError, match="is not empty"):
         written(tmp_path / "other", driven)
-    with pytest.raises(lp.RunError, match="is a file"):
+    with pytest.raises(lp.errors.RunError, match="is a file"):
         written(tmp_path / "other" / "notes.txt", driven)
-    with pytest.raises(lp.RunError, match="cannot be made"):
+    with pytest.raises(lp.errors.RunError, match="cannot be made"):
         written(tmp_path / "other" / "notes.txt" / "run", driven)
     (tmp_path / "empty").mkdir()
     written(tmp_path / "empty", driven)
@@ -218,7 +218,7 @@ def test_a_folder_that_vanishes(tmp_path, driven):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")
     (tmp_path / "run" / "run.json").unlink()
     (tmp_path / "run").rmdir()
-    with pytest.raises(lp.RunError, match="cannot be written"):
+    with pytest.raises(lp.errors.RunError, match="cannot be written"):
         writer.finish(status="finished", dataset=driven.result.to_xarray())
 
 
@@ -236,26 +236,26 @@ def test_checkpoint_continues(tmp_path):
 
 
 def test_runs_that_cannot_be_opened(tmp_path, driven):
-    with pytest.raises(lp.RunError, match="holds no run"):
+    with pytest.raises(lp.errors.RunError, match="holds no run"):
         runs.open(tmp_path)
     (tmp_path / "run.json").write_text("{")
-    with pytest.raises(lp.RunError, match="is damaged"):
+    with pytest.raises(lp.errors.RunError, match="is damaged"):
         runs.open(tmp_path)
     (tmp_path / "run.json").write_text('{"format": 99}')
-    with pytest.raises(lp.RunError, match="not a record of this version"):
+    with pytest.raises(lp.errors.RunError, match="not a record of this version"):
         runs.open(tmp_path)
     (tmp_path / "run.json").write_text(json.dumps({"format": 1, "status": "running"}))
     run = runs.open(tmp_path)
     assert run.title == tmp_path.name
     assert run.checks == []
-    with pytest.raises(lp.RunError, match="holds no estimates; its status is 'running'"):
+    with pytest.raises(lp.errors.RunError, match="holds no estimates; its status is 'running'"):
         _ = run.dataset
     (tmp_path / "estimates.nc").write_text("not netCDF")
-    with pytest.raises(lp.RunError, match="is damaged"):
+    with pytest.raises(lp.errors.RunError, match="is damaged"):
         _ = run.dataset
     for checks in ([{"name": "k"}], {"name": "k"}, 5):
         (tmp_path / "run.json").write_text(json.dumps({"format": 1, "checks": checks}))
-        with pytest.raises(lp.RunError, match=r"run\.json is damaged"):
+        with pytest.raises(lp.errors.RunError, match=r"run\.json is damaged"):
             _ = runs.open(tmp_path).checks
 
 

@@ -70,7 +70,7 @@ def test_a_checkpoint_is_not_unpickled(tmp_path):
     hostile = pickle.dumps(Hostile(trace))
     for content in (hostile, forged([["z", "|O", [1]]], hostile.ljust(1024))):
         path.write_bytes(content)
-        with pytest.raises(lp.RunError, match="not a checkpoint"):
+        with pytest.raises(lp.errors.RunError, match="not a checkpoint"):
             who.load(path)
     assert not trace.exists()
     with pytest.raises(TypeError, match="numbers and texts"):
@@ -90,7 +90,7 @@ def test_a_checkpoint_is_not_unpickled(tmp_path):
     ],
 )
 def test_a_checkpoint_that_says_it_is_larger_or_other_is_refused(described):
-    with pytest.raises(lp.RunError, match="not a checkpoint"):
+    with pytest.raises(lp.errors.RunError, match="not a checkpoint"):
         checkpoint.unpacked(forged(described, bytes(16)), "it")
 
 
@@ -123,7 +123,7 @@ def test_a_damaged_checkpoint_is_one_sentence():
             del content[int(rng.integers(0, len(content))) :]
         try:
             who.restore(bytes(content))
-        except lp.RunError:
+        except lp.errors.RunError:
             refused += 1
     assert refused > 250
 
@@ -196,7 +196,7 @@ def test_a_damaged_dataset_is_one_sentence(hostile):
         path.write_bytes(content[: len(content) - int(rng.integers(0, 2)) * 1000])
         try:
             _ = runs.open(hostile).dataset
-        except lp.RunError:
+        except lp.errors.RunError:
             refused += 1
     assert refused > 100
 
@@ -205,7 +205,7 @@ def test_a_damaged_dataset_is_one_sentence(hostile):
 def test_a_case_cannot_allow_its_own_code(hostile):
     path = hostile / "case.toml"
     path.write_text("allow_code = true\n" + path.read_text())
-    with pytest.raises(lp.CaseError, match="allow_code"):
+    with pytest.raises(lp.errors.CaseError, match="allow_code"):
         cases.load(path)
     assert not Path("trace").exists()
 
@@ -216,21 +216,21 @@ def test_a_case_cannot_allow_its_own_code(hostile):
 def test_a_case_is_short(tmp_path):
     path = tmp_path / "case.toml"
     path.write_text("#" * 1_000_001)
-    with pytest.raises(lp.CaseError, match="longer than 1000000 bytes"):
+    with pytest.raises(lp.errors.CaseError, match="longer than 1000000 bytes"):
         cases.load(path)
     path.write_text("a = " + "[" * 100_000)
-    with pytest.raises(lp.CaseError, match="not valid TOML"):
+    with pytest.raises(lp.errors.CaseError, match="not valid TOML"):
         cases.load(path)
 
 
 def test_a_record_is_short(tmp_path):
     path = tmp_path / "run.json"
     path.write_text('{"format": 1, "title": "' + "x" * 10_000_000 + '"}')
-    with pytest.raises(lp.RunError, match="longer than"):
+    with pytest.raises(lp.errors.RunError, match="longer than"):
         runs.open(tmp_path)
     for text in (b"[" * 100_000, b"{", b"[]", b'{"format": "1"}', b"\xff"):
         path.write_bytes(text)
-        with pytest.raises(lp.RunError, match=r"run\.json"):
+        with pytest.raises(lp.errors.RunError, match=r"run\.json"):
             runs.open(tmp_path)
 
 
@@ -372,7 +372,7 @@ def test_elsewhere_a_token_is_made(serving):
     [("0.0.0.0", "short"), ("127.0.0.1", "a b"), ("127.0.0.1", "a;b"), ("127.0.0.1", "a\nb: c")],
 )
 def test_tokens_that_are_none(host, token):
-    with pytest.raises(lp.RunError, match="token"):
+    with pytest.raises(lp.errors.RunError, match="token"):
         Address(host, token=token)
 
 
@@ -535,7 +535,7 @@ def test_nothing_is_written_through_links_of_a_strangers_directory(tmp_path):
     assert victim.read_text() == "mine"
     for name in ("report.md", "estimates.nc", "checkpoint.bin", "overview.png", "run.json"):
         assert not (run / name).is_symlink()
-    with pytest.raises(lp.RunError, match="is a link"):
+    with pytest.raises(lp.errors.RunError, match="is a link"):
         RunWriter.reopen(run, command=["x"], settings=(), **options)
 
 

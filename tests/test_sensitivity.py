@@ -216,7 +216,7 @@ def test_a_sensor_that_sees_a_parameter():
     q_true = np.array([1.5, 0.4])
     ident = lp.Identifier(model, sensors, lp.SensitivityLaw())
     for t, u in zip(times[1:], truth(model, q_true, 0.0, times, SCHEME)[1:], strict=True):
-        moment = lp.Moment(t)
+        moment = lp.fem.Moment(t)
         estimate = ident.step(t, ident.observed.predict(u, q_true, moment))
     assert estimate.parameters["offset"][0] == pytest.approx(0.4, abs=1e-3)
     assert estimate.parameters["s"][0] == pytest.approx(1.5, abs=1e-2)
@@ -272,25 +272,25 @@ def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
 
 class TestRefusals:
     def test_options(self):
-        with pytest.raises(lp.LawError, match="drift"):
+        with pytest.raises(lp.errors.LawError, match="drift"):
             lp.SensitivityLaw(drift=-1.0)
-        with pytest.raises(lp.LawError, match="memory"):
+        with pytest.raises(lp.errors.LawError, match="memory"):
             lp.SensitivityLaw(memory=0.0)
-        with pytest.raises(lp.LawError, match="noise"):
+        with pytest.raises(lp.errors.LawError, match="noise"):
             lp.SensitivityLaw(noise=0.0)
-        with pytest.raises(lp.LawError, match="choose one"):
+        with pytest.raises(lp.errors.LawError, match="choose one"):
             lp.SensitivityLaw(memory=1.0, replay=lp.Replay())
-        with pytest.raises(lp.LawError, match="first"):
+        with pytest.raises(lp.errors.LawError, match="first"):
             lp.Replay(window=5, first=6)
-        with pytest.raises(lp.LawError, match="iterations"):
+        with pytest.raises(lp.errors.LawError, match="iterations"):
             lp.Replay(iterations=0)
 
     def test_no_noise_level(self):
-        with pytest.raises(lp.LawError, match="noise="):
+        with pytest.raises(lp.errors.LawError, match="noise="):
             lp.Identifier(conductivity(), lp.Points([0.5]), lp.SensitivityLaw())
 
     def test_modes_of_an_unknown_field(self):
-        with pytest.raises(lp.LawError, match="modes"):
+        with pytest.raises(lp.errors.LawError, match="modes"):
             lp.Identifier(
                 excited(4), lp.Points([0.5], noise=0.1), lp.SensitivityLaw(modes={"p": 3})
             )
@@ -327,11 +327,11 @@ class TestConsistency:
 
 @pytest.mark.parametrize("name", ["replay", "jumps", "guards"])
 def test_a_switch_is_no_option(name: str):
-    with pytest.raises(lp.LawError, match=f"{name} must be a {name.title()}, or None"):
+    with pytest.raises(lp.errors.LawError, match=f"{name} must be a {name.title()}, or None"):
         lp.SensitivityLaw(**{name: True})
 
 
 @pytest.mark.parametrize("modes", [0, -1, 2.5])
 def test_modes_are_counted(modes: float):
-    with pytest.raises(lp.LawError, match="modes must be whole numbers of at least 1"):
+    with pytest.raises(lp.errors.LawError, match="modes must be whole numbers of at least 1"):
         lp.Identifier(excited(4), lp.Points([0.5], noise=0.1), lp.SensitivityLaw(modes=modes))

@@ -61,19 +61,25 @@ def test_averages_over_named_parts_and_boundaries():
     np.testing.assert_allclose(z, [0.25, 3.0, 1.75], rtol=1e-12)
     z = read(plate(), lp.Averages({"r": "right", "t": "top"}), lambda x: x[0] ** 2 + 3 * x[1] ** 2)
     np.testing.assert_allclose(z, [2.0, 1 / 3 + 3.0], rtol=1e-12)
-    with pytest.raises(lp.ObservationError, match=r"region 'a' is 'nowhere'; the mesh names"):
+    with pytest.raises(
+        lp.errors.ObservationError, match=r"region 'a' is 'nowhere'; the mesh names"
+    ):
         observe(rod(), lp.Averages({"a": "nowhere"}))
 
 
 @pytest.mark.parametrize("mean", [True, False])
 def test_line_integrals_are_exact(mean):
     lines = {"a": (0.13, 0.77), "whole": (1.0, 0.0)}
-    z = read(rod(element=ElementLineHermite()), lp.LineIntegrals(lines, mean), lambda x: x[0] ** 3)
+    z = read(
+        rod(element=ElementLineHermite()),
+        lp.observation.LineIntegrals(lines, mean),
+        lambda x: x[0] ** 3,
+    )
     exact = np.array([(0.77**4 - 0.13**4) / 4, 0.25])
     np.testing.assert_allclose(z, exact / [0.64, 1.0] if mean else exact, rtol=1e-11)
 
     a, b = np.array([0.1, 0.05]), np.array([0.9, 0.8])
-    z = read(plate(), lp.LineIntegrals({"beam": (a, b)}, mean), lambda x: x[0] * x[1])
+    z = read(plate(), lp.observation.LineIntegrals({"beam": (a, b)}, mean), lambda x: x[0] * x[1])
     s = np.polynomial.Polynomial
     average = (s([a[0], b[0] - a[0]]) * s([a[1], b[1] - a[1]])).integ()(1.0)
     length = np.linalg.norm(b - a)
@@ -86,7 +92,7 @@ def test_line_integrals_follow_kinks_from_cell_to_cell():
     u = np.random.default_rng(0).standard_normal(8)
     x = np.linspace(0.05, 0.93, 200_001)
     exact = trapezoid(np.interp(x, model.state.mesh.p[0], u), x)
-    G = observe(model, lp.LineIntegrals({"a": (0.05, 0.93)})).G
+    G = observe(model, lp.observation.LineIntegrals({"a": (0.05, 0.93)})).G
     assert (G @ u)[0] == pytest.approx(exact, abs=1e-8)
     for owner, ends in (
         (plate(), ([0.03, 0.9], [0.95, 0.2])),
@@ -100,22 +106,24 @@ def test_line_integrals_follow_kinks_from_cell_to_cell():
         u = np.random.default_rng(1).standard_normal(block.size)
         s = (np.arange(4000) + 0.5) / 4000
         fine = (block.probe(a[:, None] + (b - a)[:, None] * s) @ u).mean()
-        found = observe(owner, lp.LineIntegrals({"a": ends}, mean=True)).G @ u
+        found = observe(owner, lp.observation.LineIntegrals({"a": ends}, mean=True)).G @ u
         assert found[0] == pytest.approx(fine, abs=1e-5)
 
 
 def test_bad_lines():
-    with pytest.raises(lp.ObservationError, match="line 'a' has no length"):
-        observe(rod(), lp.LineIntegrals({"a": (0.2, 0.2)}))
-    with pytest.raises(lp.ObservationError, match=r"line 'a': point .* lies outside of the mesh"):
-        observe(rod(), lp.LineIntegrals({"a": (0.2, 1.2)}))
-    with pytest.raises(lp.ObservationError, match="the mesh has 1 coordinates"):
-        observe(rod(), lp.LineIntegrals({"a": ([0.2, 0.1], [0.3, 0.1])}))
+    with pytest.raises(lp.errors.ObservationError, match="line 'a' has no length"):
+        observe(rod(), lp.observation.LineIntegrals({"a": (0.2, 0.2)}))
+    with pytest.raises(
+        lp.errors.ObservationError, match=r"line 'a': point .* lies outside of the mesh"
+    ):
+        observe(rod(), lp.observation.LineIntegrals({"a": (0.2, 1.2)}))
+    with pytest.raises(lp.errors.ObservationError, match="the mesh has 1 coordinates"):
+        observe(rod(), lp.observation.LineIntegrals({"a": ([0.2, 0.1], [0.3, 0.1])}))
 
 
 def test_functionals_are_integrals_of_forms():
     flux = lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))
-    sensors = lp.Functionals(
+    sensors = lp.observation.Functionals(
         {
             "flux": flux,
             "energy": lambda q, u, x: q.k * u**2 / 2,
@@ -131,21 +139,28 @@ def test_functionals_are_integrals_of_forms():
     assert H_u.shape == (3, 21)
     np.testing.assert_allclose(H_u.sum(axis=1), [0.0, 2.0, 3.0], atol=1e-11)
     np.testing.assert_allclose(H_q, [[0.0], [0.5], [0.0]], atol=1e-12)
-    with pytest.raises(lp.ObservationError, match=r"no matrix G .* use SensitivityLaw"):
+    with pytest.raises(lp.errors.ObservationError, match=r"no matrix G .* use SensitivityLaw"):
         observed.split()
-    with pytest.raises(lp.ObservationError, match=r"sensor 'bad'.*failed at its first evaluation"):
-        observe(rod(), lp.Functionals({"bad": lambda q, u, x: q.nothing * u}))
+    with pytest.raises(
+        lp.errors.ObservationError, match=r"sensor 'bad'.*failed at its first evaluation"
+    ):
+        observe(rod(), lp.observation.Functionals({"bad": lambda q, u, x: q.nothing * u}))
 
 
 def test_functionals_of_fields_and_single_unknowns():
     field = lp.Field(lp.interval(0.0, 1.0, 5), ElementLineP1(), prior=1.0)
     model = lp.Model(lp.Field(field.mesh, ElementLineP2()), field, A=lambda q, u, v, x: q * u * v)
-    z = read(model, lp.Functionals({"z": lambda q, u, x: q**2 * u}), lambda x: x[0], lambda x: x[0])
+    z = read(
+        model,
+        lp.observation.Functionals({"z": lambda q, u, x: q**2 * u}),
+        lambda x: x[0],
+        lambda x: x[0],
+    )
     np.testing.assert_allclose(z, [0.25], rtol=1e-12)
 
 
 def test_moving_sensors():
-    sensors = lp.Moving({"probe": "x", "other": "y"}, noise=0.1)
+    sensors = lp.observation.Moving({"probe": "x", "other": "y"}, noise=0.1)
     assert sensors.inputs == ("x", "y")
     observed, u = observe(rod(), sensors), rod().state_space.interpolate(lambda x: x[0] ** 2)
     for moment, expected in (
@@ -161,18 +176,20 @@ def test_moving_sensors():
         H, direct = observed.jacobian(u, np.ones(1), moment)
         np.testing.assert_allclose((H @ u)[seen], np.array(expected)[seen], atol=1e-14)
         assert direct is None
-    scan = lp.Moving({"s": ("x", "y")})
+    scan = lp.observation.Moving({"s": ("x", "y")})
     z = read(plate(), scan, lambda x: x[0] * x[1], moment=at(x=0.31, y=0.72))
     np.testing.assert_allclose(z, [0.31 * 0.72], rtol=1e-12)
-    with pytest.raises(lp.ObservationError, match=r"position channels .*'x'.*has 2 coordinates"):
-        observe(plate(), lp.Moving({"s": "x"}))
+    with pytest.raises(
+        lp.errors.ObservationError, match=r"position channels .*'x'.*has 2 coordinates"
+    ):
+        observe(plate(), lp.observation.Moving({"s": "x"}))
 
 
 def test_combined_sensors():
     parts = [
         lp.Points({"a": 0.3}, noise=0.1),
         lp.Averages({"b": "core", "c": "right"}, noise=0.5),
-        lp.Moving({"d": "x"}, noise=0.2),
+        lp.observation.Moving({"d": "x"}, noise=0.2),
     ]
     observed = observe(rod(), lp.Combined(parts))
     assert observed.names == ("a", "b", "c", "d")
@@ -184,13 +201,13 @@ def test_combined_sensors():
     assert not observed.linear
     linear = observe(rod(), lp.Combined(parts[:2]))
     assert linear.linear
-    lp.check_observation(linear).raise_if_failed()
+    lp.diagnostics.check_observation(linear).raise_if_failed()
     np.testing.assert_array_equal(observe(rod(), lp.Combined([lp.Full()], noise=2.0)).noise, 2.0)
-    with pytest.raises(lp.ObservationError, match="names must differ"):
+    with pytest.raises(lp.errors.ObservationError, match="names must differ"):
         observe(rod(), lp.Combined([lp.Points({"a": 0.3}), lp.Points({"a": 0.4})]))
-    with pytest.raises(lp.ObservationError, match="not to both"):
+    with pytest.raises(lp.errors.ObservationError, match="not to both"):
         lp.Combined(parts, noise=1.0)
-    with pytest.raises(lp.ObservationError, match="at least one"):
+    with pytest.raises(lp.errors.ObservationError, match="at least one"):
         lp.Combined([])
 
 
@@ -203,7 +220,7 @@ CALIBRATION = {"gain": lp.Scalar(1.2), "R": lp.Piecewise({"a": "core"}, prior=0.
 
 def test_calibrated_sensors():
     model = rod(**{**CALIBRATION, "R": lp.Piecewise({"a": "core", "b": "core"}, prior=0.5)})
-    sensors = lp.Calibrated(lp.Points([0.3, 0.6]), gained, inputs=("Q",), noise=0.1)
+    sensors = lp.observation.Calibrated(lp.Points([0.3, 0.6]), gained, inputs=("Q",), noise=0.1)
     z = read(model, sensors, lambda x: x[0], moment=at(Q=2.0))
     np.testing.assert_allclose(z, [0.36 + 0.09, 0.72 + 0.36], rtol=1e-12)
     observed = observe(model, sensors)
@@ -212,31 +229,35 @@ def test_calibrated_sensors():
     )
     np.testing.assert_allclose(H_u.sum(axis=1), [1.2 + 2.0] * 2, rtol=1e-12)
     np.testing.assert_allclose(H_q, [[1.0, 2.0, 0.0]] * 2, rtol=1e-12)
-    moving = lp.Calibrated(lp.Moving({"m": "x", "n": "y"}), lambda y, q, x: q.gain * y.mean() + y)
+    moving = lp.observation.Calibrated(
+        lp.observation.Moving({"m": "x", "n": "y"}), lambda y, q, x: q.gain * y.mean() + y
+    )
     seen = observe(model, moving)
     assert not seen.available(at(x=0.5)).any()  # the mean of both needs both
-    moving = lp.Calibrated(lp.Moving({"m": "x", "n": "y"}), lambda y, q, x: q.gain * y)
+    moving = lp.observation.Calibrated(
+        lp.observation.Moving({"m": "x", "n": "y"}), lambda y, q, x: q.gain * y
+    )
     seen = observe(model, moving)
     np.testing.assert_array_equal(seen.available(at(x=0.5)), [True, False])
     H_u, H_q = seen.jacobian(np.ones(21), model.initial_parameter(), at(x=0.5))
     np.testing.assert_allclose(H_u.sum(axis=1), [1.2, 0.0], rtol=1e-12)
     np.testing.assert_allclose(H_q, [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], rtol=1e-12)
-    with pytest.raises(lp.ObservationError, match="give noise= to it and not to its base"):
-        lp.Calibrated(lp.Points([0.3], noise=1.0), gained)
-    with pytest.raises(lp.ObservationError, match=r"shape \(\) for 2 sensors"):
-        read(model, lp.Calibrated(lp.Points([0.3, 0.4]), lambda y, q, x: y.sum()), 0.0)
+    with pytest.raises(lp.errors.ObservationError, match="give noise= to it and not to its base"):
+        lp.observation.Calibrated(lp.Points([0.3], noise=1.0), gained)
+    with pytest.raises(lp.errors.ObservationError, match=r"shape \(\) for 2 sensors"):
+        read(model, lp.observation.Calibrated(lp.Points([0.3, 0.4]), lambda y, q, x: y.sum()), 0.0)
 
 
 def test_the_gradient_law_names_the_other_one():
     model = rod()
     for sensors in (
-        lp.Moving({"m": "x"}),
-        lp.Functionals({"f": lambda q, u, x: u}),
-        lp.Calibrated(lp.Points([0.3]), lambda y, q, x: q.k * y),
+        lp.observation.Moving({"m": "x"}),
+        lp.observation.Functionals({"f": lambda q, u, x: u}),
+        lp.observation.Calibrated(lp.Points([0.3]), lambda y, q, x: q.k * y),
         lp.Points({"a": 0.3}, {"a": lambda q, x: q.k}),
-        lp.Combined([lp.Points([0.3]), lp.Moving({"m": "x"})]),
+        lp.Combined([lp.Points([0.3]), lp.observation.Moving({"m": "x"})]),
     ):
-        with pytest.raises(lp.LawError, match="use SensitivityLaw"):
+        with pytest.raises(lp.errors.LawError, match="use SensitivityLaw"):
             lp.Identifier(model, sensors, lp.GradientLaw())
 
 
@@ -246,8 +267,10 @@ anything = st.floats(-3.0, 3.0)
 
 EVERY_CLASS = {
     item
-    for item in (getattr(lp, name) for name in lp.__all__)
-    if isinstance(item, type) and issubclass(item, lp.Observation) and item is not lp.Observation
+    for item in (getattr(lp.observation, name) for name in lp.observation.__all__)
+    if isinstance(item, type)
+    and issubclass(item, lp.observation.Observation)
+    and item is not lp.observation.Observation
 }
 
 
@@ -260,24 +283,28 @@ def sensors_of_any_kind(draw):
         lp.Points([a]),
         lp.Points({"p": a}, {"p": lambda q, x: c * q.gain - x.inputs["x"] * q.R}, inputs=("x",)),
         lp.Averages({"A": "core", "B": "left", "C": lambda x: x[0] > 0.4}),
-        lp.LineIntegrals({"l": (a, b + 1e-3 if a == b else b)}, mean=draw(st.booleans())),
-        lp.Functionals(
+        lp.observation.LineIntegrals(
+            {"l": (a, b + 1e-3 if a == b else b)}, mean=draw(st.booleans())
+        ),
+        lp.observation.Functionals(
             {
                 "f": lambda q, u, x: c * q.gain**2 * u**power * x[0] + q.R / q.gain * x.inputs["x"],
                 "g": lp.On("right", lambda q, u, x: -q.R * lp.dot(lp.grad(u), x.normal) * x.t),
             },
             inputs=("x",),
         ),
-        lp.Moving({"m": "x", "n": "missing"}),
-        lp.Transformed(lp.Points({"t": a}), lambda y: np.exp(c * y / 2)),
+        lp.observation.Moving({"m": "x", "n": "missing"}),
+        lp.observation.Transformed(lp.Points({"t": a}), lambda y: np.exp(c * y / 2)),
         lp.Full(),
         lp.Subdomain(lambda x: x[0] > 0.8 * a),
-        lp.Matrix(np.random.default_rng(power).standard_normal((3, 13)) + c),
+        lp.observation.Matrix(np.random.default_rng(power).standard_normal((3, 13)) + c),
     ]
     both = lp.Combined([base[k] for k in (1, 2, 3, 4, 5, 6)])
     base += [
         both,
-        lp.Calibrated(both, lambda y, q, x: q.gain * y + c * q.R * x.inputs["x"] * y[0] * y**2),
+        lp.observation.Calibrated(
+            both, lambda y, q, x: q.gain * y + c * q.R * x.inputs["x"] * y[0] * y**2
+        ),
     ]
     assert {type(sensor) for sensor in base} == EVERY_CLASS
     return draw(st.sampled_from(base))
@@ -290,7 +317,7 @@ def test_any_sensor_passes_the_checks(sensors, position, seed):
     model = rod(6, **CALIBRATION)
     inputs = {name: position for name in ("x",) if name in sensors.inputs}
     inputs |= {name: 2.0 for name in ("missing",) if name in sensors.inputs}  # outside
-    lp.check_observation(sensors, model, seed=seed, inputs=inputs).raise_if_failed()
+    lp.diagnostics.check_observation(sensors, model, seed=seed, inputs=inputs).raise_if_failed()
 
 
 def test_a_wrong_jacobian_is_found():
@@ -300,7 +327,7 @@ def test_a_wrong_jacobian_is_found():
 
     model = rod()
     wrong = Wrong(lp.Points([0.3]), model.state_space, model.X, model.parameter_space)
-    failed = [line.name for line in lp.check_observation(wrong).lines if not line.ok]
+    failed = [line.name for line in lp.diagnostics.check_observation(wrong).lines if not line.ok]
     assert failed == ["G'(u) by differences", "G'(q) by differences"]
 
 
@@ -341,7 +368,7 @@ def identified(model, sensors, truth, noise, inputs=None, steps=120, check=None)
 def test_a_boundary_flux_and_one_point_find_the_conductivity():
     flux = lp.On("right", lambda q, u, x: -q.k * lp.dot(lp.grad(u), x.normal))
     sensors = lp.Combined(
-        [lp.Functionals({"flux": flux}, noise=0.01), lp.Points({"T": 0.4}, noise=0.01)]
+        [lp.observation.Functionals({"flux": flux}, noise=0.01), lp.Points({"T": 0.4}, noise=0.01)]
     )
     identified(heated(), sensors, {"k": 0.6}, 0.01)
 
@@ -351,7 +378,7 @@ def test_a_moving_sensor_finds_the_conductivity():
     def inputs(t):
         return {"x": np.nan if t < 0.3 else 0.5 + 0.6 * np.sin(t)}  # out of the rod at times
 
-    identified(heated(), lp.Moving({"T": "x"}, noise=0.01), {"k": 0.6}, 0.01, inputs)
+    identified(heated(), lp.observation.Moving({"T": "x"}, noise=0.01), {"k": 0.6}, 0.01, inputs)
 
 
 @pytest.mark.slow
@@ -360,7 +387,7 @@ def test_offsets_by_direct_and_gain_by_calibration():
     direct = {"A": lambda q, x: q.a, "B": lambda q, x: q.b}
     offsets = lp.Points({"A": 0.2, "B": 0.5, "C": 0.8}, direct, noise=0.005)
     identified(model, offsets, {"k": 0.6, "a": 0.2, "b": -0.1}, 0.005)
-    gains = lp.Calibrated(
+    gains = lp.observation.Calibrated(
         lp.Points({"A": 0.2, "B": 0.6}),
         lambda y, q, x: y * np.array([q.gain, 1.0]),
         noise=0.005,
@@ -372,17 +399,21 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
     model, law = heated(), lp.SensitivityLaw()
     sensors = lp.Combined(
         [
-            lp.Moving({"T": "x"}, noise=0.01),
-            lp.Functionals({"Q": lambda q, u, x: x.inputs["c"] * u}, inputs=("c",), noise=0.01),
+            lp.observation.Moving({"T": "x"}, noise=0.01),
+            lp.observation.Functionals(
+                {"Q": lambda q, u, x: x.inputs["c"] * u}, inputs=("c",), noise=0.01
+            ),
         ]
     )
     assert sensors.inputs == ("x", "c")
     assert sensors.optional == {"x"}
     identifier = lp.Identifier(model, sensors, law)
     assert identifier.channels == ("T", "Q", "x", "c")
-    with pytest.raises(lp.MissingInputError, match="No estimate before the first sample"):
+    with pytest.raises(lp.errors.MissingInputError, match="No estimate before the first sample"):
         identifier.estimate()
-    with pytest.raises(lp.MissingInputError, match=r"input 'c' has no value.*all of \['c'\]"):
+    with pytest.raises(
+        lp.errors.MissingInputError, match=r"input 'c' has no value.*all of \['c'\]"
+    ):
         identifier.step(0.0, {"T": 0.0})
     identifier.step(0.0, {"T": 0.0, "c": 1.0})
     estimate = identifier.step(0.1, {"T": 5.0, "Q": np.nan})
@@ -400,7 +431,7 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
     np.testing.assert_array_equal(identifier.estimate().q, again.estimate().q)
     # The channels of withheld sensors are inputs, too.
     hidden = lp.Identifier(
-        model, lp.Points({"P": 0.5}, noise=0.1), law, withheld=lp.Moving({"T": "x"})
+        model, lp.Points({"P": 0.5}, noise=0.1), law, withheld=lp.observation.Moving({"T": "x"})
     )
     assert hidden.inputs == ("x",)
     hidden.step(0.0, {"P": 0.0, "T": 1.0})
@@ -409,7 +440,9 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
 
 
 def test_the_component_must_exist():
-    with pytest.raises(lp.SpaceError, match=r"of='c': the components of the state are \['u'\]"):
+    with pytest.raises(
+        lp.errors.SpaceError, match=r"of='c': the components of the state are \['u'\]"
+    ):
         observe(rod(), lp.Points([0.3], of="c"))
 
 
@@ -417,12 +450,12 @@ def test_the_component_must_exist():
     "build",
     [
         lambda: lp.Combined([lp.Points([0.5])], of="u"),
-        lambda: lp.Calibrated(lp.Points([0.5]), lambda y, q, x: y, of="u"),
-        lambda: lp.Transformed(lp.Points([0.5]), lambda y: y, of="u"),
-        lambda: lp.Functionals({"f": lambda q, u, x: u}, of="u"),
-        lambda: lp.Matrix(np.eye(3), of="u"),
+        lambda: lp.observation.Calibrated(lp.Points([0.5]), lambda y, q, x: y, of="u"),
+        lambda: lp.observation.Transformed(lp.Points([0.5]), lambda y: y, of="u"),
+        lambda: lp.observation.Functionals({"f": lambda q, u, x: u}, of="u"),
+        lambda: lp.observation.Matrix(np.eye(3), of="u"),
     ],
 )
 def test_a_component_that_says_nothing_is_refused(build):
-    with pytest.raises(lp.ObservationError, match="of='u' says nothing"):
+    with pytest.raises(lp.errors.ObservationError, match="of='u' says nothing"):
         build()

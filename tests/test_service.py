@@ -213,9 +213,9 @@ def test_it_begins_with_the_first_sample_that_has_what_is_needed(here):
     )
     assert code == 0
     assert runs.open("run").dataset.sizes["time"] == 5
-    with pytest.raises(lp.DataError, match="'left'"):
+    with pytest.raises(lp.errors.DataError, match="'left'"):
         call("run", "case.toml", "--realtime", "--data", "-", "--out", "none", stdin=lines[0])
-    with pytest.raises(lp.DataError, match="no sample came"):
+    with pytest.raises(lp.errors.DataError, match="no sample came"):
         call("run", "case.toml", "--realtime", "--data", "-", "--out", "void", stdin="")
 
 
@@ -240,7 +240,7 @@ def test_estimates_as_lines_of_json(here):
 )
 def test_a_speed_of_nothing_is_refused(here, arguments, told):
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(4))))
-    with pytest.raises(lp.ConfigurationError, match=told):
+    with pytest.raises(lp.errors.ConfigurationError, match=told):
         call("run", case('file = "rows.csv"'), "--out", "run", *arguments)
     assert not Path("run").exists()
 
@@ -384,7 +384,7 @@ def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
     with (
         caplog.at_level("WARNING"),
         Wiring(loaded, Rows(wrong)) as wiring,
-        pytest.raises(lp.DataError, match=r"no sample came \(malformed: .*'time'"),
+        pytest.raises(lp.errors.DataError, match=r"no sample came \(malformed: .*'time'"),
     ):
         wiring.live()
     assert [one.message.split(":")[0] for one in caplog.records] == ["malformed"]

@@ -272,13 +272,13 @@ def test_a_field_is_prolonged() -> None:
 def test_says_where_the_mesh_is_not_followed() -> None:
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(
-        lp.Field(mesh, lp.quadratic(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0}),
+        lp.Field(mesh, lp.fem.quadratic(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0}),
         lp.Scalar(1.0, std=0.3),
         A=lambda q, u, v, x: 0.1 * q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     given = lp.Identifier(model, SENSORS, lp.SensitivityLaw(), u0=0.0)
     assert ran(given, samples()[:10]).notes["mesh_unfollowed"] == 1.0
-    few = lp.SensitivityLaw(shadows=lp.Shadows(largest=10))
+    few = lp.SensitivityLaw(shadows=lp.laws.Shadows(largest=10))
     assert ran(identifier(8, few), samples()[:10]).notes["mesh_unfollowed"] == 1.0
 
 
@@ -294,12 +294,12 @@ def test_speaks_and_names_the_cause() -> None:
 
 
 def test_refuses_shadows_of_nothing() -> None:
-    with pytest.raises(lp.LawError, match="Shadows: none is left"):
-        lp.Shadows(step=False, mesh=False, inputs=False)
-    with pytest.raises(lp.LawError, match="shadows must be a Shadows"):
+    with pytest.raises(lp.errors.LawError, match="Shadows: none is left"):
+        lp.laws.Shadows(step=False, mesh=False, inputs=False)
+    with pytest.raises(lp.errors.LawError, match="shadows must be a Shadows"):
         lp.SensitivityLaw(shadows=True)  # type: ignore[arg-type]
-    with pytest.raises(lp.LawError, match="largest must be at least 1"):
-        lp.Shadows(largest=0)
+    with pytest.raises(lp.errors.LawError, match="largest must be at least 1"):
+        lp.laws.Shadows(largest=0)
 
 
 def test_orders_of_both_schemes_are_known() -> None:

@@ -116,7 +116,7 @@ def test_refuses_a_batch_that_does_not_continue(offset, count, said):
     items, one = stream(model, 6), shard(model)
     one.step(0, items[:5])
     before = one.dump()
-    with pytest.raises(lp.OffsetError, match=said):
+    with pytest.raises(lp.errors.OffsetError, match=said):
         one.step(offset, items[offset : offset + count])
     assert one.dump() == before
     assert one.step(5, items[5:8]).status == ["ok"] * 3

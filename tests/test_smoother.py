@@ -76,7 +76,7 @@ def dense(model, samples):
             gain = 0.7 * np.sqrt(evolution.growth(h, 0.7)[0]) * theta[2 + k]
             q = np.array([0.5 + evolution.transition(h)[0, 0] * (q[0] - 0.5) + gain, q[1]])
             S, load = M / h + B, M @ u / h - A @ q
-            u = model.impose(np.zeros(n), lp.Moment(t1))
+            u = model.impose(np.zeros(n), lp.fem.Moment(t1))
             u[free] = np.linalg.solve(S[np.ix_(free, free)], (load - S @ u)[free])
             found.append(np.concatenate([q, u]))
         return np.array(found)
@@ -260,12 +260,12 @@ def test_what_cannot_be_smoothed_says_so_in_a_sentence():
         (lp.SensitivityLaw(memory=2.0), "memory= lets the past fade"),
     ):
         result = lp.Identifier(model, SENSORS, law).run(stream)
-        with pytest.raises(lp.LawError, match=match):
+        with pytest.raises(lp.errors.LawError, match=match):
             result.smoothed()
     identifier = lp.Identifier(model, SENSORS, lp.SensitivityLaw())
-    with pytest.raises(lp.ConfigurationError, match="samples of this result are not known"):
+    with pytest.raises(lp.errors.ConfigurationError, match="samples of this result are not known"):
         drive(identifier, [lp.Sample(*item) for item in stream]).result.smoothed()
-    with pytest.raises(lp.ConfigurationError, match="from its first sample on"):
+    with pytest.raises(lp.errors.ConfigurationError, match="from its first sample on"):
         identifier.smoothed(stream)
 
 

@@ -155,16 +155,16 @@ def test_a_smoothed_stream_can_be_read_again_and_knows_its_length():
     ],
 )
 def test_wrong_settings(make, words):
-    with pytest.raises(lp.ConfigurationError, match=words):
+    with pytest.raises(lp.errors.ConfigurationError, match=words):
         make()
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=repr)
 def test_wrong_samples(stage):
-    with pytest.raises(lp.SampleError, match="not later"):
+    with pytest.raises(lp.errors.SampleError, match="not later"):
         list(stage([(1.0, [0.0]), (1.0, [0.0])]))
-    with pytest.raises(lp.SampleError, match="shape"):
+    with pytest.raises(lp.errors.SampleError, match="shape"):
         list(stage([(1.0, [0.0]), (2.0, [0.0, 1.0])]))
     wrong = type(stage)(**{**vars(stage), "noise": [1.0, 2.0]})
-    with pytest.raises(lp.ConfigurationError, match="2 values of noise for 1 channels"):
+    with pytest.raises(lp.errors.ConfigurationError, match="2 values of noise for 1 channels"):
         list(wrong([(1.0, [0.0])]))

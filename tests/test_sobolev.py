@@ -56,7 +56,7 @@ def test_gram_is_the_spectral_power(name, zero, s):
 def test_spaces_pass_their_check(name, s):
     for zero in ({}, {"boundary": 0.0}):
         model = CASES[name].model(inner=lp.Sobolev(s, LENGTH), q_dirichlet=zero)
-        lp.check_space(model.Q).raise_if_failed()
+        lp.diagnostics.check_space(model.Q).raise_if_failed()
         np.testing.assert_array_equal(model.Q.riesz(np.ones(model.Q.dim))[model.Q.fixed], 0.0)
 
 
@@ -93,7 +93,7 @@ def test_names_of_orders():
         reaction(mesh, ElementQuadBFS(), inner="H2"),
     ):
         assert not isinstance(model.Q, BorderedSpace)
-        lp.check_space(model.Q).raise_if_failed()
+        lp.diagnostics.check_space(model.Q).raise_if_failed()
     q = model.parameter_space.interpolate(lambda x: x[0] ** 2 * x[1])
     # u^2 + 2 |grad u|^2 + |hess u|^2 for u = x^2 y
     grad = 4 / 9 + 1 / 5
@@ -117,7 +117,7 @@ def test_products_with_other_unknowns():
         "b": lp.Field(mesh, element, inner="H1"),
     }
     model = lp.Model(lp.Field(mesh, element), parts, A=lambda q, u, v, x: (q.a + q.b + q.k) * u * v)
-    lp.check_space(model.Q).raise_if_failed()
+    lp.diagnostics.check_space(model.Q).raise_if_failed()
     gram, part = model.Q.gram.toarray(), model.parameter_space.part
     alone = lp.Model(lp.Field(mesh, element), parts["a"], product).Q
     np.testing.assert_allclose(gram[part("a"), part("a")], alone.gram.toarray(), rtol=1e-9)
@@ -152,7 +152,9 @@ def test_modes_of_a_large_space_are_powers_of_those_of_H1(monkeypatch):
     phi, power = two.Q.modes(4, two.parameter_mass)
     np.testing.assert_allclose(power, first**1.5, rtol=1e-3)
     np.testing.assert_allclose(phi.T @ two.Q.dual(phi), np.eye(4), atol=1e-7)
-    with pytest.raises(lp.SpaceError, match="is dense and has 1089 rows; it is written out up to"):
+    with pytest.raises(
+        lp.errors.SpaceError, match="is dense and has 1089 rows; it is written out up to"
+    ):
         _ = two.Q.gram
 
 
@@ -161,7 +163,7 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
     """The auxiliary unknowns change the linear algebra, not the result."""
     model = excited(10, ElementLineP1(), inner=lp.Sobolev(s, LENGTH))
     plain = excited(10, ElementLineP1())
-    plain.__dict__["Q"] = lp.HilbertSpace(model.Q.gram, "Q", model.Q.fixed)
+    plain.__dict__["Q"] = lp.spaces.HilbertSpace(model.Q.gram, "Q", model.Q.fixed)
     found = []
     for one in (model, plain):
         twin = Twin(
@@ -172,7 +174,7 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
             u_true=excited_u,
             times=0.1 * np.arange(11),
         )
-        strict = lp.Newton(tolerance=1e-10, share=0.0)
+        strict = lp.stepping.Newton(tolerance=1e-10, share=0.0)
         law = lp.GradientLaw(gain=100.0, sigma=0.01, newton=strict)
         start = {"q0": 0.0, "u0": lambda x: excited_u(x, 0.0)}
         found.append(lp.Identifier(one, lp.Full(), law, **start).run(twin).last)
@@ -202,13 +204,13 @@ def test_both_laws_identify(law, inner):
 
 def test_bad_orders():
     for s in (-1.0, np.nan, np.inf):
-        with pytest.raises(lp.SpaceError, match="the order s must be a number >= 0"):
+        with pytest.raises(lp.errors.SpaceError, match="the order s must be a number >= 0"):
             lp.Sobolev(s)
     for length in (0.0, np.nan):
-        with pytest.raises(lp.SpaceError, match="length must be a positive number"):
+        with pytest.raises(lp.errors.SpaceError, match="length must be a positive number"):
             lp.Sobolev(1.0, length)
-    with pytest.raises(lp.SpaceError, match="not symmetric"):
-        BorderedSpace(lp.HilbertSpace(CASES["line P1"].model().Q.gram).gram * np.nan, 13)
+    with pytest.raises(lp.errors.SpaceError, match="not symmetric"):
+        BorderedSpace(lp.spaces.HilbertSpace(CASES["line P1"].model().Q.gram).gram * np.nan, 13)
 
 
 @pytest.mark.parametrize(
@@ -227,5 +229,5 @@ def test_the_prior_deviation_is_that_at_a_point(mesh, s):
     unit = np.zeros(model.Q.dim)
     unit[centre] = 1.0
     assert np.sqrt(model.Q.riesz(unit)[centre]) == pytest.approx(0.7, rel=0.05)
-    with pytest.raises(lp.SpaceError, match="take a larger s"):
+    with pytest.raises(lp.errors.SpaceError, match="take a larger s"):
         lp.Sobolev(s).pointwise(2 * s)

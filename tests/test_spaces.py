@@ -44,8 +44,8 @@ def test_gain_scales_the_adjoint():
     rng = np.random.default_rng(2)
     u, r = rng.standard_normal((2, model.X.dim))
     A = model.A(u)
-    Q = lp.HilbertSpace(model.Q.gram / 50.0, "Q", model.Q.fixed)
-    scaled = lp.DualOperator(A.matrix, Q, model.X)
+    Q = lp.spaces.HilbertSpace(model.Q.gram / 50.0, "Q", model.Q.fixed)
+    scaled = lp.operators.DualOperator(A.matrix, Q, model.X)
     np.testing.assert_allclose(scaled.adjoint(r), 50.0 * A.adjoint(r), rtol=1e-9)
 
 
@@ -69,7 +69,7 @@ def test_std_divides_the_inner_product():
 
 def test_singular_inner_product_is_one_sentence():
     model = reaction(line(), ElementLineP1(), inner=laplace)
-    with pytest.raises(lp.SpaceError, match="Gram matrix of Q is singular") as caught:
+    with pytest.raises(lp.errors.SpaceError, match="Gram matrix of Q is singular") as caught:
         _ = model.Q.factor
     assert "zero-order term" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -96,24 +96,24 @@ def test_indefinite_inner_products_are_refused():
         return u * v - 0.01 * lp.dot(lp.grad(u), lp.grad(v))
 
     for inner in (negative, weak):
-        with pytest.raises(lp.SpaceError, match="not positive definite"):
+        with pytest.raises(lp.errors.SpaceError, match="not positive definite"):
             _ = reaction(line(30), ElementLineP1(), inner=inner).Q.factor
 
 
 def test_bad_gram_matrices():
-    with pytest.raises(lp.SpaceError, match="square"):
-        lp.HilbertSpace(sp.csr_array((2, 3)))
-    with pytest.raises(lp.SpaceError, match="not symmetric"):
-        lp.HilbertSpace(sp.csr_array([[1.0, 0.5], [0.0, 1.0]]))
-    with pytest.raises(lp.SpaceError, match="not finite"):
-        lp.HilbertSpace(sp.csr_array([[1.0, np.nan], [np.nan, 1.0]]))
+    with pytest.raises(lp.errors.SpaceError, match="square"):
+        lp.spaces.HilbertSpace(sp.csr_array((2, 3)))
+    with pytest.raises(lp.errors.SpaceError, match="not symmetric"):
+        lp.spaces.HilbertSpace(sp.csr_array([[1.0, 0.5], [0.0, 1.0]]))
+    with pytest.raises(lp.errors.SpaceError, match="not finite"):
+        lp.spaces.HilbertSpace(sp.csr_array([[1.0, np.nan], [np.nan, 1.0]]))
 
 
 def test_operator_must_fit_its_spaces():
     model = CASES["line P2 / P1"].model()
     A = model.A(np.ones(model.X.dim))
-    with pytest.raises(lp.SpaceError, match=r"shape \(25, 13\).*need \(13, 25\)"):
-        lp.DualOperator(A.matrix, model.X, model.Q)
+    with pytest.raises(lp.errors.SpaceError, match=r"shape \(25, 13\).*need \(13, 25\)"):
+        lp.operators.DualOperator(A.matrix, model.X, model.Q)
 
 
 def test_norms_and_duals():
@@ -162,31 +162,31 @@ def test_modes_of_a_large_space_are_those_of_a_dense_solver():
 @pytest.mark.parametrize("count", [0, 14])
 def test_number_of_modes_must_exist(count):
     model = CASES["line P1"].model()
-    with pytest.raises(lp.SpaceError, match=f"13 free coefficients; got modes={count}"):
+    with pytest.raises(lp.errors.SpaceError, match=f"13 free coefficients; got modes={count}"):
         model.Q.modes(count, model.parameter_mass)
 
 
 def test_bad_unknowns():
     mesh, element = line(), ElementLineP1()
-    with pytest.raises(lp.SpaceError, match="expected 'L2', 'H1'"):
+    with pytest.raises(lp.errors.SpaceError, match="expected 'L2', 'H1'"):
         lp.Field(mesh, element, inner="H3")
-    with pytest.raises(lp.SpaceError, match=r"no boundary 'top'.*'left'"):
+    with pytest.raises(lp.errors.SpaceError, match=r"no boundary 'top'.*'left'"):
         lp.Field(mesh, element, dirichlet={"top": 0.0})
     for std in (0.0, -1.0, np.inf, np.nan):
-        with pytest.raises(lp.SpaceError, match="std must be a positive number"):
+        with pytest.raises(lp.errors.SpaceError, match="std must be a positive number"):
             lp.Scalar(std=std)
-    with pytest.raises(lp.SpaceError, match="lower < upper"):
+    with pytest.raises(lp.errors.SpaceError, match="lower < upper"):
         lp.Scalar(bounds=(1.0, 1.0))
-    with pytest.raises(lp.SpaceError, match=r"prior 3\.0 lies outside"):
+    with pytest.raises(lp.errors.SpaceError, match=r"prior 3\.0 lies outside"):
         lp.Piecewise({"a": lambda x: x[0] < 1}, prior=3.0, bounds=(0.0, 2.0))
-    with pytest.raises(lp.SpaceError, match="at least one region"):
+    with pytest.raises(lp.errors.SpaceError, match="at least one region"):
         lp.Piecewise({})
     for bad in ((1.0, 0.0, 4), (0.0, 1.0, 0), (0.0, np.nan, 4)):
-        with pytest.raises(lp.SpaceError, match="needs stop > start and cells >= 1"):
+        with pytest.raises(lp.errors.SpaceError, match="needs stop > start and cells >= 1"):
             lp.interval(*bad)
-    with pytest.raises(lp.SpaceError, match="at least one unknown"):
+    with pytest.raises(lp.errors.SpaceError, match="at least one unknown"):
         lp.Model(lp.Field(mesh, element), {}, product)
-    with pytest.raises(lp.SpaceError, match="'R b': the name must be a Python identifier"):
+    with pytest.raises(lp.errors.SpaceError, match="'R b': the name must be a Python identifier"):
         lp.Model(lp.Field(mesh, element), {"R b": lp.Scalar()}, product)
 
 

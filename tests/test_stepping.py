@@ -140,7 +140,7 @@ def test_substeps_are_the_same_steps_taken_by_hand(scheme):
 
 def interval(t0=1.0, t1=3.0, z0=(2.0, np.nan, 1.0), z1=(4.0, 6.0, np.nan)):
     inputs = (Inputs({"Q": 10.0}), Inputs({"Q": 20.0}))
-    return lp.Interval(t0, t1, *inputs, np.array(z0), np.array(z1))
+    return lp.stepping.Interval(t0, t1, *inputs, np.array(z0), np.array(z1))
 
 
 def test_between_two_samples_data_are_linear():
@@ -267,22 +267,28 @@ class Equation:
 
 def test_newton_solves():
     equation = Equation([8.0, 27.0])
-    found = lp.Newton(tolerance=1e-10).solve(equation, np.array([2.5, 2.5])).at
+    found = lp.stepping.Newton(tolerance=1e-10).solve(equation, np.array([2.5, 2.5])).at
     np.testing.assert_allclose(found.y, [2.0, 3.0], rtol=1e-9)
     assert found.size <= 1e-10
-    by_function = lp.Newton(tolerance=1e-10).solve(equation, lambda: np.array([2.5, 2.5])).at
+    by_function = (
+        lp.stepping.Newton(tolerance=1e-10).solve(equation, lambda: np.array([2.5, 2.5])).at
+    )
     np.testing.assert_array_equal(by_function.y, found.y)
 
 
 def test_newton_keeps_its_factor_while_it_is_good():
     equation = Equation([8.0])
-    lp.Newton(tolerance=1e-10).solve(equation, np.array([2.001]))
+    lp.stepping.Newton(tolerance=1e-10).solve(equation, np.array([2.001]))
     assert equation.factors == 1
 
 
 @pytest.mark.parametrize("tolerance", [1e-15, 1e-17, 0.0])
 def test_newton_goes_as_far_as_rounding_lets_it(tolerance):
-    found = lp.Newton(tolerance=tolerance).solve(Equation([3.0, 1e5]), np.array([1.5, 50.0])).at
+    found = (
+        lp.stepping.Newton(tolerance=tolerance)
+        .solve(Equation([3.0, 1e5]), np.array([1.5, 50.0]))
+        .at
+    )
     np.testing.assert_allclose(found.y, np.cbrt([3.0, 1e5]), rtol=4e-16)
 
 
@@ -297,7 +303,7 @@ def test_newton_goes_as_far_as_rounding_lets_it(tolerance):
 )
 def test_newton_begins_where_the_start_is_good(near, kept, made):
     equation = Cubic()
-    newton = lp.Newton(tolerance=1e-10, share=0.0)
+    newton = lp.stepping.Newton(tolerance=1e-10, share=0.0)
     found = newton.solve(equation, lambda: pytest.fail("not needed"), Near(np.array([near]), kept))
     np.testing.assert_allclose(found.at.y, 6.0, rtol=1e-9)
     assert equation.factors == made
@@ -307,20 +313,26 @@ def test_newton_stops_at_a_share_of_the_residual_that_the_start_had():
     near = Near(np.array([6.001]), Slope(2.0 / 0.96))  # leaves about a twentieth in each update
     start = np.array([5.6])
     had = Cubic().evaluate(near.y).size
-    few = lp.Newton(tolerance=1e-12, share=0.1).solve(Cubic(), start, near)
-    more = lp.Newton(tolerance=1e-12, share=1e-3).solve(Cubic(), start, near)
-    full = lp.Newton(tolerance=1e-12, share=0.0).solve(Cubic(), start, near)
+    few = lp.stepping.Newton(tolerance=1e-12, share=0.1).solve(Cubic(), start, near)
+    more = lp.stepping.Newton(tolerance=1e-12, share=1e-3).solve(Cubic(), start, near)
+    full = lp.stepping.Newton(tolerance=1e-12, share=0.0).solve(Cubic(), start, near)
     assert 1 == few.updates < more.updates < full.updates
     assert few.at.size <= 0.1 * had
     assert more.at.size <= 1e-3 * had
     assert full.at.size <= 1e-12
-    capped = lp.Newton(tolerance=1e-12, share=0.5, ceiling=1e-9).solve(Cubic(), start, near)
+    capped = lp.stepping.Newton(tolerance=1e-12, share=0.5, ceiling=1e-9).solve(
+        Cubic(), start, near
+    )
     assert capped.at.size <= 1e-9
 
 
 def test_a_stage_that_needs_a_small_difference_is_solved_until_it_is_resolved():
-    rough = lp.Newton(tolerance=1e-2).solve(Equation([8.0]), np.array([2.5])).at
-    fine = lp.Newton(tolerance=1e-2).solve(Equation([8.0], resolution=1e-9), np.array([2.5])).at
+    rough = lp.stepping.Newton(tolerance=1e-2).solve(Equation([8.0]), np.array([2.5])).at
+    fine = (
+        lp.stepping.Newton(tolerance=1e-2)
+        .solve(Equation([8.0], resolution=1e-9), np.array([2.5]))
+        .at
+    )
     assert abs(rough.residual[0]) > 1e-9
     assert abs(fine.residual[0]) <= 1e-9
 
@@ -329,9 +341,9 @@ def test_a_stage_that_needs_a_small_difference_is_solved_until_it_is_resolved():
 def test_a_prediction_that_leads_nowhere_is_given_up(near):
     """From there Newton goes far below, or does not even begin."""
     equation, plain = Cubic(), Cubic()
-    newton = lp.Newton(tolerance=1e-10, iterations=12)
+    newton = lp.stepping.Newton(tolerance=1e-10, iterations=12)
     y = newton.solve(equation, np.array([5.8]), Near(np.array([near]), Slope(1e-3))).at.y
-    expected = lp.Newton(tolerance=1e-10).solve(plain, np.array([5.8])).at.y
+    expected = lp.stepping.Newton(tolerance=1e-10).solve(plain, np.array([5.8])).at.y
     np.testing.assert_allclose(y, expected, rtol=1e-9)
 
 
@@ -345,14 +357,14 @@ def test_an_update_that_goes_too_far_is_shortened():
         def factor(self, at, last=None):
             return Slope(1.0 / (1.0 + at.y[0] ** 2))
 
-    found = lp.Newton(tolerance=1e-12).solve(Arc([0.0]), np.array([20.0])).at
+    found = lp.stepping.Newton(tolerance=1e-12).solve(Arc([0.0]), np.array([20.0])).at
     assert abs(found.y[0]) < 1e-12
 
 
 @pytest.mark.parametrize("slope", [0.01, 0.3, 30.0, 1e4])
 def test_a_wrong_factor_never_makes_a_solution(slope):
     """Updates are as small as one likes with a factor that is too large; the residual is not."""
-    newton = lp.Newton(tolerance=1e-8, share=0.0)
+    newton = lp.stepping.Newton(tolerance=1e-8, share=0.0)
     near = Near(np.array([2.1]), Slope(slope * 12.0))
     found = newton.solve(Equation([8.0]), np.array([2.5]), near).at
     assert abs(found.y[0] ** 3 - 8.0) <= 8e-8
@@ -361,11 +373,11 @@ def test_a_wrong_factor_never_makes_a_solution(slope):
 @pytest.mark.parametrize(
     ("equation", "start", "newton", "code"),
     [
-        (Equation([8.0]), 3.0, lp.Newton(iterations=1), "not_converged"),
-        (Equation([8.0], slope=-3.0), 3.0, lp.Newton(iterations=2000), "not_converged"),
-        (Equation([8.0]), 0.0, lp.Newton(), "singular"),
-        (Equation([8.0], slope=1e-200), 3.0, lp.Newton(), "not_finite"),
-        (Equation([np.nan]), 1.0, lp.Newton(), "not_finite"),
+        (Equation([8.0]), 3.0, lp.stepping.Newton(iterations=1), "not_converged"),
+        (Equation([8.0], slope=-3.0), 3.0, lp.stepping.Newton(iterations=2000), "not_converged"),
+        (Equation([8.0]), 0.0, lp.stepping.Newton(), "singular"),
+        (Equation([8.0], slope=1e-200), 3.0, lp.stepping.Newton(), "not_finite"),
+        (Equation([np.nan]), 1.0, lp.stepping.Newton(), "not_finite"),
     ],
 )
 def test_newton_says_how_it_failed(equation, start, newton, code):
@@ -378,7 +390,7 @@ def test_newton_says_how_it_failed(equation, start, newton, code):
 def test_tolerance_is_relative_in_each_line():
     """State and parameter may differ by many orders of magnitude."""
     equation = Equation([1e-24, 1e24])
-    y = lp.Newton(tolerance=1e-9).solve(equation, np.array([1.3e-8, 1.1e8])).at.y
+    y = lp.stepping.Newton(tolerance=1e-9).solve(equation, np.array([1.3e-8, 1.1e8])).at.y
     np.testing.assert_allclose(y, [1e-8, 1e8], rtol=1e-8)
 
 
@@ -389,9 +401,9 @@ def test_forward_stage_of_an_affine_model_is_one_factorisation():
     q = np.ones(model.Q.dim)
     u = np.random.default_rng(1).standard_normal(model.X.dim)
     first = forward.solve(u, q, 0.1, Moment(0.1))
-    kept = forward.factor(q, 0.1, lp.Moment())
-    assert forward.factor(q.copy(), 0.1, lp.Moment()) is kept
-    assert forward.factor(2 * q, 0.1, lp.Moment()) is not kept
+    kept = forward.factor(q, 0.1, lp.fem.Moment())
+    assert forward.factor(q.copy(), 0.1, lp.fem.Moment()) is kept
+    assert forward.factor(2 * q, 0.1, lp.fem.Moment()) is not kept
     # What is kept never changes the numbers.
     np.testing.assert_array_equal(ForwardStage(model).solve(u, q, 0.1, Moment(0.1)), first)
     # And it solves the equation.
@@ -462,7 +474,7 @@ def test_shortcuts_of_affine_models_do_not_change_the_numbers():
 def test_tangent_is_the_derivative_of_a_stage():
     """S du = M dc/h: sensitivities are derivatives of the discrete step, not approximations."""
     model, _ = cubic()
-    forward = ForwardStage(model, lp.Newton(tolerance=1e-13))
+    forward = ForwardStage(model, lp.stepping.Newton(tolerance=1e-13))
     q = np.array([1.5])
     rng = np.random.default_rng(2)
     c, dc = rng.standard_normal((2, model.X.dim))

@@ -232,7 +232,7 @@ def _weighted(u, v, x):
 
 
 def _rough(u, v, x):
-    return u * v + lp.dot(lp.grad(u), lp.grad(v)) + lp.ddot(lp.hess(u), lp.hess(v))
+    return u * v + lp.dot(lp.grad(u), lp.grad(v)) + lp.fem.ddot(lp.fem.hess(u), lp.fem.hess(v))
 
 
 def test_lanczos_gives_what_the_dense_solver_gives(monkeypatch):
@@ -293,7 +293,7 @@ def test_all_propositions_hold_on_the_excited_twin(u0, data):
     """With exact data d = 0, so the three propositions speak about the same run."""
     gain = 1000.0
     twin = twin_of(seed_excited, 60)
-    tracker = follow(twin, lp.GradientLaw(gain, lp.ResidualDamping(1.0)), u0)
+    tracker = follow(twin, lp.GradientLaw(gain, lp.laws.ResidualDamping(1.0)), u0)
     c = constants_of(twin, gain)
     dg.conditions(tracker.errors, c, data=data, c1=1.0).raise_if_failed()
     report = dg.bounds(tracker.errors, c, data=data).raise_if_failed()
@@ -328,7 +328,7 @@ def test_the_energy_never_grows_with_the_default_rule(gain):
     """ResidualDamping leaves out the part of the bound with p; bound 1 holds all the same."""
     twin = twin_of(seed, 20)
     tracker = follow(
-        twin, lp.GradientLaw(gain, lp.ResidualDamping(1.0)), lambda x: seed.u_true(x, 0.0)
+        twin, lp.GradientLaw(gain, lp.laws.ResidualDamping(1.0)), lambda x: seed.u_true(x, 0.0)
     )
     lines = dg.bounds(tracker.errors, constants_of(twin, gain)).lines
     assert lines[0].ok
@@ -336,7 +336,7 @@ def test_the_energy_never_grows_with_the_default_rule(gain):
 
 def test_a_condition_that_fails_says_what_to_do():
     twin = twin_of(seed, 10)
-    tracker = follow(twin, lp.GradientLaw(100.0, lp.ResidualDamping(0.1)), 0.0)
+    tracker = follow(twin, lp.GradientLaw(100.0, lp.laws.ResidualDamping(0.1)), 0.0)
     report = dg.conditions(tracker.errors, constants_of(twin, 100.0))
     assert not report.ok
     assert "mu is below the paper's bound" in str(report)
@@ -351,7 +351,7 @@ def test_noise_and_T_star():
     full = lp.Full(reconstruction=Tikhonov("V", 1e-5))
     noise = RelativeNoise(0.01)
     twin = twin_of(seed_excited, 0, observation=full, times=0.01 * np.arange(60), noise=noise)
-    tracker = follow(twin, lp.GradientLaw(gain, lp.ResidualDamping(10.0)), 0.0)
+    tracker = follow(twin, lp.GradientLaw(gain, lp.laws.ResidualDamping(10.0)), 0.0)
     c = constants_of(twin, gain)
     T = dg.stopping_time(tracker.errors, c)
     assert 0.0 < T < 0.5
@@ -376,7 +376,7 @@ def test_smoothed_data_with_the_papers_rule():
         noise=RelativeNoise(0.001),
     )
     c = constants_of(twin, gain)
-    tracker = follow(twin, lp.GradientLaw(gain, lp.ResidualDamping(1.0)), 0.0)
+    tracker = follow(twin, lp.GradientLaw(gain, lp.laws.ResidualDamping(1.0)), 0.0)
     d = max(item.d.V for item in tracker.errors)
     rate = max(item.rate for item in tracker.errors)
     law = lp.GradientLaw(gain, SmoothedBound(c, 0.0, d, rate, 1.0, 1e-6))
@@ -454,7 +454,7 @@ def test_gramian_of_a_constant_state_is_that_of_one_matrix():
     u = model.initial(lambda x: np.sin(np.pi * x[0]))
     excitation = dg.Excitation(spaces, 0.2, gain=9.0)
     found = excitation.spectrum(accumulated(excitation, [u] * 5, 0.1))
-    norm = constants_module._norm_of_A(model, u, lp.Moment(0.0))[0]
+    norm = constants_module._norm_of_A(model, u, lp.fem.Moment(0.0))[0]
     assert found.strength[0] == pytest.approx(0.2 * norm * 3.0 * np.sqrt(2), rel=1e-9)
     assert found.windows == 2
     gram = found.modes.T @ model.Q.gram @ found.modes / 9.0
@@ -559,7 +559,7 @@ def test_links_refuse(options, words):
 
 def test_interpolation_along_a_run_stays_within_its_bounds():
     twin = twin_of(seed_excited, 30)
-    tracker = follow(twin, lp.GradientLaw(1000.0, lp.ResidualDamping(1.0)), 0.0)
+    tracker = follow(twin, lp.GradientLaw(1000.0, lp.laws.ResidualDamping(1.0)), 0.0)
     found = dg.interpolation([item.r for item in tracker.errors])
     c = constants_of(twin, 1000.0)
     assert 1 / c.observed_ratio <= found.c_int <= found.C_int <= 1 + 1e-9
@@ -572,7 +572,7 @@ def test_interpolation_along_a_run_stays_within_its_bounds():
 
 def test_the_page_with_truth():
     twin = twin_of(seed_excited, 40, noise=RelativeNoise(1e-4))
-    law = lp.GradientLaw(1000.0, lp.ResidualDamping(1.0))
+    law = lp.GradientLaw(1000.0, lp.laws.ResidualDamping(1.0))
     identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=0.0)
     found = dg.theory_report(identifier, twin, noise=1e-4, twin=twin)
     assert [report.name for report in found.reports] == [

@@ -136,9 +136,11 @@ class Case:
         How many are taken.
     """
 
-    law: lp.Law[Any, Any]
+    law: lp.laws.Law[Any, Any]
     model: Callable[[], lp.Model] = rod
-    sensors: Callable[[], lp.Observation] = lambda: lp.Points([0.25, 0.5, 0.75], noise=0.05)
+    sensors: Callable[[], lp.observation.Observation] = lambda: lp.Points(
+        [0.25, 0.5, 0.75], noise=0.05
+    )
     missing: float = 0.0
     samples: int = 6
 
@@ -146,25 +148,25 @@ class Case:
         return lp.Identifier(model, self.sensors(), self.law, u0=0.0, halvings=0)
 
 
-def inner() -> lp.Observation:
+def inner() -> lp.observation.Observation:
     return lp.Subdomain(lambda x: (x[0] > 0.2) & (x[0] < 0.8))
 
 
-def averages() -> lp.Observation:
+def averages() -> lp.observation.Observation:
     return lp.Averages({"a": lambda x: x[0] < 0.4, "b": lambda x: x[0] > 0.5}, noise=0.02)
 
 
-def smoothed() -> lp.Observation:
-    return lp.Full(noise=0.02, reconstruction=lp.Tikhonov("X"))
+def smoothed() -> lp.observation.Observation:
+    return lp.Full(noise=0.02, reconstruction=lp.observation.Tikhonov("X"))
 
 
-def probe() -> lp.Observation:
+def probe() -> lp.observation.Observation:
     return lp.Combined(
-        [lp.Moving({"probe": "at"}, noise=0.05), lp.Points({"fixed": 0.4}, noise=0.05)]
+        [lp.observation.Moving({"probe": "at"}, noise=0.05), lp.Points({"fixed": 0.4}, noise=0.05)]
     )
 
 
-GUARDED = lp.SensitivityLaw(guards=lp.Guards(), jumps=lp.Jumps(settle=4))
+GUARDED = lp.SensitivityLaw(guards=lp.laws.Guards(), jumps=lp.Jumps(settle=4))
 REPLAYING = lp.SensitivityLaw(replay=lp.Replay(first=4))
 
 CASES = {
@@ -183,8 +185,8 @@ CASES = {
     ),
     "auto gain, inputs": Case(lp.GradientLaw(gain="auto"), powered_field, inner, missing=0.02),
     "auto gain, square": Case(lp.GradientLaw(gain="auto"), square, inner),
-    "Baumeister": Case(lp.BaumeisterLaw(gain=10.0), field_rod, lp.Full),
-    "Kuegler": Case(lp.KueglerLaw(gain=10.0), nonlinear_rod, inner, samples=4),
+    "Baumeister": Case(lp.laws.BaumeisterLaw(gain=10.0), field_rod, lp.Full),
+    "Kuegler": Case(lp.laws.KueglerLaw(gain=10.0), nonlinear_rod, inner, samples=4),
     "sensitivity": Case(lp.SensitivityLaw(), samples=8),
     "sensitivity, inputs": Case(lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=8),
     "sensitivity, nonlinear": Case(lp.SensitivityLaw(), nonlinear_rod, samples=5),

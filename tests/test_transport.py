@@ -134,15 +134,15 @@ def test_the_equations_build():
     four = {**pair, "phi": SHARE, "omega": ONE}
     both = EQUATIONS["mobile_immobile"].build(mesh, four, {}, inlet="flux")
     assert list(both.state_space.blocks) == ["c", "s"]
-    with pytest.raises(lp.ModelError, match="fed by the input c_in"):
+    with pytest.raises(lp.errors.ModelError, match="fed by the input c_in"):
         EQUATIONS["mobile_immobile"].build(mesh, four, {"left": 1.0}, inlet="flux")
 
 
 def test_what_is_refused():
     mesh = lp.interval(0.0, 1.0, 4)
-    with pytest.raises(lp.ModelError, match="inlet='open'; expected one of flux, fixed"):
+    with pytest.raises(lp.errors.ModelError, match="inlet='open'; expected one of flux, fixed"):
         advection_dispersion(mesh, ONE, ONE, inlet="open")
-    with pytest.raises(lp.ModelError, match="R must be at least 1"):
+    with pytest.raises(lp.errors.ModelError, match="R must be at least 1"):
         advection_dispersion(mesh, ONE, ONE, R=0.0)
 
 

@@ -98,7 +98,9 @@ def test_analytic_truth_is_the_formula() -> None:
 
 
 @pytest.mark.parametrize("observation", [SENSORS, MIDDLE])
-def test_fine_truth_lies_between_discrete_and_analytic(observation: lp.Observation) -> None:
+def test_fine_truth_lies_between_discrete_and_analytic(
+    observation: lp.observation.Observation,
+) -> None:
     fine = twin(truth="fine", observation=observation, fine=build(48), fine_dt=0.005)
     discrete = twin(observation=observation)
     exact = twin(truth="analytic", observation=observation)
@@ -132,7 +134,9 @@ def test_same_seed_same_noise() -> None:
 
 @pytest.mark.study
 @pytest.mark.parametrize("observation", [SENSORS, MIDDLE, lp.Full()])
-def test_relative_noise_has_its_level_in_the_norm_of_Z(observation: lp.Observation) -> None:
+def test_relative_noise_has_its_level_in_the_norm_of_Z(
+    observation: lp.observation.Observation,
+) -> None:
     level, squares = 0.05, []
     for seed in range(300):
         noisy = twin(observation=observation, noise=RelativeNoise(level), seed=seed)
@@ -169,7 +173,7 @@ def test_absolute_noise() -> None:
     ]
     std = np.std(draws, axis=0).mean(axis=0)
     assert np.allclose(std, [0.1, 2.0], rtol=0.1)
-    with pytest.raises(lp.ConfigurationError, match="2 standard deviations for"):
+    with pytest.raises(lp.errors.ConfigurationError, match="2 standard deviations for"):
         list(twin(noise=AbsoluteNoise([0.1, 2.0])))
 
 
@@ -251,18 +255,18 @@ def test_inputs_travel_with_the_samples() -> None:
     ],
 )
 def test_refusals(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(lp.ConfigurationError, match=message):
+    with pytest.raises(lp.errors.ConfigurationError, match=message):
         twin(**options)
 
 
 def test_refuses_what_has_no_answer() -> None:
-    with pytest.raises(lp.ConfigurationError, match="level must be"):
+    with pytest.raises(lp.errors.ConfigurationError, match="level must be"):
         RelativeNoise(-0.1)
-    with pytest.raises(lp.ConfigurationError, match="one number >= 0"):
+    with pytest.raises(lp.errors.ConfigurationError, match="one number >= 0"):
         AbsoluteNoise(-1.0)
-    with pytest.raises(lp.ConfigurationError, match="not a sample time"):
+    with pytest.raises(lp.errors.ConfigurationError, match="not a sample time"):
         twin().u(0.05)
-    with pytest.raises(lp.ConfigurationError, match="q_true is zero"):
+    with pytest.raises(lp.errors.ConfigurationError, match="q_true is zero"):
         twin(q_true=0.0).baseline()
 
 
@@ -282,5 +286,5 @@ def test_a_truth_that_cannot_be_computed_says_so() -> None:
         u0=0.0,
         times=[0.0, 1.0],
     )
-    with pytest.raises(lp.ConfigurationError, match=r"truth .* cannot be computed"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"truth .* cannot be computed"):
         list(stream)

@@ -51,7 +51,7 @@ PLACES: dict[str, tuple[float, float, float, list[Any], Any]] = {
     ),
     "exponent of a reaction": (
         1.5, 0.5, 2.0,
-        [lambda q, u, v, x: lp.absolute(u + 0.1) ** q.a * v,
+        [lambda q, u, v, x: lp.fem.absolute(u + 0.1) ** q.a * v,
          lp.On("left", lambda q, u, v, x: -swing(x) * v)],
         None,
     ),
@@ -88,7 +88,9 @@ def model_of(place: str) -> lp.Model:
     return lp.Model(state, {"a": lp.Scalar(prior, std)}, A=[*base, *terms], initial=initial)
 
 
-def found(model: lp.Model, sensors: lp.Observation, truth: Any, **law: Any) -> lp.Estimate:
+def found(
+    model: lp.Model, sensors: lp.observation.Observation, truth: Any, **law: Any
+) -> lp.Estimate:
     """Return the last estimate from noisy data of the model itself."""
     rng = np.random.default_rng(0)
     filtering = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None, verdict=False, **law)
@@ -98,7 +100,7 @@ def found(model: lp.Model, sensors: lp.Observation, truth: Any, **law: Any) -> l
     u = model.initial_state(exact)
 
     def sample(t: float) -> Any:
-        z = identifier.observed.predict(u, physical, lp.Moment(t))
+        z = identifier.observed.predict(u, physical, lp.fem.Moment(t))
         return z + NOISE * rng.standard_normal(len(z))
 
     estimate = identifier.step(0.0, sample(0.0))
@@ -130,11 +132,13 @@ def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
         unknowns["offset"] = lp.Scalars(("A", "C"), 0.0, 0.5)
         truth["offset"] = [0.3, -0.2]
         direct = {name: lambda q, x, name=name: q.offset[name] for name in ("A", "C")}
-        sensors: lp.Observation = lp.Points(dict(points.points), direct=direct, noise=NOISE)
+        sensors: lp.observation.Observation = lp.Points(
+            dict(points.points), direct=direct, noise=NOISE
+        )
     elif what == "gain":
         unknowns["gain"] = lp.Scalars(("A", "B"), 1.0, 0.2)
         truth["gain"] = [1.1, 0.9]
-        sensors = lp.Calibrated(
+        sensors = lp.observation.Calibrated(
             points,
             lambda y, q, x: y * np.array([q.gain["A"], q.gain["B"], 1.0]),
             noise=NOISE,
@@ -142,7 +146,7 @@ def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
     else:
         unknowns["R"] = lp.Scalar(0.1, 0.1)
         truth["R"] = 0.25
-        sensors = lp.Calibrated(
+        sensors = lp.observation.Calibrated(
             points, lambda y, q, x: y + np.array([q.R, 0.0, 0.0]) * swing(x), noise=NOISE
         )
     model = lp.Model(lp.Field(MESH, ElementLineP1()), unknowns, A=base)

@@ -61,7 +61,7 @@ def test_transforms_have_their_inverse_and_derivatives(latent: float, lower: flo
 
 
 @pytest.mark.parametrize(
-    "evolution", [CONSTANT, lp.RandomWalk(0.3), lp.MeanReverting(2.0), lp.Periodic(5.0, 3)]
+    "evolution", [CONSTANT, lp.RandomWalk(0.3), lp.MeanReverting(2.0), lp.fem.Periodic(5.0, 3)]
 )
 def test_transitions_are_exponentials_and_compose(evolution: Any):
     K = evolution.generator
@@ -86,9 +86,9 @@ UNKNOWNS = {
         {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}, 0.4, 0.2, transform="log"
     ),
     "field": lp.Field(mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.2, transform="log"),
-    "periodic": lp.Scalar(0.4, 0.1, evolution=lp.Periodic(5.0, 2)),
+    "periodic": lp.Scalar(0.4, 0.1, evolution=lp.fem.Periodic(5.0, 2)),
     "periodic field": lp.Field(
-        mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.1, evolution=lp.Periodic(5.0)
+        mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.1, evolution=lp.fem.Periodic(5.0)
     ),
     "walk": lp.Scalar(0.4, 0.2, evolution=lp.RandomWalk(0.1)),
     "own": lp.Piecewise(
@@ -151,14 +151,14 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
         (lambda: lp.Scalars(()), "names must be given and differ"),
         (lambda: lp.RandomWalk(0.0), "rate must be a positive number"),
         (lambda: lp.MeanReverting(-1.0), "time must be a positive number"),
-        (lambda: lp.Periodic(1.0, 0), "harmonics must be at least 1"),
+        (lambda: lp.fem.Periodic(1.0, 0), "harmonics must be at least 1"),
         (lambda: lp.Field(mesh, ElementLineP1(), bounds=(0, 1)), "bounds need transform"),
         (
             lambda: lp.Field(mesh, ElementLineHermite(), prior=1.0, transform="log"),
             "element of first order",
         ),
         (
-            lambda: lp.Scalar(1.0, 1.0, transform="log", evolution=lp.Periodic(1.0)),
+            lambda: lp.Scalar(1.0, 1.0, transform="log", evolution=lp.fem.Periodic(1.0)),
             "together with Periodic",
         ),
     ],
@@ -190,14 +190,14 @@ def test_the_gradient_law_learns_a_positive_field_and_a_nonlinear_unknown():
 
     model = rod({"a": UNKNOWNS["field"], "c": lp.Scalar(1.0, 0.01)}, A)
     full = lp.Full()
-    law = lp.GradientLaw(gain=100.0, damping=lp.ResidualDamping(10.0))
+    law = lp.GradientLaw(gain=100.0, damping=lp.laws.ResidualDamping(10.0))
     identifier = lp.Identifier(model, full, law)
     truth = model.initial_parameter({"a": lambda x: 0.5 + 0.2 * np.sin(3 * x[0]), "c": 1.0})
     forward, u = ForwardStage(model), model.initial(0.0)
     times = np.arange(0.0, 20.0, 0.05)
     identifier.step(0.0, identifier.observed.G @ u)
     for t0, t1 in itertools.pairwise(times):
-        u = forward.solve(u, truth, t1 - t0, lp.Moment(t1))
+        u = forward.solve(u, truth, t1 - t0, lp.fem.Moment(t1))
         estimate = identifier.step(t1, identifier.observed.G @ u)
         assert estimate.status.ok
     exact = model.latent.value(truth)
@@ -226,7 +226,7 @@ def test_a_periodic_unknown_is_followed_without_delay():
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
     samples = data(a, np.arange(0.0, 30.0, 0.05))
-    periodic = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.Periodic(10.0))})
+    periodic = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.fem.Periodic(10.0))})
     walking = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.RandomWalk(0.1))})
     error, deviations = rms(estimates(periodic, BARE, samples), a, 10.0)
     slower, _ = rms(estimates(walking, BARE, samples), a, 10.0)
@@ -254,14 +254,14 @@ def test_the_gradient_law_rotates_a_periodic_unknown():
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
     errors = {}
-    for name, evolution in (("periodic", lp.Periodic(10.0)), ("constant", CONSTANT)):
+    for name, evolution in (("periodic", lp.fem.Periodic(10.0)), ("constant", CONSTANT)):
         model = rod({"a": lp.Scalar(0.2, 0.2, evolution=evolution)})
-        law = lp.GradientLaw(gain=10.0, damping=lp.ResidualDamping(10.0))
+        law = lp.GradientLaw(gain=10.0, damping=lp.laws.ResidualDamping(10.0))
         identifier = lp.Identifier(model, lp.Full(), law)
         forward, u = ForwardStage(rod({"a": lp.Scalar(0.3)})), model.initial(0.0)
         times, found = np.arange(0.0, 40.0, 0.05), []
         for t0, t1 in itertools.pairwise(times):
-            u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.Moment(t1))
+            u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.fem.Moment(t1))
             found.append(identifier.step(t1, identifier.observed.G @ u))
         errors[name] = np.sqrt(np.mean([(e.parameters["a"][0] - a(e.t)) ** 2 for e in found[400:]]))
     assert 3 * errors["periodic"] < errors["constant"]
@@ -344,24 +344,24 @@ def test_a_model_takes_more_unknowns_for_its_sensors():
     np.testing.assert_array_equal(
         more.initial_state(more.initial_parameter()), model.initial_state(np.array([0.2]))
     )
-    with pytest.raises(lp.ModelError, match="'a' is taken"):
+    with pytest.raises(lp.errors.ModelError, match="'a' is taken"):
         model.with_unknowns({"a": lp.Scalar()})
-    with pytest.raises(lp.ModelError, match="has no name"):
+    with pytest.raises(lp.errors.ModelError, match="has no name"):
         rod(lp.Scalar(), lambda q, u, v, x: q * u * v).with_unknowns({"b": lp.Scalar()})
 
 
 @pytest.mark.parametrize(
     "kink",
     [
-        lambda u: lp.absolute(u - 0.5),
-        lambda u: lp.maximum(u, 0.5 * u**2),
-        lambda u: lp.minimum(u, 0.3),
-        lambda u: lp.positive(u - 0.2) ** 2,
+        lambda u: lp.fem.absolute(u - 0.5),
+        lambda u: lp.fem.maximum(u, 0.5 * u**2),
+        lambda u: lp.fem.minimum(u, 0.3),
+        lambda u: lp.fem.positive(u - 0.2) ** 2,
     ],
 )
 def test_functions_with_kinks_have_their_derivatives(kink: Any):
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
-        return (q.a**2 + lp.absolute(q.a - 3.0)) * kink(u) * v
+        return (q.a**2 + lp.fem.absolute(q.a - 3.0)) * kink(u) * v
 
     check_model(rod({"a": lp.Scalar(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()
 

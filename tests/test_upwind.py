@@ -11,7 +11,7 @@ from livepde.fem import upwind
 
 def steady(model, u):
     K, free = model.form_B.matrix("v", "u").tocsc(), np.flatnonzero(model.X.free)
-    u = model.impose(u, lp.Moment())
+    u = model.impose(u, lp.fem.Moment())
     u[free] = spsolve(K[free][:, free], -(K @ u)[free])
     return u
 
@@ -67,7 +67,7 @@ def test_no_wiggles_in_the_plane():
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: (
             kappa * lp.dot(lp.grad(u), lp.grad(v))
-            + lp.dot(lp.mul(upwind(b, kappa, x.h), lp.grad(u)), lp.grad(v))
+            + lp.dot(lp.fem.mul(upwind(b, kappa, x.h), lp.grad(u)), lp.grad(v))
             + b[0] * lp.grad(u)[0] * v
         ),
     )

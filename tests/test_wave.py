@@ -53,7 +53,7 @@ def test_the_energy_decays_only_by_damping(d):
 
 def test_a_moving_end_needs_its_velocity():
     moving = {"left": lambda x, t: np.sin(t)}
-    with pytest.raises(lp.ModelError, match="give its time derivative"):
+    with pytest.raises(lp.errors.ModelError, match="give its time derivative"):
         wave(STRING, lp.Scalar(1.0), dirichlet=moving)
     speed = {"left": lambda x, t: np.cos(t)}
     model = wave(STRING, lp.Scalar(1.0), dirichlet=moving, velocity=speed)
@@ -64,7 +64,7 @@ def test_a_moving_end_needs_its_velocity():
 
 def test_shipped_checks():
     model = wave(STRING, lp.Scalar(1.0, 0.5), lp.Scalar(0.2, 0.1), FIXED, f=lambda x, t: x[0])
-    lp.check_model(model).raise_if_failed()
+    lp.diagnostics.check_model(model).raise_if_failed()
     assert list(model.parameter_space.labels) == ["c2", "d"]
 
 

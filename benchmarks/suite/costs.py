@@ -13,7 +13,8 @@ from typing import Any
 from benchmarks import ROOT
 from benchmarks.fleet import fleet
 from benchmarks.step import problem, step
-from livepde import GradientLaw, Identifier, ResidualDamping, SensitivityLaw
+from livepde import GradientLaw, Identifier, SensitivityLaw
+from livepde.laws import ResidualDamping
 
 LAWS = ("gradient", "sensitivity")
 MODES = 10

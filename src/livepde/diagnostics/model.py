@@ -333,7 +333,7 @@ def _taylor(
         "step take the derivative."
         if given
         else "a complex step cannot see abs, max, min or a comparison: write them as "
-        f"livepde.absolute, maximum, minimum, or give d{name[0]}= with the derivative in u."
+        f"livepde.fem.absolute, maximum, minimum, or give d{name[0]}= with the derivative in u."
     )
     if name.startswith("d("):
         remedy = remedy.replace("dd=", "dA=")

@@ -29,7 +29,7 @@ def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
     --------
     >>> import scipy.sparse as sp
     >>> import livepde as lp
-    >>> check_space(lp.HilbertSpace(sp.csr_array([[2.0, 1.0], [1.0, 2.0]]))).ok
+    >>> check_space(lp.spaces.HilbertSpace(sp.csr_array([[2.0, 1.0], [1.0, 2.0]]))).ok
     True
     """
     rng = np.random.default_rng(seed)

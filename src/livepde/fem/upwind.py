@@ -41,7 +41,7 @@ def upwind(b: Any, kappa: Any, h: Any) -> Any:
     >>> k = 0.01
     >>> line = lambda u, v, x: (k + upwind(2.0, k, x.h)) * lp.dot(lp.grad(u), lp.grad(v))
     >>> def plane(u, v, x):
-    ...     return lp.dot(lp.mul(upwind((2.0, x[0]), k, x.h), lp.grad(u)), lp.grad(v))
+    ...     return lp.dot(lp.fem.mul(upwind((2.0, x[0]), k, x.h), lp.grad(u)), lp.grad(v))
     >>> round(float(upwind(2.0, k, 0.1)), 6)  # nearly |b| h/2
     0.09
     """

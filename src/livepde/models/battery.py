@@ -34,7 +34,7 @@ def battery_particle(
 
     I > 0 extracts lithium, as in the negative electrode during discharge. The concentration at the
     surface is the state at the right end of the mesh; a voltage is a function of it, see
-    `livepde.Calibrated`.
+    `livepde.observation.Calibrated`.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def grouted_borehole(
     mesh
         Radius in m, best graded: `livepde.interval(0.9 * r_p, r_far, 60, geometric=True)`. It
         begins a bit below r_p, the fluid; the nodes next to r_p and r_b are moved onto them. Or
-        radius and height in m, `livepde.grid(r, z)` with z from 0 to H/2, graded to 0.
+        radius and height in m, `livepde.fem.grid(r, z)` with z from 0 to H/2, graded to 0.
     k
         Conductivity of the ground in W/(m K).
     rho_c

@@ -27,8 +27,8 @@ def burgers(
     Parameters
     ----------
     mesh
-        `livepde.interval(...)` or `livepde.line(...)`. A shock is about 4 nu/(a jump) wide and must
-        be resolved by several cells of the default element.
+        `livepde.interval(...)` or `livepde.fem.line(...)`. A shock is about 4 nu/(a jump) wide and
+        must be resolved by several cells of the default element.
     nu
         Viscosity: unknown or a number.
     advection
