@@ -530,3 +530,57 @@ def test_every_visitor_has_a_page_that_needs_nothing_from_elsewhere(tmp_path):
         shown = answer.read().decode()
     assert "https://" not in shown
     assert os.fspath(tmp_path) not in shown
+
+
+@pytest.fixture
+def several(tmp_path):
+    """A folder with two runs, of which one has failed at its first sample."""
+    for name in ("east", "north west"):
+        who = identifier()
+        with begun(tmp_path / name, who, title=name) as journal:
+            drive(who, samples(4 if name == "east" else 0), journal=journal)
+    (tmp_path / "notes").mkdir()
+    return tmp_path
+
+
+def test_many_runs_are_a_table(several):
+    from livepde.dashboard.overview import PerRun, overview_table
+
+    views = PerRun(several, "", 10, lambda name: View(several / name))
+    for _ in range(2):
+        told, table = overview_table(views)
+    assert told.children == "2 runs."
+    titles = [cell.children for cell in table.children[0].children.children]
+    assert titles[4:] == ["alpha [m²/s] ± std. dev.", "loss [1/s] ± std. dev."]
+    rows = {row.children[0].children.children: row.children for row in table.children[1].children}
+    assert {*rows} == {"east", "north west"}
+    assert rows["north west"][0].children.href == "/run/north%20west/"
+    assert rows["north west"][4].children == "–"
+    assert " ± " in rows["east"][4].children
+    with pytest.raises(KeyError):
+        views["../east"]
+    with pytest.raises(KeyError):
+        views["notes"]
+
+
+def test_each_run_has_its_page_behind_the_table(several):
+    with served(several) as url:
+        for path, known in (("", "_dash-"), ("run/east/", "/run/east/_dash-")):
+            answer = urllib.request.urlopen(url + path, timeout=PATIENCE)
+            assert known in answer.read().decode()
+            assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+        other = urllib.request.urlopen(f"{url}run/notes/", timeout=PATIENCE)
+        assert "/run/notes/" not in other.read().decode()  # no run: the table
+    with served(several, token="secret") as url:
+        address = url.partition("?")[0]
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(f"{address}run/east/_dash-layout", timeout=PATIENCE)
+
+
+@pytest.mark.browser
+def test_a_visitor_goes_from_the_table_to_a_run(several):
+    with served(several) as url, chromium() as page:
+        page.get(url)
+        wait(page, lambda p: "±" in text(p, "#runs"))
+        page.find_element("link text", "east").click()
+        wait(page, lambda p: count(p) == 4)

@@ -21,7 +21,9 @@ PORT = 8050
 
 
 def watch(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="RUN", help="A run directory, or a folder of runs.")
+    ],
     address: Annotated[
         str,
         typer.Option(
@@ -45,6 +47,8 @@ def watch(
 ) -> None:
     """Show a run in a browser, while it goes on and afterwards; Ctrl-C ends it.
 
+    Of a folder of runs, a fleet's say, it shows a table with a link to the page of each.
+
     Example:    livepde watch runs/mycase
     Elsewhere:  livepde watch runs/mycase --address 0.0.0.0:8050
     """
@@ -52,7 +56,8 @@ def watch(
     from livepde.dashboard import serve
     from livepde.runs.web import Address
 
-    runs.open(folder)  # what is no run is said before all else
+    if not runs.run_names(folder) or (folder / runs.RECORD).exists():
+        runs.open(folder)  # what is no run is said before all else
     server = serve(folder, Address.read(address, PORT, token))
     try:
         if attached:  # to a run that may be killed without a word

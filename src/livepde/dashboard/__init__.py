@@ -29,7 +29,8 @@ def serve(path: Path, address: Address) -> Server:
     Parameters
     ----------
     path
-        The run directory, finished or going on.
+        The run directory, finished or going on; or a folder of such, a fleet's say, of which the
+        page is a table with a link to the page of each run.
     address
         Where to listen.
 
@@ -41,6 +42,10 @@ def serve(path: Path, address: Address) -> Server:
         Dash is not installed.
     """
     check_installed()
+    from livepde.dashboard.overview import overview_page
     from livepde.dashboard.page import page
+    from livepde.runs import RECORD, run_names
 
+    if not (path / RECORD).exists() and run_names(path):
+        return Server(overview_page(path), address)
     return Server(page(path).server, address)

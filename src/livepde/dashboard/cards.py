@@ -25,7 +25,18 @@ from livepde.runs.directory import bound_text
 from livepde.runs.summary import channel_errors, digits
 from livepde.verdict import Severity
 
-__all__ = ["cards", "chip", "facts", "pretty", "summary", "tables", "verdict"]
+__all__ = [
+    "Level",
+    "cards",
+    "chip",
+    "facts",
+    "gravest",
+    "pretty",
+    "sign",
+    "summary",
+    "tables",
+    "verdict",
+]
 
 Level = Literal["good", "info", "warn", "bad"]
 
@@ -74,7 +85,7 @@ def _between(low: str, high: str) -> str:
 def chip(seen: RunView) -> list[Any]:
     """Return the status of a run."""
     level, text = STATUS.get(seen.status, ("info", seen.status))
-    return [_sign(level), html.Span(text)]
+    return [sign(level), html.Span(text)]
 
 
 def facts(seen: RunView) -> str:
@@ -116,8 +127,24 @@ def summary(seen: RunView) -> str:
     return f"{found}."
 
 
+def gravest(seen: RunView) -> tuple[Level, str]:
+    """Return the level and the sentence of the gravest finding on a run."""
+    levels: tuple[Level, ...] = ("bad", "warn", "good", "info")
+    return min(_found(seen), key=lambda item: levels.index(item[0]), default=("info", "–"))
+
+
 def verdict(seen: RunView) -> list[Any]:
     """Return whether anything is wrong: a sentence each, the gravest first."""
+    found = _found(seen)
+    lines = [html.Li([sign(level), html.Span(text)], className=level) for level, text in found]
+    if len(lines) <= MOST_SAID + 1:
+        return lines
+    rest = [html.Summary(f"and {len(lines) - MOST_SAID} more"), html.Ul(lines[MOST_SAID:])]
+    return [*lines[:MOST_SAID], html.Li(html.Details(rest))]
+
+
+def _found(seen: RunView) -> list[tuple[Level, str]]:
+    """Return the findings on a run: level and sentence."""
     found: list[tuple[Level, str]] = []
     if seen.problem:
         found.append(("bad", seen.problem))
@@ -151,15 +178,11 @@ def verdict(seen: RunView) -> list[Any]:
     if seen.gap > 1 and seen.doubts and not seen.ended:
         text = f"Looked at is one in {seen.gap} samples of this long run; counts are of those."
         found.append(("info", text))
-    found += [("info", note) for note in seen.notes]
-    lines = [html.Li([_sign(level), html.Span(text)], className=level) for level, text in found]
-    if len(lines) <= MOST_SAID + 1:
-        return lines
-    rest = [html.Summary(f"and {len(lines) - MOST_SAID} more"), html.Ul(lines[MOST_SAID:])]
-    return [*lines[:MOST_SAID], html.Li(html.Details(rest))]
+    return found + [("info", note) for note in seen.notes]
 
 
-def _sign(level: Level) -> Any:
+def sign(level: Level) -> Any:
+    """Return the sign of a level."""
     hidden: Any = {"aria-hidden": "true"}  # it only repeats what the text says
     return html.Span(SIGNS[level], className=f"sign {level}", **hidden)
 
@@ -217,7 +240,7 @@ def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
     level, text = VERDICTS[state]
     if state in ("partly", "pinned"):
         text += f", {100 * left:.2g}\N{NO-BREAK SPACE}% open"
-    return html.P([_sign(level), text], className="known")
+    return html.P([sign(level), text], className="known")
 
 
 def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
@@ -236,7 +259,7 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
         count, some = int(modes.attrs["of"]), float(modes.values[k])
         level: Level = "good" if some > 0.9 * count else "info" if some >= 1.0 else "warn"
         text = f"{some:.1f} of {count} modes told by the data"
-        lines.append(html.P([_sign(level), text], className="known"))
+        lines.append(html.P([sign(level), text], className="known"))
     return html.Article(
         [
             html.H3(name),

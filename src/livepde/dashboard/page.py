@@ -19,20 +19,22 @@ from livepde.dashboard.view import View
 if TYPE_CHECKING:
     from flask import Response
 
-__all__ = ["page"]
+__all__ = ["application", "harden", "page"]
 
 FAST, CATCHING_UP, SLOW = 2000, 300, 10_000  # milliseconds between two looks
 STOPS = 400  # of the slider
 OPEN = ("waiting", "running", "silent")  # a run in which something may happen soon
 
 
-def page(path: Path) -> dash.Dash:
+def page(path: Path, prefix: str = "/") -> dash.Dash:
     """Return the page of a run.
 
     Parameters
     ----------
     path
         The run directory, finished or going on.
+    prefix
+        Where browsers find the page, as it ends: it may be mounted below another one.
 
     Raises
     ------
@@ -40,20 +42,27 @@ def page(path: Path) -> dash.Dash:
         There is no run.
     """
     view = View(path)
-    app = dash.Dash(
-        "livepde",
-        assets_folder=str(Path(__file__).with_name("assets")),
-        serve_locally=True,
-        title=markup.escape(f"{view.look().title} – livepde"),
-        update_title="",
-        meta_tags=[{"name": "viewport", "content": "width=device-width, initial-scale=1"}],
-    )
+    app = application(f"{view.look().title} – livepde", prefix)
     app.layout = _skeleton
     _look(app, view)
     _steer(app, view)
     _draw(app, view)
-    _harden(app)
+    harden(app)
     return app
+
+
+def application(title: str, prefix: str = "/") -> dash.Dash:
+    """Return a page without content that loads nothing from elsewhere."""
+    return dash.Dash(
+        "livepde",
+        assets_folder=str(Path(__file__).with_name("assets")),
+        serve_locally=True,
+        title=markup.escape(title),
+        update_title="",
+        meta_tags=[{"name": "viewport", "content": "width=device-width, initial-scale=1"}],
+        requests_pathname_prefix=prefix,
+        routes_pathname_prefix="/",
+    )
 
 
 def _skeleton() -> Any:
@@ -267,7 +276,7 @@ def _framed(panel: Panel) -> Any:
     )
 
 
-def _harden(app: dash.Dash) -> None:
+def harden(app: dash.Dash) -> None:
     """Tell browsers to load nothing from elsewhere, and to run no script but the page's own."""
     scripts = " ".join(
         f"'{found}'" if not found.startswith("'") else found for found in app.csp_hashes()

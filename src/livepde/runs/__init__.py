@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from livepde.runs.directory import JOURNAL, RECORD, Run, RunWriter, free_path, refuse_taken
+from livepde.runs.directory import (
+    JOURNAL,
+    RECORD,
+    Run,
+    RunWriter,
+    free_path,
+    refuse_taken,
+    run_names,
+)
 from livepde.runs.directory import open_run as open
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
@@ -39,6 +47,7 @@ __all__ = [
     "measures",
     "open",
     "refuse_taken",
+    "run_names",
     "severities",
     "stopped_by_signals",
     "tables",

@@ -48,6 +48,7 @@ __all__ = [
     "open_run",
     "plain",
     "refuse_taken",
+    "run_names",
 ]
 
 FORMAT = 1
@@ -93,16 +94,17 @@ def _nearest(folder: Path) -> str:
     """Return where the run may be that is not in this folder: below it, or in runs/."""
     if folder.is_file():  # a case, or a file of a run
         folder = folder.parent
-    near = difflib.get_close_matches(folder.name, _runs_in(folder.parent), n=1)
+    near = difflib.get_close_matches(folder.name, run_names(folder.parent), n=1)
     likely = [folder.parent / name for name in near]
     for place in (folder, folder / RUNS, folder.parent / RUNS):
-        known = _runs_in(place)
+        known = run_names(place)
         named = [name for name in known if name == folder.name] or known[-1:]
         likely += [place / name for name in named]
     return f"did you mean '{likely[0]}'?" if likely else "'livepde run CASE' makes one in runs/."
 
 
-def _runs_in(folder: Path) -> list[str]:
+def run_names(folder: Path) -> list[str]:
+    """Return the names of the run directories in a folder."""
     return sorted(item.parent.name for item in folder.glob(f"*/{RECORD}"))
 
 
