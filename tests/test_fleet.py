@@ -181,7 +181,8 @@ PAIRS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "law"), PAIRS)
 def test_equals_separate_identifiers(model, law):
-    fleet, _ = compare(MODELS[model](), LAWS[law])
+    steps = 8 if model == "walks" else 16  # whose iterated start is dear
+    fleet, _ = compare(MODELS[model](), LAWS[law], partial(samples, steps=steps))
     assert fleet.together, fleet.note
 
 

@@ -263,7 +263,10 @@ def square(cells=12):
             lp.GradientLaw(10.0, newton=lp.stepping.Newton(tolerance=1e-11, share=0.0)),
             lp.Subdomain(lambda x: x[0] < 0.6),
         ),
-        (lp.SensitivityLaw(modes=4, noise=1e-3), lp.Points([(0.3, 0.4), (0.7, 0.6)])),
+        (
+            lp.SensitivityLaw(modes=4, noise=1e-3, start_window=1, shadows=None),
+            lp.Points([(0.3, 0.4), (0.7, 0.6)]),
+        ),
     ],
 )
 def test_estimates_on_large_meshes(law, sensors, pieces, monkeypatch):
