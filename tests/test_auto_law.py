@@ -242,15 +242,15 @@ def test_it_keeps_the_contract_of_a_law(noise: float | None):
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_a_resumed_run_gives_the_same_numbers(noise: float | None, tmp_path: Any):
     """Saved before, at and after a replay, as often as the run goes on from there."""
-    stops, first = (5, 45, 190, 260), build(noise=noise)
+    stops, first = (5, 45, 100, 120), build(noise=noise)
     for begin, stop in pairwise((0, *stops)):
         run(first, still()[begin:stop])
         first.save(tmp_path / f"{stop}.bin")
-    expected = run(build(noise=noise), still()[:300])[-1]
+    expected = run(build(noise=noise), still()[:140])[-1]
     for stop in stops:
         second = build(noise=noise)
         second.load(tmp_path / f"{stop}.bin")
-        found = run(second, still()[stop:300])[-1]
+        found = run(second, still()[stop:140])[-1]
         np.testing.assert_array_equal(found.q, expected.q)
         np.testing.assert_array_equal(found.u, expected.u)
         assert found.belief.q_factor is not None

@@ -131,7 +131,7 @@ def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
 @pytest.mark.slow
 def test_a_result_keeps_little_more_than_its_numbers():
     identifier = rod(withheld=lp.Points({"T_0": 0.4}))
-    count = 3000
+    count = 1000
     result = identifier.run(samples(count, ["T_0"]))
     records, axes = result.records, {"time", "snapshot"}
     data = result.to_xarray()

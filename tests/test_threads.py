@@ -187,17 +187,17 @@ CASES = {
     "auto gain, square": Case(lp.GradientLaw(gain="auto"), square, inner),
     "Baumeister": Case(lp.laws.BaumeisterLaw(gain=10.0), field_rod, lp.Full),
     "Kuegler": Case(lp.laws.KueglerLaw(gain=10.0), nonlinear_rod, inner, samples=4),
-    "sensitivity": Case(lp.SensitivityLaw(), samples=8),
-    "sensitivity, inputs": Case(lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=8),
+    "sensitivity": Case(lp.SensitivityLaw(), samples=6),
+    "sensitivity, inputs": Case(lp.SensitivityLaw(drift=0.01), powered_rod, missing=0.2, samples=6),
     "sensitivity, nonlinear": Case(lp.SensitivityLaw(), nonlinear_rod, samples=5),
-    "sensitivity, positive unknown": Case(lp.SensitivityLaw(), positive_rod, samples=8),
+    "sensitivity, positive unknown": Case(lp.SensitivityLaw(), positive_rod, samples=5),
     "sensitivity, moving sensor": Case(lp.SensitivityLaw(), powered_rod, probe),
-    "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages, samples=12),
+    "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages, samples=6),
     "sensitivity, large square": Case(
         lp.SensitivityLaw(modes=3), large_square, averages, samples=3
     ),
-    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=8),
-    "guards and jumps": Case(GUARDED, powered_rod, samples=8),
+    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=6),
+    "guards and jumps": Case(GUARDED, powered_rod, samples=6),
     "bank": Case(lp.AutoLaw(), powered_rod, samples=6),
 }
 

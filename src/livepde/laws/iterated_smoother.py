@@ -11,22 +11,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
 
 from livepde.laws.assimilation import assimilate, assimilate_at_once
 from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, without_ledger
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.members import changed, put, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
+from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
-__all__ = ["expecting", "iterate_starts", "missed", "moved"]
+__all__ = ["expecting", "iterate_starts", "missed", "moved", "unaccompanied"]
 
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
@@ -102,7 +103,9 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     log = state.log[:, int(state.window[0]) :]
     opening = first_interval(log, problem.channels)
     intervals = intervals_since(log, problem.channels)
-    samples = _Samples(work, state, opening, intervals)
+    # A search needs neither the ledger nor the errors of the discretisation, which cost as much
+    # again: the last pass alone follows them.
+    samples = _Samples(*unaccompanied(work, state), opening, intervals)
     ends: list[_Pass] = []
     for trajectory in _beginnings(samples, (1 + len(intervals), state.now.C.shape[2])):
         one = samples.about(trajectory)
@@ -113,8 +116,21 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
             break
     if not ends:
         return None
-    best = min(ends, key=lambda one: one.misfit)
+    trajectory = min(ends, key=lambda one: one.misfit).trajectory
+    best = _Samples(work, state, opening, intervals).about(trajectory)
+    if best is None:
+        return None
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
+
+
+def unaccompanied(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityWork, SensitivityState]:
+    """Return a filter that follows no discretisation error and keeps no ledger, and one member."""
+    none = ShadowState.none(len(state), state.now.u.shape[1], state.now.C.shape[2])
+    start, now = (changed(without_ledger(x), shadows=none) for x in (state.start, state.now))
+    filter_ = replace(work.filter, shadows=None, judge=None)
+    return replace(work, filter=filter_), changed(state, start=start, now=now)
 
 
 def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:

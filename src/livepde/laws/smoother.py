@@ -29,12 +29,11 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.laws.assimilation import assimilate_at_once
 from livepde.laws.base import FixedInterval
-from livepde.laws.filter_state import FilterState, without_ledger
+from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
-from livepde.laws.iterated_smoother import expecting, missed, moved
+from livepde.laws.iterated_smoother import expecting, missed, moved, unaccompanied
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import KeptFactors
 
@@ -80,7 +79,7 @@ def smoothed(
         The member before the first sample, and its filter after the last one in the run: its noise
         level and the statistics of its innovations are those of all samples.
     """
-    work, before = _bare(work, before)
+    work, before = unaccompanied(work, before)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # not finite: not used
         best = _descended(_FixedInterval(work, before, after, data))
     return _backward(best, after)
@@ -93,22 +92,12 @@ def evidence(
 
     Minus infinity where they cannot be followed. Parameters as for `smoothed`.
     """
-    work, before = _bare(work, before)
+    work, before = unaccompanied(work, before)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         samples = _FixedInterval(work, before, after, data)
         samples.work = replace(work, options=replace(work.options, adaptive=True))
         found = samples.about(samples.estimated)
     return float(found.points[-1].x.evidence[0]) if found is not None else -np.inf
-
-
-def _bare(
-    work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityWork, SensitivityState]:
-    """Return a filter that follows no discretisation error and keeps no ledger, and one member."""
-    none = ShadowState.none(len(state), state.now.u.shape[1], state.now.C.shape[2])
-    start, now = (changed(without_ledger(x), shadows=none) for x in (state.start, state.now))
-    filter_ = replace(work.filter, shadows=None, judge=None)
-    return replace(work, filter=filter_), changed(state, start=start, now=now)
 
 
 def _descended(samples: _FixedInterval) -> _SmootherPass:
