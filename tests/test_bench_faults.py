@@ -169,15 +169,15 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_soak_in_small(monkeypatch):
-    monkeypatch.setattr(soak, "WARM", 100)
-    monkeypatch.setattr(soak, "BLOCK", 50)
-    outcome = soak.soak(300)
+    monkeypatch.setattr(soak, "WARM", 200)
+    monkeypatch.setattr(soak, "BLOCK", 100)
+    outcome = soak.soak(700)
     checks = {check.name.split(":")[0]: check for check in outcome.checks}
     assert checks["memory"].ok
     assert checks["steps that failed"].ok
     assert checks["estimates that a reader does not find"].ok
     assert checks["relative error of k at the end"].ok
-    with pytest.raises(lp.errors.RunError, match="at least 200"):
+    with pytest.raises(lp.errors.RunError, match="at least 400"):
         soak.soak(100)
 
 

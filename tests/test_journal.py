@@ -687,7 +687,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
 
 @pytest.mark.slow
 def test_an_open_reader_does_not_let_the_log_grow(tmp_path):
-    run = started(tmp_path, 3000)
+    run = started(tmp_path, 1500)
     with Journal.open(tmp_path / NAME) as reader:
         slow = reader.after(0)
         run.sinks.append(First(slow))
