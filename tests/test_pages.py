@@ -357,7 +357,7 @@ def test_pages_that_the_program_writes(monkeypatch):
     assert "Example: `livepde run mycase/case.toml`\n" in commands
     keys = hooks.on_page_markdown("<!-- keys of a case -->")
     assert "| `prior` | a quantity | required |" in keys
-    assert '| `spacing` | `"uniform"` or `"geometric"` | `"uniform"` |' in keys
+    assert '| `spacing` | `"uniform"` or `"geometric"` or [' in keys
     assert "| `start` | a date or a time |  |" in keys
     assert "| `cells` | a whole number or [a whole number, a whole number] |  |" in keys
     assert "## `[unknowns.NAME.evolution]`" in keys

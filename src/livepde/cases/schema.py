@@ -83,8 +83,10 @@ class MeshSpec(Spec):
             if "spacing" in self.model_fields_set:
                 raise ValueError("spacing belongs to an interval with cells")
         elif given == {"start", "stop", "cells"}:
-            if not isinstance(self.cells, int) or pair:
-                raise ValueError("cells, spacing: expected one each for an interval")
+            if not isinstance(self.cells, int):
+                raise ValueError("cells: expected one number for an interval")
+            if pair:
+                raise ValueError("spacing: expected one word for an interval")
         elif given == {"x", "y", "cells"}:
             if isinstance(self.cells, int) or (self.spacing != "uniform" and not pair):
                 raise ValueError("expected cells = [nx, ny], spacing = [of x, of y] of a rectangle")
