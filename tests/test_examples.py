@@ -44,6 +44,7 @@ def test_every_example_is_tested():
         "room_wall",
         "battery_charge",
         "live_shards",
+        "live_shards_ray",
     }
 
 
