@@ -225,7 +225,7 @@ def test_an_unknown_initial_state_learns_from_a_first_sample():
 @pytest.mark.slow
 def test_a_bound_is_kept_and_left_again():
     model = rod(bounds=(0.45, 0.55))
-    fleet, estimate = compare(model, LAWS["plain"], members=6)
+    fleet, estimate = compare(model, law(start_window=4), members=6)
     assert fleet.together
     alpha, _ = estimate.parameters["alpha"]
     assert np.isin(alpha, (0.45, 0.55)).any()
@@ -248,7 +248,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
         (rod(), lp.laws.Guards()),
         (rod(bounds=(0.45, 0.55)), None),
     ):
-        fleet, estimate = compare(model, lp.SensitivityLaw(guards=guards), stream)
+        fleet, estimate = compare(model, law(guards=guards, start_window=4), stream)
         assert fleet.together
         assert estimate.ok.all()
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], ["a", "b", "c", "d"])
@@ -310,7 +310,7 @@ def moving_matrix():
     ],
 )
 def test_other_models_step_one_by_one_and_say_so(build, why):
-    fleet, _ = compare(build(), LAWS["plain"])
+    fleet, _ = compare(build(), LAWS["plain"], partial(samples, steps=8))
     assert why in fleet.note
 
 
