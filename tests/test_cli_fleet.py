@@ -379,6 +379,7 @@ if __name__ == "__main__":
 WORKERS = {"dask": "--multiprocessing-fork", "ray": "ray::PoolActor"}
 
 
+@pytest.mark.study
 @pytest.mark.process
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
 @pytest.mark.usefixtures("longer")
