@@ -13,6 +13,7 @@ import livepde as lp
 from livepde.errors import LawError
 from livepde.runs import doubts, verdict
 from livepde.verdict import LEVELS, Finding, Verdict, WithheldLedger, discretised
+from livepde.verdict.findings import flat
 
 TIMES = np.linspace(0.0, 8.0, 161)
 NOISE = 0.02
@@ -412,3 +413,12 @@ def test_the_worst_finding_decides_and_none_is_said_twice():
     assert len(set(found.sentences)) == len(found.sentences)
     assert Verdict.of(notes).level == "trusted"
     assert found.with_findings([grave]).findings == found.findings
+
+
+def test_a_finding_of_later_data_takes_the_place_of_an_earlier_one():
+    """A page reads the verdict of some samples ago, and the shares that are left now."""
+    earlier = Verdict.of([flat("a", 0.92), flat("b", 0.95)], [], [])
+    found = earlier.with_findings([flat("a", 0.94)])
+    assert sorted(one.subject for one in found.findings) == ["a", "b"]
+    assert any("94%" in text for text in found.sentences)
+    assert not any("92%" in text for text in found.sentences)

@@ -295,10 +295,15 @@ class Verdict:
         return cls.of((), ("everything: no law has judged the run",))
 
     def with_findings(self, more: Iterable[Finding]) -> Verdict:
-        """Return the verdict with more findings; one that says the same is not said twice."""
+        """Return the verdict with more findings, none of which is said twice.
+
+        One on the same unknown or sensor as an earlier one takes its place: it is of later data.
+        """
         said = {finding.text for finding in self.findings}
         new = [finding for finding in more if finding.text not in said]
-        return Verdict.of([*self.findings, *new], self.untested, self.unseen)
+        later = {(finding.what, finding.subject) for finding in new if finding.subject}
+        kept = [one for one in self.findings if (one.what, one.subject) not in later]
+        return Verdict.of([*kept, *new], self.untested, self.unseen)
 
     @property
     def sentences(self) -> list[str]:
