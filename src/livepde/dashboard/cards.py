@@ -58,10 +58,10 @@ STATUS: dict[str, tuple[Level, str]] = {
     "unreadable": ("bad", "cannot be read"),
 }
 VERDICTS: dict[str, tuple[Level, str]] = {
-    "pinned": ("good", "well known"),
-    "partly": ("info", "partly known"),
+    "pinned": ("good", "well determined"),
+    "partly": ("info", "partly determined"),
     "moves": ("info", "changes with time"),
-    "flat": ("warn", "hardly known yet"),
+    "flat": ("warn", "hardly determined yet"),
     "at its bound": ("warn", "at its bound: the bound decides"),
 }
 
@@ -239,7 +239,7 @@ def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
     state = "moves" if moves and known.verdict == "partly" else known.verdict
     level, text = VERDICTS[state]
     if state in ("partly", "pinned"):
-        text += f", {100 * left:.2g}\N{NO-BREAK SPACE}% open"
+        text += f": {100 * left:.2g}\N{NO-BREAK SPACE}% of prior std. dev. left"
     return html.P([sign(level), text], className="known")
 
 
